@@ -1,0 +1,1 @@
+"""The control PLC: scan cycle, sequence player and guards between the optimiser and the plant."""

@@ -1,0 +1,11 @@
+"""`python -m control_plc`: the control PLC as a service of its own."""
+
+import sys
+
+from coldloop.service import main
+
+from control_plc.runtime import serve
+from control_plc.settings import ControlSettings
+
+if __name__ == "__main__":
+    sys.exit(main("control_plc", ControlSettings, serve, None))

@@ -1,0 +1,36 @@
+"""Configuration of the control PLC, checked when it is made and immutable after."""
+
+from typing import Annotated
+
+from coldloop.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
+from coldloop.limits import InputLimits
+from coldloop.modbus.settings import ServerSettings
+from coldloop.model_settings import ModelSettings
+from coldloop.registers.codec import WordOrder
+from coldloop.session import SessionSettings
+from coldloop.telemetry import TelemetrySettings
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class ControlSection(BaseModel):
+    """Section `control_plc` of the configuration."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    server: ServerSettings = ServerSettings(port=CONTROL_PORT)
+    word_order: WordOrder = WordOrder.HIGH_FIRST
+    plant: Endpoint = Endpoint(port=PLANT_PORT)
+    scan_tolerance_ms: Annotated[float, Field(gt=0)] = 5.0
+    """Lateness of a scan, in real time, that counts as an overrun."""
+
+
+class ControlSettings(BaseModel):
+    """What the control PLC reads of a configuration."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    limits: InputLimits = InputLimits()
+    model: ModelSettings = ModelSettings()
+    session: SessionSettings = SessionSettings()
+    control_plc: ControlSection = ControlSection()
+    telemetry: TelemetrySettings = TelemetrySettings()

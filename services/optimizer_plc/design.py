@@ -1,0 +1,67 @@
+"""What the constrained predictive controller is asked to do: weights, bands and instants (paper, section IV).
+
+The paper leaves weights and scaling open; `docs/science.md` says why these were chosen.
+"""
+
+from typing import Annotated, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveFloat, model_validator
+
+N_INPUTS = 3
+N_SLACKS = 4
+"""Slack inputs of the paper: L1 low, L1 high, T5 low, T5 high."""
+
+Triple = tuple[float, float, float]
+Pair = tuple[float, float]
+
+
+def _rising_instants(instants: tuple[int, ...]) -> tuple[int, ...]:
+    if not instants or instants[0] < 1 or any(b <= a for a, b in zip(instants, instants[1:], strict=False)):
+        raise ValueError("instants are rising sample numbers from 1 on")
+    return instants
+
+
+Instants = Annotated[tuple[int, ...], AfterValidator(_rising_instants)]
+
+
+class ControlDesign(BaseModel):
+    """The constrained control problem. Inputs are in the order (CV155 %, NCR22_A W, CV156 %)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    decision_instants: Instants = (1, 2, 4, 8, 16, 50, 100)
+    constraint_instants: Instants = (1, 2, 3, 4, 6, 8, 16, 24, 32, 48, 60, 72, 84, 100)
+    output_low: Pair = (59.0, 9.0)
+    """Bands of L1 (%) and T5 (K)."""
+    output_high: Pair = (61.0, 16.0)
+    input_scale: Triple = (10.0, 50.0, 10.0)
+    input_weight: Triple = (1e-2, 4e-4, 1e-2)
+    """Diagonal of R, on deviations from the operating point."""
+    pressure_scale: PositiveFloat = 2000.0
+    level_scale: PositiveFloat = 1.0
+    """In % of the vessel."""
+    temperature_scale: PositiveFloat = 1.0
+    state_weight: PositiveFloat = 0.1
+    violation_weight: tuple[PositiveFloat, PositiveFloat] = (100.0, 100.0)
+    """rho, per %^2 of L1 and K^2 of T5 and sample."""
+
+    @property
+    def horizon(self) -> int:
+        """N_p, in sampling periods."""
+        return self.decision_instants[-1]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.constraint_instants[-1] > self.horizon:
+            raise ValueError("constraint_instants end behind the last of decision_instants, which is the horizon")
+        if any(low >= high for low, high in zip(self.output_low, self.output_high, strict=True)):
+            raise ValueError("each of output_low is below its output_high")
+        if min(*self.input_scale, *self.input_weight) <= 0:
+            raise ValueError("input_scale and input_weight are positive")
+        return self
+
+
+def trivial_design(design: ControlDesign) -> ControlDesign:
+    """Return the same problem with every sample a decision and a constraint instant: 700 variables, 1000 rows."""
+    every = tuple(range(1, design.horizon + 1))
+    return design.model_copy(update={"decision_instants": every, "constraint_instants": every})

@@ -1,0 +1,202 @@
+"""What the optimiser believes of the plant's state at an updating instant."""
+
+from enum import StrEnum
+from typing import Annotated, NamedTuple, Protocol
+
+import numpy as np
+from coldloop.compiled import kernel
+from coldloop.process import SAMPLING_PERIOD_S, TICK_S
+from coldloop.registers.control_plc import Update
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+
+from optimizer_plc.linear_algebra import multiply
+from optimizer_plc.prediction import PredictionModel
+
+Array = NDArray[np.float64]
+
+
+class EstimatorKind(StrEnum):
+    """Which estimator."""
+
+    KALMAN = "kalman"
+    STATE_FEEDBACK = "state-feedback"
+
+
+class EstimatorSettings(BaseModel):
+    """Settings of the estimator; standard deviations are per square root of a sampling period of 5 s."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: EstimatorKind = EstimatorKind.KALMAN
+    load_walk_w: PositiveFloat = 3.0
+    """Random walk of the load mismatch, W."""
+    pressure_noise_pa: PositiveFloat = 50.0
+    volume_noise_m3: PositiveFloat = 1e-5
+    temperature_noise_k: PositiveFloat = 0.05
+    level_sensor: PositiveFloat = 0.01
+    """Standard deviation of the sensors: %, Hz, K and bar."""
+    speed_sensor: PositiveFloat = 1.0
+    temperature_sensor: PositiveFloat = 0.02
+    pressure_sensor: PositiveFloat = 1e-3
+    initial_periods: Annotated[int, Field(ge=1)] = 400
+    """Longest run of the Riccati recursion for a stationary gain, in periods."""
+
+
+class Estimate(NamedTuple):
+    """State and load as deviations from the operating point."""
+
+    x: Array
+    w: float
+    mismatch: float
+    """Share of w that no sensor saw, W."""
+
+
+class Estimator(Protocol):
+    """Turns measurements at updating instants into states."""
+
+    def correct(self, update: Update) -> Estimate:
+        """Take the measurement at an updating instant."""
+
+    def predict(self, segments: list[tuple[Array, int]]) -> Array:
+        """Move to the next updating instant under (input deviation, ticks) segments; return the state there."""
+
+
+class StateFeedback:
+    """Believes the simulated state; not free of offset, for it does not know why the model is wrong."""
+
+    def __init__(self, prediction: PredictionModel) -> None:
+        self._model = prediction
+        self._estimate = Estimate(np.zeros(prediction.n_states), 0.0, 0.0)
+
+    def correct(self, update: Update) -> Estimate:
+        """Take the simulated state."""
+        m = self._model.model
+        self._estimate = Estimate(np.asarray(update.x) - m.x0, update.load - m.w0, 0.0)
+        return self._estimate
+
+    def predict(self, segments: list[tuple[Array, int]]) -> Array:
+        """Predict with the model."""
+        return _through(self._model, self._estimate.x, self._estimate.w, segments)
+
+
+class KalmanFilter:
+    """Stationary Kalman filter on the LTI model with one slow load-mismatch state; the known load is fed in."""
+
+    def __init__(self, prediction: PredictionModel, settings: EstimatorSettings) -> None:
+        self._model = prediction
+        self._settings = settings
+        self._x = np.zeros(prediction.n_states)
+        self._mismatch = 0.0
+        self._estimate = Estimate(self._x, 0.0, 0.0)
+        self._gains: dict[int, Array] = {}
+        self._since = 1
+
+    def correct(self, update: Update) -> Estimate:
+        """Correct the predicted state by the measurement, with the gain of the period that just ended."""
+        m = self._model.model
+        u = np.asarray(update.u_before) - m.u0
+        known = update.load - m.w0
+        innovation = np.asarray(update.y) - m.y0 - self._model.output(self._x, u, known + self._mismatch)
+        correction = multiply(self._gain(self._since), innovation[:, None])[:, 0]
+        self._x = self._x + correction[:-1]
+        self._mismatch += float(correction[-1])
+        self._estimate = Estimate(self._x, known + self._mismatch, self._mismatch)
+        return self._estimate
+
+    def predict(self, segments: list[tuple[Array, int]]) -> Array:
+        """Predict with the model and the mismatch."""
+        self._x = _through(self._model, self._estimate.x, self._estimate.w, segments)
+        self._since = sum(ticks for _, ticks in segments)
+        return self._x
+
+    def _gain(self, ticks: int) -> Array:
+        if ticks not in self._gains:
+            self._gains[ticks] = self._stationary_gain(ticks)
+        return self._gains[ticks]
+
+    def _stationary_gain(self, ticks: int) -> Array:
+        s, model = self._settings, self._model
+        nx = self._model.n_states
+        step = self._model.transitions[min(ticks, max(self._model.transitions))]
+        A = np.eye(nx + 1)
+        A[:nx, :nx], A[:nx, nx] = step.A, step.F[:, 0]
+        C = np.ascontiguousarray(np.hstack([model.C, model.G]))
+        drift = np.full(nx + 1, s.temperature_noise_k)
+        drift[0], drift[1], drift[nx] = s.pressure_noise_pa, s.volume_noise_m3, s.load_walk_w
+        sensors = np.full(C.shape[0], s.temperature_sensor)
+        sensors[0], sensors[1], sensors[12:] = s.level_sensor, s.speed_sensor, s.pressure_sensor
+        share = ticks * TICK_S / SAMPLING_PERIOD_S
+        return stationary_gain(A, C, drift**2 * share, sensors**2, s.initial_periods)
+
+
+def _through(model: PredictionModel, x: Array, w: float, segments: list[tuple[Array, int]]) -> Array:
+    for u, ticks in segments:
+        x = model.advance(x, u, w, ticks)
+    return x
+
+
+@kernel
+def _measure(P: Array, C: Array, sensor: float, output: int, column: Array) -> None:
+    """Write the gain of one scalar measurement into `column` and update P by it."""
+    n = P.shape[0]
+    variance = sensor
+    for i in range(n):
+        column[i] = 0.0
+        for j in range(n):
+            column[i] += P[i, j] * C[output, j]
+    for i in range(n):
+        variance += C[output, i] * column[i]
+    for i in range(n):
+        for j in range(n):
+            P[i, j] -= column[i] * column[j] / variance
+    for i in range(n):
+        column[i] /= variance
+
+
+@kernel
+def stationary_gain(A: Array, C: Array, process: Array, sensors: Array, periods: int) -> Array:
+    """Return the stationary gain (n, n_y) by the Riccati recursion, one scalar measurement after the other.
+
+    `process` (n) and `sensors` (n_y) are variances. No matrix is inverted: sensors are independent.
+    """
+    n, m = A.shape[0], C.shape[0]
+    P = np.zeros((n, n))
+    for i in range(n):
+        P[i, i] = 100.0 * process[i]
+    columns = np.zeros((m, n))
+    previous = np.zeros((m, n))
+    At = np.ascontiguousarray(A.T)
+    for _ in range(periods):
+        P = multiply(multiply(A, P), At)
+        for i in range(n):
+            P[i, i] += process[i]
+        for output in range(m):
+            _measure(P, C, sensors[output], output, columns[output])
+        change, size = 0.0, 0.0
+        for output in range(m):
+            for i in range(n):
+                change = max(change, abs(columns[output, i] - previous[output, i]))
+                size = max(size, abs(columns[output, i]))
+                previous[output, i] = columns[output, i]
+        if change <= 1e-9 * size:
+            break
+    return _joint_gain(columns, C)
+
+
+@kernel
+def _joint_gain(columns: Array, C: Array) -> Array:
+    """Return the matrix that does at once what the scalar corrections `columns` (n_y, n) do one after the other."""
+    m, n = columns.shape
+    gain = np.zeros((n, m))
+    for source in range(m):
+        x = np.zeros(n)
+        for output in range(m):
+            residual = 1.0 if output == source else 0.0
+            for j in range(n):
+                residual -= C[output, j] * x[j]
+            for i in range(n):
+                x[i] += columns[output, i] * residual
+        for i in range(n):
+            gain[i, source] = x[i]
+    return gain

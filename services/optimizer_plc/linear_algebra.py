@@ -1,0 +1,66 @@
+"""Dense linear algebra as plain loops: the same bits on every processor, in single or double precision.
+
+The inner loops run along rows, so that they vectorise without changing the order of any sum.
+"""
+
+import numpy as np
+from coldloop.compiled import kernel
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+
+
+@kernel
+def multiply(A: Array, B: Array) -> Array:
+    """Return A B for A (n, k) and B (k, m)."""
+    product = np.zeros((A.shape[0], B.shape[1]), A.dtype)
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            factor = A[i, k]
+            if factor != 0.0:
+                for j in range(B.shape[1]):
+                    product[i, j] += factor * B[k, j]
+    return product
+
+
+@kernel
+def apply(A: Array, x: Array, result: Array) -> None:
+    """Add A x to `result` for the transposed storage A (k, n), x (k), result (n)."""
+    for k in range(A.shape[0]):
+        factor = x[k]
+        if factor != 0.0:
+            for j in range(A.shape[1]):
+                result[j] += factor * A[k, j]
+
+
+@kernel
+def cholesky(M: Array) -> None:
+    """Overwrite the upper triangle of the symmetric positive definite M (n, n) by U with U' U = M."""
+    n = M.shape[0]
+    for k in range(n):
+        pivot = np.sqrt(M[k, k])
+        M[k, k] = pivot
+        inverse = M.dtype.type(1.0) / pivot
+        for j in range(k + 1, n):
+            M[k, j] *= inverse
+        for i in range(k + 1, n):
+            factor = M[k, i]
+            if factor != 0.0:
+                for j in range(i, n):
+                    M[i, j] -= factor * M[k, j]
+
+
+@kernel
+def cholesky_solve(U: Array, b: Array) -> None:
+    """Overwrite b (n) by the solution of U' U x = b."""
+    n = U.shape[0]
+    for k in range(n):
+        b[k] /= U[k, k]
+        factor = b[k]
+        for j in range(k + 1, n):
+            b[j] -= factor * U[k, j]
+    for k in range(n - 1, -1, -1):
+        total = b[k]
+        for j in range(k + 1, n):
+            total -= U[k, j] * b[j]
+        b[k] = total / U[k, k]

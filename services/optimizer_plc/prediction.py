@@ -1,0 +1,75 @@
+"""The discrete prediction model, at the sampling period and at every updating period.
+
+One matrix triple for a tick comes with the model file; those of longer periods are its powers, so no matrix
+exponential is needed on line.
+"""
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from coldloop.lti_model import LtiModel
+from coldloop.process import L1, T5, TICK_S, TICKS_PER_SAMPLE
+from numpy.typing import NDArray
+
+from optimizer_plc.linear_algebra import multiply
+
+Array = NDArray[np.float64]
+
+
+class Transition(NamedTuple):
+    """x(t + period) = A x(t) + B u + F w, for constant u and w; deviations from the operating point."""
+
+    A: Array
+    B: Array
+    F: Array
+
+    def then(self, later: "Transition") -> "Transition":
+        """Return the transition over this period followed by `later`, under the same inputs."""
+        return Transition(
+            multiply(later.A, self.A),
+            multiply(later.A, self.B) + later.B,
+            multiply(later.A, self.F) + later.F,
+        )
+
+
+class PredictionModel:
+    """LTI model of the plant around its operating point.
+
+    `transitions[k]` spans k ticks, k = 1..ticks of a sampling period. Outputs are y = C x + D u + G w, of which
+    `constrained` are the rows of L1 and T5.
+    """
+
+    constrained = (L1, T5)
+
+    def __init__(self, model: LtiModel) -> None:
+        self.model = model
+        discrete = model.discretised(TICK_S)
+        tick = Transition(*(np.array(M, order="C") for M in (discrete.A, discrete.B, discrete.F[:, None])))
+        self.C, self.D, self.G = np.array(model.C), np.array(model.D), np.array(model.G[:, None])
+        self.transitions = {1: tick}
+        for ticks in range(2, TICKS_PER_SAMPLE + 1):
+            self.transitions[ticks] = self.transitions[ticks - 1].then(tick)
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.model.A.shape[0])
+
+    @cached_property
+    def sample(self) -> Transition:
+        """The transition over one sampling period of 5 s."""
+        return self.transitions[TICKS_PER_SAMPLE]
+
+    def advance(self, x: Array, u: Array, w: float, ticks: int) -> Array:
+        """Return the state after `ticks` ticks under constant deviations u and w."""
+        while ticks > 0:
+            step = min(ticks, TICKS_PER_SAMPLE)
+            A, B, F = self.transitions[step]
+            x = multiply(A, x[:, None])[:, 0] + multiply(B, u[:, None])[:, 0] + F[:, 0] * w
+            ticks -= step
+        return x
+
+    def output(self, x: Array, u: Array, w: float) -> Array:
+        """Return the deviation of the measured output, shape (22,)."""
+        return multiply(self.C, x[:, None])[:, 0] + multiply(self.D, u[:, None])[:, 0] + self.G[:, 0] * w

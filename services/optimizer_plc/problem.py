@@ -1,0 +1,252 @@
+"""The condensed quadratic problem: min z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high.
+
+z holds, knot by knot, the 3 inputs (deviations from the operating point over `input_scale`) and then, knot by knot,
+the 4 slacks of the output bands. phi and gamma are affine in the predicted state, the load and the input applied
+before the first knot; Phi and Gamma are constant. No factor 1/2 stands before Phi (`docs/science.md`, ruling 11).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from coldloop.limits import InputLimits
+from coldloop.process import TICKS_PER_SAMPLE
+from numpy.typing import NDArray
+
+from optimizer_plc.design import N_INPUTS, N_SLACKS, ControlDesign
+from optimizer_plc.linear_algebra import apply, multiply
+from optimizer_plc.prediction import PredictionModel
+from optimizer_plc.profile import interpolation, shift
+
+Array = NDArray[np.float64]
+
+RATE_ROW_GAIN = 4.0
+"""Rate rows are divided by their largest coefficient and multiplied by this: with a softer penalty a truncated or
+penalised solution undercuts the optimum by breaking the rate limits."""
+
+
+class QuadraticProblem(NamedTuple):
+    """One instance of the problem; shapes (n, n), (n,), (m, n), (m,), (n,), (n,). `constant` completes the cost."""
+
+    Phi: Array
+    phi: Array
+    Gamma: Array
+    gamma: Array
+    low: Array
+    high: Array
+    constant: float
+
+
+class Situation(NamedTuple):
+    """What an instance depends on, as deviations from the operating point."""
+
+    x: Array
+    w: float
+    u_before: Array
+    """Input applied just before the first knot takes effect."""
+    elapsed_ticks: int = TICKS_PER_SAMPLE
+    """Time since the update before; matters when the rate limit follows the elapsed time."""
+
+
+class PredictiveProblem:
+    """Builds instances of the QP for one design and one prediction model.
+
+    Sizes: n = 7 decision instants x 7 = 49 variables; m = 56 output rows and 38 rate rows with the paper's instants.
+    """
+
+    def __init__(self, prediction: PredictionModel, design: ControlDesign, limits: InputLimits) -> None:
+        self.design = design
+        self.limits = limits
+        self.n_knots = len(design.decision_instants)
+        self.n_inputs = N_INPUTS * self.n_knots
+        self.size = (N_INPUTS + N_SLACKS) * self.n_knots
+        self._model = prediction
+        self._knots_to_samples = interpolation(design.decision_instants, np.arange(1, design.horizon + 1))
+        self._input_scale = np.asarray(design.input_scale)
+        self._condense()
+        self._build_output_rows()
+        self._build_rate_rows()
+        self.Gamma = np.ascontiguousarray(np.vstack([self._output_rows, self._rate_rows]))
+        self.Gamma_transposed = _transposed(self.Gamma)
+        self._shifts: dict[int, Array] = {}
+
+    # -- construction ------------------------------------------------------------------------------------------------
+
+    def _condense(self) -> None:
+        """Accumulate Phi, the map to phi, the constant and the constrained outputs over the horizon."""
+        design, model = self.design, self._model
+        n, nx = self.size, model.n_states
+        A, B, F = model.sample
+        to_z = np.zeros((nx, n))
+        to_s = np.hstack([np.eye(nx), np.zeros((nx, 1))])
+        Q = self._state_weights()
+        R = np.asarray(design.input_weight)
+        C, D, G = (matrix[list(model.constrained)] for matrix in (model.C, model.D, model.G))
+        Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))
+        outputs_z, outputs_s = [], []
+        for weights in self._knots_to_samples:
+            u_of_z = self._input_map(weights)
+            to_z = multiply(A, to_z) + multiply(B, u_of_z)
+            to_s = multiply(A, to_s)
+            to_s[:, -1] += F[:, 0]
+            weighted_z, weighted_s = Q[:, None] * to_z, Q[:, None] * to_s
+            Phi += multiply(_transposed(to_z), weighted_z) + multiply(_transposed(u_of_z), R[:, None] * u_of_z)
+            cross += 2.0 * multiply(_transposed(to_s), weighted_z)
+            constant += multiply(_transposed(to_s), weighted_s)
+            outputs_z.append(multiply(C, to_z) + multiply(D, u_of_z))
+            through_w = multiply(C, to_s)
+            through_w[:, -1] += G[:, 0]
+            outputs_s.append(through_w)
+        self._Phi_deviation = Phi
+        self._phi_map, self._constant_map = cross, constant
+        self.outputs_z, self.outputs_s = np.array(outputs_z), np.array(outputs_s)
+        self.stacked_outputs_z = _transposed(self.outputs_z.reshape(-1, n))
+        self.stacked_outputs_s = _transposed(self.outputs_s.reshape(-1, nx + 1))
+        self.y0 = model.model.y0[list(model.constrained)]
+        self.Phi = np.ascontiguousarray(Phi + self._slack_weights())
+
+    def _state_weights(self) -> Array:
+        design, nx = self.design, self._model.n_states
+        level_per_volume = self._model.C[self._model.constrained[0], 1]
+        scales = np.full(nx, design.temperature_scale)
+        scales[0] = design.pressure_scale
+        scales[1] = design.level_scale / level_per_volume
+        shares = np.full(nx, 1.0 / (nx - 2))
+        shares[:2] = 1.0
+        self.state_weights: Array = design.state_weight * shares / scales**2
+        return self.state_weights
+
+    def _input_map(self, weights: Array) -> Array:
+        """Return the matrix (3, n) from z to the input deviation at a sample with these knot weights."""
+        u_of_z = np.zeros((N_INPUTS, self.size))
+        for knot, weight in enumerate(weights):
+            for i in range(N_INPUTS):
+                u_of_z[i, N_INPUTS * knot + i] = weight * self._input_scale[i]
+        return u_of_z
+
+    def _slack_map(self, weights: Array) -> Array:
+        slack_of_z = np.zeros((N_SLACKS, self.size))
+        for knot, weight in enumerate(weights):
+            for i in range(N_SLACKS):
+                slack_of_z[i, self.n_inputs + N_SLACKS * knot + i] = weight
+        return slack_of_z
+
+    def _slack_weights(self) -> Array:
+        level, temperature = self.design.violation_weight
+        rho = np.array([level, level, temperature, temperature])
+        total = np.zeros((self.size, self.size))
+        for weights in self._knots_to_samples:
+            slack_of_z = self._slack_map(weights)
+            total += multiply(_transposed(slack_of_z), rho[:, None] * slack_of_z)
+        return total
+
+    def _build_output_rows(self) -> None:
+        """Rows -y_j - s <= -low and y_j - s <= high at each constraint instant, for L1 and then T5."""
+        design = self.design
+        rows, states, bounds = [], [], []
+        for instant in design.constraint_instants:
+            slack_of_z = self._slack_map(self._knots_to_samples[instant - 1])
+            for output in range(2):
+                y_z, y_s = self.outputs_z[instant - 1][output], self.outputs_s[instant - 1][output]
+                low, high = design.output_low[output] - self.y0[output], design.output_high[output] - self.y0[output]
+                rows += [-y_z - slack_of_z[2 * output], y_z - slack_of_z[2 * output + 1]]
+                states += [y_s, -y_s]
+                bounds += [-low, high]
+        self._output_rows, self._output_bounds = np.array(rows), np.array(bounds)
+        self._output_states = np.ascontiguousarray(np.array(states).T)
+
+    def _build_rate_rows(self) -> None:
+        """Rows +-(u_b - u_a) <= (b - a) rate for each interval between decision instants, unless always true.
+
+        The first interval starts at the input applied before the first knot.
+        """
+        design, limits = self.design, self.limits
+        ranges = np.asarray(limits.high) - np.asarray(limits.low)
+        rows, bounds, before, first = [], [], [], []
+        starts = (design.decision_instants[0] - 1, *design.decision_instants[:-1])
+        for knot, (start, end) in enumerate(zip(starts, design.decision_instants, strict=True)):
+            for i in range(N_INPUTS):
+                limit = (end - start) * limits.rate[i]
+                if limit >= ranges[i]:
+                    continue
+                row = np.zeros(self.size)
+                row[N_INPUTS * knot + i] = self._input_scale[i]
+                if knot:
+                    row[N_INPUTS * (knot - 1) + i] = -self._input_scale[i]
+                for sign in (1.0, -1.0):
+                    rows.append(sign * row)
+                    bounds.append(limit)
+                    first.append(knot == 0)
+                    before.append(sign * np.eye(N_INPUTS)[i] * (knot == 0))
+        gains = RATE_ROW_GAIN / np.abs(rows).max(axis=1)
+        self._rate_rows = np.array(rows) * gains[:, None]
+        self._rate_bounds, self._rate_first = np.array(bounds) * gains, np.array(first)
+        self._rate_before = np.ascontiguousarray((np.array(before) * gains[:, None]).T)
+        self.row_gains = np.concatenate([np.ones(len(self._output_rows)), gains])
+
+    # -- instances ---------------------------------------------------------------------------------------------------
+
+    def at(self, situation: Situation) -> QuadraticProblem:
+        """Return the instance of the problem for a situation."""
+        s = np.append(situation.x, situation.w)
+        phi = np.zeros(self.size)
+        apply(self._phi_map, s, phi)
+        m_outputs = len(self._output_bounds)
+        gamma = np.concatenate([self._output_bounds, self._rates(situation)])
+        apply(self._output_states, s, gamma[:m_outputs])
+        apply(self._rate_before, situation.u_before, gamma[m_outputs:])
+        low, high = self.bounds(situation)
+        weighted = np.zeros(len(s))
+        apply(self._constant_map, s, weighted)
+        return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, _dot(s, weighted))
+
+    def bounds(self, situation: Situation) -> tuple[Array, Array]:
+        """Return the box: input ranges, slacks >= 0, and the first knot within its rate of the input before it."""
+        u0 = self._model.model.u0
+        low_u = (np.asarray(self.limits.low) - u0) / self._input_scale
+        high_u = (np.asarray(self.limits.high) - u0) / self._input_scale
+        reach = np.asarray(self.limits.rate) * self.limits.rate_share(situation.elapsed_ticks)
+        slacks = N_SLACKS * self.n_knots
+        low = np.concatenate([np.tile(low_u, self.n_knots), np.zeros(slacks)])
+        high = np.concatenate([np.tile(high_u, self.n_knots), np.full(slacks, np.inf)])
+        start = situation.u_before
+        low[:N_INPUTS] = np.clip((start - reach) / self._input_scale, low_u, high_u)
+        high[:N_INPUTS] = np.clip((start + reach) / self._input_scale, low_u, high_u)
+        return low, high
+
+    def _rates(self, situation: Situation) -> Array:
+        share = self.limits.rate_share(situation.elapsed_ticks)
+        return self._rate_bounds * np.where(self._rate_first, share, 1.0)
+
+    # -- profiles ----------------------------------------------------------------------------------------------------
+
+    def shifted(self, z: Array, ticks: int) -> Array:
+        """Return the profile z shifted by `ticks` ticks."""
+        if ticks not in self._shifts:
+            self._shifts[ticks] = shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE)
+        S = self._shifts[ticks]
+        inputs, slacks = z[: self.n_inputs].reshape(-1, N_INPUTS), z[self.n_inputs :].reshape(-1, N_SLACKS)
+        return np.concatenate([multiply(S, inputs).ravel(), multiply(S, slacks).ravel()])
+
+    def inputs(self, z: Array, samples: int) -> Array:
+        """Return the inputs of the first `samples` sampling periods, shape (samples, 3), in physical units.
+
+        The rates between knots are rows of the problem, which a truncated solution may break; what is sent keeps them.
+        """
+        knots = z[: self.n_inputs].reshape(-1, N_INPUTS) * self._input_scale
+        u: Array = multiply(self._knots_to_samples[:samples], knots) + self._model.model.u0
+        rate = np.asarray(self.limits.rate)
+        for sample in range(1, samples):
+            u[sample] = np.clip(u[sample], u[sample - 1] - rate, u[sample - 1] + rate)
+        return u
+
+    def hold(self, u: Array) -> Array:
+        """Return the profile that keeps the input deviation u, without slack."""
+        return np.concatenate([np.tile(u / self._input_scale, self.n_knots), np.zeros(N_SLACKS * self.n_knots)])
+
+
+def _transposed(M: Array) -> Array:
+    return np.ascontiguousarray(M.T)
+
+
+def _dot(a: Array, b: Array) -> float:
+    return float(multiply(a[None, :], b[:, None])[0, 0])

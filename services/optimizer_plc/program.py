@@ -1,0 +1,217 @@
+"""The optimiser PLC's program: the implementation scheme of the paper's section II, steps (1) to (5).
+
+For each update the control PLC latches, `plan` decides the updating period and `solve` computes the sequence that is
+played from its end on. Pure: no sockets, no clock, no sleeping.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from coldloop.limits import InputLimits
+from coldloop.lti_model import LtiModel
+from coldloop.process import TICKS_PER_SAMPLE
+from coldloop.registers.codec import as_transmitted
+from coldloop.registers.control_plc import Plan, SequenceHeader, SequenceRow, Update, Verdict
+from coldloop.registers.optimizer_plc import Optimization
+from coldloop.sequence import InputSequence, sealed
+from numpy.typing import NDArray
+
+from optimizer_plc.budget import PlcBudget
+from optimizer_plc.costs import augmented_cost, indicators
+from optimizer_plc.estimator import Estimate, Estimator, EstimatorKind, KalmanFilter, StateFeedback
+from optimizer_plc.prediction import PredictionModel
+from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
+from optimizer_plc.settings import ProgramSettings
+from optimizer_plc.solvers import make_solver
+from optimizer_plc.updating_period import Algorithm1, Assessment, FixedPeriod, Observation, UpdatingRule
+
+Array = NDArray[np.float64]
+
+UNDECIDED = Assessment(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """A profile, the situation it was computed for, and the sequence that tells it to the control PLC."""
+
+    z: Array
+    situation: Situation
+    first_tick: int
+    sequence: InputSequence | None
+    hot_start: float = 0.0
+    last_but_one: float = 0.0
+    delivered: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Period:
+    """The updating period being computed."""
+
+    update: Update
+    estimate: Estimate
+    iterations: int
+    ticks: int
+    effective: float
+    assessment: Assessment
+
+
+class OptimizerProgram:
+    """Estimator, problem, solver and updating rule, put together."""
+
+    def __init__(self, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
+        self.settings = settings
+        self.model_digest = model.short_digest
+        self._prediction = PredictionModel(model)
+        self._problem = PredictiveProblem(self._prediction, settings.design, limits)
+        self._solver = make_solver(settings)
+        self._budget = PlcBudget(settings.budget, self._solver.tau_1_s)
+        self.restart(settings.updating_period_s)
+
+    def restart(self, updating_period_s: float) -> None:
+        """Forget everything and begin a session at the operating point; 0 s is the adaptive updating period."""
+        self._rule = self._make_rule(updating_period_s)
+        self._estimator: Estimator = self._make_estimator()
+        nothing = Situation(np.zeros(self._prediction.n_states), 0.0, np.zeros(3))
+        self._playing = Delivery(self._problem.hold(np.zeros(3)), nothing, 0, None)
+        self._sent: Delivery | None = None
+        self._last: _Period | None = None
+        self._sequences = 0
+
+    def _make_rule(self, updating_period_s: float) -> UpdatingRule:
+        adaptive = self.settings.adaptive
+        if updating_period_s:
+            return FixedPeriod(self._budget.iterations(round(updating_period_s * TICKS_PER_SAMPLE / 5)))
+        return Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta)
+
+    def _make_estimator(self) -> Estimator:
+        if self.settings.estimator.kind is EstimatorKind.STATE_FEEDBACK:
+            return StateFeedback(self._prediction)
+        return KalmanFilter(self._prediction, self.settings.estimator)
+
+    # -- steps (4), (5) and (2): at an updating instant ---------------------------------------------------------------
+
+    def plan(self, update: Update) -> Plan:
+        """Take the update latched at t_i and decide the updating period that begins there."""
+        estimate = self._estimator.correct(update)
+        self._follow(update)
+        self._sequences = max(self._sequences, update.playing)
+        played = self._playing
+        here = played.situation._replace(x=estimate.x, w=estimate.w)
+        effective = self._cost(self._problem.at(here), played.z)
+        iterations, assessment = self._decide(effective, update)
+        ticks = self._budget.period(iterations)
+        self._last = _Period(update, estimate, iterations, ticks, effective, assessment)
+        return Plan(update.update, update.tick + ticks)
+
+    def _follow(self, update: Update) -> None:
+        """Find out which profile the control PLC plays from this instant on."""
+        sent = self._sent
+        if sent is not None and sent.sequence is not None and sent.sequence.header.number == update.playing:
+            self._playing = sent
+        elif self._last is not None:
+            late = update.tick - self._last.update.tick
+            self._playing = Delivery(
+                self._problem.shifted(self._playing.z, late),
+                self._playing.situation,
+                self._playing.first_tick,
+                self._playing.sequence,
+            )
+
+    def _decide(self, effective: float, update: Update) -> tuple[int, Assessment]:
+        """Step (4): the rule decides, unless the last sequence never took effect."""
+        last, played = self._last, self._playing
+        if last is None:
+            return self._rule.first, UNDECIDED
+        if played is not self._sent or played.first_tick != update.tick:
+            return last.iterations, UNDECIDED
+        observation = Observation(
+            last.iterations, last.effective, played.hot_start, played.last_but_one, played.delivered, effective
+        )
+        return self._rule.next(observation)
+
+    # -- step (3): during the updating period -------------------------------------------------------------------------
+
+    def answer_after_s(self) -> float:
+        """Return the plant time from the instant of the last `plan` until the PLC has computed its answer."""
+        return self._budget.answer_after_s(self._period.iterations)
+
+    @property
+    def _period(self) -> _Period:
+        if self._last is None:
+            raise RuntimeError("solve and answer_after_s follow plan")
+        return self._last
+
+    def solve(self) -> InputSequence:
+        """Predict the state at t_{i+1}, shift the profile, do q iterations; return the sequence to play from there."""
+        period = self._period
+        segments = self._segments(period)
+        x = self._estimator.predict(segments)
+        situation = Situation(x, period.estimate.w, segments[-1][0], period.ticks)
+        qp = self._problem.at(situation)
+        self._solver.start(qp, self._problem.shifted(self._playing.z, period.ticks))
+        hot_start = last_but_one = self._solver.cost
+        for _ in range(period.iterations):
+            last_but_one = self._solver.cost
+            self._solver.iterate()
+        z = self._solver.solution
+        floor = qp.constant + self.settings.adaptive.cost_floor
+        sequence = self._sequence(period, z)
+        self._sent = Delivery(
+            z, situation, sequence.header.first_tick, sequence,
+            hot_start + floor, last_but_one + floor, self._solver.cost + floor,
+        )  # fmt: skip
+        return sequence
+
+    def _segments(self, period: _Period) -> list[tuple[Array, int]]:
+        """Return the inputs played during the period as (deviation, ticks), runs of equal inputs joined."""
+        u0 = self._prediction.model.u0
+        sequence = self._playing.sequence
+        if sequence is None:
+            return [(np.asarray(period.update.u) - u0, period.ticks)]
+        segments: list[tuple[Array, int]] = []
+        previous: SequenceRow | None = None
+        for tick in range(period.update.tick, period.update.tick + period.ticks):
+            row = sequence.rows[min(tick - self._playing.first_tick, len(sequence.rows) - 1)]
+            if row == previous:
+                segments[-1] = (segments[-1][0], segments[-1][1] + 1)
+            else:
+                segments.append((np.asarray(row) - u0, 1))
+            previous = row
+        return segments
+
+    def _sequence(self, period: _Period, z: Array) -> InputSequence:
+        length = self.settings.sequence_ticks
+        samples = -(-length // TICKS_PER_SAMPLE)
+        inputs = [as_transmitted(SequenceRow(*row)) for row in self._problem.inputs(z, samples).tolist()]
+        rows = [inputs[tick // TICKS_PER_SAMPLE] for tick in range(length)]
+        self._sequences += 1
+        header = SequenceHeader(
+            number=self._sequences,
+            update=period.update.update,
+            first_tick=period.update.tick + period.ticks,
+            length=length,
+            tau_u=period.ticks,
+            model_digest=self.model_digest,
+            crc=0,
+        )
+        return sealed(header, rows)
+
+    def _cost(self, qp: QuadraticProblem, z: Array) -> float:
+        floor = qp.constant + self.settings.adaptive.cost_floor
+        return float(augmented_cost(qp, z, self._solver.alpha)) + floor
+
+    # -- diagnostics --------------------------------------------------------------------------------------------------
+
+    def report(self, verdict: Verdict) -> Optimization:
+        """Return what was done with the last update, once the control PLC has answered."""
+        period, sent = self._period, self._sent
+        if sent is None:
+            raise RuntimeError("report follows solve")
+        predicted = indicators(self._problem, self._problem.at(sent.situation), sent.z, sent.situation)
+        a = period.assessment
+        return Optimization(
+            update=period.update.update, tick=period.update.tick, tau_u=period.ticks, iterations=period.iterations,
+            verdict=verdict, j_effective=period.effective, j_hot_start=sent.hot_start, j_delivered=sent.delivered,
+            j_dev=predicted.j_dev, j_cst=predicted.j_cst, violation=predicted.violation, efficiency=a.efficiency,
+            mismatch=a.mismatch, contraction=a.contraction, gamma=a.gamma, load_mismatch=period.estimate.mismatch,
+        )  # fmt: skip

@@ -1,0 +1,149 @@
+"""The optimiser PLC on the bus: client of the control PLC, server of its own diagnostics."""
+
+import asyncio
+import logging
+import time
+from collections.abc import Mapping
+
+from coldloop import __version__
+from coldloop.errors import ModelFileError
+from coldloop.lti_model import load
+from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.server import DeviceIdentity, ModbusServer
+from coldloop.process import TICK_S
+from coldloop.registers.bank import RegisterBank
+from coldloop.registers.common import Identity, ServiceState
+from coldloop.registers.control_plc import CONTROL_MAP, Acknowledgement, AwaitUpdate, Update, Verdict
+from coldloop.registers.declaration import Block
+from coldloop.registers.optimizer_plc import HISTORY_ROWS, OPTIMIZER_MAP, Optimization, OptimizerSession
+from coldloop.session import Pace, TimeMode
+from coldloop.telemetry import Telemetry
+
+from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.settings import OptimizerSettings
+
+log = logging.getLogger("coldloop.optimizer_plc")
+
+STRANGER = AwaitUpdate(session=0, update=0)
+"""Asks for a fresh update, whatever the session."""
+
+
+class OptimizerPlc:
+    """Connects the program to the registers and to the control PLC."""
+
+    def __init__(self, settings: OptimizerSettings) -> None:
+        section = settings.optimizer_plc
+        self._settings = settings
+        self._program = OptimizerProgram(load(settings.model.file), section.program, settings.limits)
+        self._control = RegisterClient(
+            CONTROL_MAP,
+            host=section.control_plc.host,
+            port=section.control_plc.port,
+            timeout_s=section.control_plc.timeout_s,
+            order=section.control_plc.word_order,
+        )
+        self.bank = RegisterBank(OPTIMIZER_MAP, section.word_order)
+        self._pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
+        self._session = 0
+        self._last: Optimization | None = None
+        self._publish_identity(0)
+
+    async def run(self) -> None:
+        """Serve one update after the other until cancelled.
+
+        Raises:
+            PeerUnreachableError: The control PLC is not there.
+            ModelFileError: The control PLC runs another model.
+        """
+        await self._control.connect(self._settings.optimizer_plc.control_plc.patience_s)
+        await self._same_model()
+        wanted = STRANGER
+        while True:
+            update = await self._control.exchange(wanted, Update)
+            asked_at = time.monotonic()
+            if not self._is_news(update, wanted):
+                wanted = STRANGER if update.session else wanted
+                continue
+            if update.session != self._session:
+                self._start(update.session)
+            await self._optimise(update, asked_at)
+            wanted = AwaitUpdate(update.session, update.update + 1)
+
+    async def _same_model(self) -> None:
+        theirs = (await self._control.read(Identity)).model_digest
+        if theirs != self._program.model_digest:
+            raise ModelFileError(
+                f"{self._control.peer} runs model {theirs:08x}, this optimiser {self._program.model_digest:08x} "
+                f"({self._settings.model.file}): give both PLCs the same model.file"
+            )
+
+    def _is_news(self, update: Update, wanted: AwaitUpdate) -> bool:
+        """Tell an awaited update from the old one that the control PLC answers with when nothing happens."""
+        if not update.session:
+            return False
+        if update.session != self._session:
+            return True
+        return wanted is STRANGER or update.update >= wanted.update
+
+    def _start(self, session: int) -> None:
+        """Begin a session, with the operator's settings where they are for this one."""
+        self._session = session
+        asked = self.bank.get(OptimizerSession)
+        period_s = self._settings.optimizer_plc.program.updating_period_s
+        if asked.session == session:
+            self._pace = Pace(bool(asked.realtime), asked.factor)
+            period_s = asked.updating_period * TICK_S
+        self._program.restart(period_s)
+        log.info("session started", extra={"session": session, "updating_period_s": period_s})
+
+    async def _optimise(self, update: Update, asked_at: float) -> None:
+        """Plan, solve and deliver; in real time, not before the PLC would have the answer."""
+        program = self._program
+        await self._control.write(program.plan(update))
+        sequence = program.solve()
+        if self._pace.realtime:
+            ready = asked_at + program.answer_after_s() / self._pace.factor
+            await asyncio.sleep(max(0.0, ready - time.monotonic()))
+        await self._control.write_rows(sequence.rows)
+        answer = await self._control.exchange(sequence.header, Acknowledgement)
+        verdict = Verdict(answer.verdict)
+        if verdict is not Verdict.ACCEPTED:
+            log.warning("sequence rejected", extra={"update": update.update, "verdict": verdict.name.lower()})
+        self._last = program.report(verdict)
+        self.bank.put(self._last, update.update % HISTORY_ROWS)
+        self._publish_identity(update.tick)
+
+    def on_write(self, block: Block) -> None:
+        """Session settings are read when the session begins."""
+
+    def _publish_identity(self, tick: int) -> None:
+        self.bank.put(
+            Identity(
+                map_digest=OPTIMIZER_MAP.digest,
+                map_version=OPTIMIZER_MAP.version,
+                state=ServiceState.RUNNING if self._session else ServiceState.READY,
+                model_digest=self._program.model_digest,
+                session=self._session,
+                tick=tick,
+                heartbeat=(self._last.update + 1 if self._last else 0) & 0xFFFF,
+            )
+        )
+
+    def snapshot(self) -> Mapping[str, object]:
+        """Return what telemetry publishes."""
+        return {"session": self._session, **(self._last._asdict() if self._last else {})}
+
+
+async def serve(settings: OptimizerSettings) -> None:
+    """Serve and optimise until cancelled."""
+    plc = OptimizerPlc(settings)
+    identity = DeviceIdentity(product="Coldloop optimiser PLC", revision=__version__)
+    server = ModbusServer(plc.bank, settings=settings.optimizer_plc.server, on_write=plc.on_write, identity=identity)
+    await server.start()
+    log.info("serving", extra={"host": settings.optimizer_plc.server.host, "port": server.port})
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(plc.run(), name="optimiser")
+            tasks.create_task(Telemetry(settings.telemetry, "optimizer_plc", plc.snapshot).run(), name="telemetry")
+    finally:
+        await server.close()

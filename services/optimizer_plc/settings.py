@@ -1,0 +1,95 @@
+"""Configuration of the optimiser PLC, checked when it is made and immutable after."""
+
+from enum import StrEnum
+from typing import Annotated, Self
+
+from coldloop.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
+from coldloop.limits import InputLimits
+from coldloop.modbus.settings import ServerSettings
+from coldloop.model_settings import ModelSettings
+from coldloop.process import TICK_S
+from coldloop.registers.codec import WordOrder
+from coldloop.registers.control_plc import SEQUENCE_ROWS
+from coldloop.session import SessionSettings
+from coldloop.telemetry import TelemetrySettings
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from optimizer_plc.budget import MAX_PERIOD_TICKS, BudgetSettings
+from optimizer_plc.design import ControlDesign
+from optimizer_plc.estimator import EstimatorSettings
+from optimizer_plc.solvers.ode import OdeSettings
+
+ADAPTIVE = 0
+
+
+class SolverName(StrEnum):
+    """Solvers that can be asked for."""
+
+    ODE = "ode"
+
+
+class AdaptiveSettings(BaseModel):
+    """Parameters of Algorithm 1."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    q_first: Annotated[int, Field(ge=1)] = 9
+    """q(t_0); 9 iterations are an updating period of 2.5 s."""
+    q_min: Annotated[int, Field(ge=1)] = 2
+    q_max: Annotated[int, Field(ge=1)] = 19
+    delta: Annotated[int, Field(ge=1)] = 2
+    cost_floor: Annotated[float, Field(gt=0)] = 1.0
+    """Constant added to J, so that it is bounded below by a positive number (Assumption 1 of the paper)."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not self.q_min <= self.q_first <= self.q_max:
+            raise ValueError("q_min <= q_first <= q_max does not hold")
+        return self
+
+
+class ProgramSettings(BaseModel):
+    """What the optimiser's program is to do."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    solver: SolverName = SolverName.ODE
+    updating_period_s: Annotated[float, Field(ge=0, le=MAX_PERIOD_TICKS * TICK_S)] = ADAPTIVE
+    """Fixed updating period, a multiple of 0.25 s; 0 is adaptive."""
+    sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 40
+    """Length of the sequences sent."""
+    adaptive: AdaptiveSettings = AdaptiveSettings()
+    design: ControlDesign = ControlDesign()
+    budget: BudgetSettings = BudgetSettings()
+    estimator: EstimatorSettings = EstimatorSettings()
+    ode: OdeSettings = OdeSettings()
+
+    @field_validator("updating_period_s")
+    @classmethod
+    def _whole_ticks(cls, value: float) -> float:
+        if value % TICK_S or 0 < value < 2 * TICK_S:
+            raise ValueError("an updating period is a multiple of 0.25 s from 0.5 s on, or 0 for adaptive")
+        return value
+
+
+class OptimizerSection(BaseModel):
+    """Section `optimizer_plc` of the configuration."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    server: ServerSettings = ServerSettings(port=OPTIMIZER_PORT)
+    word_order: WordOrder = WordOrder.HIGH_FIRST
+    control_plc: Endpoint = Endpoint(port=CONTROL_PORT)
+    program: ProgramSettings = ProgramSettings()
+
+
+class OptimizerSettings(BaseModel):
+    """What the optimiser PLC reads of a configuration."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    limits: InputLimits = InputLimits()
+    model: ModelSettings = ModelSettings()
+    session: SessionSettings = SessionSettings()
+    optimizer_plc: OptimizerSection = OptimizerSection()
+    telemetry: TelemetrySettings = TelemetrySettings()

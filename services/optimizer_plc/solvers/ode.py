@@ -1,0 +1,203 @@
+"""The ODE-based solver (paper, section III): TR-BDF2 along dz/dt = -dJ/dz of the augmented cost.
+
+One iteration is one step of the two-stage method of Bank et al. (1985). Both stages share one factorised matrix and
+take one Newton step each; the result is projected into the box. A step that would raise J is rejected and spends its
+iteration on a smaller step size, so J never rises (Definition 1 of the paper).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from coldloop.compiled import kernel
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, PositiveFloat
+
+from optimizer_plc.costs import augmented_cost
+from optimizer_plc.linear_algebra import cholesky, cholesky_solve
+from optimizer_plc.problem import QuadraticProblem
+
+Array = NDArray[np.float64]
+
+G = 2.0 - np.sqrt(2.0)
+"""gamma of TR-BDF2: with this value both stages have the same matrix."""
+C1 = 1.0 / (G * (2.0 - G))
+C0 = (1.0 - G) ** 2 * C1
+D = G / 2.0
+ERROR_CONSTANT = (-3.0 * G * G + 4.0 * G - 2.0) / (12.0 * (2.0 - G))
+
+
+class OdeSettings(BaseModel):
+    """Settings of the ODE-based solver."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    alpha: PositiveFloat = 3000.0
+    """Penalty weight: 30 times the weight of a band violation."""
+    cost_scale: PositiveFloat = 1e-4
+    """The flow is that of cost_scale * J: the rule for the first step size is not scale invariant."""
+    tolerance: PositiveFloat = 1.0
+    """Local error accepted in one step, in scaled variables."""
+    growth: PositiveFloat = 5.0
+    """Largest growth of the step size from one iteration to the next."""
+    rejection: PositiveFloat = 0.5
+    """Factor on the step size after a rejected step."""
+    tau_1_s: PositiveFloat = 0.25
+
+
+class Flow(NamedTuple):
+    """Constants of the integration."""
+
+    alpha: float
+    cost_scale: float
+    tolerance: float
+    growth: float
+    rejection: float
+
+
+class OdeSolver:
+    """TR-BDF2 on the gradient flow, one step an iteration."""
+
+    def __init__(self, settings: OdeSettings) -> None:
+        self.alpha = settings.alpha
+        self.tau_1_s = settings.tau_1_s
+        self._flow = Flow(
+            settings.alpha, settings.cost_scale, settings.tolerance, settings.growth, settings.rejection
+        )
+
+    def start(self, problem: QuadraticProblem, guess: Array) -> None:
+        """Begin with `guess` projected into the box, and with the paper's first step size sqrt(1 / |dz/dt|)."""
+        self._problem = problem
+        self._z = np.clip(guess, problem.low, problem.high)
+        self._cost = augmented_cost(problem, self._z, self.alpha)
+        self._stiff = np.zeros_like(problem.gamma)
+        self._dt = first_step(problem, self._z, self._flow)
+
+    def iterate(self) -> None:
+        """Take one step."""
+        self._dt, self._cost = step(self._problem, self._z, self._stiff, self._cost, self._dt, self._flow)
+
+    @property
+    def solution(self) -> Array:
+        """The present point, shape (n,)."""
+        return self._z.copy()
+
+    @property
+    def cost(self) -> float:
+        """Augmented cost at the present point."""
+        return self._cost
+
+
+@kernel
+def velocity(qp: QuadraticProblem, z: Array, flow: Flow, result: Array, active: Array) -> None:
+    """Write dz/dt = -cost_scale dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0."""
+    n = z.shape[0]
+    for i in range(n):
+        slope = 0.0
+        for j in range(n):
+            slope += qp.Phi[i, j] * z[j]
+        result[i] = 2.0 * slope + qp.phi[i]
+    for r in range(qp.Gamma.shape[0]):
+        excess = -qp.gamma[r]
+        for j in range(n):
+            excess += qp.Gamma[r, j] * z[j]
+        active[r] = 0.0
+        if excess > 0.0:
+            active[r] = 1.0
+            factor = 2.0 * flow.alpha * excess
+            for j in range(n):
+                result[j] += factor * qp.Gamma[r, j]
+    for i in range(n):
+        result[i] *= -flow.cost_scale
+
+
+@kernel
+def hold_at_bounds(qp: QuadraticProblem, z: Array, v: Array) -> Array:
+    """Stop the components of v that would leave the box at z; return which ones (1.0) as a mask (n,)."""
+    held = np.zeros_like(z)
+    for i in range(z.shape[0]):
+        if (z[i] <= qp.low[i] and v[i] < 0.0) or (z[i] >= qp.high[i] and v[i] > 0.0):
+            held[i] = 1.0
+            v[i] = 0.0
+    return held
+
+
+@kernel
+def release(M: Array, held: Array) -> None:
+    """Make the rows and columns of held components those of the identity, so that a solve leaves them alone."""
+    n = M.shape[0]
+    for i in range(n):
+        for j in range(i, n):
+            if held[i] + held[j] > 0.0:
+                M[i, j] = 1.0 if i == j else 0.0
+
+
+@kernel
+def first_step(qp: QuadraticProblem, z: Array, flow: Flow) -> float:
+    """Return sqrt(1 / |dz/dt|)."""
+    v = np.empty_like(z)
+    velocity(qp, z, flow, v, np.empty_like(qp.gamma))
+    total = 0.0
+    for i in range(v.shape[0]):
+        total += v[i] * v[i]
+    return np.sqrt(1.0 / max(np.sqrt(total), 1e-12))
+
+
+@kernel
+def stage_matrix(qp: QuadraticProblem, stiff: Array, dt: float, flow: Flow) -> Array:
+    """Return I + (gamma / 2) dt Hess(cost_scale J), upper triangle, with the rows that `stiff` (m,) names."""
+    n = qp.phi.shape[0]
+    M = np.empty((n, n), qp.phi.dtype)
+    weight = D * dt * flow.cost_scale * 2.0
+    for i in range(n):
+        for j in range(i, n):
+            M[i, j] = weight * qp.Phi[i, j]
+        M[i, i] += 1.0
+    for r in range(qp.Gamma.shape[0]):
+        if stiff[r] > 0.0:
+            for i in range(n):
+                factor = weight * flow.alpha * qp.Gamma[r, i]
+                if factor != 0.0:
+                    for j in range(i, n):
+                        M[i, j] += factor * qp.Gamma[r, j]
+    return M
+
+
+@kernel
+def step(qp: QuadraticProblem, z: Array, stiff: Array, cost: float, dt: float, flow: Flow) -> tuple[float, float]:
+    """Move z by one TR-BDF2 step of size dt, or not at all; return the next step size and the cost at z."""
+    n = z.shape[0]
+    v0, vg, v1 = np.empty_like(z), np.empty_like(z), np.empty_like(z)
+    active, ahead = np.empty_like(qp.gamma), np.empty_like(qp.gamma)
+    velocity(qp, z, flow, v0, active)
+    for r in range(active.shape[0]):
+        stiff[r] = max(stiff[r], active[r])
+    held = hold_at_bounds(qp, z, v0)
+    M = stage_matrix(qp, stiff, dt, flow)
+    release(M, held)
+    cholesky(M)
+    change = G * dt * v0
+    cholesky_solve(M, change)
+    zg = z + change
+    velocity(qp, zg, flow, vg, ahead)
+    for r in range(active.shape[0]):
+        stiff[r] = ahead[r]
+    for i in range(n):
+        vg[i] *= 1.0 - held[i]
+    change = C1 * zg - C0 * z - zg + D * dt * vg
+    cholesky_solve(M, change)
+    candidate = zg + change
+    velocity(qp, candidate, flow, v1, active)
+    for i in range(n):
+        v1[i] *= 1.0 - held[i]
+    error = 0.0
+    for i in range(n):
+        local = 2.0 * ERROR_CONSTANT * dt * (v0[i] / G - vg[i] / (G * (1.0 - G)) + v1[i] / (1.0 - G))
+        error = max(error, abs(local))
+        candidate[i] = min(max(candidate[i], qp.low[i]), qp.high[i])
+    reached = augmented_cost(qp, candidate, flow.alpha)
+    if not reached <= cost:
+        return dt * flow.rejection, cost
+    for i in range(n):
+        z[i] = candidate[i]
+    wanted = (flow.tolerance / max(error, 1e-12)) ** (1.0 / 3.0)
+    return dt * min(flow.growth, max(flow.rejection, wanted)), reached

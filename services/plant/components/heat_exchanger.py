@@ -1,0 +1,89 @@
+"""Counter-flow heat exchanger: cells of high-pressure gas and aluminium, and a low-pressure side without storage."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from coldloop.compiled import kernel
+from plant.helium.properties import Helium, isobar_cell, saturation, vapour_enthalpy_and_cp
+from plant.numeric import Array, at_least, at_most
+
+LARGEST_RATIO = 8.0  # of the mean to the cold-end difference; more would be too stiff for a step of 0.25 s
+TRICKLE = 1e-9  # kg/s, below which the low-pressure gas simply takes the temperature of the cell
+
+
+class HeatExchanger(NamedTuple):
+    """A counter-flow exchanger, cut into equal cells from the hot end to the cold end."""
+
+    UA: float
+    """Heat transfer coefficient times area, W/K."""
+    volume: float
+    """Volume of the high-pressure side, m3."""
+    aluminium: float
+    """Mass of the wall, kg."""
+    cells: int
+    """Number of cells, 1 or more."""
+
+
+class HighPressureFlow(NamedTuple):
+    """The warm stream as it enters at the hot end, at 16 bar."""
+
+    mass_flow: float
+    """kg/s."""
+    T: float
+    """K."""
+
+
+class LowPressureFlow(NamedTuple):
+    """The cold stream as it enters at the cold end, or leaves at the hot end."""
+
+    mass_flow: float
+    """kg/s."""
+    P: float
+    """Pa, the same all along."""
+    T: float
+    """K."""
+    h: float
+    """J/kg; carried along so that energy is conserved exactly, whatever the tables' error."""
+
+
+@kernel
+def driving_difference(T_before: float, T_cell: float, T_low: float) -> float:
+    """Return the temperature difference (K) between the mean of a cell and the low-pressure gas that enters it.
+
+    With a mean, a cell of many transfer units cools the gas below the stream that cools it. The second law forbids
+    that: the difference fades with that at the cold end, from well outside ordinary operation (there a ratio of 2 to 5).
+    """
+    cold_end = T_cell - T_low
+    limit = LARGEST_RATIO * cold_end if cold_end.real > 0.0 else cold_end
+    return at_most(0.5 * (T_before + T_cell) - T_low, limit)
+
+
+@kernel
+def exchange(
+    exchanger: HeatExchanger, T: Array, high: HighPressureFlow, low: LowPressureFlow, helium: Helium, dT: Array
+) -> LowPressureFlow:
+    """Write the rates of the cell temperatures into `dT` (K/s) and return the low-pressure flow at the hot end.
+
+    `T` holds the temperatures of gas and wall in each cell, hot end first (K). The low-pressure side is marched from
+    the cold end; in a cell it approaches the mean T_m of the gas that enters and the gas that leaves:
+    T_out = T_m - (T_m - T_L) exp(-UA/(N m_L cp_L)), with cp_L where it enters the cell.
+    """
+    T_sat = saturation(low.P, helium).T
+    transfer = exchanger.UA / exchanger.cells
+    sweeping = at_least(low.mass_flow, TRICKLE)
+    T_low, h_low = low.T, low.h
+    _, cp_low = vapour_enthalpy_and_cp(low.P, T_low, T_sat, helium)
+    h_cell, rho_cp, c_wall = isobar_cell(T[exchanger.cells - 1], helium)
+    for i in range(exchanger.cells - 1, -1, -1):
+        T_before = T[i - 1] if i > 0 else high.T
+        h_before, rho_cp_before, c_wall_before = isobar_cell(T_before, helium)
+        drive = driving_difference(T_before, T[i], T_low)
+        T_low = T_low + drive * (1.0 - np.exp(-transfer / (sweeping * cp_low)))
+        h_next, cp_low = vapour_enthalpy_and_cp(low.P, T_low, T_sat, helium)
+        heat = low.mass_flow * (h_next - h_low)
+        capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
+        dT[i] = (high.mass_flow * (h_before - h_cell) - heat) / capacity
+        h_low = h_next
+        h_cell, rho_cp, c_wall = h_before, rho_cp_before, c_wall_before
+    return LowPressureFlow(low.mass_flow, low.P, T_low, h_low)

@@ -1,0 +1,31 @@
+"""Low-pressure return: two flow resistances in series, with the turbine's exhaust joining between them."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from coldloop.compiled import kernel
+from plant.numeric import at_least
+
+
+class ReturnLine(NamedTuple):
+    """The way of the vapour from the bath to the compressor."""
+
+    cold_resistance: float
+    """From the bath to the mixing point, Pa s2/kg2."""
+    warm_resistance: float
+    """From the mixing point to the compressor, Pa s2/kg2."""
+
+
+@kernel
+def return_flow(line: ReturnLine, P_bath: float, P_suction: float, joining_flow: float) -> tuple[float, float]:
+    """Return the mass flow of the vapour (kg/s) and the pressure at the mixing point (Pa).
+
+    The flow m_v solves P_bath - P_suction = r_c m_v^2 + r_w (m_v + m_t)^2; nothing flows back into the bath.
+    """
+    total = line.cold_resistance + line.warm_resistance
+    half_slope = line.warm_resistance * joining_flow
+    rest = at_least(P_bath - P_suction - half_slope * joining_flow, 0.0)
+    vapour_flow = at_least(np.sqrt(half_slope * half_slope + total * rest) - half_slope, 0.0) / total
+    sum_flow = vapour_flow + joining_flow
+    return vapour_flow, P_suction + line.warm_resistance * sum_flow * sum_flow

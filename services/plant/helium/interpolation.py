@@ -1,0 +1,100 @@
+"""Piecewise-cubic tables on uniform grids.
+
+The tables hold, at each node, the value and the slopes of a twice differentiable cubic spline, the slopes multiplied
+by the grid's step. Reading one is then the cubic Hermite formula between two nodes (or its tensor product between
+four). Arguments outside the grid are held at its edge.
+"""
+
+from typing import NamedTuple
+
+from coldloop.compiled import kernel
+from plant.numeric import RealArray
+
+# Weights of (left value, left slope, right value, right slope).
+Weights = tuple[float, float, float, float]
+
+
+class Curves(NamedTuple):
+    """Several functions of one variable, tabulated on the same grid."""
+
+    start: float
+    """Argument at the first node."""
+    step: float
+    """Distance between nodes."""
+    nodes: RealArray
+    """Shape (nodes, functions, 2): value, slope times step."""
+
+
+class Surface(NamedTuple):
+    """One function of two variables, tabulated."""
+
+    row_start: float
+    """First argument at the first row of nodes."""
+    row_step: float
+    """Distance between rows."""
+    column_start: float
+    """Second argument at the first column of nodes."""
+    column_step: float
+    """Distance between columns."""
+    nodes: RealArray
+    """Shape (rows, columns, 4): value, slope along the columns, slope along the rows, mixed slope."""
+
+
+@kernel
+def locate(position: float, start: float, step: float, count: int) -> tuple[int, float]:
+    """Return the index of the node to the left of `position` and the fraction of the way to the next."""
+    scaled = (position - start) / step
+    index = max(min(int(scaled.real), count - 2), 0)
+    fraction = scaled - index
+    if fraction.real < 0.0:
+        fraction = 0.0 * fraction
+    elif fraction.real > 1.0:
+        fraction = 0.0 * fraction + 1.0
+    return index, fraction
+
+
+@kernel
+def hermite_weights(t: float) -> Weights:
+    """Return the cubic Hermite weights at the fraction `t` of a step."""
+    rest = 1.0 - t
+    return (1.0 + 2.0 * t) * rest * rest, t * rest * rest, t * t * (3.0 - 2.0 * t), -t * t * rest
+
+
+@kernel
+def hermite_slope_weights(t: float) -> Weights:
+    """Return the derivatives of the cubic Hermite weights with respect to `t`."""
+    rest = 1.0 - t
+    return -6.0 * t * rest, rest * (1.0 - 3.0 * t), 6.0 * t * rest, t * (3.0 * t - 2.0)
+
+
+@kernel
+def read_curve(nodes: RealArray, index: int, function: int, weights: Weights) -> float:
+    """Return one function of a `Curves`, given the interval and the weights within it."""
+    left: float = weights[0] * nodes[index, function, 0] + weights[1] * nodes[index, function, 1]
+    right: float = weights[2] * nodes[index + 1, function, 0] + weights[3] * nodes[index + 1, function, 1]
+    return left + right
+
+
+@kernel
+def read_surface(table: Surface, row: float, column: float) -> tuple[float, float]:
+    """Return the function's value and its derivative along the columns."""
+    nodes = table.nodes
+    i, t = locate(row, table.row_start, table.row_step, nodes.shape[0])
+    j, s = locate(column, table.column_start, table.column_step, nodes.shape[1])
+    across = hermite_weights(t)
+    left, left_slope = _between_rows(nodes, i, j, across)
+    right, right_slope = _between_rows(nodes, i, j + 1, across)
+    w, d = hermite_weights(s), hermite_slope_weights(s)
+    value = w[0] * left + w[1] * left_slope + w[2] * right + w[3] * right_slope
+    slope = d[0] * left + d[1] * left_slope + d[2] * right + d[3] * right_slope
+    return value, slope / table.column_step
+
+
+@kernel
+def _between_rows(nodes: RealArray, row: int, column: int, across: Weights) -> tuple[float, float]:
+    """Return the value and the slope along the columns, at a column of nodes and between two rows."""
+    value = across[0] * nodes[row, column, 0] + across[1] * nodes[row, column, 2]
+    value += across[2] * nodes[row + 1, column, 0] + across[3] * nodes[row + 1, column, 2]
+    slope = across[0] * nodes[row, column, 1] + across[1] * nodes[row, column, 3]
+    slope += across[2] * nodes[row + 1, column, 1] + across[3] * nodes[row + 1, column, 3]
+    return value, slope

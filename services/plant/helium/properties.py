@@ -1,0 +1,189 @@
+"""Thermodynamic properties of helium, read from the shipped tables.
+
+All kernels take real or complex arguments, are differentiable, and hold arguments outside the tables at the edge.
+Enthalpies and entropies share CoolProp's reference. `tabulate` says how the tables are made and how exact they are.
+"""
+
+from functools import cache
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coldloop.compiled import kernel
+from plant.helium.interpolation import (
+    Curves,
+    Surface,
+    hermite_slope_weights,
+    hermite_weights,
+    locate,
+    read_curve,
+    read_surface,
+)
+from plant.numeric import at_least
+
+GAS_CONSTANT = 2077.26  # J/(kg K), of helium
+SUPERHEAT_OFFSET = 0.3  # K, keeps the logarithm of the superheat finite on the saturation line
+EXCESS_OFFSET = 1500.0  # J/kg, the same for the enthalpy above that of the saturated vapour
+
+
+class Helium(NamedTuple):
+    """The tables that the kernels of this module read."""
+
+    isobar: Curves
+    """Along the 16 bar isobar, in ln T, 4 to 300 K: enthalpy, density, rho cp; and the heat capacity of aluminium."""
+    saturation: Curves
+    """Along the saturation line, in P, 0.9 to 1.9 bar: T, rho_l, rho_v, h_l, h_v, s_v."""
+    vapour: Surface
+    """On (P, ln(T - Tsat + 0.3 K)): h."""
+    vapour_superheat: Surface
+    """On (P, ln(h - h_v + 1500 J/kg)): ln(T - Tsat + 0.3 K)."""
+    vapour_excess: Surface
+    """On (P, s - s_v): ln(h - h_v + 1500 J/kg)."""
+    turbine_entropy: Surface
+    """On (ln P, ln h), 1 to 16 bar: s + R ln P, which is smooth down to low pressures."""
+
+
+class Saturation(NamedTuple):
+    """Properties of boiling helium at one pressure, or their derivatives with respect to the pressure (per Pa)."""
+
+    T: float
+    """Temperature, K."""
+    rho_l: float
+    """Density of the liquid, kg/m3."""
+    rho_v: float
+    """Density of the vapour, kg/m3."""
+    h_l: float
+    """Enthalpy of the liquid, J/kg."""
+    h_v: float
+    """Enthalpy of the vapour, J/kg."""
+    s_v: float
+    """Entropy of the vapour, J/(kg K)."""
+
+
+@cache
+def load_helium() -> Helium:
+    """Return the shipped tables."""
+    with files("plant.helium").joinpath("helium_tables.npz").open("rb") as file, np.load(file) as archive:
+        stored: dict[str, Any] = {name: archive[name] for name in archive.files}
+
+    def curves(name: str) -> Curves:
+        start, step = stored[f"{name}_grid"].tolist()
+        return Curves(start, step, stored[name])
+
+    def surface(name: str) -> Surface:
+        row_start, row_step, column_start, column_step = stored[f"{name}_grid"].tolist()
+        return Surface(row_start, row_step, column_start, column_step, stored[name])
+
+    return Helium(
+        isobar=curves("isobar"),
+        saturation=curves("saturation"),
+        vapour=surface("vapour"),
+        vapour_superheat=surface("vapour_superheat"),
+        vapour_excess=surface("vapour_excess"),
+        turbine_entropy=surface("turbine_entropy"),
+    )
+
+
+@kernel
+def helium_of(fields: Any) -> Helium:  # noqa: ANN401 - any nesting of tuples
+    """Rebuild the tables from nested plain tuples, see `plant.integrator.advance_and_read`."""
+    return Helium(
+        Curves(*fields[0]),
+        Curves(*fields[1]),
+        Surface(*fields[2]),
+        Surface(*fields[3]),
+        Surface(*fields[4]),
+        Surface(*fields[5]),
+    )
+
+
+@kernel
+def isobar_enthalpy_and_density(T: float, helium: Helium) -> tuple[float, float]:
+    """Return h (J/kg) and rho (kg/m3) of the gas at 16 bar and `T` (K, 4 to 300)."""
+    table = helium.isobar
+    i, t = locate(np.log(T), table.start, table.step, table.nodes.shape[0])
+    weights = hermite_weights(t)
+    return read_curve(table.nodes, i, 0, weights), read_curve(table.nodes, i, 1, weights)
+
+
+@kernel
+def isobar_cell(T: float, helium: Helium) -> tuple[float, float, float]:
+    """Return what an exchanger cell needs at 16 bar and `T` (K): h (J/kg), rho cp (J/(m3 K)), c_Al (J/(kg K))."""
+    table = helium.isobar
+    i, t = locate(np.log(T), table.start, table.step, table.nodes.shape[0])
+    weights = hermite_weights(t)
+    nodes = table.nodes
+    return read_curve(nodes, i, 0, weights), read_curve(nodes, i, 2, weights), read_curve(nodes, i, 3, weights)
+
+
+@kernel
+def saturation(P: float, helium: Helium) -> Saturation:
+    """Return the properties of boiling helium at `P` (Pa, 0.9e5 to 1.9e5)."""
+    table = helium.saturation
+    i, t = locate(P, table.start, table.step, table.nodes.shape[0])
+    w = hermite_weights(t)
+    n = table.nodes
+    return Saturation(
+        read_curve(n, i, 0, w),
+        read_curve(n, i, 1, w),
+        read_curve(n, i, 2, w),
+        read_curve(n, i, 3, w),
+        read_curve(n, i, 4, w),
+        read_curve(n, i, 5, w),
+    )
+
+
+@kernel
+def saturation_slopes(P: float, helium: Helium) -> Saturation:
+    """Return the derivatives of `saturation` with respect to P, per Pa; outside the table those at its edge."""
+    table = helium.saturation
+    i, t = locate(P, table.start, table.step, table.nodes.shape[0])
+    w = hermite_slope_weights(t)
+    n = table.nodes
+    return Saturation(
+        read_curve(n, i, 0, w) / table.step,
+        read_curve(n, i, 1, w) / table.step,
+        read_curve(n, i, 2, w) / table.step,
+        read_curve(n, i, 3, w) / table.step,
+        read_curve(n, i, 4, w) / table.step,
+        read_curve(n, i, 5, w) / table.step,
+    )
+
+
+@kernel
+def vapour_enthalpy_and_cp(P: float, T: float, T_sat: float, helium: Helium) -> tuple[float, float]:
+    """Return h (J/kg) and cp (J/(kg K)) of the vapour at `P` (Pa, 0.9e5 to 1.9e5) and `T` (K, T_sat to 120)."""
+    superheat = at_least(T - T_sat, 0.0) + SUPERHEAT_OFFSET
+    h, slope = read_surface(helium.vapour, P, np.log(superheat))
+    return h, slope / superheat
+
+
+@kernel
+def vapour_temperature(P: float, h: float, sat: Saturation, helium: Helium) -> float:
+    """Return T (K) at `P` (Pa) and `h` (J/kg); with `h` below that of the saturated vapour, the boiling point."""
+    if h.real <= sat.h_v.real:
+        return sat.T + 0.0 * h
+    superheat, _ = read_surface(helium.vapour_superheat, P, np.log(h - sat.h_v + EXCESS_OFFSET))
+    T: float = sat.T + np.exp(superheat) - SUPERHEAT_OFFSET
+    return T
+
+
+@kernel
+def enthalpy_after_isentropic_expansion(P: float, s: float, helium: Helium) -> float:
+    """Return h (J/kg) at `P` (Pa, 0.9e5 to 1.9e5) and `s` (J/(kg K)); wet vapour follows dh = T ds."""
+    sat = saturation(P, helium)
+    if s.real <= sat.s_v.real:
+        return sat.h_v + sat.T * (s - sat.s_v)
+    excess, _ = read_surface(helium.vapour_excess, P, s - sat.s_v)
+    h: float = sat.h_v + np.exp(excess) - EXCESS_OFFSET
+    return h
+
+
+@kernel
+def entropy_before_expansion(P: float, h: float, helium: Helium) -> float:
+    """Return s (J/(kg K)) at `P` (Pa, 1e5 to 16e5) and `h` (J/kg, 36e3 to 528e3, that is 10 to 100 K at 16 bar)."""
+    log_pressure = np.log(at_least(P, 1.0))
+    entropy_sum, _ = read_surface(helium.turbine_entropy, log_pressure, np.log(h))
+    s: float = entropy_sum - GAS_CONSTANT * log_pressure
+    return s

@@ -1,0 +1,131 @@
+"""Heat loads: named scenarios and CSV files.
+
+The paper does not print its load profiles. The six hours a to f are random telegraphs about the load of the operating
+point, each of another family; `docs/science.md` says how they were chosen.
+"""
+
+import csv
+import math
+import random
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from coldloop.errors import LoadFileError
+from coldloop.process import TICK_S
+from plant.program import LoadProfile
+
+HOUR_TICKS: Final = int(3600 / TICK_S)
+
+
+class Family(NamedTuple):
+    """A family of random telegraphs: steps from the mean load (W), and how long they last (s)."""
+
+    steps: tuple[float, ...]
+    shortest_s: float
+    longest_s: float
+    seed: int
+
+
+HOURS: Final = {
+    "a": Family((0.0, 60.0, -60.0), 60.0, 400.0, 11),
+    "b": Family((0.0, 75.0, -75.0, 100.0, -100.0), 40.0, 300.0, 12),
+    "c": Family((0.0, 60.0, -60.0, 100.0, -150.0), 20.0, 200.0, 13),
+    "d": Family((0.0, 150.0, -75.0, -75.0), 40.0, 240.0, 14),
+    "e": Family((0.0, 200.0, -100.0, -100.0, -60.0), 20.0, 120.0, 15),
+    "f": Family((0.0, 75.0, -75.0, 100.0, -60.0, 150.0, -200.0), 20.0, 160.0, 16),
+    "g": Family((0.0, 60.0, -60.0, 75.0, -75.0), 30.0, 250.0, 17),
+    "h": Family((0.0, 100.0, -100.0, 150.0, -150.0), 30.0, 200.0, 18),
+}
+
+NAMED: Final = {
+    **{name: (name,) for name in "abcdef"},
+    "2h": ("a", "b"),
+    "6h": tuple("abcdef"),
+    "8h": tuple("abcdefgh"),
+}
+
+
+def telegraph(family: Family, mean_w: float) -> LoadProfile:
+    """Return one hour of a family about `mean_w`, in whole ticks, starting and ending at the mean."""
+    draw = random.Random(family.seed).random  # noqa: S311 not for secrets; the one generator stable over versions
+    times, watts = [0], [mean_w]
+    tick = round(family.longest_s / TICK_S)
+    while tick < HOUR_TICKS:
+        step = mean_w + family.steps[int(draw() * len(family.steps))]
+        if step != watts[-1]:
+            times.append(tick)
+            watts.append(step)
+        tick += round((family.shortest_s + draw() * (family.longest_s - family.shortest_s)) / TICK_S)
+    return LoadProfile(tuple(times), tuple(watts))
+
+
+def concatenated(hours: list[LoadProfile]) -> LoadProfile:
+    """Return one-hour profiles one after the other."""
+    times: list[int] = []
+    watts: list[float] = []
+    for hour, profile in enumerate(hours):
+        times += [hour * HOUR_TICKS + time for time in profile.times]
+        watts += profile.watts
+    return LoadProfile(tuple(times), tuple(watts))
+
+
+def find_load(name: str, mean_w: float) -> LoadProfile:
+    """Return the load of a scenario's name or of a CSV file.
+
+    Raises:
+        LoadFileError: There is neither such a name nor a file that can be read.
+    """
+    if name in NAMED:
+        return concatenated([telegraph(HOURS[hour], mean_w) for hour in NAMED[name]])
+    path = Path(name)
+    if not path.exists():
+        raise LoadFileError(f"load {name}: neither a file nor one of {', '.join(NAMED)}")
+    return read_load_file(path)
+
+
+def read_load_file(path: Path) -> LoadProfile:
+    """Return the load of a CSV file with the columns time_s and load_w, steps held.
+
+    Raises:
+        LoadFileError: One line that names file, line and remedy.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise LoadFileError(f"{path}: not UTF-8 text (byte {error.start}); save it as UTF-8") from None
+    except OSError as error:
+        raise LoadFileError(f"{path}: {error.strerror}; name a readable CSV file") from None
+    reader = csv.DictReader(text.splitlines())
+    missing = {"time_s", "load_w"} - set(reader.fieldnames or ())
+    if missing:
+        raise LoadFileError(f"{path}: no column {' and '.join(sorted(missing))}; the first line is time_s,load_w")
+    times, watts = [], []
+    for row in reader:
+        time, load = (
+            _number(row[column], f"{path}, line {reader.line_num}, {column}") for column in ("time_s", "load_w")
+        )
+        tick = round(time / TICK_S)
+        where = f"{path}, line {reader.line_num}"
+        if abs(tick * TICK_S - time) > 1e-6:
+            raise LoadFileError(f"{where}: {time:g} s is not a multiple of {TICK_S} s")
+        if load < 0:
+            raise LoadFileError(f"{where}: a load of {load:g} W is negative; loads are heat into the bath, 0 W or more")
+        if tick != 0 and not times:
+            raise LoadFileError(f"{where}: the first step is at {time:g} s; begin at 0 s")
+        if times and tick <= times[-1]:
+            raise LoadFileError(f"{where}: {time:g} s does not come after {times[-1] * TICK_S:g} s; sort by time_s")
+        times.append(tick)
+        watts.append(load)
+    if not times:
+        raise LoadFileError(f"{path}: no steps; add a line such as 0,385")
+    return LoadProfile(tuple(times), tuple(watts))
+
+
+def _number(text: str | None, where: str) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise LoadFileError(f"{where}: {text!r} is not a finite number")
+    return value

@@ -1,0 +1,67 @@
+"""The model file's maker: `python -m plant.model FILE` writes the linear model of the reference cold box."""
+
+import hashlib
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coldloop.lti_model import LtiModel
+from plant import cold_box
+from plant.cold_box import REFERENCE, ColdBox
+from plant.equilibrium import find_equilibrium
+from plant.helium.properties import Helium, load_helium
+from plant.linearisation import linearise
+
+OPERATING_INPUTS = (43.0, 75.0, 36.0)  # CV155 %, NCR22_A W, CV156 %; left of the capacity maximum at CV155 = 50 %
+OPERATING_LEVEL = 60.0  # %
+
+
+def build_model(box: ColdBox = REFERENCE) -> LtiModel:
+    """Return the linear model of `box` at the operating point.
+
+    Raises:
+        plant.equilibrium.NoEquilibriumError: the box does not come to rest at the operating inputs.
+    """
+    helium = load_helium()
+    rest = find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, box, helium)
+    linear = linearise(rest.x, rest.u, rest.w, box, helium)
+    return LtiModel(
+        **linear._asdict(),
+        x0=rest.x,
+        u0=rest.u,
+        w0=rest.w,
+        y0=rest.y,
+        state_names=cold_box.STATE_NAMES,
+        state_units=cold_box.STATE_UNITS,
+        input_names=cold_box.INPUT_NAMES,
+        input_units=cold_box.INPUT_UNITS,
+        output_names=cold_box.OUTPUT_NAMES,
+        output_units=cold_box.OUTPUT_UNITS,
+        load_name=cold_box.LOAD_NAME,
+        load_unit=cold_box.LOAD_UNIT,
+        parameters_digest=parameters_digest(box, helium),
+    )
+
+
+def parameters_digest(box: ColdBox, helium: Helium) -> str:
+    """Return the SHA-256 over every parameter and every table entry, in hexadecimal."""
+    digest = hashlib.sha256()
+    _add(digest, (box, helium))
+    return digest.hexdigest()
+
+
+def _add(digest: Any, part: Any) -> None:  # noqa: ANN401 - hashlib's object and a nested tuple have no public type
+    if isinstance(part, tuple):
+        for name, value in zip(getattr(part, "_fields", ("",) * len(part)), part, strict=True):
+            digest.update(f"{name}:".encode())
+            _add(digest, value)
+    elif isinstance(part, np.ndarray):
+        digest.update(part.astype("<f8").tobytes())
+    else:
+        digest.update(f"{part!r};".encode())
+
+
+if __name__ == "__main__":
+    build_model().save(Path(sys.argv[1]))

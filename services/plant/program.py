@@ -1,0 +1,135 @@
+"""The plant as a program: inputs in, one tick forward, measurements out. No sockets, no clock."""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isfinite
+
+import numpy as np
+
+from plant.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, ColdBox, outputs
+from plant.helium.properties import load_helium
+from plant.integrator import advance_and_read, plain_tuples
+from plant.numeric import RealArray
+
+
+@dataclass(frozen=True)
+class LoadProfile:
+    """The heat load over time, in steps that are held.
+
+    Raises:
+        ValueError: times do not start at 0 or do not increase, lengths differ, or a load is negative or not finite.
+    """
+
+    times: tuple[int, ...]
+    """Ticks at which the load changes, from 0."""
+    watts: tuple[float, ...]
+    """The load from each of these ticks on, W."""
+
+    def __post_init__(self) -> None:
+        if not self.times or self.times[0] != 0 or len(self.times) != len(self.watts):
+            raise ValueError("a load profile needs a load for each time, the first at tick 0")
+        if any(later <= earlier for earlier, later in zip(self.times, self.times[1:], strict=False)):
+            raise ValueError("the times of a load profile must increase")
+        if not all(0.0 <= load < inf for load in self.watts):
+            raise ValueError("loads are finite and not negative")
+
+    def value(self, tick: int) -> float:
+        """Return the load (W) that is held from `tick` (0 or later) to the next."""
+        return self.watts[bisect_right(self.times, tick) - 1]
+
+
+@dataclass(frozen=True)
+class MeasurementNoise:
+    """White Gaussian noise on the outputs, one draw a tick whoever reads them.
+
+    Raises:
+        ValueError: not one standard deviation per output, or one that is negative or not finite.
+    """
+
+    deviations: tuple[float, ...]
+    """Standard deviation of each output, in its unit; shape (22,)."""
+    seed: int
+    """Seed of the PCG64 generator, 0 or more."""
+
+    def __post_init__(self) -> None:
+        if len(self.deviations) != len(OUTPUT_NAMES) or not all(0.0 <= sigma < inf for sigma in self.deviations):
+            raise ValueError(f"noise needs {len(OUTPUT_NAMES)} standard deviations, finite and not negative")
+
+
+class PlantProgram:
+    """The simulated cold box, advanced tick by tick.
+
+    Args:
+        box: The parameters of the cold box.
+        x0: State at tick 0, 28 numbers; from the model file, so that trajectories agree to the bit everywhere.
+        u0: Inputs held until the first `apply`, 3 numbers.
+        load: The heat load over time.
+        noise: Noise on the measurements; None measures exactly.
+        tick_s: Length of a tick in seconds, above 0 and at most 1.6 where the integration stays stable.
+
+    Raises:
+        ValueError: an argument of wrong length, not finite, or out of range.
+    """
+
+    def __init__(
+        self,
+        *,
+        box: ColdBox,
+        x0: Sequence[float],
+        u0: Sequence[float],
+        load: LoadProfile,
+        noise: MeasurementNoise | None = None,
+        tick_s: float = 0.25,
+    ) -> None:
+        if not 0.0 < tick_s <= 1.6:
+            raise ValueError(f"a tick of {tick_s} s is outside 0 to 1.6 s")
+        helium = load_helium()
+        self.tick = 0
+        self._tick_s = tick_s
+        self._box, self._helium = plain_tuples(box), plain_tuples(helium)
+        self._x = _vector(x0, STATE_NAMES, "states")
+        self._u = _vector(u0, INPUT_NAMES, "inputs")
+        self._load = load
+        self._deviations = np.array(noise.deviations) if noise else None
+        self._generator = np.random.Generator(np.random.PCG64(noise.seed if noise else 0))
+        self._measured = self._sample(outputs(self._x, self._u, self.load, box, helium))
+
+    @property
+    def state(self) -> tuple[float, ...]:
+        """The 28 states at the current tick, without noise."""
+        return tuple(self._x.tolist())
+
+    @property
+    def load(self) -> float:
+        """The heat load (W) held from the current tick to the next."""
+        return self._load.value(self.tick)
+
+    def measure(self) -> tuple[float, ...]:
+        """Return the 22 outputs at the current tick, taken before inputs applied at this tick act."""
+        return self._measured
+
+    def apply(self, u: Sequence[float]) -> None:
+        """Hold `u` (CV155 %, NCR22_A W, CV156 %) over the ticks that follow; the valves saturate by themselves.
+
+        Raises:
+            ValueError: not three finite numbers.
+        """
+        self._u = _vector(u, INPUT_NAMES, "inputs")
+
+    def advance(self) -> None:
+        """Go one tick forward."""
+        self._x, y = advance_and_read(self._x, self._u, self.load, self._tick_s, self._box, self._helium)
+        self.tick += 1
+        self._measured = self._sample(y)
+
+    def _sample(self, y: RealArray) -> tuple[float, ...]:
+        if self._deviations is not None:
+            y = y + self._deviations * self._generator.standard_normal(len(y))
+        return tuple(y.tolist())
+
+
+def _vector(values: Sequence[float], names: tuple[str, ...], what: str) -> RealArray:
+    if len(values) != len(names) or not all(isfinite(value) for value in values):
+        raise ValueError(f"expected {len(names)} finite {what}, not {list(values)}")
+    return np.array(values, dtype=np.float64)

@@ -1,0 +1,166 @@
+"""The plant on the bus: a remote I/O rack in front of the simulation.
+
+In lock-step, writing the outputs of the present tick answers with its measurement and then moves the plant on. In
+real time the plant moves by the clock, half a tick away from the scans, whatever the control PLC does.
+"""
+
+import asyncio
+import logging
+import time
+from collections.abc import Mapping
+
+from coldloop import __version__
+from coldloop.clock import Pacer, Schedule
+from coldloop.modbus.server import DeviceIdentity, ModbusServer
+from coldloop.model_file import ModelHeader, read_header
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
+from coldloop.registers.bank import RegisterBank
+from coldloop.registers.common import Identity, ServiceState
+from coldloop.registers.declaration import Block
+from coldloop.registers.plant import (
+    HISTORY_ROWS,
+    PLANT_MAP,
+    Actuators,
+    LoadStep,
+    Measurement,
+    PlantSample,
+    PlantSession,
+)
+from coldloop.session import Pace, TimeMode
+from coldloop.telemetry import Telemetry
+from plant.cold_box import REFERENCE
+from plant.load import find_load
+from plant.program import LoadProfile, MeasurementNoise, PlantProgram
+from plant.settings import PlantSettings
+
+log = logging.getLogger("coldloop.plant")
+
+
+def make_program(header: ModelHeader, settings: PlantSettings, load: LoadProfile, seed: int) -> PlantProgram:
+    """Return the plant at the operating point of its model file."""
+    deviations = settings.plant.sensors.deviations
+    noise = MeasurementNoise(deviations, seed) if any(deviations) else None
+    return PlantProgram(box=REFERENCE, x0=header.x0, u0=header.u0, load=load, noise=noise)
+
+
+class PlantRack:
+    """Connects the program to the registers."""
+
+    def __init__(self, settings: PlantSettings) -> None:
+        self._settings = settings
+        self._header = read_header(settings.model.file)
+        self.bank = RegisterBank(PLANT_MAP, settings.plant.word_order)
+        load = find_load(settings.plant.load, self._header.w0)
+        self._begin(1 if settings.session.autostart else 0, self._configured_pace(), load, settings.plant.seed)
+
+    def _configured_pace(self) -> Pace:
+        session = self._settings.session
+        return Pace(session.mode is TimeMode.REALTIME, session.factor)
+
+    def _begin(self, session: int, pace: Pace, load: LoadProfile, seed: int) -> None:
+        self._program = make_program(self._header, self._settings, load, seed)
+        self._session, self._pace = session, pace
+        self._applied = tuple(self._header.u0)
+        self._moving = False
+        self._clock: asyncio.Task[None] | None = None
+        self.bank.put(self._measurement())
+        self._publish()
+
+    def on_write(self, block: Block) -> None:
+        """Take what a client has written."""
+        if block.record is Actuators:
+            self._exchange(self.bank.get(Actuators))
+        elif block.record is PlantSession:
+            self._start_session(self.bank.get(PlantSession))
+
+    # -- sessions ------------------------------------------------------------------------------------------------------
+
+    def _start_session(self, asked: PlantSession) -> None:
+        if self._clock is not None:
+            self._clock.cancel()
+        steps = [self.bank.get(LoadStep, row) for row in range(asked.load_steps)]
+        load = LoadProfile(tuple(s.tick for s in steps), tuple(s.watts for s in steps))
+        self._begin(asked.session, Pace(bool(asked.realtime), asked.factor), load, asked.seed)
+        log.info("session started", extra={"session": asked.session, "realtime": bool(asked.realtime)})
+
+    # -- exchange ------------------------------------------------------------------------------------------------------
+
+    def _exchange(self, asked: Actuators) -> None:
+        if self._moving:  # the next request came in before the plant had moved on
+            self._advance()
+        self._applied = (asked.cv155, asked.ncr22, asked.cv156)
+        self._program.apply(self._applied)
+        self.bank.put(self._measurement())
+        loop = asyncio.get_running_loop()
+        if self._pace.realtime:
+            if self._clock is None:
+                self._clock = loop.create_task(self._run_by_the_clock(), name="plant clock")
+        elif asked.tick == self._program.tick:
+            self._moving = True
+            loop.call_soon(self._advance)  # after the answer is on its way
+
+    def _advance(self) -> None:
+        """Record the tick that ends and move on to the next."""
+        if not self._moving:
+            return
+        self._moving = False
+        program = self._program
+        self.bank.put(
+            PlantSample(program.tick, program.load, self._applied, program.measure(), program.state),
+            program.tick % HISTORY_ROWS,
+        )
+        program.advance()
+        self._publish()
+
+    async def _run_by_the_clock(self) -> None:
+        pacer = Pacer(Schedule(time.monotonic(), self._pace.factor))
+        while True:
+            await pacer.until(self._program.tick + 0.5)
+            self._moving = True
+            self._advance()
+            self.bank.put(self._measurement())
+
+    # -- what others see -----------------------------------------------------------------------------------------------
+
+    def _measurement(self) -> Measurement:
+        program = self._program
+        return Measurement(program.tick, program.load, program.measure(), program.state)
+
+    def _publish(self) -> None:
+        program = self._program
+        self.bank.put(
+            Identity(
+                map_digest=PLANT_MAP.digest,
+                map_version=PLANT_MAP.version,
+                state=ServiceState.RUNNING if self._session else ServiceState.READY,
+                model_digest=self._header.short_digest,
+                session=self._session,
+                tick=program.tick,
+                heartbeat=program.tick & 0xFFFF,
+            )
+        )
+
+    def snapshot(self) -> Mapping[str, object]:
+        """Return what telemetry publishes."""
+        program = self._program
+        return {
+            "session": self._session,
+            "tick": program.tick,
+            "load_w": program.load,
+            "inputs": dict(zip(INPUT_NAMES, self._applied, strict=True)),
+            "outputs": dict(zip(OUTPUT_NAMES, program.measure(), strict=True)),
+        }
+
+
+async def serve(settings: PlantSettings) -> None:
+    """Serve the plant until cancelled."""
+    rack = PlantRack(settings)
+    identity = DeviceIdentity(product="Coldloop plant", revision=__version__)
+    server = ModbusServer(rack.bank, settings=settings.plant.server, on_write=rack.on_write, identity=identity)
+    await server.start()
+    log.info("serving", extra={"host": settings.plant.server.host, "port": server.port})
+    try:
+        await Telemetry(settings.telemetry, "plant", rack.snapshot).run()
+        await asyncio.Event().wait()
+    finally:
+        await server.close()

@@ -1,0 +1,59 @@
+"""Configuration of the plant service, checked when it is made and immutable after."""
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from coldloop.endpoints import PLANT_PORT
+from coldloop.modbus.settings import ServerSettings
+from coldloop.model_settings import ModelSettings
+from coldloop.registers.codec import WordOrder
+from coldloop.session import SessionSettings
+from coldloop.telemetry import TelemetrySettings
+
+Deviation = Annotated[float, Field(ge=0)]
+
+
+class SensorSettings(BaseModel):
+    """Standard deviations of the sensors' noise; 0 is an exact sensor."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    level: Deviation = 0.0
+    """%."""
+    speed: Deviation = 0.0
+    """Hz."""
+    temperature: Deviation = 0.0
+    """K."""
+    pressure: Deviation = 0.0
+    """bar."""
+
+    @property
+    def deviations(self) -> tuple[float, ...]:
+        """Standard deviation of each output."""
+        return (self.level, self.speed, *[self.temperature] * 10, *[self.pressure] * 10)
+
+
+class PlantSection(BaseModel):
+    """Section `plant` of the configuration."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    server: ServerSettings = ServerSettings(port=PLANT_PORT)
+    word_order: WordOrder = WordOrder.HIGH_FIRST
+    load: str = "2h"
+    """Named load or CSV file."""
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
+    """Seed of the sensors' noise."""
+    sensors: SensorSettings = SensorSettings()
+
+
+class PlantSettings(BaseModel):
+    """What the plant service reads of a configuration."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model: ModelSettings = ModelSettings()
+    session: SessionSettings = SessionSettings()
+    plant: PlantSection = PlantSection()
+    telemetry: TelemetrySettings = TelemetrySettings()

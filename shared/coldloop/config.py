@@ -1,0 +1,136 @@
+"""Configuration: a TOML file, then the environment, then the command line, each overriding the one before.
+
+The environment spells `COLDLOOP__SECTION__KEY=value`, the command line `--set section.key=value`; both read the
+value as TOML, and as text when it is none. Every value remembers where it came from.
+"""
+
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from coldloop.errors import ConfigurationError
+
+PREFIX = "COLDLOOP__"
+DEFAULT = "default"
+
+M = TypeVar("M", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class Configuration(Generic[M]):
+    """Validated settings, and the source of each value that is not a default (by dotted key)."""
+
+    settings: M
+    sources: Mapping[str, str]
+
+    def effective(self) -> list[tuple[str, Any, str]]:
+        """Return (dotted key, value, source) of every value."""
+        rows = _flattened(self.settings.model_dump(mode="json"))
+        return [(key, value, self.sources.get(key, DEFAULT)) for key, value in rows.items()]
+
+
+class _Layers:
+    """Values by section, with the source of each."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, Any] = {}
+        self.sources: dict[str, str] = {}
+
+    def put(self, key: str, value: object, source: str) -> None:
+        """Set the value of a dotted key."""
+        *sections, last = key.split(".")
+        place = self.values
+        for section in sections:
+            place = place.setdefault(section, {})
+            if not isinstance(place, dict):
+                raise ConfigurationError(f"{source}: {key} is not a section; see `coldloop config` for the keys")
+        place[last] = value
+        self.sources[key] = source
+
+
+def load_configuration(
+    model: type[M],
+    *,
+    file: Path | None = None,
+    environment: Mapping[str, str] | None = None,
+    assignments: Iterable[str] = (),
+    options: Mapping[str, tuple[object, str]] | None = None,
+    others: Iterable[str] = (),
+) -> Configuration[M]:
+    """Return the validated configuration.
+
+    Args:
+        model: Pydantic model of the whole configuration.
+        file: TOML file.
+        environment: Where to look for `COLDLOOP__...`; the process's own by default.
+        assignments: `section.key=value` from the command line.
+        options: Values of dedicated command-line options, by dotted key, each with the option's name.
+        others: Sections of other services, which the file and the environment may hold and `model` does not know.
+
+    Raises:
+        ConfigurationError: One line that names the key, its source and the remedy.
+    """
+    layers = _Layers()
+    if file is not None:
+        for key, value in _flattened(_read_toml(file)).items():
+            layers.put(key, value, str(file))
+    for name, value in sorted((os.environ if environment is None else environment).items()):
+        if name.startswith(PREFIX):
+            layers.put(name[len(PREFIX) :].lower().replace("__", "."), _parsed(value), name)
+    for assignment in assignments:
+        key, separator, value = assignment.partition("=")
+        if not separator:
+            raise ConfigurationError(f"--set {assignment}: write --set section.key=value")
+        layers.put(key.strip(), _parsed(value), f"--set {key.strip()}")
+    for key, (option, name) in (options or {}).items():
+        layers.put(key, option, name)
+    for section in others:
+        if section not in model.model_fields:
+            layers.values.pop(section, None)
+    try:
+        return Configuration(model.model_validate(layers.values), layers.sources)
+    except ValidationError as error:
+        raise ConfigurationError(_explained(error, layers.sources)) from None
+
+
+def _read_toml(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"{file}: {error.strerror}; name a readable TOML file with --config") from None
+    except UnicodeDecodeError:
+        raise ConfigurationError(f"{file}: not UTF-8 text; save it as UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(f"{file}: not TOML: {error}") from None
+
+
+def _parsed(value: str) -> object:
+    try:
+        return tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return value
+
+
+def _flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            flat.update(_flattened(value, f"{prefix}{key}."))
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def _explained(error: ValidationError, sources: Mapping[str, str]) -> str:
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    source = next((s for k, s in sources.items() if k == key or k.startswith(f"{key}.") or key.startswith(f"{k}.")), "")
+    where = f"{source}: {key}" if source and not source.endswith(key) else source or key or "configuration"
+    if first["type"] == "extra_forbidden":
+        return f"{where}: no such key; `coldloop config` lists the keys"
+    return f"{where}: {first['msg'][0].lower()}{first['msg'][1:]} (got {first['input']!r})"

@@ -1,0 +1,58 @@
+"""Everything that Coldloop raises on purpose.
+
+    ColdloopError
+    ├── UsageError                  exit code 2: what the caller asked for cannot be done
+    │   ├── ConfigurationError      a key, a value or a configuration file
+    │   └── LoadFileError           a load profile
+    ├── ModelFileError              a prediction model that is missing, damaged or of another plant
+    └── LinkError                   the bus: a port, a peer, an answer
+        ├── PortInUseError
+        ├── PeerUnreachableError
+        └── RequestRefusedError     the peer answered with a Modbus exception
+
+A message is one line that says what, where, and what to do.
+"""
+
+
+class ColdloopError(Exception):
+    """Root of the tree; `exit_code` is what a program ends with when it cannot go on."""
+
+    exit_code = 1
+
+
+class UsageError(ColdloopError):
+    """What the caller asked for cannot be done."""
+
+    exit_code = 2
+
+
+class ConfigurationError(UsageError):
+    """A configuration key or value is wrong, or its file cannot be read."""
+
+
+class LoadFileError(UsageError):
+    """A load profile cannot be read."""
+
+
+class ModelFileError(ColdloopError):
+    """A prediction model is missing, damaged, or does not belong to the plant."""
+
+
+class LinkError(ColdloopError):
+    """The bus failed."""
+
+
+class PortInUseError(LinkError):
+    """A server cannot listen where it was told to."""
+
+
+class PeerUnreachableError(LinkError):
+    """A peer does not answer, or does not speak as its register map says."""
+
+
+class RequestRefusedError(LinkError):
+    """A peer answered a request with a Modbus exception."""
+
+    def __init__(self, message: str, exception_code: int) -> None:
+        super().__init__(message)
+        self.exception_code = exception_code

@@ -1,0 +1,238 @@
+"""A typed client of one server: records in, records out."""
+
+import asyncio
+import logging
+import struct
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, Final, TypeVar, cast
+
+from pymodbus.client import AsyncModbusTcpClient
+from pymodbus.exceptions import ConnectionException, ModbusException
+
+from coldloop.errors import PeerUnreachableError, RequestRefusedError
+from coldloop.modbus.peer_check import check_peer
+from coldloop.modbus.raw_pdu import RawDecoder, RawPdu
+from coldloop.modbus.requests import (
+    MAX_READ_WORDS,
+    MAX_WRITE_WORDS,
+    READ_HOLDING_REGISTERS,
+    READ_WRITE_REGISTERS,
+    WRITE_MULTIPLE_REGISTERS,
+)
+from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
+from coldloop.registers.common import Identity
+from coldloop.registers.declaration import Block, RegisterMap
+
+R = TypeVar("R", bound=tuple[Any, ...])
+
+CONNECT_PAUSE_S: Final = 0.1
+
+_READ: Final = struct.Struct(">HH")
+_WRITE: Final = struct.Struct(">HHB")
+_READ_WRITE: Final = struct.Struct(">HHHHB")
+_EXCEPTIONS: Final = {
+    1: "illegal function",
+    2: "no such register, or not writable",
+    3: "illegal value",
+    4: "failure in the server",
+    11: "no such unit id",
+}
+
+# pymodbus logs each failure besides reporting it; here every one becomes an error of Coldloop's that says more.
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+
+
+class RegisterClient:
+    """Reads and writes the records of one server.
+
+    Args:
+        register_map: What the server serves.
+        host: Where it is.
+        port: Its TCP port.
+        timeout_s: How long connecting, and each answer, may take.
+        order: Word order of 32-bit values.
+
+    Requests of several tasks are sent one after the other. After a lost connection the next request connects again.
+
+    All requests raise `PeerUnreachableError` when there is no answer in time and `RequestRefusedError` when the
+    answer is a Modbus exception.
+    """
+
+    def __init__(
+        self,
+        register_map: RegisterMap,
+        *,
+        host: str,
+        port: int,
+        timeout_s: float,
+        order: WordOrder = WordOrder.HIGH_FIRST,
+    ) -> None:
+        self._map = register_map
+        self._order = order
+        self._host = host
+        self._port = port
+        self._timeout_s = timeout_s
+        self._turn = asyncio.Lock()
+        self._places: dict[type[tuple[Any, ...]], tuple[Block, RecordCodec]] = {
+            block.record: (block, codec_of(block, order)) for block in register_map.blocks
+        }
+
+    @property
+    def peer(self) -> str:
+        """The server, as messages name it."""
+        return f"{self._map.service} at {self._host}:{self._port}"
+
+    async def connect(self, patience_s: float) -> None:
+        """Connect, and make sure that the peer speaks this register map in this word order.
+
+        Args:
+            patience_s: How long to go on trying while nobody answers.
+
+        Raises:
+            PeerUnreachableError: Nobody answers, or not as the register map says.
+        """
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + patience_s
+        while True:
+            try:
+                block, codec = self._places[Identity]
+                raw = await self._read_words(block, block.address, codec.size // 2)
+            except PeerUnreachableError:
+                if loop.time() >= deadline:
+                    raise
+                await asyncio.sleep(min(CONNECT_PAUSE_S, patience_s))
+            except RequestRefusedError as error:
+                raise PeerUnreachableError(
+                    f"something else than {self.peer} answers there (no identity block): check host and port"
+                ) from error
+            else:
+                check_peer(raw, self._map, self._order, self.peer)
+                return
+
+    async def read(self, record: type[R]) -> R:
+        """Return the record (its first row)."""
+        return (await self.read_rows(record, 0, 1))[0]
+
+    async def read_rows(self, record: type[R], start: int, count: int) -> list[R]:
+        """Return `count` rows from row `start` on; rows that need several requests are read in several."""
+        block, codec = self._places[record]
+        row_words = codec.size // 2
+        rows_at_once = MAX_READ_WORDS // row_words
+        rows: list[R] = []
+        for first in range(start, start + count, rows_at_once):
+            here = min(rows_at_once, start + count - first)
+            raw = await self._read_words(block, block.address + first * row_words, here * row_words)
+            rows += [cast("R", codec.decode(raw, row * codec.size)) for row in range(here)]
+        return rows
+
+    async def write(self, record: tuple[Any, ...]) -> None:
+        """Write the record (its first row)."""
+        await self.write_rows([record])
+
+    async def write_rows(self, records: Sequence[tuple[Any, ...]], start: int = 0) -> None:
+        """Write rows of one block from row `start` on; rows that need several requests are written in several."""
+        if not records:
+            return
+        block, codec = self._places[type(records[0])]
+        row_words = codec.size // 2
+        rows_at_once = MAX_WRITE_WORDS // row_words
+        for first in range(0, len(records), rows_at_once):
+            data = b"".join([codec.encode(record) for record in records[first : first + rows_at_once]])
+            head = _WRITE.pack(block.address + (start + first) * row_words, len(data) // 2, len(data))
+            answer = await self._transact(RawPdu(WRITE_MULTIPLE_REGISTERS, head + data), block)
+            if answer != head[: _READ.size]:
+                raise self._nonsense(block)
+
+    async def exchange(self, record: tuple[Any, ...], answer: type[R], *, patience_s: float | None = None) -> R:
+        """Write `record`, then read `answer`, in one request.
+
+        Args:
+            record: What to write.
+            answer: What to read.
+            patience_s: How long the answer may take when the server lets it wait; `timeout_s` by default.
+        """
+        block, codec = self._places[type(record)]
+        answer_block, answer_codec = self._places[answer]
+        data = codec.encode(record)
+        head = _READ_WRITE.pack(answer_block.address, answer_codec.size // 2, block.address, len(data) // 2, len(data))
+        raw = await self._transact(RawPdu(READ_WRITE_REGISTERS, head + data), block, patience_s)
+        return cast("R", answer_codec.decode(self._checked(raw, answer_codec.size, answer_block), 1))
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._client.close()
+
+    async def _read_words(self, block: Block, address: int, count: int) -> bytes:
+        raw = await self._transact(RawPdu(READ_HOLDING_REGISTERS, _READ.pack(address, count)), block)
+        return self._checked(raw, 2 * count, block)[1:]
+
+    def _checked(self, raw: bytes, size: int, block: Block) -> bytes:
+        if len(raw) != size + 1 or raw[0] != size:
+            raise self._nonsense(block)
+        return raw
+
+    async def _transact(self, request: RawPdu, block: Block, patience_s: float | None = None) -> bytes:
+        """Send a request, connecting first where needed; return the bytes behind the answer's function code."""
+        async with self._turn:
+            client = self._client
+            if not client.connected:
+                await self._open()
+            client.ctx.comm_params.timeout_connect = patience_s or self._timeout_s
+            try:
+                response = await client.execute(False, request)  # noqa: FBT003 - pymodbus takes it by position only
+            except ModbusException as error:
+                client.close()  # a late answer must not meet a later request
+                raise self._silent(block, error) from error
+            except asyncio.CancelledError:
+                client.close()
+                raise
+        if not isinstance(response, RawPdu) or response.function_code & 0x7F != request.function_code:
+            raise self._nonsense(block)
+        if response.function_code != request.function_code:
+            raise self._refused(request.function_code, block, response.payload)
+        return response.payload
+
+    async def _open(self) -> None:
+        self._client.ctx.comm_params.timeout_connect = self._timeout_s
+        if not await self._client.connect():
+            raise PeerUnreachableError(f"nobody listens as {self.peer}: start it, or check host and port")
+
+    @cached_property
+    def _client(self) -> AsyncModbusTcpClient:
+        # Neither retries nor reconnection in the background: a request fails within its time, and the next one
+        # connects again. pymodbus only notices a lost connection by the time-out, so it is told here.
+        client = AsyncModbusTcpClient(
+            self._host,
+            port=self._port,
+            name=self._map.service,
+            timeout=self._timeout_s,
+            retries=0,
+            reconnect_delay=0,
+            trace_connect=self._connection_changed,
+        )
+        client.ctx.framer.decoder = RawDecoder(is_server=False)
+        return client
+
+    def _connection_changed(self, connected: bool) -> None:  # noqa: FBT001 - pymodbus' signature
+        answer = self._client.ctx.response_future
+        if not connected and not answer.done():
+            answer.set_exception(ConnectionException("closed by the peer"))
+
+    def _silent(self, block: Block, error: ModbusException) -> PeerUnreachableError:
+        what = "closed the connection" if isinstance(error, ConnectionException) else "did not answer in time"
+        return PeerUnreachableError(
+            f"{self.peer} {what} at a request for block '{block.name}': check that it runs and is what listens there"
+        )
+
+    def _refused(self, function: int, block: Block, payload: bytes) -> RequestRefusedError:
+        code = int.from_bytes(payload, "big")
+        meaning = _EXCEPTIONS.get(code, "not a code that Coldloop uses")
+        return RequestRefusedError(
+            f"{self.peer} refused function {function} on block '{block.name}': exception {code}, {meaning}", code
+        )
+
+    def _nonsense(self, block: Block) -> PeerUnreachableError:
+        return PeerUnreachableError(
+            f"{self.peer} answered a request for block '{block.name}' with something else: check host and port"
+        )

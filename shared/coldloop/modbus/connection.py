@@ -1,0 +1,193 @@
+"""One connection of a server: frames in, answers out, and the wait that a write may ask for.
+
+Everything runs in the callbacks of the event loop. A request costs no task and no await unless `on_write` asks for a
+wait; then requests that arrive behind it stay in the buffer until its answer is written.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterator
+from functools import partial
+from time import monotonic
+from typing import Final, cast
+
+from coldloop.modbus.framing import Frame, MalformedFrameError, framed, next_frame
+from coldloop.modbus.refusals import RefusalLog
+from coldloop.modbus.requests import NO_SUCH_UNIT, SERVER_FAILURE, RequestHandler, Written, exception_answer
+from coldloop.modbus.settings import ServerSettings
+from coldloop.registers.bank import RefusedAccessError
+from coldloop.registers.declaration import Block
+
+INPUT_LIMIT: Final = 64 * 1024
+"""Bytes of unserved requests beyond which a connection is not read from."""
+
+OUTPUT_CHUNK: Final = 16 * 1024
+"""Bytes of answers that are written at once; a client that does not take them is not served further."""
+
+OnWrite = Callable[[Block], Awaitable[None] | None]
+
+_KINDS: Final = {1: "illegal_function", 2: "illegal_address", 3: "illegal_value"}
+
+
+class Connection(asyncio.Protocol):
+    """Serves one client. `opened` and `lost` tell the server that the connection exists and that it is gone."""
+
+    def __init__(
+        self,
+        *,
+        handler: RequestHandler,
+        settings: ServerSettings,
+        on_write: OnWrite,
+        refusals: RefusalLog,
+        opened: Callable[["Connection"], None],
+        lost: Callable[["Connection"], None],
+    ) -> None:
+        self._handler = handler
+        self._settings = settings
+        self._on_write = on_write
+        self._refusals = refusals
+        self._opened = opened
+        self._lost = lost
+        self._loop = asyncio.get_running_loop()
+        self._buffer = bytearray()
+        self._wait: asyncio.Future[None] | None = None
+        self._output_blocked = False
+        self._reading_paused = False
+        self.last_request = monotonic()  # not the loop's time, which uvloop rounds to milliseconds
+        self.peer = "?"
+
+    @property
+    def idle(self) -> bool:
+        """Whether no request is waiting for its answer."""
+        return self._wait is None
+
+    def close(self) -> None:
+        """Close when what was answered has been sent."""
+        self._transport.close()
+
+    def abort(self) -> None:
+        """Close now."""
+        self._transport.abort()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin to serve (event loop callback)."""
+        self._transport = cast("asyncio.Transport", transport)
+        self.peer = "{}:{}".format(*transport.get_extra_info("peername"))
+        self._idle_timer = self._loop.call_later(self._settings.idle_timeout_s, self._check_idle)
+        self._opened(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - why it was lost changes nothing
+        """Cancel what the client no longer waits for (event loop callback)."""
+        self._idle_timer.cancel()
+        if self._wait is not None:
+            self._wait.cancel()
+        self._lost(self)
+
+    def data_received(self, data: bytes) -> None:
+        """Answer all requests that are whole by now (event loop callback)."""
+        self._buffer += data
+        self._serve()
+
+    def pause_writing(self) -> None:
+        """Stop serving a client that does not read its answers (event loop callback)."""
+        self._output_blocked = True
+
+    def resume_writing(self) -> None:
+        """Go on serving (event loop callback)."""
+        self._output_blocked = False
+        self.last_request = monotonic()
+        self._serve()
+
+    def _serve(self) -> None:
+        while self._wait is None and not self._output_blocked:
+            answers = self._answers()
+            if not answers:
+                break
+            self.last_request = monotonic()
+            self._transport.write(answers)
+        self._regulate_reading()
+
+    def _regulate_reading(self) -> None:
+        pause = self._output_blocked or len(self._buffer) > INPUT_LIMIT
+        if pause is self._reading_paused or self._transport.is_closing():
+            return
+        self._reading_paused = pause
+        if pause:
+            self._transport.pause_reading()
+        else:
+            self._transport.resume_reading()
+
+    def _answers(self) -> bytes:
+        """Take the next whole requests out of the buffer and return their answers, to be written at once."""
+        answers = b""
+        position = 0
+        try:
+            while len(answers) < OUTPUT_CHUNK and self._wait is None:
+                frame = next_frame(self._buffer, position)
+                if frame is None:
+                    break
+                position = frame.end
+                answers += self._answer(frame)
+        except MalformedFrameError as error:
+            if not answers:  # otherwise they are sent first, and the next call comes here again
+                self._refusals.note("malformed_frame", self.peer, str(error))
+                position = len(self._buffer)
+                self._transport.close()
+        del self._buffer[:position]
+        return answers
+
+    def _answer(self, frame: Frame) -> bytes:
+        """Carry a request out; return its answer, or nothing when it waits or is to be ignored."""
+        if frame.unit not in self._settings.unit_ids:
+            self._refusals.note("unknown_unit", self.peer, f"unit id {frame.unit} is not served")
+            if self._settings.unknown_unit == "silence":
+                return b""
+            return framed(frame, exception_answer(frame.pdu[0], NO_SUCH_UNIT))
+        try:
+            outcome = self._handler.handle(frame.pdu)
+        except RefusedAccessError as refusal:
+            self._refusals.note(_KINDS[refusal.exception_code], self.peer, f"function {frame.pdu[0]}: {refusal}")
+            return framed(frame, exception_answer(frame.pdu[0], refusal.exception_code))
+        except Exception as error:  # noqa: BLE001 - whatever goes wrong in here, the client gets an answer
+            return self._failure(frame, error)
+        if isinstance(outcome, Written):
+            return self._answer_written(frame, outcome, iter(outcome.blocks))
+        return framed(frame, outcome)
+
+    def _answer_written(self, frame: Frame, written: Written, blocks: Iterator[Block]) -> bytes:
+        """Tell the program about the blocks; return the answer, or nothing when the program makes it wait."""
+        try:
+            for block in blocks:
+                waiting = self._on_write(block)
+                if waiting is not None:
+                    self._wait = asyncio.ensure_future(waiting)
+                    self._wait.add_done_callback(partial(self._go_on, frame, written, blocks))
+                    return b""
+        except Exception as error:  # noqa: BLE001 - whatever the program does wrong, the client gets an answer
+            return self._failure(frame, error)
+        return framed(frame, written.answer())
+
+    def _go_on(self, frame: Frame, written: Written, blocks: Iterator[Block], wait: asyncio.Future[None]) -> None:
+        self._wait = None
+        error = asyncio.CancelledError("wait cancelled") if wait.cancelled() else wait.exception()
+        if self._transport.is_closing():
+            return
+        answer = self._answer_written(frame, written, blocks) if error is None else self._failure(frame, error)
+        if answer:
+            self.last_request = monotonic()
+            self._transport.write(answer)
+        self._serve()
+
+    def _failure(self, frame: Frame, error: BaseException) -> bytes:
+        self._refusals.note("server_failure", self.peer, f"function {frame.pdu[0]}: {error!r}")
+        return framed(frame, exception_answer(frame.pdu[0], SERVER_FAILURE))
+
+    def _check_idle(self) -> None:
+        now = monotonic()
+        if self._wait is not None:
+            self.last_request = now
+        remaining = self.last_request + self._settings.idle_timeout_s - now
+        if remaining > 0:
+            self._idle_timer = self._loop.call_later(remaining, self._check_idle)
+            return
+        self._refusals.note("idle_timeout", self.peer, f"no whole request for {self._settings.idle_timeout_s:g} s")
+        self._transport.abort()

@@ -1,0 +1,48 @@
+"""What a server refuses: counted always, logged now and then."""
+
+import logging
+import time
+from dataclasses import dataclass, fields
+from typing import Final
+
+LOG_INTERVAL_S: Final = 10.0
+
+_logger = logging.getLogger("coldloop.modbus")
+
+
+@dataclass(slots=True)
+class ErrorCounters:
+    """Errors since the server was made, by kind."""
+
+    illegal_function: int = 0
+    illegal_address: int = 0
+    illegal_value: int = 0
+    server_failure: int = 0
+    unknown_unit: int = 0
+    malformed_frame: int = 0
+    idle_timeout: int = 0
+    connection_evicted: int = 0
+    connection_refused: int = 0
+
+
+class RefusalLog:
+    """Counts each refusal and logs at most one line of a kind in `LOG_INTERVAL_S`, so that no client floods the log."""
+
+    def __init__(self, service: str) -> None:
+        self.counters = ErrorCounters()
+        self._service = service
+        self._next_line = dict.fromkeys((field.name for field in fields(ErrorCounters)), 0.0)
+        self._unlogged = dict.fromkeys(self._next_line, 0)
+
+    def note(self, kind: str, peer: str, reason: str) -> None:
+        """Count a refusal of `kind`, a field of `ErrorCounters`."""
+        setattr(self.counters, kind, getattr(self.counters, kind) + 1)
+        now = time.monotonic()
+        if now < self._next_line[kind]:
+            self._unlogged[kind] += 1
+            return
+        _logger.warning(
+            "service=%s kind=%s peer=%s unlogged=%d reason=%s", self._service, kind, peer, self._unlogged[kind], reason
+        )
+        self._next_line[kind] = now + LOG_INTERVAL_S
+        self._unlogged[kind] = 0

@@ -1,0 +1,139 @@
+"""The model file: a JSON document that carries its own SHA-256 digest.
+
+Needs the standard library only, so that the control PLC can check which model it runs without numpy.
+"""
+
+import hashlib
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from coldloop.errors import ModelFileError
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelHeader:
+    """What a model file says about itself, without its matrices."""
+
+    digest: str
+    """SHA-256 of the content, in hexadecimal."""
+    parameters_digest: str
+    """The same for the plant's parameters and property tables that the model was made from."""
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_names: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_names: tuple[str, ...]
+    output_units: tuple[str, ...]
+    load_name: str
+    load_unit: str
+    x0: tuple[float, ...]
+    """State at the operating point, in `state_units`."""
+    u0: tuple[float, ...]
+    """Inputs at the operating point, in `input_units`."""
+    w0: float
+    """Load at the operating point, in `load_unit`."""
+    y0: tuple[float, ...]
+    """Outputs at the operating point, in `output_units`."""
+
+    @property
+    def short_digest(self) -> int:
+        """The first 32 bits of the digest, as they stand in the registers."""
+        return short_digest_of(self.digest)
+
+
+def read_header(path: Path) -> ModelHeader:
+    """Return the header of a model file after verifying the whole file.
+
+    Raises:
+        ModelFileError: the file is missing, unreadable, of another version, damaged or inconsistent.
+    """
+    return header_of(read_document(path), path)
+
+
+def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
+    """Return the header part of a document that `read_document` has verified; `path` is for the message."""
+    try:
+        described: dict[str, Any] = {name: str(document[name]) for name in TEXTS}
+        described |= {name: tuple(str(text) for text in document[name]) for name in LISTS_OF_TEXT}
+        described |= {name: tuple(float(number) for number in document[name]) for name in VECTORS}
+        header = ModelHeader(w0=float(document["w0"]), **described)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ModelFileError(f"{path}: {error!r} in the model file; {REMEDY}") from error
+    for kind, values in zip(KINDS, (header.x0, header.u0, header.y0), strict=True):
+        names, units = getattr(header, f"{kind}_names"), getattr(header, f"{kind}_units")
+        if not len(names) == len(units) == len(values):
+            raise ModelFileError(f"{path}: {kind} names, units and values differ in number; {REMEDY}")
+    return header
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """Return the content of a model file whose format and digest are right.
+
+    Raises:
+        ModelFileError: the file is missing, unreadable, not JSON, not finite, of another version or damaged.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+    except FileNotFoundError as error:
+        raise ModelFileError(f"{path}: no such model file; {REMEDY}") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise ModelFileError(f"{path}: not a readable model file ({error}); {REMEDY}") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise ModelFileError(f"{path}: not a model file of format {FORMAT}; {REMEDY}")
+    try:
+        found = digest_of(document)
+    except ValueError as error:  # a number such as 1e999 reads as infinite
+        raise ModelFileError(f"{path}: a number that is not finite; {REMEDY}") from error
+    if document.get("digest") != found:
+        raise ModelFileError(f"{path}: digest mismatch, the file was changed after it was made; {REMEDY}")
+    return document
+
+
+def write_document(path: Path, document: dict[str, Any]) -> None:
+    """Write a document with its digest; the file appears whole or not at all.
+
+    Raises:
+        ValueError: a number is not finite.
+        OSError: the file cannot be written.
+    """
+    text = json.dumps({**document, "digest": digest_of(document)}, sort_keys=True, indent=1, allow_nan=False)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def digest_of(document: dict[str, Any]) -> str:
+    """Return the SHA-256 of a document without its `digest`: sorted keys, shortest exact floats, no spaces."""
+    content = {name: value for name, value in document.items() if name != "digest"}
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def short_digest_of(digest: str) -> int:
+    """Return the first 32 bits of a hexadecimal digest."""
+    return int(digest[:8], 16)
+
+
+def _refuse(constant: str) -> float:
+    raise ValueError(f"{constant} is not finite")
+
+
+TEXTS = ("digest", "parameters_digest", "load_name", "load_unit")
+VECTORS = ("x0", "u0", "y0")
+KINDS = ("state", "input", "output")
+LISTS_OF_TEXT = tuple(f"{kind}_{what}" for kind in KINDS for what in ("names", "units"))
+REMEDY = "make it anew with `python -m plant.model FILE`"

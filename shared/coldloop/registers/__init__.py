@@ -1,0 +1,1 @@
+"""Register maps: each register is declared once, everything else is derived from the declaration."""

@@ -1,0 +1,92 @@
+"""Records to register words and back."""
+
+import struct
+from enum import StrEnum
+from functools import cache
+from typing import Any, TypeVar, cast
+
+from coldloop.registers.declaration import Block, fields_of
+
+R = TypeVar("R", bound=tuple[Any, ...])
+
+
+class WordOrder(StrEnum):
+    """Which half of a 32-bit value stands at the lower address."""
+
+    HIGH_FIRST = "high-first"
+    LOW_FIRST = "low-first"  # the habit of Schneider's PLCs
+
+
+class RecordCodec:
+    """Encodes the rows of one block, byte by byte as they travel on the bus."""
+
+    def __init__(self, block: Block, order: WordOrder) -> None:
+        self._struct = struct.Struct(">" + block.letters)
+        self._record = block.record
+        self._arrays = [len(field.elements) for field in fields_of(block.record).values()]
+        self._flat = not any(self._arrays)
+        self._swaps = _swapped_words(block.letters) if order is WordOrder.LOW_FIRST else None
+        self._words = struct.Struct(f">{self._struct.size // 2}H")
+        self.size = self._struct.size
+
+    def encode(self, record: tuple[Any, ...]) -> bytes:
+        """Return the row's bytes.
+
+        Raises:
+            struct.error, OverflowError: A value does not fit its register.
+        """
+        raw = self._struct.pack(*(record if self._flat else self._flattened(record)))
+        return raw if self._swaps is None else self._reordered(raw)
+
+    def decode(self, data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[Any, ...]:
+        """Return the record that stands in `data` at `offset` (bytes)."""
+        if self._swaps is not None:
+            data, offset = self._reordered(data[offset : offset + self.size]), 0
+        values = self._struct.unpack_from(data, offset)
+        return self._record(*(values if self._flat else self._nested(values)))
+
+    def _flattened(self, record: tuple[Any, ...]) -> list[Any]:
+        flat: list[Any] = []
+        for value, elements in zip(record, self._arrays, strict=True):
+            if elements:
+                flat += value
+            else:
+                flat.append(value)
+        return flat
+
+    def _nested(self, values: tuple[Any, ...]) -> list[Any]:
+        nested: list[Any] = []
+        start = 0
+        for elements in self._arrays:
+            nested.append(values[start : start + elements] if elements else values[start])
+            start += elements or 1
+        return nested
+
+    def _reordered(self, raw: bytes | bytearray | memoryview) -> bytes:
+        words = self._words.unpack(raw)
+        return self._words.pack(*[words[source] for source in self._swaps or ()])
+
+
+def _swapped_words(letters: str) -> list[int]:
+    swapped: list[int] = []
+    for letter in letters:
+        position = len(swapped)
+        swapped += [position] if letter == "H" else [position + 1, position]
+    return swapped
+
+
+@cache
+def codec_of(block: Block, order: WordOrder = WordOrder.HIGH_FIRST) -> RecordCodec:
+    """Return the (shared) codec of a block."""
+    return RecordCodec(block, order)
+
+
+@cache
+def _wire_codec(record: type[tuple[Any, ...]]) -> RecordCodec:
+    return RecordCodec(Block("wire", 0, record, ""), WordOrder.HIGH_FIRST)
+
+
+def as_transmitted(record: R) -> R:
+    """Return `record` as its reader sees it after a journey over the bus: every float rounded to single precision."""
+    codec = _wire_codec(type(record))
+    return cast("R", codec.decode(codec.encode(record)))

@@ -1,0 +1,152 @@
+"""Register map of the control PLC: the optimiser's side of the link, and what operators see."""
+
+from enum import IntEnum
+from typing import Annotated, Final, NamedTuple
+
+from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
+from coldloop.registers.common import IDENTITY_BLOCK
+from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
+
+SEQUENCE_ROWS: Final = 240
+
+
+class Mode(IntEnum):
+    """Who decides the outputs: the rungs of the fail-safe ladder that exist so far."""
+
+    HOLD = 0
+    MPC = 1
+
+
+class Verdict(IntEnum):
+    """What the control PLC thinks of a sequence."""
+
+    NONE = 0
+    ACCEPTED = 1
+    LATE = 2
+    WRONG_UPDATE = 3
+    WRONG_TICK = 4
+    WRONG_LENGTH = 5
+    WRONG_MODEL = 6
+    BAD_CRC = 7
+    OUT_OF_RANGE = 8
+    RATE_EXCEEDED = 9
+    REPEATED = 10
+
+
+class Process(NamedTuple):
+    """The process at the last scan."""
+
+    tick: Annotated[int, u32("Tick of the scan")]
+    load: Annotated[float, f32("Heat load NCR22_HL", unit="W")]
+    u: Annotated[tuple[float, ...], f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS)]
+    y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
+
+
+class Status(NamedTuple):
+    """State of the sequence player and of the scan cycle."""
+
+    mode: Annotated[int, u16("0 hold, 1 MPC")]
+    update: Annotated[int, u32("Last update latched")]
+    next_update_tick: Annotated[int, u32("Tick of the next updating instant; 0 while it is not known")]
+    playing: Annotated[int, u32("Number of the sequence being played; 0 is none")]
+    remaining: Annotated[int, u16("Ticks of that sequence still to be played")]
+    accepted: Annotated[int, u32("Sequences accepted")]
+    rejected: Annotated[int, u32("Sequences rejected")]
+    deadline_misses: Annotated[int, u32("Updating instants at which no sequence had arrived")]
+    overruns: Annotated[int, u32("Scans that began more than the tolerance late")]
+    lateness_max: Annotated[float, f32("Largest lateness of a scan in real time", unit="ms")]
+    lateness_p99: Annotated[float, f32("99th percentile of the lateness of a scan in real time", unit="ms")]
+
+
+class Update(NamedTuple):
+    """What is latched at an updating instant for the optimiser."""
+
+    session: Annotated[int, u32("Session")]
+    update: Annotated[int, u32("Number of the update; 0 is the one at tick 0")]
+    tick: Annotated[int, u32("Tick of the updating instant t_i")]
+    playing: Annotated[int, u32("Number of the sequence being played from this instant on; 0 is none")]
+    load: Annotated[float, f32("Heat load NCR22_HL", unit="W")]
+    u_before: Annotated[tuple[float, ...], f32_array("Input applied until this instant", INPUT_NAMES, INPUT_UNITS)]
+    u: Annotated[tuple[float, ...], f32_array("Input applied from this instant on", INPUT_NAMES, INPUT_UNITS)]
+    y: Annotated[tuple[float, ...], f32_array("Output measured at this instant", OUTPUT_NAMES, OUTPUT_UNITS)]
+    x: Annotated[tuple[float, ...], f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS)]
+
+
+class AwaitUpdate(NamedTuple):
+    """Written together with a read of the latch, makes the answer wait for the update named."""
+
+    session: Annotated[int, u32("Session of the update before the awaited one")]
+    update: Annotated[int, u32("Number of the awaited update")]
+
+
+class Plan(NamedTuple):
+    """The updating period that the optimiser has decided for an update."""
+
+    update: Annotated[int, u32("Update that is planned")]
+    next_update_tick: Annotated[int, u32("Tick of the next updating instant t_{i+1}")]
+
+
+class Acknowledgement(NamedTuple):
+    """Answer to the last sequence committed."""
+
+    number: Annotated[int, u32("Number of the sequence")]
+    verdict: Annotated[
+        int,
+        u16(
+            "0 none, 1 accepted, 2 late, 3 wrong update, 4 wrong tick, 5 wrong length, 6 wrong model, 7 bad CRC, "
+            "8 out of range, 9 rate exceeded, 10 repeated"
+        ),
+    ]
+
+
+class SequenceHeader(NamedTuple):
+    """Describes the sequence in the spare buffer; writing it commits the sequence."""
+
+    number: Annotated[int, u32("Number of the sequence, rising")]
+    update: Annotated[int, u32("Update that the sequence answers")]
+    first_tick: Annotated[int, u32("First tick at which it is valid, t_{i+1}")]
+    length: Annotated[int, u16("Rows in use", high=SEQUENCE_ROWS)]
+    tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i that it was computed in", unit="0.25 s")]
+    model_digest: Annotated[int, u32("First 32 bits of the digest of the prediction model")]
+    crc: Annotated[int, u32("CRC-32 of the header before this field and of the rows in use, as big-endian words")]
+
+
+class SequenceRow(NamedTuple):
+    """Inputs of one tick."""
+
+    cv155: Annotated[float, f32("Opening of the Joule-Thomson valve", unit="%")]
+    ncr22: Annotated[float, f32("Actuator part of the bath heater's power", unit="W")]
+    cv156: Annotated[float, f32("Opening of the turbine valve", unit="%")]
+
+
+class ControlSession(NamedTuple):
+    """Starts a session when written."""
+
+    session: Annotated[int, u32("Number of the session; a new number starts anew from tick 0")]
+    realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)]
+    factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
+
+
+class Grant(NamedTuple):
+    """How far the control PLC may go in lock-step."""
+
+    until_tick: Annotated[int, u32("The control PLC scans every tick before this one", unit="0.25 s")]
+
+
+CONTROL_MAP: Final = RegisterMap(
+    service="control_plc",
+    version=1,
+    blocks=(
+        IDENTITY_BLOCK,
+        Block("status", 30, Status, "Sequence player and scan cycle"),
+        Block("process", 100, Process, "The process at the last scan"),
+        Block("update", 200, Update, "Latched at the last updating instant"),
+        Block("await update", 400, AwaitUpdate, "Lets a read of the latch wait for a new update", Role.OPTIMIZER),
+        Block("plan", 410, Plan, "Decided updating period", Role.OPTIMIZER),
+        Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence"),
+        Block("sequence header", 430, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
+        Block("session", 450, ControlSession, "Start of a session", Role.OPERATOR),
+        Block("grant", 460, Grant, "How far to go in lock-step", Role.OPERATOR),
+        Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
+    ),
+)

@@ -1,0 +1,177 @@
+"""How a register is declared.
+
+A *record* is a `NamedTuple` whose fields are annotated with what the bus needs to know of them. A *block* gives a
+record its place in the address space and its writer; a *map* is all blocks of one server. Tables, accessors, checks
+and documentation follow from these three.
+"""
+
+import hashlib
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum, StrEnum
+from functools import cache, cached_property
+from typing import NamedTuple, cast, get_type_hints
+
+
+class Kind(Enum):
+    """Type of a register: its name, its `struct` letter and the number of 16-bit words that it takes."""
+
+    U16 = ("uint16", "H", 1)
+    U32 = ("uint32", "I", 2)
+    F32 = ("float32", "f", 2)
+
+    def __init__(self, label: str, letter: str, words: int) -> None:
+        self.label = label
+        self.letter = letter
+        self.words = words
+
+
+class Role(StrEnum):
+    """Who may write a block."""
+
+    OPTIMIZER = "optimizer"
+    CONTROL = "control"
+    OPERATOR = "operator"
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """What the bus knows of one field of a record: type, unit, range and meaning.
+
+    A field with `elements` is an array: its value is a tuple with one number for each named element, and `units`
+    gives each its unit.
+    """
+
+    kind: Kind
+    description: str
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    elements: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> int:
+        """Number of 16-bit words."""
+        return self.kind.words * max(1, len(self.elements))
+
+
+def u16(description: str, *, unit: str = "", high: int = 0xFFFF) -> Field:
+    """Declare an unsigned 16-bit register."""
+    return Field(Kind.U16, description, unit, 0, high)
+
+
+def u32(description: str, *, unit: str = "") -> Field:
+    """Declare an unsigned 32-bit register pair."""
+    return Field(Kind.U32, description, unit)
+
+
+def f32(description: str, *, unit: str = "", low: float | None = None, high: float | None = None) -> Field:
+    """Declare an IEEE-754 single-precision register pair."""
+    return Field(Kind.F32, description, unit, low, high)
+
+
+def f32_array(description: str, elements: tuple[str, ...], units: tuple[str, ...]) -> Field:
+    """Declare one single-precision register pair for each element."""
+    return Field(Kind.F32, description, elements=elements, units=units)
+
+
+@cache
+def fields_of(record: type[tuple[object, ...]]) -> dict[str, Field]:
+    """Return the declared fields of a record class, in their order."""
+    declared: dict[str, Field] = {}
+    for name, hint in get_type_hints(record, include_extras=True).items():
+        metadata = [item for item in getattr(hint, "__metadata__", ()) if isinstance(item, Field)]
+        if len(metadata) != 1:
+            raise TypeError(f"{record.__name__}.{name} needs exactly one register declaration")
+        declared[name] = metadata[0]
+    return declared
+
+
+class Register(NamedTuple):
+    """One register of a map, as documentation and clients see it. `address` is 0-based."""
+
+    block: str
+    name: str
+    address: int
+    kind: Kind
+    unit: str
+    low: float | None
+    high: float | None
+    writer: Role | None
+    description: str
+
+
+@dataclass(frozen=True)
+class Block:
+    """A record's place in a map: `rows` copies of it one after the other from `address` on."""
+
+    name: str
+    address: int
+    record: type[tuple[object, ...]]
+    description: str
+    writer: Role | None = None
+    rows: int = 1
+
+    @cached_property
+    def row_words(self) -> int:
+        """Words of one row."""
+        return sum(field.words for field in fields_of(self.record).values())
+
+    @property
+    def end(self) -> int:
+        """First address behind the block."""
+        return self.address + self.row_words * self.rows
+
+    @cached_property
+    def letters(self) -> str:
+        """`struct` letters of one row, without byte order."""
+        return "".join(field.kind.letter * max(1, len(field.elements)) for field in fields_of(self.record).values())
+
+    def registers(self, row: int = 0) -> Iterator[Register]:
+        """Yield the registers of one row."""
+        address = self.address + row * self.row_words
+        for name, field in fields_of(self.record).items():
+            for position, element in enumerate(field.elements or ("",)):
+                label = f"{name}.{element}" if element else name
+                unit = field.units[position] if field.units else field.unit
+                yield Register(
+                    self.name, label, address, field.kind, unit, field.low, field.high, self.writer, field.description
+                )
+                address += field.kind.words
+
+
+@dataclass(frozen=True)
+class RegisterMap:
+    """All blocks of one server. `version` rises when the meaning of a register changes."""
+
+    service: str
+    version: int
+    blocks: tuple[Block, ...]
+
+    def __post_init__(self) -> None:
+        end = 0
+        for block in self.blocks:
+            if block.address < end or block.end > 0x10000:
+                raise ValueError(f"block {block.name} of {self.service} overlaps another one or the end of the map")
+            end = block.end
+
+    def block_of(self, record: type[tuple[object, ...]]) -> Block:
+        """Return the block that holds `record`."""
+        return self._by_record[record]
+
+    @cached_property
+    def _by_record(self) -> dict[type[tuple[object, ...]], Block]:
+        return {block.record: block for block in self.blocks}
+
+    @cached_property
+    def digest(self) -> int:
+        """32-bit digest of everything a client depends on: addresses, types, units, ranges and writers."""
+        layout = [
+            (block.rows, [(r.name, r.address, r.kind.label, r.unit, r.low, r.high, r.writer) for r in block.registers()])
+            for block in self.blocks
+        ]
+        canonical = json.dumps([self.service, self.version, layout]).encode()
+        return cast("int", struct.unpack(">I", hashlib.sha256(canonical).digest()[:4])[0])

@@ -1,0 +1,50 @@
+"""Register map of the optimiser PLC: what it did with each update, and the settings of a session."""
+
+from typing import Annotated, Final, NamedTuple
+
+from coldloop.registers.common import IDENTITY_BLOCK
+from coldloop.registers.declaration import Block, RegisterMap, Role, f32, u16, u32
+
+HISTORY_ROWS: Final = 256
+
+
+class OptimizerSession(NamedTuple):
+    """Settings of a session, taken when its first update arrives."""
+
+    session: Annotated[int, u32("Number of the session")]
+    realtime: Annotated[int, u16("0 lock-step, 1 real time: answers then arrive when the PLC would have them", high=1)]
+    factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
+    updating_period: Annotated[int, u16("Fixed updating period; 0 is adaptive", unit="0.25 s")]
+
+
+class Optimization(NamedTuple):
+    """What the optimiser did between two updating instants. Costs are those of the augmented cost function J."""
+
+    update: Annotated[int, u32("Update")]
+    tick: Annotated[int, u32("Tick of the updating instant t_i")]
+    tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i", unit="0.25 s")]
+    iterations: Annotated[int, u16("Iterations q(t_i)")]
+    verdict: Annotated[int, u16("Verdict of the control PLC on the sequence")]
+    j_effective: Annotated[float, f32("J_i: the profile being played, at the state reached")]
+    j_hot_start: Annotated[float, f32("J+_i: the shifted profile, at the predicted state")]
+    j_delivered: Annotated[float, f32("Ĵ_{i+1}: the delivered profile, at the predicted state")]
+    j_dev: Annotated[float, f32("Predicted deviation cost of the delivered profile")]
+    j_cst: Annotated[float, f32("Predicted constraint violation cost of the delivered profile")]
+    violation: Annotated[float, f32("Largest violated row, max(Γp - γ, 0), of the delivered profile")]
+    efficiency: Annotated[float, f32("E^r of Algorithm 1")]
+    mismatch: Annotated[float, f32("D^r of Algorithm 1")]
+    contraction: Annotated[float, f32("K^r of Algorithm 1")]
+    gamma: Annotated[float, f32("Γ of Algorithm 1, the gradient that decides the next step in q")]
+    load_mismatch: Annotated[float, f32("Estimated load mismatch", unit="W")]
+
+
+
+OPTIMIZER_MAP: Final = RegisterMap(
+    service="optimizer_plc",
+    version=1,
+    blocks=(
+        IDENTITY_BLOCK,
+        Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
+        Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
+    ),
+)

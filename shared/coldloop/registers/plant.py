@@ -1,0 +1,70 @@
+"""Register map of the plant: a remote I/O rack, and the controls of a simulation."""
+
+from typing import Annotated, Final, NamedTuple
+
+from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
+from coldloop.registers.common import IDENTITY_BLOCK
+from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
+
+HISTORY_ROWS: Final = 256
+LOAD_ROWS: Final = 2048
+
+
+class Actuators(NamedTuple):
+    """Outputs of the control PLC for one tick."""
+
+    tick: Annotated[int, u32("Tick that these outputs are for; in lock-step writing the present one moves the plant on")]
+    cv155: Annotated[float, f32("Opening of the Joule-Thomson valve", unit="%", low=0, high=100)]
+    ncr22: Annotated[float, f32("Actuator part of the bath heater's power", unit="W", low=0, high=1000)]
+    cv156: Annotated[float, f32("Opening of the turbine valve", unit="%", low=0, high=100)]
+
+
+class Measurement(NamedTuple):
+    """What the rack reads at one tick."""
+
+    tick: Annotated[int, u32("Tick at which these values were read")]
+    load: Annotated[float, f32("Heat load NCR22_HL (the same heater, so it is known)", unit="W")]
+    y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
+    x: Annotated[tuple[float, ...], f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS)]
+
+
+class PlantSession(NamedTuple):
+    """Starts a simulation session when written."""
+
+    session: Annotated[int, u32("Number of the session; a new number starts anew from tick 0")]
+    realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)]
+    factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
+    seed: Annotated[int, u32("Seed of the sensor noise")]
+    noise: Annotated[float, f32("Sensor noise as a multiple of the configured one; 0 is none", low=0, high=100)]
+    load_steps: Annotated[int, u16("Rows of the load table that are in use", high=LOAD_ROWS)]
+
+
+class LoadStep(NamedTuple):
+    """One step of the load table, held until the next one."""
+
+    tick: Annotated[int, u32("First tick of the step", unit="0.25 s")]
+    watts: Annotated[float, f32("Heat load", unit="W", low=-10_000, high=10_000)]
+
+
+class PlantSample(NamedTuple):
+    """One row of the history: everything physical at one tick. The row of tick n is n modulo the number of rows."""
+
+    tick: Annotated[int, u32("Tick of the row")]
+    load: Annotated[float, f32("Heat load", unit="W")]
+    u: Annotated[tuple[float, ...], f32_array("Input applied from this tick on", INPUT_NAMES, INPUT_UNITS)]
+    y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
+    x: Annotated[tuple[float, ...], f32_array("Simulated state", STATE_NAMES, STATE_UNITS)]
+
+
+PLANT_MAP: Final = RegisterMap(
+    service="plant",
+    version=1,
+    blocks=(
+        IDENTITY_BLOCK,
+        Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL),
+        Block("measurement", 200, Measurement, "Inputs of the control PLC"),
+        Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
+        Block("load table", 1000, LoadStep, "Heat load over the session", Role.OPERATOR, LOAD_ROWS),
+        Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
+    ),
+)

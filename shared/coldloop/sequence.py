@@ -1,0 +1,33 @@
+"""The sequence contract: what the optimiser sends, and the seal that shows a torn one.
+
+The checks themselves are the control PLC's; `docs/link.md` describes the whole exchange.
+"""
+
+import zlib
+from collections.abc import Sequence as Rows
+from typing import NamedTuple
+
+from coldloop.registers.codec import codec_of
+from coldloop.registers.control_plc import CONTROL_MAP, SequenceHeader, SequenceRow
+
+_HEADER = codec_of(CONTROL_MAP.block_of(SequenceHeader))
+_ROW = codec_of(CONTROL_MAP.block_of(SequenceRow))
+_CRC_BYTES = 4
+
+
+class InputSequence(NamedTuple):
+    """A header and its rows, one row a tick."""
+
+    header: SequenceHeader
+    rows: Rows[SequenceRow]
+
+
+def checksum(header: SequenceHeader, rows: Rows[SequenceRow]) -> int:
+    """Return the CRC-32 of header (without its CRC) and rows, whatever the word order of the link."""
+    crc = zlib.crc32(_HEADER.encode(header)[:-_CRC_BYTES])
+    return zlib.crc32(b"".join([_ROW.encode(row) for row in rows]), crc)
+
+
+def sealed(header: SequenceHeader, rows: Rows[SequenceRow]) -> InputSequence:
+    """Return the sequence with its CRC filled in."""
+    return InputSequence(header._replace(crc=checksum(header, rows)), rows)

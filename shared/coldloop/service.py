@@ -1,0 +1,86 @@
+"""How a service starts as a program of its own: options, configuration, logs, event loop, signals, exit code."""
+
+import argparse
+import asyncio
+import contextlib
+import signal
+import sys
+from collections.abc import Awaitable, Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
+
+from coldloop import __version__
+from coldloop.config import load_configuration
+from coldloop.errors import ColdloopError
+from coldloop.logs import set_up_logs
+
+S = TypeVar("S", bound=BaseModel)
+
+SECTIONS = ("limits", "model", "session", "plant", "control_plc", "optimizer_plc", "telemetry", "rig")
+"""Sections of a configuration file; each service reads those that concern it."""
+
+
+def add_configuration_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that every program has."""
+    parser.add_argument("--config", type=Path, metavar="FILE", help="configuration file (TOML)")
+    parser.add_argument(
+        "--set", dest="assignments", action="append", default=[], metavar="KEY=VALUE",
+        help="set one key, such as control_plc.server.port=5021; may be repeated",
+    )  # fmt: skip
+    parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
+
+
+def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], arguments: Sequence[str] | None) -> int:
+    """Run a service until it is told to stop; return its exit code."""
+    parser = argparse.ArgumentParser(prog=f"python -m {name}", description=f"Coldloop: the {name} service.")
+    add_configuration_options(parser)
+    parser.add_argument("--version", action="version", version=__version__)
+    options = parser.parse_args(arguments)
+    set_up_logs(name, options.log_level)
+    try:
+        configuration = load_configuration(
+            settings, file=options.config, assignments=options.assignments, others=SECTIONS
+        )
+        return run_event_loop(lambda: _until_signal(serve(configuration.settings)))
+    except ColdloopError as error:
+        sys.stderr.write(f"{name}: {error}\n")
+        return error.exit_code
+
+
+def run_event_loop(start: Callable[[], Any]) -> int:
+    """Run a coroutine that returns an exit code, on the fastest event loop there is."""
+    try:
+        import uvloop  # noqa: PLC0415 not on every platform
+    except ImportError:
+        factory = None
+    else:
+        factory = uvloop.new_event_loop
+    with asyncio.Runner(loop_factory=factory) as runner:
+        return int(runner.run(start()))
+
+
+async def _until_signal(service: Awaitable[None]) -> int:
+    """Run the service; SIGTERM and SIGINT end it in good order."""
+    loop = asyncio.get_running_loop()
+    task = asyncio.ensure_future(service)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        with contextlib.suppress(NotImplementedError):  # Windows
+            loop.add_signal_handler(number, task.cancel)
+    try:
+        await task
+    except asyncio.CancelledError:
+        return 0
+    except BaseExceptionGroup as group:
+        raise _first_cause(group) from None
+    return 0
+
+
+def _first_cause(group: BaseExceptionGroup[BaseException]) -> BaseException:
+    for error in group.exceptions:
+        if isinstance(error, BaseExceptionGroup):
+            return _first_cause(error)
+        if isinstance(error, ColdloopError):
+            return error
+    return group

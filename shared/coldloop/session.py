@@ -1,0 +1,34 @@
+"""A session: one run of the rig from tick 0, in lock-step or in real time."""
+
+from enum import StrEnum
+from typing import Annotated, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class TimeMode(StrEnum):
+    """What makes time go on."""
+
+    LOCKSTEP = "lockstep"
+    """The control PLC, as fast as the optimiser answers."""
+    REALTIME = "realtime"
+    """The clock."""
+
+
+class SessionSettings(BaseModel):
+    """What a service does when it starts and nobody has told it anything yet."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    autostart: bool = False
+    """Begin session 1 at once instead of waiting for an operator."""
+    mode: TimeMode = TimeMode.REALTIME
+    factor: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
+    """Seconds of plant time in one second of real time, in real time."""
+
+
+class Pace(NamedTuple):
+    """Time base of a session under way."""
+
+    realtime: bool
+    factor: float

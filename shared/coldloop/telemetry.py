@@ -1,0 +1,81 @@
+"""Telemetry to an MQTT broker, off unless one is configured. Control never waits for it.
+
+Topics, under `prefix` (default `coldloop`):
+    <prefix>/<service>/state      retained: {"state": "online"}; "offline" is the last will
+    <prefix>/<service>/telemetry  retained: the newest snapshot as JSON, every `period_s` of real time
+"""
+
+import asyncio
+import json
+import logging
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Annotated
+
+import aiomqtt
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+
+log = logging.getLogger("coldloop.telemetry")
+
+Snapshot = Callable[[], Mapping[str, object]]
+
+
+class TelemetrySettings(BaseModel):
+    """Where to publish to."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    broker: str = ""
+    """Host of the broker; empty is off."""
+    port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    prefix: Annotated[str, Field(pattern=r"^[^#+]+$")] = "coldloop"
+    period_s: PositiveFloat = 1.0
+    """Real time between snapshots."""
+    queue: Annotated[int, Field(ge=1)] = 100
+    """Snapshots kept while the broker is away; the oldest go first."""
+    timeout_s: PositiveFloat = 5.0
+
+
+class Telemetry:
+    """Publishes snapshots of one service."""
+
+    def __init__(self, settings: TelemetrySettings, service: str, snapshot: Snapshot) -> None:
+        self._settings = settings
+        self._topic = f"{settings.prefix}/{service}"
+        self._snapshot = snapshot
+        self._waiting: deque[str] = deque(maxlen=settings.queue)
+        self._arrived = asyncio.Event()
+
+    async def run(self) -> None:
+        """Sample and publish until cancelled; return at once when telemetry is off."""
+        if not self._settings.broker:
+            return
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._sample(), name="telemetry sampling")
+            tasks.create_task(self._keep_publishing(), name="telemetry publishing")
+
+    async def _sample(self) -> None:
+        while True:
+            self._waiting.append(json.dumps(self._snapshot()))
+            self._arrived.set()
+            await asyncio.sleep(self._settings.period_s)
+
+    async def _keep_publishing(self) -> None:
+        while True:
+            try:
+                await self._publish()
+            except aiomqtt.MqttError as error:
+                log.warning("broker lost", extra={"broker": self._settings.broker, "reason": str(error)})
+            await asyncio.sleep(self._settings.timeout_s)
+
+    async def _publish(self) -> None:
+        s = self._settings
+        offline = aiomqtt.Will(f"{self._topic}/state", json.dumps({"state": "offline"}), qos=1, retain=True)
+        async with aiomqtt.Client(s.broker, s.port, will=offline, timeout=s.timeout_s) as client:
+            await client.publish(f"{self._topic}/state", json.dumps({"state": "online"}), qos=1, retain=True)
+            while True:
+                await self._arrived.wait()
+                self._arrived.clear()
+                while self._waiting:
+                    await client.publish(f"{self._topic}/telemetry", self._waiting[0], qos=1, retain=True)
+                    self._waiting.popleft()

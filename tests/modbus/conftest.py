@@ -1,0 +1,131 @@
+"""Real servers on free ports, and raw connections to them."""
+
+import asyncio
+import contextlib
+import inspect
+import struct
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from coldloop.modbus.server import DeviceIdentity, ModbusServer, OnWrite, ServerSettings
+from coldloop.registers.bank import RegisterBank
+from coldloop.registers.codec import WordOrder
+from coldloop.registers.common import Identity
+from coldloop.registers.declaration import Block, RegisterMap
+from coldloop.registers.plant import PLANT_MAP
+
+PATIENCE_S = 20.0
+
+
+def frame(pdu: bytes, transaction: int = 1, unit: int = 1) -> bytes:
+    return struct.pack(">HHHB", transaction, 0, len(pdu) + 1, unit) + pdu
+
+
+@dataclass
+class Wire:
+    """A connection that sends and receives bytes."""
+
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+
+    def send(self, data: bytes) -> None:
+        self.writer.write(data)
+
+    async def answer(self) -> tuple[int, int, bytes]:
+        """Return transaction id, unit id and PDU of the next answer."""
+        head = await self.reader.readexactly(7)
+        transaction, protocol, length, unit = struct.unpack(">HHHB", head)
+        assert protocol == 0
+        return transaction, unit, await self.reader.readexactly(length - 1)
+
+    async def ask(self, pdu: bytes, transaction: int = 1, unit: int = 1) -> bytes:
+        self.send(frame(pdu, transaction, unit))
+        answer = await self.answer()
+        assert answer[:2] == (transaction, unit)
+        return answer[2]
+
+    async def closed(self) -> bytes:
+        """Wait until the server closes the connection; return what came before."""
+        received = b""
+        with contextlib.suppress(ConnectionResetError):
+            while data := await self.reader.read(65536):
+                received += data
+        return received
+
+
+@dataclass
+class Running:
+    """A server that is listening, what is behind it, and the names of the blocks that were written."""
+
+    server: ModbusServer
+    bank: RegisterBank
+    written: list[str] = field(default_factory=list)
+    writers: list[asyncio.StreamWriter] = field(default_factory=list)
+
+    async def connect(self) -> Wire:
+        reader, writer = await asyncio.open_connection("127.0.0.1", self.server.port)
+        self.writers.append(writer)
+        return Wire(reader, writer)
+
+
+Serve = Callable[..., AbstractAsyncContextManager[Running]]
+
+
+@contextlib.asynccontextmanager
+async def served(
+    register_map: RegisterMap = PLANT_MAP,
+    *,
+    order: WordOrder = WordOrder.HIGH_FIRST,
+    on_write: OnWrite | None = None,
+    identity: DeviceIdentity | None = None,
+    **settings: Any,  # noqa: ANN401 - any field of ServerSettings
+) -> AsyncIterator[Running]:
+    bank = RegisterBank(register_map, order)
+    bank.put(Identity(map_digest=register_map.digest, map_version=register_map.version))
+    written: list[str] = []
+
+    def note(block: Block) -> None:
+        written.append(block.name)
+
+    server = ModbusServer(
+        bank,
+        settings=ServerSettings(**{"port": 0, **settings}),
+        on_write=on_write or note,
+        identity=identity or DeviceIdentity(product=register_map.service, revision="0.1"),
+    )
+    running = Running(server, bank, written)
+    await server.start()
+    try:
+        yield running
+    finally:
+        for writer in running.writers:
+            writer.close()
+        await server.close()
+
+
+@pytest.fixture
+def serve() -> Serve:
+    return served
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test that is a coroutine, in a loop of its own and within `PATIENCE_S`; any traceback logged fails it."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    names = inspect.signature(pyfuncitem.obj).parameters
+    arguments = {name: pyfuncitem.funcargs[name] for name in names}
+    complaints: list[dict[str, Any]] = []
+
+    async def story() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: complaints.append(context))
+        async with asyncio.timeout(PATIENCE_S):
+            await pyfuncitem.obj(**arguments)
+
+    asyncio.run(story())
+    assert not complaints
+    return True

@@ -1,0 +1,137 @@
+"""Each component conserves mass and energy, and behaves at its limits."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from plant.cold_box import REFERENCE
+from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow, exchange
+from plant.components.phase_separator import contents, level, separate
+from plant.components.return_line import return_flow
+from plant.components.turbine import expand, turbine_flow
+from plant.components.valve import valve_mass_flow
+from plant.helium.properties import (
+    isobar_cell,
+    isobar_enthalpy_and_density,
+    load_helium,
+    saturation,
+    vapour_enthalpy_and_cp,
+)
+
+HELIUM = load_helium()
+VALVE = REFERENCE.jt_valve
+BATH = REFERENCE.separator
+TURBINE = REFERENCE.turbine
+flows = st.floats(0.005, 0.1)
+
+
+@settings(deadline=None)
+@given(opening=st.floats(-50.0, 0.0))
+def test_a_closed_valve_passes_nothing(opening: float) -> None:
+    assert valve_mass_flow(VALVE, opening, 150.0, 16e5, 1.2e5) == 0.0
+
+
+@settings(deadline=None)
+@given(opening=st.floats(100.0, 500.0))
+def test_a_valve_opens_no_further_than_fully(opening: float) -> None:
+    assert valve_mass_flow(VALVE, opening, 150.0, 16e5, 1.2e5) == valve_mass_flow(VALVE, 100.0, 150.0, 16e5, 1.2e5)
+
+
+def test_a_valve_passes_nothing_against_the_pressure() -> None:
+    assert valve_mass_flow(VALVE, 50.0, 150.0, 1e5, 2e5) == 0.0
+
+
+@settings(deadline=None)
+@given(opening=st.floats(1.0, 100.0), T=st.floats(10.0, 80.0))
+def test_turbine_valve_and_nozzle_pass_the_same_flow(opening: float, T: float) -> None:
+    _, rho = isobar_enthalpy_and_density(T, HELIUM)
+    flow, P_between = turbine_flow(TURBINE, opening, 16e5, T, rho)
+    assert flow == pytest.approx(valve_mass_flow(TURBINE.inlet_valve, opening, rho, 16e5, P_between), rel=1e-6)
+    assert flow == pytest.approx(TURBINE.nozzle * P_between / np.sqrt(T), rel=1e-12)
+
+
+def test_a_shut_turbine_neither_flows_nor_turns() -> None:
+    h, rho = isobar_enthalpy_and_density(19.0, HELIUM)
+    flow, P_between = turbine_flow(TURBINE, 0.0, 16e5, 19.0, rho)
+    assert (flow, P_between) == (0.0, 0.0)
+    exhaust = expand(TURBINE, h, P_between, 1.15e5, HELIUM)
+    assert (exhaust.h_out, exhaust.speed) == (h, 0.0)
+
+
+@settings(deadline=None)
+@given(P_in=st.floats(3e5, 16e5), T=st.floats(12.0, 80.0))
+def test_a_turbine_takes_its_share_of_the_isentropic_drop(P_in: float, T: float) -> None:
+    h, _ = isobar_enthalpy_and_density(T, HELIUM)
+    exhaust = expand(TURBINE, h, P_in, 1.15e5, HELIUM)
+    drop = (exhaust.speed / TURBINE.speed_coefficient) ** 2
+    assert 0.0 < drop < h
+    assert h - exhaust.h_out == pytest.approx(TURBINE.efficiency * drop, rel=1e-9)
+
+
+@settings(deadline=None)
+@given(P_bath=st.floats(1.0e5, 1.9e5), exhaust=st.floats(0.0, 0.1))
+def test_the_pressure_drops_of_the_return_line_add_up(P_bath: float, exhaust: float) -> None:
+    line = REFERENCE.return_line
+    flow, P_mix = return_flow(line, P_bath, 1.05e5, exhaust)
+    assert flow >= 0.0
+    assert P_mix == pytest.approx(1.05e5 + line.warm_resistance * (flow + exhaust) ** 2)
+    if flow > 0.0:
+        assert P_bath - P_mix == pytest.approx(line.cold_resistance * flow**2, abs=1e-4)
+    else:
+        assert P_mix >= P_bath
+
+
+@settings(deadline=None)
+@given(m_high=flows, m_low=flows, T_high=st.floats(15.0, 80.0), T_low=st.floats(4.6, 14.0))
+def test_what_an_exchanger_takes_from_one_stream_it_gives_to_the_other(
+    m_high: float, m_low: float, T_high: float, T_low: float
+) -> None:
+    exchanger = REFERENCE.nef2
+    T = np.linspace(T_high - 1.0, T_low + 0.5, exchanger.cells)
+    h_low, _ = vapour_enthalpy_and_cp(1.15e5, T_low, saturation(1.15e5, HELIUM).T, HELIUM)
+    entering = LowPressureFlow(m_low, 1.15e5, T_low, h_low)
+    dT = np.empty(exchanger.cells)
+    leaving = exchange(exchanger, T, HighPressureFlow(m_high, T_high), entering, HELIUM, dT)
+    stored = 0.0
+    for T_cell, rate in zip(T, dT, strict=True):
+        _, rho_cp, c_wall = isobar_cell(T_cell, HELIUM)
+        stored += (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells * rate
+    h_in, _ = isobar_enthalpy_and_density(T_high, HELIUM)
+    h_out, _ = isobar_enthalpy_and_density(T[-1], HELIUM)
+    gained = m_low * (leaving.h - entering.h)
+    assert stored == pytest.approx(m_high * (h_in - h_out) - gained, rel=1e-9, abs=1e-6)
+    assert T_low <= leaving.T <= T_high
+
+
+@settings(deadline=None)
+@given(
+    P=st.floats(0.95e5, 1.8e5),
+    share=st.floats(0.05, 0.95),
+    inflow=st.floats(0.0, 0.1),
+    outflow=st.floats(0.0, 0.1),
+    heat=st.floats(0.0, 1000.0),
+)
+def test_the_bath_stores_the_mass_and_energy_that_enter(
+    P: float, share: float, inflow: float, outflow: float, heat: float
+) -> None:
+    V_l, h_in, dt = share * BATH.volume, 7600.0, 1e-2
+    dP, dV = separate(BATH, P, V_l, inflow, h_in, outflow, heat, HELIUM)
+    mass_after, energy_after = contents(BATH, P + dP * dt / 2, V_l + dV * dt / 2, HELIUM)
+    mass_before, energy_before = contents(BATH, P - dP * dt / 2, V_l - dV * dt / 2, HELIUM)
+    assert (mass_after - mass_before) / dt == pytest.approx(inflow - outflow, abs=1e-8)
+    h_v = saturation(P, HELIUM).h_v
+    assert (energy_after - energy_before) / dt == pytest.approx(inflow * h_in - outflow * h_v + heat, abs=1e-3)
+
+
+def test_an_empty_bath_gets_no_emptier_and_a_full_one_no_fuller() -> None:
+    _, emptying = separate(BATH, 1.2e5, 0.0, 0.0, 7600.0, 0.03, 500.0, HELIUM)
+    _, filling = separate(BATH, 1.2e5, BATH.volume, 0.1, 0.0, 0.0, 0.0, HELIUM)
+    assert emptying == filling == 0.0
+    assert separate(BATH, 1.2e5, 0.0, 0.05, 3000.0, 0.01, 0.0, HELIUM)[1] > 0.0
+
+
+@settings(deadline=None)
+@given(V_l=st.floats(-0.1, 0.3))
+def test_the_level_gauge_reads_0_to_100(V_l: float) -> None:
+    assert 0.0 <= level(BATH, V_l) <= 100.0

@@ -1,0 +1,129 @@
+import struct
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from coldloop.registers.bank import IllegalAddressError, IllegalValueError, RefusedAccessError, RegisterBank
+from coldloop.registers.codec import WordOrder, codec_of
+from coldloop.registers.common import IDENTITY_BLOCK, Identity
+from coldloop.registers.control_plc import CONTROL_MAP, SequenceRow
+from coldloop.registers.declaration import Block, RegisterMap, Role, f32
+from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
+from coldloop.registers.plant import PLANT_MAP, Actuators, LoadStep
+
+if TYPE_CHECKING:
+    from tests.registers.conftest import Records
+
+BANKS = {order: {each: RegisterBank(each, order) for each in (CONTROL_MAP, OPTIMIZER_MAP)} for order in WordOrder}
+WRITABLE = {
+    f"{register_map.service}: {block.name}": (register_map, block)
+    for register_map in (CONTROL_MAP, OPTIMIZER_MAP)
+    for block in register_map.blocks
+    if block.writer is not None
+}
+
+
+class Bounds(NamedTuple):
+    above: Annotated[float, f32("At least 1", low=1)]
+    below: Annotated[float, f32("At most 2", high=2)]
+
+
+@pytest.fixture
+def control() -> RegisterBank:
+    return RegisterBank(CONTROL_MAP)
+
+
+@pytest.mark.parametrize("order", WordOrder)
+@pytest.mark.parametrize(("register_map", "block"), WRITABLE.values(), ids=WRITABLE.keys())
+@settings(max_examples=10, deadline=None)
+@given(data=st.data())
+def test_what_is_written_is_what_is_read(
+    records: "Records", order: WordOrder, register_map: RegisterMap, block: Block, data: st.DataObject
+) -> None:
+    bank = BANKS[order][register_map]
+    record = data.draw(records(block))
+    row = data.draw(st.integers(0, block.rows - 1))
+    raw = codec_of(block, order).encode(record)
+    address = block.address + row * block.row_words
+    assert bank.write(address, raw) == [block]
+    assert bank.get(block.record, row) == record
+    assert bank.read(address, block.row_words) == raw
+
+
+@settings(max_examples=200, deadline=None)
+@given(address=st.integers(0, 0xFFFF), data=st.binary(min_size=1, max_size=123).map(lambda half: half + half))
+def test_a_refused_write_stores_nothing_and_an_accepted_one_everything(address: int, data: bytes) -> None:
+    bank = BANKS[WordOrder.HIGH_FIRST][CONTROL_MAP]
+    whole = bank.read(500, 1440)
+    try:
+        bank.write(address, data)
+    except RefusedAccessError:
+        assert bank.read(500, 1440) == whole
+    else:
+        assert bank.read(address, len(data) // 2) == data
+
+
+@given(first=st.integers(0, 7), count=st.integers(1, 8))
+def test_a_write_takes_32_bit_values_whole_or_not_at_all(first: int, count: int) -> None:
+    assume(first + count <= 8)
+    bank = BANKS[WordOrder.HIGH_FIRST][CONTROL_MAP]
+    if first % 2 == 0 and count % 2 == 0:
+        bank.write(500 + first, bytes(2 * count))
+    else:
+        with pytest.raises(IllegalValueError, match="whole or not at all"):
+            bank.write(500 + first, bytes(2 * count))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+def test_a_float_that_is_no_number_is_refused_even_without_a_range(control: RegisterBank, value: float) -> None:
+    with pytest.raises(IllegalValueError, match=r"sequence\.ncr22 is not a finite number"):
+        control.write(500, struct.pack(">3f", 1.0, value, 1.0))
+    assert control.get(SequenceRow) == SequenceRow(0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("row", [0, 7, 239])
+def test_a_row_is_written_where_it_stands(control: RegisterBank, row: int) -> None:
+    control.put(SequenceRow(1.0, 2.0, 3.0), row)
+    assert control.read(500 + 6 * row, 6) == struct.pack(">3f", 1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize(("address", "count"), [(13, 1), (12, 2), (0xFFFF, 1), (0xFFFF, 2), (29, 2), (1940, 1)])
+def test_registers_that_are_not_declared_are_not_read(control: RegisterBank, address: int, count: int) -> None:
+    with pytest.raises(IllegalAddressError):
+        control.read(address, count)
+
+
+@pytest.mark.parametrize(("address", "count"), [(0, 2), (13, 1), (404, 2), (400, 6), (0xFFFF, 1), (0xFFFF, 2)])
+def test_registers_that_are_not_writable_are_not_written(control: RegisterBank, address: int, count: int) -> None:
+    with pytest.raises(IllegalAddressError):
+        control.write(address, bytes(2 * count))
+
+
+def test_a_range_with_one_end_is_checked_and_named() -> None:
+    bounds = RegisterMap("bounds", 1, (IDENTITY_BLOCK, Block("bounds", 50, Bounds, "", Role.OPERATOR)))
+    bank = RegisterBank(bounds)
+    bank.write(50, struct.pack(">2f", 1e30, -1e30))
+    with pytest.raises(IllegalValueError, match=r"bounds\.above = 0\.5 is below 1"):
+        bank.write(50, struct.pack(">f", 0.5))
+    with pytest.raises(IllegalValueError, match=r"bounds\.below = 2\.5 is above 2"):
+        bank.write(52, struct.pack(">f", 2.5))
+
+
+def test_the_ends_of_a_range_belong_to_it() -> None:
+    bank = RegisterBank(PLANT_MAP)
+    bank.write(100, struct.pack(">Ifff", 1, 0.0, 1000.0, 100.0))
+    assert bank.get(Actuators) == Actuators(1, 0.0, 1000.0, 100.0)
+    bank.write(403, struct.pack(">f", 0.01))  # in single precision this is less than 0.01
+
+
+def test_a_write_over_several_rows_names_its_block_once() -> None:
+    bank = RegisterBank(PLANT_MAP)
+    assert [block.name for block in bank.write(1000, struct.pack(">IfIf", 0, 1.0, 5, 2.0))] == ["load table"]
+    assert bank.get(LoadStep, 1) == LoadStep(5, 2.0)
+
+
+def test_the_program_sees_records_and_the_bus_sees_words(control: RegisterBank) -> None:
+    control.put(Identity(tick=0x01020304))
+    assert control.read(10, 2) == b"\1\2\3\4"
