@@ -88,12 +88,14 @@ class OptimizerPlc:
     def _start(self, session: int) -> None:
         """Begin a session, with the operator's settings where they are for this one."""
         self._session = session
+        self._last = None
         asked = self.bank.get(OptimizerSession)
         period_s = self._settings.optimizer_plc.program.updating_period_s
         if asked.session == session:
             self._pace = Pace(bool(asked.realtime), asked.factor)
             period_s = asked.updating_period * TICK_S
         self._program.restart(period_s)
+        self._publish_identity(0)
         log.info("session started", extra={"session": session, "updating_period_s": period_s})
 
     async def _optimise(self, update: Update, asked_at: float) -> None:

@@ -31,14 +31,14 @@ from coldloop.telemetry import Telemetry
 from plant.cold_box import REFERENCE
 from plant.load import find_load
 from plant.program import LoadProfile, MeasurementNoise, PlantProgram
-from plant.settings import PlantSettings
+from plant.settings import PlantSettings, SensorSettings
 
 log = logging.getLogger("coldloop.plant")
 
 
-def make_program(header: ModelHeader, settings: PlantSettings, load: LoadProfile, seed: int) -> PlantProgram:
+def make_program(header: ModelHeader, sensors: SensorSettings, load: LoadProfile, seed: int) -> PlantProgram:
     """Return the plant at the operating point of its model file."""
-    deviations = settings.plant.sensors.deviations
+    deviations = sensors.deviations
     noise = MeasurementNoise(deviations, seed) if any(deviations) else None
     return PlantProgram(box=REFERENCE, x0=header.x0, u0=header.u0, load=load, noise=noise)
 
@@ -58,7 +58,7 @@ class PlantRack:
         return Pace(session.mode is TimeMode.REALTIME, session.factor)
 
     def _begin(self, session: int, pace: Pace, load: LoadProfile, seed: int) -> None:
-        self._program = make_program(self._header, self._settings, load, seed)
+        self._program = make_program(self._header, self._settings.plant.sensors, load, seed)
         self._session, self._pace = session, pace
         self._applied = tuple(self._header.u0)
         self._moving = False

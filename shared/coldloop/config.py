@@ -4,6 +4,7 @@ The environment spells `COLDLOOP__SECTION__KEY=value`, the command line `--set s
 value as TOML, and as text when it is none. Every value remembers where it came from.
 """
 
+import json
 import os
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -96,6 +97,12 @@ def load_configuration(
         return Configuration(model.model_validate(layers.values), layers.sources)
     except ValidationError as error:
         raise ConfigurationError(_explained(error, layers.sources)) from None
+
+
+def to_environment(settings: BaseModel) -> dict[str, str]:
+    """Return the variables that make a process load these settings."""
+    flat = _flattened(settings.model_dump(mode="json"))
+    return {PREFIX + key.upper().replace(".", "__"): json.dumps(value) for key, value in flat.items() if value is not None}
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

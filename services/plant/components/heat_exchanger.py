@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.compiled import kernel
-from plant.helium.properties import Helium, isobar_cell, saturation, vapour_enthalpy_and_cp
+from plant.helium.properties import Helium, Saturation, isobar_cell, saturation, vapour_enthalpy_and_cp
 from plant.numeric import Array, at_least, at_most
 
 LARGEST_RATIO = 8.0  # of the mean to the cold-end difference; more would be too stiff for a step of 0.25 s
@@ -60,6 +60,28 @@ def driving_difference(T_before: float, T_cell: float, T_low: float) -> float:
 
 
 @kernel
+def take_up(
+    low: LowPressureFlow, cp: float, drive: float, UA: float, sat: Saturation, helium: Helium
+) -> tuple[float, float, float]:
+    """Return T (K), h (J/kg) and cp (J/(kg K)) of the low-pressure flow after one cell of `UA` (W/K).
+
+    Wet vapour, as a very cold turbine exhaust brings it, boils dry at constant temperature before it warms up, and
+    saturated vapour that is cooled becomes wet.
+    """
+    if low.h.real < sat.h_v.real:
+        boiling = UA * drive / low.mass_flow
+        missing = sat.h_v - low.h
+        if boiling.real <= missing.real:
+            return sat.T + 0.0 * boiling, low.h + boiling, cp
+        UA = UA * (1.0 - missing / boiling)
+    T = low.T + drive * (1.0 - np.exp(-UA / (low.mass_flow * cp)))
+    if T.real < sat.T.real:
+        return sat.T + 0.0 * T, sat.h_v + cp * (T - sat.T), cp
+    h, cp_out = vapour_enthalpy_and_cp(low.P, T, sat.T, helium)
+    return T, h, cp_out
+
+
+@kernel
 def exchange(
     exchanger: HeatExchanger, T: Array, high: HighPressureFlow, low: LowPressureFlow, helium: Helium, dT: Array
 ) -> LowPressureFlow:
@@ -69,18 +91,17 @@ def exchange(
     the cold end; in a cell it approaches the mean T_m of the gas that enters and the gas that leaves:
     T_out = T_m - (T_m - T_L) exp(-UA/(N m_L cp_L)), with cp_L where it enters the cell.
     """
-    T_sat = saturation(low.P, helium).T
-    transfer = exchanger.UA / exchanger.cells
+    sat = saturation(low.P, helium)
+    UA = exchanger.UA / exchanger.cells
     sweeping = at_least(low.mass_flow, TRICKLE)
     T_low, h_low = low.T, low.h
-    _, cp_low = vapour_enthalpy_and_cp(low.P, T_low, T_sat, helium)
+    _, cp_low = vapour_enthalpy_and_cp(low.P, T_low, sat.T, helium)
     h_cell, rho_cp, c_wall = isobar_cell(T[exchanger.cells - 1], helium)
     for i in range(exchanger.cells - 1, -1, -1):
         T_before = T[i - 1] if i > 0 else high.T
         h_before, rho_cp_before, c_wall_before = isobar_cell(T_before, helium)
         drive = driving_difference(T_before, T[i], T_low)
-        T_low = T_low + drive * (1.0 - np.exp(-transfer / (sweeping * cp_low)))
-        h_next, cp_low = vapour_enthalpy_and_cp(low.P, T_low, T_sat, helium)
+        T_low, h_next, cp_low = take_up(LowPressureFlow(sweeping, low.P, T_low, h_low), cp_low, drive, UA, sat, helium)
         heat = low.mass_flow * (h_next - h_low)
         capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
         dT[i] = (high.mass_flow * (h_before - h_cell) - heat) / capacity

@@ -1,0 +1,124 @@
+"""The three services as processes on localhost."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import sys
+from collections.abc import AsyncIterator, Awaitable
+from pathlib import Path
+from typing import TypeVar
+
+from coldloop.config import PREFIX, to_environment
+from coldloop.endpoints import Endpoint
+from coldloop.errors import LinkError
+
+from rig.network import RigEndpoints
+from rig.settings import Settings
+
+T = TypeVar("T")
+
+SERVICES = ("plant", "control_plc", "optimizer_plc")
+START_PATIENCE_S = 90.0
+"""The first start on a machine compiles the kernels."""
+STOP_GRACE_S = 5.0
+
+
+class LocalServices:
+    """Processes of the three services; an async context in which they live.
+
+    Their logs go to `<folder>/<service>.log`.
+    """
+
+    def __init__(self, settings: Settings, log_folder: Path) -> None:
+        ports = _free_ports(len(SERVICES))
+        self.endpoints = RigEndpoints(*(Endpoint(port=port, patience_s=START_PATIENCE_S) for port in ports))
+        self._environment = {
+            **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
+            **to_environment(_wired(settings, self.endpoints)),
+        }
+        self._logs = log_folder
+        self._processes: dict[str, asyncio.subprocess.Process] = {}
+
+    async def __aenter__(self) -> "LocalServices":
+        """Start them."""
+        self._logs.mkdir(parents=True, exist_ok=True)
+        for service in SERVICES:
+            with self._log(service).open("wb") as log:
+                self._processes[service] = await asyncio.create_subprocess_exec(
+                    sys.executable, "-m", service, stdin=asyncio.subprocess.DEVNULL, stdout=log, stderr=log,
+                    env=self._environment,
+                )  # fmt: skip
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """End them."""
+        for process in self._processes.values():
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(signal.SIGTERM)
+        for process in self._processes.values():
+            try:
+                async with asyncio.timeout(STOP_GRACE_S):
+                    await process.wait()
+            except TimeoutError:
+                process.kill()
+                await process.wait()
+
+    async def during(self, work: Awaitable[T]) -> T:
+        """Return the result of `work`, unless a service ends before.
+
+        Raises:
+            LinkError: A service ended; with the last line that it wrote.
+        """
+        task = asyncio.ensure_future(work)
+        deaths = {asyncio.ensure_future(process.wait()): name for name, process in self._processes.items()}
+        try:
+            await asyncio.wait({task, *deaths}, return_when=asyncio.FIRST_COMPLETED)
+            if task.done():
+                return task.result()
+            dead = next(name for death, name in deaths.items() if death.done())
+            raise LinkError(f"the {dead} service has ended: {self._last_words(dead)} (log: {self._log(dead)})")
+        finally:
+            for pending in (task, *deaths):
+                pending.cancel()
+            await asyncio.gather(task, *deaths, return_exceptions=True)
+
+    def _log(self, service: str) -> Path:
+        return self._logs / f"{service}.log"
+
+    def _last_words(self, service: str) -> str:
+        lines = self._log(service).read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return lines[-1] if lines else "without a word"
+
+
+def _wired(settings: Settings, endpoints: RigEndpoints) -> Settings:
+    """Return the settings with the servers on these endpoints and the clients pointed at them."""
+    def server(section: str, endpoint: Endpoint) -> object:
+        return getattr(settings, section).server.model_copy(update={"host": endpoint.host, "port": endpoint.port})
+
+    order = {"word_order": endpoints.plant.word_order}
+    return settings.model_copy(
+        update={
+            "session": settings.session.model_copy(update={"autostart": False}),
+            "plant": settings.plant.model_copy(update={"server": server("plant", endpoints.plant), **order}),
+            "control_plc": settings.control_plc.model_copy(
+                update={"server": server("control_plc", endpoints.control_plc), "plant": endpoints.plant, **order}
+            ),
+            "optimizer_plc": settings.optimizer_plc.model_copy(
+                update={
+                    "server": server("optimizer_plc", endpoints.optimizer_plc),
+                    "control_plc": endpoints.control_plc,
+                    **order,
+                }
+            ),
+        }
+    )  # fmt: skip
+
+
+def _free_ports(count: int) -> list[int]:
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for one in sockets:
+            one.bind(("127.0.0.1", 0))
+        return [int(one.getsockname()[1]) for one in sockets]

@@ -1,0 +1,174 @@
+"""A rig of three services on the bus: started here, or already up; driven and recorded over Modbus alone."""
+
+import asyncio
+import time
+from typing import NamedTuple
+
+from coldloop.endpoints import Endpoint
+from coldloop.errors import LinkError, ModelFileError
+from coldloop.modbus.client import RegisterClient
+from coldloop.model_file import read_header
+from coldloop.process import TICK_S
+from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, Status
+from coldloop.registers.declaration import RegisterMap
+from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
+from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, Optimization, OptimizerSession
+from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, LoadStep, PlantSample, PlantSession
+
+from rig.recording import LinkStatistics, Recorder
+from rig.scenario import Scenario
+from rig.settings import Settings
+
+AHEAD = HISTORY_ROWS - 32
+"""Ticks that the control PLC may be ahead of the recording, so that the history still has them."""
+QUIET_S = 20.0
+"""A rig on which nothing happens for this long is given up."""
+BATCH = 16
+"""Ticks to wait for before reading, in lock-step."""
+
+
+class RigEndpoints(NamedTuple):
+    """Where the three servers are."""
+
+    plant: Endpoint
+    control_plc: Endpoint
+    optimizer_plc: Endpoint
+
+
+class NetworkRig:
+    """Client of all three services."""
+
+    def __init__(self, endpoints: RigEndpoints, settings: Settings) -> None:
+        self._settings = settings
+        self._plant = _client(PLANT_MAP, endpoints.plant)
+        self._control = _client(CONTROL_MAP, endpoints.control_plc)
+        self._optimizer = _client(OPTIMIZER_MAP, endpoints.optimizer_plc)
+
+    async def connect(self, patience_s: float) -> None:
+        """Connect to all three, and make sure that all run the model of our configuration.
+
+        Raises:
+            PeerUnreachableError: One is not there.
+            ModelFileError: One runs another model.
+        """
+        file = self._settings.model.file
+        ours = read_header(file).short_digest
+        for client in (self._plant, self._control, self._optimizer):
+            await client.connect(patience_s)
+            theirs = (await client.read(Identity)).model_digest
+            if theirs != ours:
+                raise ModelFileError(
+                    f"{client.peer} runs model {theirs:08x}, not {ours:08x} of {file}: give all of them the same model"
+                )
+
+    def close(self) -> None:
+        """Close the connections."""
+        for client in (self._plant, self._control, self._optimizer):
+            client.close()
+
+    async def run(self, scenario: Scenario, recorder: Recorder) -> None:
+        """Start a session for the scenario and record it.
+
+        Raises:
+            LinkError: The rig stopped moving, or went faster than it could be recorded.
+        """
+        session = await self._start(scenario)
+        updates = _UpdateReader(self._optimizer, recorder, session)
+        quiet_since = time.monotonic()
+        pause_s = 20 * TICK_S / scenario.factor if scenario.realtime else 0.001
+        while len(recorder.samples) < scenario.ticks:
+            arrived = await self._read_samples(session, scenario, recorder)
+            await updates.read()
+            now = time.monotonic()
+            if arrived:
+                quiet_since = now
+            elif now - quiet_since > max(QUIET_S, 4 * TICK_S / scenario.factor):
+                raise LinkError(
+                    f"{self._plant.peer} has not moved from tick {len(recorder.samples)} for {now - quiet_since:.0f} s: "
+                    "see the logs of the control PLC and of the optimiser"
+                )
+            await asyncio.sleep(min(max(pause_s, 0.001), 0.2))
+        await updates.read_until(scenario.ticks)
+        status = await self._control.read(Status)
+        recorder.link = LinkStatistics(
+            status.deadline_misses, status.overruns, status.lateness_max, status.lateness_p99
+        )
+
+    async def _start(self, scenario: Scenario) -> int:
+        """Write the load and the settings of a new session to all three; return its number."""
+        session = 1
+        for client in (self._plant, self._control, self._optimizer):
+            session = max(session, (await client.read(Identity)).session + 1)
+        load = scenario.load
+        steps = [LoadStep(tick, watts) for tick, watts in zip(load.times, load.watts, strict=True)]
+        realtime = int(scenario.realtime)
+        await self._optimizer.write(
+            OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / TICK_S))
+        )
+        await self._plant.write_rows(steps)
+        await self._plant.write(PlantSession(session, realtime, scenario.factor, scenario.seed, 1.0, len(steps)))
+        await self._control.write(ControlSession(session, realtime, scenario.factor))
+        return session
+
+    async def _read_samples(self, session: int, scenario: Scenario, recorder: Recorder) -> int:
+        """Read the ticks that have gone by since the last call; return their number."""
+        first = len(recorder.samples)
+        if not scenario.realtime:
+            await self._control.write(Grant(min(scenario.ticks, first + AHEAD)))
+        identity = await self._plant.read(Identity)
+        if identity.session != session:
+            raise LinkError(f"{self._plant.peer} was taken over by session {identity.session}: one run at a time")
+        last = min(identity.tick, scenario.ticks)
+        if last - first < min(BATCH, scenario.ticks - first):
+            return 0
+        for tick in range(first, last):
+            (sample,) = await self._plant.read_rows(PlantSample, tick % HISTORY_ROWS, 1)
+            if sample.tick != tick:
+                raise LinkError(
+                    f"{self._plant.peer} has overwritten tick {tick} before it was recorded: choose a lower --factor"
+                )
+            recorder.sample(sample)
+        return last - first
+
+
+class _UpdateReader:
+    """Reads the optimiser's history as it grows."""
+
+    def __init__(self, client: RegisterClient, recorder: Recorder, session: int) -> None:
+        self._client = client
+        self._recorder = recorder
+        self._session = session
+
+    async def read(self) -> None:
+        """Read the updates that have been done since the last call."""
+        done = len(self._recorder.updates)
+        identity = await self._client.read(Identity)
+        if identity.session != self._session:
+            return
+        new = (identity.heartbeat - done) & 0xFFFF
+        if new > UPDATE_ROWS:
+            raise LinkError(f"{self._client.peer} has overwritten update {done} before it was recorded")
+        for update in range(done, done + new):
+            self._recorder.update((await self._client.read_rows(Optimization, update % UPDATE_ROWS, 1))[0])
+
+    async def read_until(self, ticks: int) -> None:
+        """Read on until the update that reaches beyond the run is there."""
+        deadline = time.monotonic() + QUIET_S
+        updates = self._recorder.updates
+        while not updates or updates[-1].tick + updates[-1].tau_u < ticks:
+            if time.monotonic() > deadline:
+                raise LinkError(f"{self._client.peer} stopped after update {len(updates) - 1}: see its log")
+            await self.read()
+            await asyncio.sleep(0.002)
+
+
+def _client(register_map: RegisterMap, endpoint: Endpoint) -> RegisterClient:
+    return RegisterClient(
+        register_map,
+        host=endpoint.host,
+        port=endpoint.port,
+        timeout_s=endpoint.timeout_s,
+        order=endpoint.word_order,
+    )
+

@@ -1,0 +1,59 @@
+"""The three programs in one process, by direct calls; what would cross the bus is rounded as the bus would round it."""
+
+from coldloop.lti_model import load
+from coldloop.model_file import read_header
+from coldloop.registers.codec import as_transmitted
+from coldloop.registers.control_plc import Update, Verdict
+from coldloop.registers.plant import LoadStep, Measurement, PlantSample
+from coldloop.sequence import InputSequence
+from control_plc.program import ControlProgram
+from optimizer_plc.program import OptimizerProgram
+from plant.program import LoadProfile, PlantProgram
+from plant.runtime import make_program
+
+from rig.recording import Recorder
+from rig.scenario import Scenario
+from rig.settings import Settings
+
+
+class OneProcessRig:
+    """Plant, control PLC and optimiser PLC, connected by calls."""
+
+    def __init__(self, settings: Settings) -> None:
+        header = read_header(settings.model.file)
+        self._settings = settings
+        self._header = header
+        program = settings.optimizer_plc.program
+        self.optimizer = OptimizerProgram(load(settings.model.file), program, settings.limits)
+        self.control = ControlProgram(
+            limits=settings.limits, model_digest=header.short_digest, initial_inputs=header.u0
+        )
+
+    def run(self, scenario: Scenario, recorder: Recorder) -> None:
+        """Run a scenario from the operating point, in lock-step."""
+        steps = [as_transmitted(LoadStep(*step)) for step in zip(scenario.load.times, scenario.load.watts, strict=True)]
+        load_table = LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
+        plant = make_program(self._header, self._settings.plant.sensors, load_table, scenario.seed)
+        self.optimizer.restart(scenario.updating_period_s)
+        self.control.restart(session=1)
+        for _ in range(scenario.ticks):
+            if self.control.awaiting_sequence:
+                self._deliver(recorder)
+            update = self._scan(plant, recorder)
+            if update is not None:
+                self.control.accept_plan(as_transmitted(self.optimizer.plan(as_transmitted(update))))
+
+    def _deliver(self, recorder: Recorder) -> None:
+        sequence = self.optimizer.solve()
+        rows = [as_transmitted(row) for row in sequence.rows]
+        answer = self.control.offer(InputSequence(as_transmitted(sequence.header), rows))
+        recorder.update(as_transmitted(self.optimizer.report(Verdict(answer.verdict))))
+
+    def _scan(self, plant: PlantProgram, recorder: Recorder) -> Update | None:
+        actuators = as_transmitted(self.control.begin_scan())
+        u = actuators[1:]
+        plant.apply(u)
+        measurement = as_transmitted(Measurement(plant.tick, plant.load, plant.measure(), plant.state))
+        recorder.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
+        plant.advance()
+        return self.control.end_scan(measurement)

@@ -1,0 +1,24 @@
+"""The whole configuration: what the three services and the rig read."""
+
+from coldloop.limits import InputLimits
+from coldloop.model_settings import ModelSettings
+from coldloop.session import SessionSettings
+from coldloop.telemetry import TelemetrySettings
+from control_plc.settings import ControlSection
+from optimizer_plc.settings import OptimizerSection
+from plant.settings import PlantSection
+from pydantic import BaseModel, ConfigDict
+
+
+class Settings(BaseModel):
+    """All sections of a configuration file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    limits: InputLimits = InputLimits()
+    model: ModelSettings = ModelSettings()
+    session: SessionSettings = SessionSettings()
+    plant: PlantSection = PlantSection()
+    control_plc: ControlSection = ControlSection()
+    optimizer_plc: OptimizerSection = OptimizerSection()
+    telemetry: TelemetrySettings = TelemetrySettings()
