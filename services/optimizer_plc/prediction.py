@@ -12,6 +12,7 @@ from coldloop.lti_model import LtiModel
 from coldloop.process import L1, T5, TICK_S, TICKS_PER_SAMPLE
 from numpy.typing import NDArray
 
+from optimizer_plc.design import ControlDesign
 from optimizer_plc.linear_algebra import multiply
 
 Array = NDArray[np.float64]
@@ -73,3 +74,15 @@ class PredictionModel:
     def output(self, x: Array, u: Array, w: float) -> Array:
         """Return the deviation of the measured output, shape (22,)."""
         return multiply(self.C, x[:, None])[:, 0] + multiply(self.D, u[:, None])[:, 0] + self.G[:, 0] * w
+
+
+def state_weights(model: LtiModel, design: ControlDesign) -> Array:
+    """Return the diagonal of Q, shape (28,): pressure, level and the mean of the temperatures weigh alike."""
+    n = model.A.shape[0]
+    scales = np.full(n, design.temperature_scale)
+    scales[0] = design.pressure_scale
+    scales[1] = design.level_scale / model.C[L1, 1]
+    shares = np.full(n, 1.0 / (n - 2))
+    shares[:2] = 1.0
+    weights: Array = design.state_weight * shares / scales**2
+    return weights

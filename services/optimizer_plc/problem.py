@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from optimizer_plc.design import N_INPUTS, N_SLACKS, ControlDesign
 from optimizer_plc.linear_algebra import apply, multiply
-from optimizer_plc.prediction import PredictionModel
+from optimizer_plc.prediction import PredictionModel, state_weights
 from optimizer_plc.profile import interpolation, shift
 
 Array = NDArray[np.float64]
@@ -78,7 +78,7 @@ class PredictiveProblem:
         A, B, F = model.sample
         to_z = np.zeros((nx, n))
         to_s = np.hstack([np.eye(nx), np.zeros((nx, 1))])
-        Q = self._state_weights()
+        Q = state_weights(model.model, design)
         R = np.asarray(design.input_weight)
         C, D, G = (matrix[list(model.constrained)] for matrix in (model.C, model.D, model.G))
         Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))
@@ -103,17 +103,6 @@ class PredictiveProblem:
         self.stacked_outputs_s = _transposed(self.outputs_s.reshape(-1, nx + 1))
         self.y0 = model.model.y0[list(model.constrained)]
         self.Phi = np.ascontiguousarray(Phi + self._slack_weights())
-
-    def _state_weights(self) -> Array:
-        design, nx = self.design, self._model.n_states
-        level_per_volume = self._model.C[self._model.constrained[0], 1]
-        scales = np.full(nx, design.temperature_scale)
-        scales[0] = design.pressure_scale
-        scales[1] = design.level_scale / level_per_volume
-        shares = np.full(nx, 1.0 / (nx - 2))
-        shares[:2] = 1.0
-        self.state_weights: Array = design.state_weight * shares / scales**2
-        return self.state_weights
 
     def _input_map(self, weights: Array) -> Array:
         """Return the matrix (3, n) from z to the input deviation at a sample with these knot weights."""

@@ -10,7 +10,8 @@ from plant.integrator import advance
 from plant.linearisation import state_and_load_jacobian, state_scales
 from plant.numeric import RealArray
 
-RELAXATION_S = 3000
+RELAXATION_S = 3000.0
+RELAXATION_STEP_S = 0.5
 LEVEL_GAIN = 100.0  # W of load per % of level, while relaxing
 TOLERANCE = 1e-10  # scaled units per second
 MAX_NEWTON_STEPS = 30
@@ -71,8 +72,8 @@ def _relaxed(u: RealArray, level: float, box: ColdBox, helium: Helium) -> tuple[
     nef34 = np.linspace(box.T_in - 5.0, 19.0, box.nef34.cells)
     x = np.concatenate([[box.P_LP + 0.18e5, volume], nef1, nef2, nef34])
     w = 0.0
-    for _ in range(RELAXATION_S):
+    for _ in range(round(RELAXATION_S / RELAXATION_STEP_S)):
         w = LEVEL_GAIN * 100.0 * (x[1] - volume) / box.separator.volume + 400.0
-        x = advance(x, u, w, 1.0, box, helium)
+        x = advance(x, u, w, RELAXATION_STEP_S, box, helium)
     x[1] = volume
     return x, float(w)

@@ -66,7 +66,7 @@ class PlantProgram:
         u0: Inputs held until the first `apply`, 3 numbers.
         load: The heat load over time.
         noise: Noise on the measurements; None measures exactly.
-        tick_s: Length of a tick in seconds, above 0 and at most 1.6 where the integration stays stable.
+        tick_s: Length of a tick in seconds, above 0 and at most 0.5, where the integration stays stable.
 
     Raises:
         ValueError: an argument of wrong length, not finite, or out of range.
@@ -82,8 +82,8 @@ class PlantProgram:
         noise: MeasurementNoise | None = None,
         tick_s: float = 0.25,
     ) -> None:
-        if not 0.0 < tick_s <= 1.6:
-            raise ValueError(f"a tick of {tick_s} s is outside 0 to 1.6 s")
+        if not 0.0 < tick_s <= 0.5:
+            raise ValueError(f"a tick of {tick_s} s is outside 0 to 0.5 s")
         helium = load_helium()
         self.tick = 0
         self._tick_s = tick_s

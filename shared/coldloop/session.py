@@ -22,7 +22,7 @@ class SessionSettings(BaseModel):
 
     autostart: bool = False
     """Begin session 1 at once instead of waiting for an operator."""
-    mode: TimeMode = TimeMode.REALTIME
+    mode: TimeMode = TimeMode.LOCKSTEP
     factor: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
     """Seconds of plant time in one second of real time, in real time."""
 

@@ -107,7 +107,7 @@ def test_halving_the_step_divides_the_error_by_about_16(plant: Plant, rest: Rest
     u = u + np.array([5.0, 20.0, -5.0])
     exact = plant.simulate(x, u, w, 20.0, dt=0.0625)
     coarse, fine = (np.max(np.abs(plant.simulate(x, u, w, 20.0, dt)[2:] - exact[2:])) for dt in (1.0, 0.5))
-    assert fine < 1e-6
+    assert fine < 2e-6  # K, at twice the tick
     assert 10.0 < coarse / fine < 40.0
 
 
@@ -117,7 +117,7 @@ def test_the_plant_stays_finite_at_the_corners_of_its_range(
     plant: Plant, rest: Rest, u: tuple[float, float, float], extra: float
 ) -> None:
     inputs, load = np.array(u), rest[2] + extra
-    x = plant.simulate(rest[0], inputs, load, 3600.0, dt=1.0)
+    x = plant.simulate(rest[0], inputs, load, 1800.0)
     assert np.all(np.isfinite(x))
     y = plant.outputs(x, inputs, load)
     assert 0.0 <= y["L1"] <= 100.0

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plant.cold_box import REFERENCE
-from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow, exchange
+from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow, driving_difference, exchange, take_up
 from plant.components.phase_separator import contents, level, separate
 from plant.components.return_line import return_flow
 from plant.components.turbine import expand, turbine_flow
@@ -89,7 +89,7 @@ def test_what_an_exchanger_takes_from_one_stream_it_gives_to_the_other(
 ) -> None:
     exchanger = REFERENCE.nef2
     T = np.linspace(T_high - 1.0, T_low + 0.5, exchanger.cells)
-    h_low, _ = vapour_enthalpy_and_cp(1.15e5, T_low, saturation(1.15e5, HELIUM).T, HELIUM)
+    h_low, _ = vapour_enthalpy_and_cp(1.15e5, T_low, saturation(1.15e5, HELIUM).T, HELIUM.vapour)
     entering = LowPressureFlow(m_low, 1.15e5, T_low, h_low)
     dT = np.empty(exchanger.cells)
     leaving = exchange(exchanger, T, HighPressureFlow(m_high, T_high), entering, HELIUM, dT)
@@ -102,6 +102,29 @@ def test_what_an_exchanger_takes_from_one_stream_it_gives_to_the_other(
     gained = m_low * (leaving.h - entering.h)
     assert stored == pytest.approx(m_high * (h_in - h_out) - gained, rel=1e-9, abs=1e-6)
     assert T_low <= leaving.T <= T_high
+
+
+@pytest.mark.parametrize(("boiled", "dry"), [(0.5, False), (2.0, True)])
+def test_wet_vapour_boils_dry_before_it_warms_up(boiled: float, dry: bool) -> None:  # noqa: FBT001
+    sat = saturation(1.2e5, HELIUM)
+    wet = LowPressureFlow(0.05, 1.2e5, sat.T, sat.h_v - 2000.0)
+    UA = boiled * 0.05 * 2000.0 / 3.0
+    T, h, _ = take_up(wet, 1e4, 3.0, UA, sat, HELIUM.vapour)
+    assert (T > sat.T, h > sat.h_v) == (dry, dry)
+    assert 0.05 * (h - wet.h) <= UA * 3.0 * (1.0 + 1e-9)
+
+
+def test_saturated_vapour_that_is_cooled_becomes_wet() -> None:
+    sat = saturation(1.2e5, HELIUM)
+    T, h, _ = take_up(LowPressureFlow(0.05, 1.2e5, sat.T, sat.h_v), 1e4, -0.5, 200.0, sat, HELIUM.vapour)
+    assert T == sat.T
+    assert h < sat.h_v
+
+
+def test_no_cell_is_driven_below_the_stream_that_cools_it() -> None:
+    assert driving_difference(6.0, 5.0, 4.5) == 1.0
+    assert driving_difference(9.0, 4.5, 4.5) == 0.0
+    assert driving_difference(9.0, 4.0, 4.5) == -0.5
 
 
 @settings(deadline=None)

@@ -58,7 +58,7 @@ def test_vapour_agrees(P: float, superheat: float) -> None:
     sat = helium_at.saturation(P, HELIUM)
     T = sat.T + superheat
     h, cp = (coolprop(name, "P", P, "T", T) for name in ("H", "C"))
-    table_h, table_cp = helium_at.vapour_enthalpy_and_cp(P, T, sat.T, HELIUM)
+    table_h, table_cp = helium_at.vapour_enthalpy_and_cp(P, T, sat.T, HELIUM.vapour)
     assert table_h == pytest.approx(h, abs=2e-5 * cp)
     assert table_cp == pytest.approx(cp, rel=2e-3)
     assert helium_at.vapour_temperature(P, h, sat, HELIUM) == pytest.approx(T, abs=2e-5)

@@ -129,7 +129,7 @@ def test_wrong_noise_is_refused(deviations: tuple[float, ...]) -> None:
         MeasurementNoise(deviations, 1)
 
 
-@pytest.mark.parametrize("wrong", [{"x0": [1.0]}, {"u0": [43.0, float("nan"), 36.0]}, {"tick_s": 0.0}, {"tick_s": 2.0}])
+@pytest.mark.parametrize("wrong", [{"x0": [1.0]}, {"u0": [43.0, float("nan"), 36.0]}, {"tick_s": 0.0}, {"tick_s": 0.6}])
 def test_a_program_checks_its_arguments(model: LtiModel, wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"finite|tick"):
         program(model, **wrong)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.compiled import kernel
+from plant.helium.interpolation import Surface
 from plant.helium.properties import Helium, Saturation, isobar_cell, saturation, vapour_enthalpy_and_cp
 from plant.numeric import Array, at_least, at_most
 
@@ -52,7 +53,7 @@ def driving_difference(T_before: float, T_cell: float, T_low: float) -> float:
     """Return the temperature difference (K) between the mean of a cell and the low-pressure gas that enters it.
 
     With a mean, a cell of many transfer units cools the gas below the stream that cools it. The second law forbids
-    that: the difference fades with that at the cold end, from well outside ordinary operation (there a ratio of 2 to 5).
+    that: the difference fades with that at the cold end, from outside ordinary operation (there a ratio of 1 to 5).
     """
     cold_end = T_cell - T_low
     limit = LARGEST_RATIO * cold_end if cold_end.real > 0.0 else cold_end
@@ -61,7 +62,7 @@ def driving_difference(T_before: float, T_cell: float, T_low: float) -> float:
 
 @kernel
 def take_up(
-    low: LowPressureFlow, cp: float, drive: float, UA: float, sat: Saturation, helium: Helium
+    low: LowPressureFlow, cp: float, drive: float, UA: float, sat: Saturation, table: Surface
 ) -> tuple[float, float, float]:
     """Return T (K), h (J/kg) and cp (J/(kg K)) of the low-pressure flow after one cell of `UA` (W/K).
 
@@ -77,7 +78,7 @@ def take_up(
     T = low.T + drive * (1.0 - np.exp(-UA / (low.mass_flow * cp)))
     if T.real < sat.T.real:
         return sat.T + 0.0 * T, sat.h_v + cp * (T - sat.T), cp
-    h, cp_out = vapour_enthalpy_and_cp(low.P, T, sat.T, helium)
+    h, cp_out = vapour_enthalpy_and_cp(low.P, T, sat.T, table)
     return T, h, cp_out
 
 
@@ -95,13 +96,15 @@ def exchange(
     UA = exchanger.UA / exchanger.cells
     sweeping = at_least(low.mass_flow, TRICKLE)
     T_low, h_low = low.T, low.h
-    _, cp_low = vapour_enthalpy_and_cp(low.P, T_low, sat.T, helium)
+    _, cp_low = vapour_enthalpy_and_cp(low.P, T_low, sat.T, helium.vapour)
     h_cell, rho_cp, c_wall = isobar_cell(T[exchanger.cells - 1], helium)
     for i in range(exchanger.cells - 1, -1, -1):
         T_before = T[i - 1] if i > 0 else high.T
         h_before, rho_cp_before, c_wall_before = isobar_cell(T_before, helium)
         drive = driving_difference(T_before, T[i], T_low)
-        T_low, h_next, cp_low = take_up(LowPressureFlow(sweeping, low.P, T_low, h_low), cp_low, drive, UA, sat, helium)
+        T_low, h_next, cp_low = take_up(
+            LowPressureFlow(sweeping, low.P, T_low, h_low), cp_low, drive, UA, sat, helium.vapour
+        )
         heat = low.mass_flow * (h_next - h_low)
         capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
         dT[i] = (high.mass_flow * (h_before - h_cell) - heat) / capacity

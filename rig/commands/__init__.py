@@ -1,0 +1,1 @@
+"""The subcommands of `coldloop`, one file each: `add_parser` and `execute`."""

@@ -1,0 +1,26 @@
+"""`coldloop config`: the effective configuration, and where each value comes from."""
+
+import argparse
+import json
+import sys
+
+from coldloop.service import add_configuration_options
+
+from rig.commands.options import configuration
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the command."""
+    parser = commands.add_parser("config", help="the effective configuration", description=__doc__)
+    add_configuration_options(parser)
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Print one line a value, as TOML with its source behind it."""
+    rows = configuration(options).effective()
+    texts = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value, _ in rows]
+    width = min(60, max(len(text) for text in texts))
+    for text, (_, _, source) in zip(texts, rows, strict=True):
+        sys.stdout.write(f"{text.ljust(width)}  # {source}\n")
+    return 0

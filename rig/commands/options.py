@@ -1,0 +1,69 @@
+"""Options that several subcommands share, and how their values are read."""
+
+import argparse
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from coldloop.config import Configuration, load_configuration
+from coldloop.endpoints import Endpoint
+from coldloop.process import TICK_S
+
+from rig.settings import Settings
+
+_UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
+
+KEYS = {
+    "load": ("plant.load", "--load"),
+    "seed": ("plant.seed", "--seed"),
+    "solver": ("optimizer_plc.program.solver", "--solver"),
+    "updating_period": ("optimizer_plc.program.updating_period_s", "--updating-period"),
+    "mode": ("session.mode", "--mode"),
+    "factor": ("session.factor", "--factor"),
+}
+"""Options that set one key of the configuration."""
+
+
+def duration(text: str) -> int:
+    """Return a duration such as 90, 90s, 15min or 2h as ticks."""
+    match = re.fullmatch(r"([+-]?\d+(?:\.\d+)?)\s*([a-z]*)", text.strip().lower())
+    if match is None or match[2] not in _UNITS:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a duration; write 90s, 15min or 2h")
+    ticks = float(match[1]) * _UNITS[match[2]] / TICK_S
+    if ticks <= 0:
+        raise argparse.ArgumentTypeError(f"'{text}' is not positive; write 90s, 15min or 2h")
+    if ticks != round(ticks):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s")
+    return round(ticks)
+
+
+def updating_period(text: str) -> float:
+    """Return an updating period in seconds, 0 for `adaptive`."""
+    if text == "adaptive":
+        return 0.0
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value <= 5:  # noqa: PLR2004
+        raise argparse.ArgumentTypeError(f"'{text}' is neither 'adaptive' nor seconds from 0.5 to 5")
+    return value
+
+
+def endpoint(text: str) -> Endpoint:
+    """Return HOST:PORT as an endpoint."""
+    host, separator, port = text.rpartition(":")
+    if not separator or not host or not port.isdecimal() or not 0 < int(port) < 0x10000:
+        raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT")
+    return Endpoint(host=host.strip("[]"), port=int(port))
+
+
+def configuration(options: argparse.Namespace) -> Configuration[Settings]:
+    """Return the effective configuration of a command."""
+    given: Mapping[str, Any] = vars(options)
+    return load_configuration(
+        Settings,
+        file=options.config,
+        assignments=options.assignments,
+        options={key: (given[name], flag) for name, (key, flag) in KEYS.items() if given.get(name) is not None},
+    )

@@ -1,0 +1,21 @@
+"""`coldloop registers`: the register maps, as a table, Markdown, CSV or JSON."""
+
+import argparse
+import sys
+
+from rig.register_listing import FORMATS, MAPS
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the command."""
+    parser = commands.add_parser("registers", help="list the Modbus registers", description=__doc__)
+    parser.add_argument("--format", choices=sorted(FORMATS), default="table")
+    parser.add_argument("--service", choices=sorted(MAPS), help="default: all")
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Print the list."""
+    maps = [MAPS[options.service]] if options.service else list(MAPS.values())
+    sys.stdout.write(FORMATS[options.format](maps))
+    return 0

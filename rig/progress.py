@@ -1,0 +1,78 @@
+"""What is seen while a run goes on: simulated time, speed, and the state of the loop in one line."""
+
+import time
+from types import TracebackType
+from typing import Self
+
+from coldloop.process import L1, T5, TICK_S
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from rig.recording import Recorder
+
+REFRESH_S = 0.1
+
+
+class RunProgress:
+    """A progress bar on standard error, with the loop's live line on a terminal."""
+
+    def __init__(self, ticks: int) -> None:
+        console = Console(stderr=True)
+        live = [TextColumn("[dim]{task.fields[line]}")] if console.is_terminal else []
+        self._bar = Progress(
+            TextColumn("{task.fields[clock]}"),
+            BarColumn(bar_width=24),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[speed]}"),
+            TimeRemainingColumn(),
+            *live,
+            console=console,
+            auto_refresh=False,
+        )
+        self._task = self._bar.add_task("", total=ticks, clock="0:00:00", speed="", line="")
+        self._started = self._shown = time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """Real time from the first tick to the last one shown."""
+        return self._shown - self._started
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._bar.refresh()
+        self._bar.stop()
+
+    def __call__(self, recorder: Recorder) -> None:
+        """Show where the run is, a few times a second."""
+        done = len(recorder.samples)
+        if done == 1:
+            self._started = time.monotonic()
+        if done % 8 and done != recorder.ticks:
+            return
+        now = time.monotonic()
+        if now - self._shown < REFRESH_S and done != recorder.ticks:
+            return
+        self._shown = now
+        seconds = done * TICK_S
+        speed = seconds / max(now - self._started, 1e-9)
+        hours, rest = divmod(int(seconds), 3600)
+        self._bar.update(
+            self._task,
+            completed=done,
+            clock=f"{hours}:{rest // 60:02}:{rest % 60:02}",
+            speed=f"{speed:,.0f} x real time",
+            line=_line(recorder),
+        )
+        self._bar.refresh()
+
+
+def _line(recorder: Recorder) -> str:
+    y = recorder.samples[-1].y
+    line = f"L1 {y[L1]:.2f} %  T5 {y[T5]:.2f} K"
+    if recorder.updates:
+        update = recorder.updates[-1]
+        line += f"  tau_u {update.tau_u * TICK_S:.2f} s  J {update.j_effective:.3g}"
+    return line
