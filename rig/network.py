@@ -107,7 +107,7 @@ class NetworkRig:
             OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / TICK_S))
         )
         await self._plant.write_rows(steps)
-        await self._plant.write(PlantSession(session, realtime, scenario.factor, scenario.seed, 1.0, len(steps)))
+        await self._plant.write(PlantSession(session, realtime, scenario.factor, scenario.seed, len(steps)))
         await self._control.write(ControlSession(session, realtime, scenario.factor))
         return session
 

@@ -5,7 +5,6 @@ from coldloop.model_file import read_header
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
 from coldloop.registers.plant import LoadStep, Measurement, PlantSample
-from coldloop.sequence import InputSequence
 from control_plc.program import ControlProgram
 from optimizer_plc.program import OptimizerProgram
 from plant.program import LoadProfile, PlantProgram
@@ -45,8 +44,7 @@ class OneProcessRig:
 
     def _deliver(self, recorder: Recorder) -> None:
         sequence = self.optimizer.solve()
-        rows = [as_transmitted(row) for row in sequence.rows]
-        answer = self.control.offer(InputSequence(as_transmitted(sequence.header), rows))
+        answer = self.control.offer(sequence)
         recorder.update(as_transmitted(self.optimizer.report(Verdict(answer.verdict))))
 
     def _scan(self, plant: PlantProgram, recorder: Recorder) -> Update | None:

@@ -2,6 +2,7 @@
 
 import math
 import struct
+from collections.abc import Sequence
 
 from coldloop.limits import InputLimits
 from coldloop.process import TICKS_PER_SAMPLE
@@ -37,6 +38,7 @@ class OutputGuard:
 
     def __init__(self, limits: InputLimits, applied: SequenceRow) -> None:
         self._limits = limits
+        self._slack = [TOLERANCE * (high - low) for low, high in zip(limits.low, limits.high, strict=True)]
         self._window = Window(applied, 0, 1.0)
         self.applied = applied
 
@@ -57,26 +59,26 @@ class OutputGuard:
         )
         return self.applied
 
-    def exceeds(self, rows: list[SequenceRow], first_tick: int, before: SequenceRow) -> bool:
+    def exceeds(self, rows: Sequence[SequenceRow], first_tick: int, before: SequenceRow) -> bool:
         """Tell whether a sequence that begins at `first_tick`, after `before`, would break a rate."""
         limits = self._limits
         window = self._window.next(first_tick, before, limits, update=True)
-        slack = [TOLERANCE * (high - low) for low, high in zip(limits.low, limits.high, strict=True)]
         for offset, row in enumerate(rows):
-            window = window.next(first_tick + offset, before, limits, update=False)
-            for i, value in enumerate(row):
-                if abs(value - window.anchor[i]) > limits.rate[i] * window.share + slack[i]:
+            if offset and offset % TICKS_PER_SAMPLE == 0:
+                window = window.next(first_tick + offset, before, limits, update=False)
+            elif offset and row == before:
+                continue
+            for value, anchor, rate, slack in zip(row, window.anchor, limits.rate, self._slack, strict=True):
+                if abs(value - anchor) > rate * window.share + slack:
                     return True
             before = row
         return False
 
-    def out_of_range(self, rows: list[SequenceRow]) -> bool:
+    def out_of_range(self, rows: Sequence[SequenceRow]) -> bool:
         """Tell whether a row holds a value that is not finite or outside the bounds."""
-        limits = self._limits
-        for row in rows:
-            for value, low, high in zip(row, limits.low, limits.high, strict=True):
-                slack = TOLERANCE * (high - low)
-                if not (math.isfinite(value) and low - slack <= value <= high + slack):
+        for row in set(rows):
+            for value, low, high, slack in zip(row, self._limits.low, self._limits.high, self._slack, strict=True):
+                if not low - slack <= value <= high + slack:  # not true of NaN either
                     return True
         return False
 

@@ -144,7 +144,7 @@ class ControlProgram:
         return self.acknowledgement
 
     def _judge(self, sequence: InputSequence) -> Verdict:  # noqa: PLR0911 one return for each clause of the contract
-        header, rows = sequence.header, list(sequence.rows)
+        header, rows = sequence
         if not 1 <= header.length == len(rows):
             return Verdict.WRONG_LENGTH
         if checksum(header, rows) != header.crc:

@@ -49,19 +49,32 @@ class Indicators(NamedTuple):
 
 
 def indicators(problem: PredictiveProblem, qp: QuadraticProblem, z: Array, situation: Situation) -> Indicators:
-    """Return the indicators of profile z in a situation (paper, section V)."""
-    design = problem.design
+    """Return the indicators of profile z in a situation (paper, section V); `qp` is the problem's instance there."""
     slackless = z.copy()
     slackless[problem.n_inputs :] = 0.0
-    deviation = quadratic_cost(qp.Phi, qp.phi, slackless) + qp.constant
-    samples = problem.outputs_z.shape[0]
-    outputs = np.zeros(2 * samples)
+    j_dev = float(quadratic_cost(qp.Phi, qp.phi, slackless)) + qp.constant
+    outputs = np.tile(problem.y0, problem.outputs_z.shape[0])
     apply(problem.stacked_outputs_z, z, outputs)
     apply(problem.stacked_outputs_s, np.append(situation.x, situation.w), outputs)
-    y = outputs.reshape(samples, 2) + problem.y0
-    v = np.maximum(y - design.output_high, 0.0) + np.maximum(design.output_low - y, 0.0)
-    violated = float(np.sum(np.sum(v * v, axis=0) * design.violation_weight))
     rows = -qp.gamma
     apply(problem.Gamma_transposed, z, rows)
-    return Indicators(deviation, violated, max(0.0, float(np.max(rows / problem.row_gains))))
+    return Indicators(j_dev, _violation_cost(outputs, problem.bands), _largest(rows, problem.row_gains))
 
+
+@kernel
+def _violation_cost(outputs: Array, bands: Array) -> float:
+    """Return the weighted squares of what outputs (2 N, L1 and T5 in turn) miss bands (3, 2: low, high, weight) by."""
+    total = 0.0
+    for i in range(outputs.shape[0]):
+        low, high, weight = bands[0, i % 2], bands[1, i % 2], bands[2, i % 2]
+        miss = max(outputs[i] - high, 0.0) + max(low - outputs[i], 0.0)
+        total += weight * miss * miss
+    return total
+
+
+@kernel
+def _largest(rows: Array, gains: Array) -> float:
+    largest = 0.0
+    for i in range(rows.shape[0]):
+        largest = max(largest, rows[i] / gains[i])
+    return largest

@@ -39,7 +39,7 @@ class EstimatorSettings(BaseModel):
     speed_sensor: PositiveFloat = 1.0
     temperature_sensor: PositiveFloat = 0.02
     pressure_sensor: PositiveFloat = 1e-3
-    initial_periods: Annotated[int, Field(ge=1)] = 400
+    longest_riccati: Annotated[int, Field(ge=1)] = 2000
     """Longest run of the Riccati recursion for a stationary gain, in periods."""
 
 
@@ -55,6 +55,9 @@ class Estimate(NamedTuple):
 class Estimator(Protocol):
     """Turns measurements at updating instants into states."""
 
+    def reset(self) -> None:
+        """Begin at the operating point."""
+
     def correct(self, update: Update) -> Estimate:
         """Take the measurement at an updating instant."""
 
@@ -67,7 +70,11 @@ class StateFeedback:
 
     def __init__(self, prediction: PredictionModel) -> None:
         self._model = prediction
-        self._estimate = Estimate(np.zeros(prediction.n_states), 0.0, 0.0)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin at the operating point."""
+        self._estimate = Estimate(np.zeros(self._model.n_states), 0.0, 0.0)
 
     def correct(self, update: Update) -> Estimate:
         """Take the simulated state."""
@@ -85,11 +92,14 @@ class KalmanFilter:
 
     def __init__(self, prediction: PredictionModel, settings: EstimatorSettings) -> None:
         self._model = prediction
-        self._settings = settings
-        self._x = np.zeros(prediction.n_states)
+        self._gains = stationary_gains(prediction, settings)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin at the operating point."""
+        self._x = np.zeros(self._model.n_states)
         self._mismatch = 0.0
         self._estimate = Estimate(self._x, 0.0, 0.0)
-        self._gains: dict[int, Array] = {}
         self._since = 1
 
     def correct(self, update: Update) -> Estimate:
@@ -98,7 +108,7 @@ class KalmanFilter:
         u = np.asarray(update.u_before) - m.u0
         known = update.load - m.w0
         innovation = np.asarray(update.y) - m.y0 - self._model.output(self._x, u, known + self._mismatch)
-        correction = multiply(self._gain(self._since), innovation[:, None])[:, 0]
+        correction = multiply(self._gains[min(self._since, len(self._gains))], innovation[:, None])[:, 0]
         self._x = self._x + correction[:-1]
         self._mismatch += float(correction[-1])
         self._estimate = Estimate(self._x, known + self._mismatch, self._mismatch)
@@ -110,24 +120,23 @@ class KalmanFilter:
         self._since = sum(ticks for _, ticks in segments)
         return self._x
 
-    def _gain(self, ticks: int) -> Array:
-        if ticks not in self._gains:
-            self._gains[ticks] = self._stationary_gain(ticks)
-        return self._gains[ticks]
 
-    def _stationary_gain(self, ticks: int) -> Array:
-        s, model = self._settings, self._model
-        nx = self._model.n_states
-        step = self._model.transitions[min(ticks, max(self._model.transitions))]
+def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> dict[int, Array]:
+    """Return the gain (n + 1, n_y) of every updating period, in ticks; the last row is that of the load mismatch."""
+    nx = prediction.n_states
+    C = np.ascontiguousarray(np.hstack([prediction.C, prediction.G]))
+    drift = np.full(nx + 1, settings.temperature_noise_k)
+    drift[0], drift[1], drift[nx] = settings.pressure_noise_pa, settings.volume_noise_m3, settings.load_walk_w
+    sensors = np.full(C.shape[0], settings.temperature_sensor)
+    sensors[0], sensors[1], sensors[12:] = settings.level_sensor, settings.speed_sensor, settings.pressure_sensor
+    P = np.diag(100.0 * drift**2)
+    gains = {}
+    for ticks, step in prediction.transitions.items():
         A = np.eye(nx + 1)
         A[:nx, :nx], A[:nx, nx] = step.A, step.F[:, 0]
-        C = np.ascontiguousarray(np.hstack([model.C, model.G]))
-        drift = np.full(nx + 1, s.temperature_noise_k)
-        drift[0], drift[1], drift[nx] = s.pressure_noise_pa, s.volume_noise_m3, s.load_walk_w
-        sensors = np.full(C.shape[0], s.temperature_sensor)
-        sensors[0], sensors[1], sensors[12:] = s.level_sensor, s.speed_sensor, s.pressure_sensor
-        share = ticks * TICK_S / SAMPLING_PERIOD_S
-        return stationary_gain(A, C, drift**2 * share, sensors**2, s.initial_periods)
+        process = drift**2 * (ticks * TICK_S / SAMPLING_PERIOD_S)
+        gains[ticks] = stationary_gain(A, C, process, sensors**2, P, settings.longest_riccati)
+    return gains
 
 
 def _through(model: PredictionModel, x: Array, w: float, segments: list[tuple[Array, int]]) -> Array:
@@ -155,20 +164,18 @@ def _measure(P: Array, C: Array, sensor: float, output: int, column: Array) -> N
 
 
 @kernel
-def stationary_gain(A: Array, C: Array, process: Array, sensors: Array, periods: int) -> Array:
-    """Return the stationary gain (n, n_y) by the Riccati recursion, one scalar measurement after the other.
+def stationary_gain(A: Array, C: Array, process: Array, sensors: Array, P: Array, periods: int) -> Array:
+    """Return the stationary gain (n, n_y) by the Riccati recursion from P, which ends as the stationary covariance.
 
-    `process` (n) and `sensors` (n_y) are variances. No matrix is inverted: sensors are independent.
+    `process` (n) and `sensors` (n_y) are variances. Sensors are independent, so measurements are taken one after the
+    other and no matrix is inverted.
     """
     n, m = A.shape[0], C.shape[0]
-    P = np.zeros((n, n))
-    for i in range(n):
-        P[i, i] = 100.0 * process[i]
     columns = np.zeros((m, n))
     previous = np.zeros((m, n))
     At = np.ascontiguousarray(A.T)
     for _ in range(periods):
-        P = multiply(multiply(A, P), At)
+        P[:] = multiply(multiply(A, P), At)
         for i in range(n):
             P[i, i] += process[i]
         for output in range(m):

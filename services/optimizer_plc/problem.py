@@ -8,6 +8,7 @@ before the first knot; Phi and Gamma are constant. No factor 1/2 stands before P
 from typing import NamedTuple
 
 import numpy as np
+from coldloop.compiled import kernel
 from coldloop.limits import InputLimits
 from coldloop.process import TICKS_PER_SAMPLE
 from numpy.typing import NDArray
@@ -58,6 +59,7 @@ class PredictiveProblem:
         self.limits = limits
         self.n_knots = len(design.decision_instants)
         self.n_inputs = N_INPUTS * self.n_knots
+        self.bands = np.array([design.output_low, design.output_high, design.violation_weight])
         self.size = (N_INPUTS + N_SLACKS) * self.n_knots
         self._model = prediction
         self._knots_to_samples = interpolation(design.decision_instants, np.arange(1, design.horizon + 1))
@@ -67,6 +69,7 @@ class PredictiveProblem:
         self._build_rate_rows()
         self.Gamma = np.ascontiguousarray(np.vstack([self._output_rows, self._rate_rows]))
         self.Gamma_transposed = _transposed(self.Gamma)
+        self._maps = self._make_maps()
         self._shifts: dict[int, Array] = {}
 
     # -- construction ------------------------------------------------------------------------------------------------
@@ -176,35 +179,27 @@ class PredictiveProblem:
 
     def at(self, situation: Situation) -> QuadraticProblem:
         """Return the instance of the problem for a situation."""
-        s = np.append(situation.x, situation.w)
-        phi = np.zeros(self.size)
-        apply(self._phi_map, s, phi)
-        m_outputs = len(self._output_bounds)
-        gamma = np.concatenate([self._output_bounds, self._rates(situation)])
-        apply(self._output_states, s, gamma[:m_outputs])
-        apply(self._rate_before, situation.u_before, gamma[m_outputs:])
-        low, high = self.bounds(situation)
-        weighted = np.zeros(len(s))
-        apply(self._constant_map, s, weighted)
-        return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, _dot(s, weighted))
-
-    def bounds(self, situation: Situation) -> tuple[Array, Array]:
-        """Return the box: input ranges, slacks >= 0, and the first knot within its rate of the input before it."""
-        u0 = self._model.model.u0
-        low_u = (np.asarray(self.limits.low) - u0) / self._input_scale
-        high_u = (np.asarray(self.limits.high) - u0) / self._input_scale
-        reach = np.asarray(self.limits.rate) * self.limits.rate_share(situation.elapsed_ticks)
-        slacks = N_SLACKS * self.n_knots
-        low = np.concatenate([np.tile(low_u, self.n_knots), np.zeros(slacks)])
-        high = np.concatenate([np.tile(high_u, self.n_knots), np.full(slacks, np.inf)])
-        start = situation.u_before
-        low[:N_INPUTS] = np.clip((start - reach) / self._input_scale, low_u, high_u)
-        high[:N_INPUTS] = np.clip((start + reach) / self._input_scale, low_u, high_u)
-        return low, high
-
-    def _rates(self, situation: Situation) -> Array:
         share = self.limits.rate_share(situation.elapsed_ticks)
-        return self._rate_bounds * np.where(self._rate_first, share, 1.0)
+        phi, gamma, low, high, constant = _instance(self._maps, situation.x, situation.w, situation.u_before, share)
+        return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, constant)
+
+    def _make_maps(self) -> "_Maps":
+        low_u = (np.asarray(self.limits.low) - self._model.model.u0) / self._input_scale
+        high_u = (np.asarray(self.limits.high) - self._model.model.u0) / self._input_scale
+        slacks = N_SLACKS * self.n_knots
+        return _Maps(
+            phi=self._phi_map,
+            constant=self._constant_map,
+            outputs=self._output_states,
+            output_bounds=self._output_bounds,
+            rate_bounds=self._rate_bounds,
+            rate_first=self._rate_first.astype(float),
+            rate_before=self._rate_before,
+            low=np.concatenate([np.tile(low_u, self.n_knots), np.zeros(slacks)]),
+            high=np.concatenate([np.tile(high_u, self.n_knots), np.full(slacks, np.inf)]),
+            rate=np.asarray(self.limits.rate) / self._input_scale,
+            input_scale=self._input_scale,
+        )
 
     # -- profiles ----------------------------------------------------------------------------------------------------
 
@@ -237,5 +232,55 @@ def _transposed(M: Array) -> Array:
     return np.ascontiguousarray(M.T)
 
 
-def _dot(a: Array, b: Array) -> float:
-    return float(multiply(a[None, :], b[:, None])[0, 0])
+
+class _Maps(NamedTuple):
+    """How an instance follows from a situation; the state and the load are stacked as s = (x, w)."""
+
+    phi: Array
+    """Shape (n_s, n)."""
+    constant: Array
+    """Shape (n_s, n_s)."""
+    outputs: Array
+    """Shape (n_s, 56)."""
+    output_bounds: Array
+    rate_bounds: Array
+    rate_first: Array
+    """1.0 for the rows of the interval before the first knot."""
+    rate_before: Array
+    """Shape (3, 38)."""
+    low: Array
+    high: Array
+    rate: Array
+    """Rates of the inputs, scaled."""
+    input_scale: Array
+
+
+@kernel
+def _instance(
+    maps: _Maps, x: Array, w: float, u_before: Array, share: float
+) -> tuple[Array, Array, Array, Array, float]:
+    """Return phi, gamma, low, high and the constant of the cost."""
+    s = np.empty(x.shape[0] + 1)
+    s[:-1] = x
+    s[-1] = w
+    phi = np.zeros(maps.phi.shape[1])
+    apply(maps.phi, s, phi)
+    outputs, rates = maps.output_bounds.shape[0], maps.rate_bounds.shape[0]
+    gamma = np.empty(outputs + rates)
+    gamma[:outputs] = maps.output_bounds
+    for r in range(rates):
+        gamma[outputs + r] = maps.rate_bounds[r] * (share if maps.rate_first[r] > 0.0 else 1.0)
+    apply(maps.outputs, s, gamma[:outputs])
+    apply(maps.rate_before, u_before, gamma[outputs:])
+    low, high = maps.low.copy(), maps.high.copy()
+    for i in range(u_before.shape[0]):  # the first knot stays within its rate of the input before it
+        start = u_before[i] / maps.input_scale[i]
+        reach = maps.rate[i] * share
+        low[i] = min(max(start - reach, maps.low[i]), maps.high[i])
+        high[i] = min(max(start + reach, maps.low[i]), maps.high[i])
+    weighted = np.zeros(s.shape[0])
+    apply(maps.constant, s, weighted)
+    constant = 0.0
+    for i in range(s.shape[0]):
+        constant += s[i] * weighted[i]
+    return phi, gamma, low, high, constant

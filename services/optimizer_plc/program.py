@@ -38,6 +38,7 @@ class Delivery:
     situation: Situation
     first_tick: int
     sequence: InputSequence | None
+    qp: QuadraticProblem | None = None
     hot_start: float = 0.0
     last_but_one: float = 0.0
     delivered: float = 0.0
@@ -65,12 +66,22 @@ class OptimizerProgram:
         self._problem = PredictiveProblem(self._prediction, settings.design, limits)
         self._solver = make_solver(settings)
         self._budget = PlcBudget(settings.budget, self._solver.tau_1_s)
+        self._estimator = self._make_estimator()
+        self._compile_kernels(model)
         self.restart(settings.updating_period_s)
+
+    def _compile_kernels(self, model: LtiModel) -> None:
+        """Go once through an update at the operating point, so that no session waits for the compiler."""
+        self.restart(0.0)
+        u, y, x = (tuple(values.tolist()) for values in (model.u0, model.y0, model.x0))
+        self.plan(Update(0, 0, 0, 0, load=model.w0, u_before=u, u=u, y=y, x=x))
+        self.solve()
+        self.report(Verdict.NONE)
 
     def restart(self, updating_period_s: float) -> None:
         """Forget everything and begin a session at the operating point; 0 s is the adaptive updating period."""
         self._rule = self._make_rule(updating_period_s)
-        self._estimator: Estimator = self._make_estimator()
+        self._estimator.reset()
         nothing = Situation(np.zeros(self._prediction.n_states), 0.0, np.zeros(3))
         self._playing = Delivery(self._problem.hold(np.zeros(3)), nothing, 0, None)
         self._sent: Delivery | None = None
@@ -157,7 +168,7 @@ class OptimizerProgram:
         floor = qp.constant + self.settings.adaptive.cost_floor
         sequence = self._sequence(period, z)
         self._sent = Delivery(
-            z, situation, sequence.header.first_tick, sequence,
+            z, situation, sequence.header.first_tick, sequence, qp,
             hot_start + floor, last_but_one + floor, self._solver.cost + floor,
         )  # fmt: skip
         return sequence
@@ -205,9 +216,9 @@ class OptimizerProgram:
     def report(self, verdict: Verdict) -> Optimization:
         """Return what was done with the last update, once the control PLC has answered."""
         period, sent = self._period, self._sent
-        if sent is None:
+        if sent is None or sent.qp is None:
             raise RuntimeError("report follows solve")
-        predicted = indicators(self._problem, self._problem.at(sent.situation), sent.z, sent.situation)
+        predicted = indicators(self._problem, sent.qp, sent.z, sent.situation)
         a = period.assessment
         return Optimization(
             update=period.update.update, tick=period.update.tick, tau_u=period.ticks, iterations=period.iterations,

@@ -14,7 +14,8 @@ from plant.numeric import RealArray
 def advance(x: RealArray, u: RealArray, w: float, dt: float, box: ColdBox, helium: Helium) -> RealArray:
     """Return the state after `dt` seconds (shape (28,)), with inputs and load held.
 
-    Stable up to dt = 0.5 s everywhere, and up to 1.6 s near the operating point. Loops run in a fixed order, so that the result is the same to the bit everywhere.
+    Stable up to dt = 0.5 s everywhere, and up to 1.6 s near the operating point. Loops run in a fixed order, so that
+    the result is the same to the bit everywhere.
     """
     n = x.shape[0]
     slope, y = np.empty(n), np.empty(22)

@@ -94,6 +94,7 @@ class PlantProgram:
         self._deviations = np.array(noise.deviations) if noise else None
         self._generator = np.random.Generator(np.random.PCG64(noise.seed if noise else 0))
         self._measured = self._sample(outputs(self._x, self._u, self.load, box, helium))
+        self._step()  # no session waits for the compiler
 
     @property
     def state(self) -> tuple[float, ...]:
@@ -119,9 +120,13 @@ class PlantProgram:
 
     def advance(self) -> None:
         """Go one tick forward."""
-        self._x, y = advance_and_read(self._x, self._u, self.load, self._tick_s, self._box, self._helium)
+        self._x, y = self._step()
         self.tick += 1
         self._measured = self._sample(y)
+
+    def _step(self) -> tuple[RealArray, RealArray]:
+        """Return the state and the outputs one tick ahead."""
+        return advance_and_read(self._x, self._u, self.load, self._tick_s, self._box, self._helium)
 
     def _sample(self, y: RealArray) -> tuple[float, ...]:
         if self._deviations is not None:

@@ -3,15 +3,17 @@
 The checks themselves are the control PLC's; `docs/link.md` describes the whole exchange.
 """
 
+import struct
 import zlib
 from collections.abc import Sequence as Rows
+from itertools import chain
 from typing import NamedTuple
 
 from coldloop.registers.codec import codec_of
 from coldloop.registers.control_plc import CONTROL_MAP, SequenceHeader, SequenceRow
 
 _HEADER = codec_of(CONTROL_MAP.block_of(SequenceHeader))
-_ROW = codec_of(CONTROL_MAP.block_of(SequenceRow))
+_ROW_LETTERS = CONTROL_MAP.block_of(SequenceRow).letters
 _CRC_BYTES = 4
 
 
@@ -25,7 +27,7 @@ class InputSequence(NamedTuple):
 def checksum(header: SequenceHeader, rows: Rows[SequenceRow]) -> int:
     """Return the CRC-32 of header (without its CRC) and rows, whatever the word order of the link."""
     crc = zlib.crc32(_HEADER.encode(header)[:-_CRC_BYTES])
-    return zlib.crc32(b"".join([_ROW.encode(row) for row in rows]), crc)
+    return zlib.crc32(struct.pack(f">{len(_ROW_LETTERS) * len(rows)}f", *chain.from_iterable(rows)), crc)
 
 
 def sealed(header: SequenceHeader, rows: Rows[SequenceRow]) -> InputSequence:

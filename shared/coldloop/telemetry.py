@@ -73,9 +73,16 @@ class Telemetry:
         offline = aiomqtt.Will(f"{self._topic}/state", json.dumps({"state": "offline"}), qos=1, retain=True)
         async with aiomqtt.Client(s.broker, s.port, will=offline, timeout=s.timeout_s) as client:
             await client.publish(f"{self._topic}/state", json.dumps({"state": "online"}), qos=1, retain=True)
-            while True:
-                await self._arrived.wait()
-                self._arrived.clear()
-                while self._waiting:
-                    await client.publish(f"{self._topic}/telemetry", self._waiting[0], qos=1, retain=True)
-                    self._waiting.popleft()
+            try:
+                await self._forward(client)
+            except asyncio.CancelledError:  # a clean end calls for no last will
+                await client.publish(f"{self._topic}/state", offline.payload, qos=1, retain=True)
+                raise
+
+    async def _forward(self, client: aiomqtt.Client) -> None:
+        while True:
+            await self._arrived.wait()
+            self._arrived.clear()
+            while self._waiting:
+                await client.publish(f"{self._topic}/telemetry", self._waiting[0], qos=1, retain=True)
+                self._waiting.popleft()

@@ -153,7 +153,10 @@ def saturation_slopes(P: float, helium: Helium) -> Saturation:
 
 @kernel
 def vapour_enthalpy_and_cp(P: float, T: float, T_sat: float, table: Surface) -> tuple[float, float]:
-    """Return h (J/kg) and cp (J/(kg K)) of the vapour, from `Helium.vapour`, at `P` (Pa, 0.9e5 to 1.9e5) and `T` (K, T_sat to 120)."""
+    """Return h (J/kg) and cp (J/(kg K)) of the vapour at `P` (Pa, 0.9e5 to 1.9e5) and `T` (K, T_sat to 120).
+
+    `table` is `Helium.vapour`.
+    """
     superheat = at_least(T - T_sat, 0.0) + SUPERHEAT_OFFSET
     h, slope = read_surface(table, P, np.log(superheat))
     return h, slope / superheat

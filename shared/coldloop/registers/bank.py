@@ -4,14 +4,16 @@ import math
 import struct
 from bisect import bisect_left
 from dataclasses import replace
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
-from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
+from coldloop.registers.codec import RecordCodec, ValueCodec, WordOrder, codec_of
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, fields_of
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
 FIRST_HALF, SECOND_HALF = 1, 2
+MAX_SPANS = 512
+"""Ranges that clients write to are remembered up to this number."""
 
 
 class RefusedAccessError(Exception):
@@ -52,6 +54,7 @@ class RegisterBank:
         self._halves = bytearray(0x10000)
         self._places: dict[type[tuple[Any, ...]], tuple[Block, RecordCodec]] = {}
         self._checks: list[tuple[int, Kind, Field, str]] = []
+        self._spans: dict[tuple[int, int], _Span] = {}
         for block in register_map.blocks:
             self._declare(block)
         self._check_addresses = [address for address, *_ in self._checks]
@@ -101,30 +104,55 @@ class RegisterBank:
             IllegalAddressError: A register does not exist or is read-only.
             IllegalValueError: A value is out of range, or half of a 32-bit value.
         """
-        end = address + len(data) // 2
+        self._checked(address, data)
+
+    def write(self, address: int, data: bytes) -> list[Block]:
+        """Check and store words from `address` on; return the blocks that they fall in."""
+        span = self._checked(address, data)
+        self._memory[2 * address : 2 * address + len(data)] = data
+        return span.blocks
+
+    def _checked(self, address: int, data: bytes) -> "_Span":
+        words = len(data) // 2
+        span = self._spans.get((address, words))
+        if span is None:
+            span = self._make_span(address, words)
+            if len(self._spans) >= MAX_SPANS:
+                self._spans.clear()
+            self._spans[address, words] = span
+        values = span.codec.unpack(data)
+        if not span.plain or not math.isfinite(sum(values)):
+            for value, (field, name) in zip(values, span.fields, strict=True):
+                _check_value(value, field, name)
+        return span
+
+    def _make_span(self, address: int, words: int) -> "_Span":
+        end = address + words
         if end > 0x10000 or self._writable.find(0, address, end) >= 0:
             raise IllegalAddressError(f"no writable register at some of {address}..{end - 1}")
         if self._halves[address] == SECOND_HALF or self._halves[end - 1] == FIRST_HALF:
             raise IllegalValueError(
                 f"a 32-bit register is written whole or not at all, {address}..{end - 1} halves one"
             )
-        for register_address, kind, field, name in self._checks[
+        checks = self._checks[
             bisect_left(self._check_addresses, address) : bisect_left(self._check_addresses, end)
-        ]:
-            start = 2 * (register_address - address)
-            _check_value(self._value(kind, data[start : start + 2 * kind.words]), field, name)
+        ]
+        return _Span(
+            codec=ValueCodec("".join(kind.letter for _, kind, _, _ in checks), self.order),
+            fields=[(field, name) for *_, field, name in checks],
+            plain=all(field.low is None and field.high is None for *_, field, _ in checks),
+            blocks=[block for block in self.map.blocks if block.address < end and address < block.end],
+        )
 
-    def write(self, address: int, data: bytes) -> list[Block]:
-        """Check and store words from `address` on; return the blocks that they fall in."""
-        self.check_write(address, data)
-        end = address + len(data) // 2
-        self._memory[2 * address : 2 * end] = data
-        return [block for block in self.map.blocks if block.address < end and address < block.end]
 
-    def _value(self, kind: Kind, raw: bytes) -> float:
-        if self.order is WordOrder.LOW_FIRST and kind.words == 2:
-            raw = raw[2:] + raw[:2]
-        return cast("float", struct.unpack(">" + kind.letter, raw)[0])
+class _Span(NamedTuple):
+    """What is known of a writable range of words, whatever is written to it."""
+
+    codec: ValueCodec
+    fields: list[tuple[Field, str]]
+    plain: bool
+    """No value has a range of its own: it is enough that all are finite."""
+    blocks: list[Block]
 
 
 def _check_value(value: float, field: Field, name: str) -> None:

@@ -1,6 +1,7 @@
 """Records to register words and back."""
 
 import struct
+from collections.abc import Iterable
 from enum import StrEnum
 from functools import cache
 from typing import Any, TypeVar, cast
@@ -17,17 +18,44 @@ class WordOrder(StrEnum):
     LOW_FIRST = "low-first"  # the habit of Schneider's PLCs
 
 
+class ValueCodec:
+    """Packs a run of registers, given by their `struct` letters, as they travel on the bus."""
+
+    def __init__(self, letters: str, order: WordOrder) -> None:
+        self._struct = struct.Struct(">" + letters)
+        self._swaps = _swapped_words(letters) if order is WordOrder.LOW_FIRST else None
+        self._words = struct.Struct(f">{self._struct.size // 2}H")
+        self.size = self._struct.size
+
+    def pack(self, values: Iterable[Any]) -> bytes:
+        """Return the bytes of `values`.
+
+        Raises:
+            struct.error, OverflowError: A value does not fit its register.
+        """
+        raw = self._struct.pack(*values)
+        return raw if self._swaps is None else self._reordered(raw)
+
+    def unpack(self, data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[Any, ...]:
+        """Return the values that stand in `data` at `offset` (bytes)."""
+        if self._swaps is not None:
+            data, offset = self._reordered(data[offset : offset + self.size]), 0
+        return self._struct.unpack_from(data, offset)
+
+    def _reordered(self, raw: bytes | bytearray | memoryview) -> bytes:
+        words = self._words.unpack(raw)
+        return self._words.pack(*[words[source] for source in self._swaps or ()])
+
+
 class RecordCodec:
-    """Encodes the rows of one block, byte by byte as they travel on the bus."""
+    """Encodes the rows of one block."""
 
     def __init__(self, block: Block, order: WordOrder) -> None:
-        self._struct = struct.Struct(">" + block.letters)
+        self._values = ValueCodec(block.letters, order)
         self._record = block.record
         self._arrays = [len(field.elements) for field in fields_of(block.record).values()]
         self._flat = not any(self._arrays)
-        self._swaps = _swapped_words(block.letters) if order is WordOrder.LOW_FIRST else None
-        self._words = struct.Struct(f">{self._struct.size // 2}H")
-        self.size = self._struct.size
+        self.size = self._values.size
 
     def encode(self, record: tuple[Any, ...]) -> bytes:
         """Return the row's bytes.
@@ -35,14 +63,11 @@ class RecordCodec:
         Raises:
             struct.error, OverflowError: A value does not fit its register.
         """
-        raw = self._struct.pack(*(record if self._flat else self._flattened(record)))
-        return raw if self._swaps is None else self._reordered(raw)
+        return self._values.pack(record if self._flat else self._flattened(record))
 
     def decode(self, data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[Any, ...]:
         """Return the record that stands in `data` at `offset` (bytes)."""
-        if self._swaps is not None:
-            data, offset = self._reordered(data[offset : offset + self.size]), 0
-        values = self._struct.unpack_from(data, offset)
+        values = self._values.unpack(data, offset)
         return self._record(*(values if self._flat else self._nested(values)))
 
     def _flattened(self, record: tuple[Any, ...]) -> list[Any]:
@@ -61,10 +86,6 @@ class RecordCodec:
             nested.append(values[start : start + elements] if elements else values[start])
             start += elements or 1
         return nested
-
-    def _reordered(self, raw: bytes | bytearray | memoryview) -> bytes:
-        words = self._words.unpack(raw)
-        return self._words.pack(*[words[source] for source in self._swaps or ()])
 
 
 def _swapped_words(letters: str) -> list[int]:

@@ -35,7 +35,6 @@ class PlantSession(NamedTuple):
     realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
     seed: Annotated[int, u32("Seed of the sensor noise")]
-    noise: Annotated[float, f32("Sensor noise as a multiple of the configured one; 0 is none", low=0, high=100)]
     load_steps: Annotated[int, u16("Rows of the load table that are in use", high=LOAD_ROWS)]
 
 

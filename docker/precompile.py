@@ -1,0 +1,49 @@
+"""Compile the numerical kernels of one service, so that its image has them: `python precompile.py SERVICE`."""  # noqa: INP001 a program
+
+import sys
+
+from coldloop.model_file import read_header
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.registers.plant import Measurement
+
+
+def plant() -> None:
+    """Go one tick forward."""
+    from plant.cold_box import REFERENCE  # noqa: PLC0415 not in every image
+    from plant.program import LoadProfile, PlantProgram  # noqa: PLC0415
+
+    header = read_header(DEFAULT_MODEL_FILE)
+    PlantProgram(box=REFERENCE, x0=header.x0, u0=header.u0, load=LoadProfile((0,), (header.w0,))).advance()
+
+
+def control_plc() -> None:
+    """Compile nothing: this service has no kernels."""
+
+
+def optimizer_plc() -> None:
+    """Answer two updates of a plant that stands still."""
+    from coldloop.limits import InputLimits  # noqa: PLC0415
+    from coldloop.lti_model import load  # noqa: PLC0415
+    from control_plc.program import ControlProgram  # noqa: PLC0415
+    from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
+    from optimizer_plc.settings import ProgramSettings  # noqa: PLC0415
+
+    model = load(DEFAULT_MODEL_FILE)
+    limits = InputLimits()
+    optimizer = OptimizerProgram(model, ProgramSettings(), limits)
+    control = ControlProgram(limits=limits, model_digest=optimizer.model_digest, initial_inputs=model.u0)
+    control.restart(1)
+    updates = 0
+    header = read_header(DEFAULT_MODEL_FILE)
+    while updates < 2:
+        if control.awaiting_sequence:
+            control.offer(optimizer.solve())
+        tick = control.begin_scan().tick
+        update = control.end_scan(Measurement(tick, header.w0, header.y0, header.x0))
+        if update is not None:
+            control.accept_plan(optimizer.plan(update))
+            updates += 1
+
+
+if __name__ == "__main__":
+    {"plant": plant, "control_plc": control_plc, "optimizer_plc": optimizer_plc}[sys.argv[1]]()

@@ -1,0 +1,111 @@
+"""The composed rig, brought up once for all tests here; they are skipped where no container engine runs."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SERVICES = ("plant", "control-plc", "optimizer-plc")
+HEALTHY_WITHIN_S = 420
+
+
+@dataclass(frozen=True)
+class ComposedRig:
+    """A composed rig that is up, on ports of its own."""
+
+    environment: dict[str, str]
+    plant: int
+    control_plc: int
+    optimizer_plc: int
+    mqtt: int
+
+    def compose(self, *arguments: str, check: bool = True) -> str:
+        """Run `docker compose` and return what it prints."""
+        done = subprocess.run(
+            ["docker", "compose", *arguments], cwd=ROOT, env=self.environment, check=False, stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        if check and done.returncode:
+            pytest.fail(f"docker compose {' '.join(arguments)}:\n{done.stdout[-4000:]}", pytrace=False)
+        return done.stdout
+
+    def inside(self, service: str, *command: str) -> str:
+        """Run a command in a service's container and return what it prints."""
+        return self.compose("exec", "-T", service, *command).strip()
+
+    def inspect(self, service: str) -> dict[str, Any]:
+        """Return what the engine knows of a service's container."""
+        container = self.compose("ps", "--quiet", service).strip()
+        done = subprocess.run(["docker", "inspect", container], env=self.environment, check=True, capture_output=True)
+        described: dict[str, Any] = json.loads(done.stdout)[0]
+        return described
+
+
+@pytest.fixture(scope="session")
+def rig() -> Iterator[ComposedRig]:
+    if not _engine_runs():
+        if "CONTAINER_ENGINE_REQUIRED" in os.environ:
+            pytest.fail("no container engine runs, or it has no `docker compose`", pytrace=False)
+        pytest.skip("no container engine runs here")
+    ports = _free_ports(4)
+    names = ("COLDLOOP_PLANT_PORT", "COLDLOOP_CONTROL_PLC_PORT", "COLDLOOP_OPTIMIZER_PLC_PORT", "COLDLOOP_MQTT_PORT")
+    published = {name: str(port) for name, port in zip(names, ports, strict=True)}
+    rig = ComposedRig({**os.environ, **published, "COMPOSE_PROJECT_NAME": f"coldloop-test-{os.getpid()}"}, *ports)
+    try:
+        rig.compose("build")
+        _bring_up(rig)
+        yield rig
+    finally:
+        rig.compose("down", "--volumes", "--rmi", "local", "--timeout", "5", check=False)
+
+
+def _bring_up(rig: ComposedRig) -> None:
+    started = rig.compose("up", "--wait", "--wait-timeout", str(HEALTHY_WITHIN_S), check=False)
+    states = rig.compose("ps", "--all", "--format", "{{.Service}}: {{.Status}}")
+    if states.count("(healthy)") != len(SERVICES) + 1:
+        logs = rig.compose("logs", "--no-color", "--tail", "20")
+        pytest.fail(f"not all became healthy\n{started}\n{states}\n{logs}", pytrace=False)
+
+
+def _engine_runs() -> bool:
+    if shutil.which("docker") is None:
+        return False
+    questions = (["docker", "compose", "version"], ["docker", "version"])
+    try:
+        return all(
+            subprocess.run(question, check=False, capture_output=True, timeout=20).returncode == 0
+            for question in questions
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+
+
+def _free_ports(count: int) -> list[int]:
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
+        return [one.getsockname()[1] for one in sockets]
+
+
+@pytest.fixture
+def coldloop() -> Callable[..., None]:
+    """`coldloop run` with its arguments; its last words are the failure if it fails."""
+
+    def run(*arguments: str) -> None:
+        done = subprocess.run(
+            [sys.executable, "-m", "rig.cli", "run", *arguments], cwd=ROOT, check=False, stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=600,
+        )  # fmt: skip
+        if done.returncode:
+            pytest.fail(f"coldloop run {' '.join(arguments)} ended with {done.returncode}:\n{done.stdout[-4000:]}")
+
+    return run

@@ -1,0 +1,129 @@
+"""The rig as `docker compose up` brings it up."""
+
+import asyncio
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import aiomqtt
+import pytest
+
+from coldloop.modbus.client import RegisterClient
+from coldloop.registers.common import Identity
+from coldloop.registers.plant import PLANT_MAP
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from conftest import ComposedRig
+
+SERVICES = ("plant", "control-plc", "optimizer-plc")
+
+
+def identity_of_plant(rig: "ComposedRig") -> Identity:
+    async def read() -> Identity:
+        client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=rig.plant, timeout_s=5.0)
+        try:
+            await client.connect(5.0)
+            return await client.read(Identity)
+        finally:
+            client.close()
+
+    return asyncio.run(read())
+
+
+def retained(rig: "ComposedRig", *topics: str) -> dict[str, Any]:
+    """Return the retained messages of these topics."""
+
+    async def read() -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        async with asyncio.timeout(20), aiomqtt.Client("127.0.0.1", rig.mqtt) as client:
+            for topic in topics:
+                await client.subscribe(topic)
+            async for message in client.messages:
+                if message.retain:
+                    found[message.topic.value] = json.loads(bytes(message.payload))
+                if len(found) == len(topics):
+                    return found
+        raise AssertionError("unreachable")
+
+    return asyncio.run(read())
+
+
+def test_it_runs_in_real_time_by_itself(rig: "ComposedRig") -> None:
+    first, started = identity_of_plant(rig), time.monotonic()
+    time.sleep(3.0)
+    second, seconds = identity_of_plant(rig), time.monotonic() - started
+    assert first.session == second.session == 1
+    assert (second.tick - first.tick) / 4 == pytest.approx(seconds, abs=1.0)
+
+
+def test_the_broker_keeps_what_each_service_tells(rig: "ComposedRig") -> None:
+    names = ("plant", "control_plc", "optimizer_plc")
+    messages = retained(rig, *[f"coldloop/{name}/{what}" for name in names for what in ("state", "telemetry")])
+    assert all(messages[f"coldloop/{name}/state"] == {"state": "online"} for name in names)
+    assert messages["coldloop/control_plc/telemetry"]["session"] == 1
+    assert messages["coldloop/control_plc/telemetry"]["mode"] == "mpc"
+
+
+@pytest.mark.parametrize("service", SERVICES)
+def test_a_service_can_do_no_harm(rig: "ComposedRig", service: str) -> None:
+    host = rig.inspect(service)["HostConfig"]
+    assert host["ReadonlyRootfs"]
+    assert host["CapDrop"] == ["ALL"]
+    assert "no-new-privileges:true" in host["SecurityOpt"]
+    assert min(host["Memory"], host["NanoCpus"], host["PidsLimit"]) > 0
+    probe = "import os, pathlib; print(os.getuid(), os.access('/', os.W_OK), os.access('/opt/coldloop', os.W_OK))"
+    assert rig.inside(service, "python", "-c", probe) == "10001 False False"
+    assert "Read-only" in rig.compose("exec", "-T", "-u", "0", service, "touch", "/opt/coldloop/x", check=False)
+
+
+def test_the_ports_are_those_of_this_machine_only(rig: "ComposedRig") -> None:
+    for service in (*SERVICES, "mosquitto"):
+        bindings = [b for port in rig.inspect(service)["HostConfig"]["PortBindings"].values() for b in port]
+        assert [binding["HostIp"] for binding in bindings] == ["127.0.0.1"]
+
+
+@pytest.mark.parametrize(
+    ("service", "absent"),
+    [("control-plc", ["numpy", "numba"]), ("plant", ["osqp", "pyarrow"]), ("optimizer-plc", ["pyarrow", "matplotlib"])],
+)
+def test_an_image_holds_only_what_its_service_needs(rig: "ComposedRig", service: str, absent: list[str]) -> None:
+    probe = f"from importlib.util import find_spec; print(any(map(find_spec, {[*absent, 'pip', 'pytest']})))"
+    assert rig.inside(service, "/opt/coldloop/bin/python", "-c", probe) == "False"
+
+
+@pytest.mark.parametrize("service", ["plant", "optimizer-plc"])
+def test_no_kernel_is_compiled_at_the_start(rig: "ComposedRig", service: str) -> None:
+    count = "find {} -name '*.nbc' | wc -l"
+    baked = rig.inside(service, "sh", "-c", count.format("/opt/coldloop/kernels"))
+    assert int(baked) > 0
+    assert rig.inside(service, "sh", "-c", count.format("/tmp/coldloop")) == baked  # noqa: S108
+
+
+def test_an_hour_in_lock_step_is_that_of_one_process(
+    rig: "ComposedRig", coldloop: "Callable[..., None]", tmp_path: Path
+) -> None:
+    scenario = ["--load", "a", "--duration", "1h"]
+    endpoints = [f"127.0.0.1:{port}" for port in (rig.plant, rig.control_plc, rig.optimizer_plc)]
+    coldloop("--attach", *endpoints, *scenario, "--out", str(tmp_path / "composed"))
+    coldloop("--in-process", *scenario, "--out", str(tmp_path / "one process"))
+    composed, one_process = (
+        json.loads((tmp_path / name / "summary.json").read_text()) for name in ("composed", "one process")
+    )
+    assert composed["ticks"] == 4 * 3600
+    assert composed["trace_sha256"] == one_process["trace_sha256"]
+    assert identity_of_plant(rig).session == 2
+
+
+def test_a_service_that_dies_is_started_again(rig: "ComposedRig") -> None:
+    before = rig.inspect("optimizer-plc")["State"]["StartedAt"]
+    rig.compose("exec", "-T", "optimizer-plc", "python", "-c", "import os; os.kill(1, 15)")
+    deadline = time.monotonic() + 90
+    while time.monotonic() < deadline:
+        state = rig.inspect("optimizer-plc")["State"]
+        if state["StartedAt"] != before and state["Health"]["Status"] == "healthy":
+            return
+        time.sleep(1)
+    pytest.fail(f"not healthy again: {state}")
