@@ -9,7 +9,6 @@ from typing import NoReturn
 
 from coldloop import __version__
 from coldloop.errors import ColdloopError
-
 from rig.commands import config, model, registers, run
 
 COMMANDS = (run, registers, model, config)

@@ -3,11 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
 from coldloop.lti_model import LtiModel
 from coldloop.process import L1, T5, TICK_S, TICKS_PER_SAMPLE
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.prediction import state_weights
-
 from rig.recording import Recording
 
 
@@ -33,17 +34,18 @@ class Indicators(NamedTuple):
     T5_outside_band_pct: float
 
 
-def instantaneous_cost(recording: Recording, model: LtiModel, design: ControlDesign) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def instantaneous_cost(recording: Recording, model: LtiModel, design: ControlDesign) -> NDArray[np.float64]:
     """Return the stage cost of each tick, shape (N,): deviations and violations of what was really reached."""
     x = recording.x.astype(float) - model.x0
     u = recording.u.astype(float) - model.u0
     constrained = recording.y[:, [L1, T5]].astype(float)
     violation = np.maximum(constrained - design.output_high, 0) + np.maximum(design.output_low - constrained, 0)
-    return (
+    cost: NDArray[np.float64] = (
         (x**2 * state_weights(model, design)).sum(axis=1)
         + (u**2 * design.input_weight).sum(axis=1)
         + (violation**2 * design.violation_weight).sum(axis=1)
     )
+    return cost
 
 
 def evaluate(recording: Recording, model: LtiModel, design: ControlDesign) -> Indicators:

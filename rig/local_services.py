@@ -6,14 +6,13 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import AsyncIterator, Awaitable
+from collections.abc import Awaitable
 from pathlib import Path
-from typing import TypeVar
+from typing import Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
 from coldloop.endpoints import Endpoint
 from coldloop.errors import LinkError
-
 from rig.network import RigEndpoints
 from rig.settings import Settings
 
@@ -41,7 +40,7 @@ class LocalServices:
         self._logs = log_folder
         self._processes: dict[str, asyncio.subprocess.Process] = {}
 
-    async def __aenter__(self) -> "LocalServices":
+    async def __aenter__(self) -> Self:
         """Start them."""
         self._logs.mkdir(parents=True, exist_ok=True)
         for service in SERVICES:
@@ -94,6 +93,7 @@ class LocalServices:
 
 def _wired(settings: Settings, endpoints: RigEndpoints) -> Settings:
     """Return the settings with the servers on these endpoints and the clients pointed at them."""
+
     def server(section: str, endpoint: Endpoint) -> object:
         return getattr(settings, section).server.model_copy(update={"host": endpoint.host, "port": endpoint.port})
 

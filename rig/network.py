@@ -15,7 +15,6 @@ from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, Optimization, OptimizerSession
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, LoadStep, PlantSample, PlantSession
-
 from rig.recording import LinkStatistics, Recorder
 from rig.scenario import Scenario
 from rig.settings import Settings
@@ -85,7 +84,7 @@ class NetworkRig:
                 quiet_since = now
             elif now - quiet_since > max(QUIET_S, 4 * TICK_S / scenario.factor):
                 raise LinkError(
-                    f"{self._plant.peer} has not moved from tick {len(recorder.samples)} for {now - quiet_since:.0f} s: "
+                    f"{self._plant.peer} stands at tick {len(recorder.samples)} for {now - quiet_since:.0f} s: "
                     "see the logs of the control PLC and of the optimiser"
                 )
             await asyncio.sleep(min(max(pause_s, 0.001), 0.2))
@@ -171,4 +170,3 @@ def _client(register_map: RegisterMap, endpoint: Endpoint) -> RegisterClient:
         timeout_s=endpoint.timeout_s,
         order=endpoint.word_order,
     )
-

@@ -9,7 +9,6 @@ from control_plc.program import ControlProgram
 from optimizer_plc.program import OptimizerProgram
 from plant.program import LoadProfile, PlantProgram
 from plant.runtime import make_program
-
 from rig.recording import Recorder
 from rig.scenario import Scenario
 from rig.settings import Settings

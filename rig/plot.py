@@ -4,12 +4,12 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from coldloop.process import INPUT_NAMES, L1, T5, TICK_S
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from optimizer_plc.design import ControlDesign
 
+from coldloop.process import INPUT_NAMES, L1, T5, TICK_S
+from optimizer_plc.design import ControlDesign
 from rig.recording import Recording
 from rig.results import whole_file
 

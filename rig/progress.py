@@ -1,13 +1,12 @@
 """What is seen while a run goes on: simulated time, speed, and the state of the loop in one line."""
 
 import time
-from types import TracebackType
 from typing import Self
 
-from coldloop.process import L1, T5, TICK_S
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from coldloop.process import L1, T5, TICK_S
 from rig.recording import Recorder
 
 REFRESH_S = 0.1
@@ -41,7 +40,9 @@ class RunProgress:
         self._bar.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._bar.refresh()
         self._bar.stop()
 

@@ -5,9 +5,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
-from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float32]
 

@@ -23,7 +23,7 @@ COLUMNS: Final = (
 
 def modicon(address: int) -> str:
     """Return the 4xxxx-style address of a 0-based one: five digits, or six beyond 49999."""
-    return f"{40001 + address}" if address < 9999 else f"{400001 + address}"  # noqa: PLR2004
+    return f"{40001 + address}" if address < 9999 else f"{400001 + address}"
 
 
 def _entries(maps: Sequence[RegisterMap]) -> Iterator[dict[str, str]]:
@@ -94,7 +94,8 @@ def _block_markdown(service: str, block: Block) -> str:
     for r in block.registers():
         bounds = f"{_bound(r.low)}..{_bound(r.high)}" if r.low is not None or r.high is not None else ""
         lines.append(
-            f"| {r.address} | {modicon(r.address)} | {r.name} | {r.kind.label} | {r.unit} | {bounds} | {r.description} |"
+            f"| {r.address} | {modicon(r.address)} | {r.name} | {r.kind.label} | {r.unit} | {bounds} "
+            f"| {r.description} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -105,7 +106,7 @@ def mbpoll_line(service: str, block: Block) -> str:
     last = registers[-1].kind
     run = [registers[-1]]
     for register in reversed(registers[:-1]):
-        if register.kind is not last or len(run) * last.words >= 124:  # noqa: PLR2004
+        if register.kind is not last or len(run) * last.words >= 124:
             break
         run.append(register)
     kind = {Kind.F32: "4:float -B", Kind.U32: "4:int -B", Kind.U16: "4"}[last]

@@ -1,7 +1,6 @@
 """The files of a run: manifest, trace, updates, summary. Each appears whole or not at all."""
 
 import json
-import os
 import platform
 import sys
 import tempfile
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+
 from coldloop import __version__
 from coldloop.errors import UsageError
 from coldloop.process import (
@@ -25,7 +25,6 @@ from coldloop.process import (
     TICK_S,
 )
 from coldloop.registers.optimizer_plc import Optimization
-
 from rig.recording import Recording
 
 DEPENDENCIES = ("numpy", "scipy", "numba", "pymodbus", "pydantic", "aiomqtt", "osqp", "pyarrow", "matplotlib")
@@ -45,12 +44,12 @@ def prepare_folder(folder: Path) -> None:
         raise UsageError(f"{folder}: {error.strerror}; choose a folder that can be written to with --out") from None
 
 
-def whole_file(path: Path, write: Callable[[Path], None]) -> None:
+def whole_file(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` make the file under another name, then give it its own."""
     draft = path.with_name(f".{path.name}.draft")
     try:
         write(draft)
-        os.replace(draft, path)
+        draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
 
@@ -58,10 +57,12 @@ def whole_file(path: Path, write: Callable[[Path], None]) -> None:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a JSON document."""
     text = json.dumps(content, indent=2, ensure_ascii=False) + "\n"
-    whole_file(path, lambda draft: draft.write_text(text, encoding="utf-8") and None)
+    whole_file(path, lambda draft: draft.write_text(text, encoding="utf-8"))
 
 
-def manifest(configuration: Mapping[str, Any], arguments: Mapping[str, Any], hashes: Mapping[str, str]) -> dict[str, Any]:
+def manifest(
+    configuration: Mapping[str, Any], arguments: Mapping[str, Any], hashes: Mapping[str, str]
+) -> dict[str, Any]:
     """Return what is needed to repeat a run."""
     return {
         "coldloop": __version__,

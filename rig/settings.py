@@ -1,5 +1,7 @@
 """The whole configuration: what the three services and the rig read."""
 
+from pydantic import BaseModel, ConfigDict
+
 from coldloop.limits import InputLimits
 from coldloop.model_settings import ModelSettings
 from coldloop.session import SessionSettings
@@ -7,7 +9,6 @@ from coldloop.telemetry import TelemetrySettings
 from control_plc.settings import ControlSection
 from optimizer_plc.settings import OptimizerSection
 from plant.settings import PlantSection
-from pydantic import BaseModel, ConfigDict
 
 
 class Settings(BaseModel):

@@ -5,7 +5,6 @@ import json
 import sys
 
 from coldloop.service import add_configuration_options
-
 from rig.commands.options import configuration
 
 

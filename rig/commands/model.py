@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+
 from coldloop.errors import UsageError
 from coldloop.lti_model import LtiModel, load
 from coldloop.process import L1, SAMPLING_PERIOD_S, T5
@@ -14,7 +15,6 @@ from plant.equilibrium import Equilibrium, find_equilibrium
 from plant.helium.properties import load_helium
 from plant.linearisation import linearisation_error
 from plant.model import OPERATING_INPUTS, OPERATING_LEVEL, build_model
-
 from rig.commands.options import configuration
 
 HORIZON_S = 100.0
@@ -72,7 +72,7 @@ def _equilibrium_lines(model: LtiModel, rest: Equilibrium) -> list[str]:
 
 def _eigenvalue_lines(model: LtiModel, error: float) -> list[str]:
     values = sorted(np.linalg.eigvals(model.A), key=lambda value: -value.real)
-    texts = [f"{v.real:.4f}" if abs(v.imag) < 1e-12 else f"{v.real:.4f}{v.imag:+.4f}i" for v in values]  # noqa: PLR2004
+    texts = [f"{v.real:.4f}" if abs(v.imag) < 1e-12 else f"{v.real:.4f}{v.imag:+.4f}i" for v in values]
     return [
         *(f"eigenvalues {'  '.join(texts[i : i + 10])} /s" for i in range(0, len(texts), 10)),
         f"derivatives within {error:.1e} of extrapolated central differences (scaled)",

@@ -8,7 +8,6 @@ from typing import Any
 from coldloop.config import Configuration, load_configuration
 from coldloop.endpoints import Endpoint
 from coldloop.process import TICK_S
-
 from rig.settings import Settings
 
 _UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
@@ -45,7 +44,7 @@ def updating_period(text: str) -> float:
         value = float(text)
     except ValueError:
         value = -1.0
-    if not 0 < value <= 5:  # noqa: PLR2004
+    if not 0 < value <= 5:
         raise argparse.ArgumentTypeError(f"'{text}' is neither 'adaptive' nor seconds from 0.5 to 5")
     return value
 

@@ -14,7 +14,6 @@ from coldloop.process import TICK_S
 from coldloop.service import add_configuration_options, run_event_loop
 from coldloop.session import TimeMode
 from plant.load import HOUR_TICKS, NAMED, find_load
-
 from rig.commands.options import configuration, duration, endpoint, updating_period
 from rig.indicators import evaluate, instantaneous_cost
 from rig.local_services import LocalServices

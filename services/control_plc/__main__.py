@@ -3,7 +3,6 @@
 import sys
 
 from coldloop.service import main
-
 from control_plc.runtime import serve
 from control_plc.settings import ControlSettings
 

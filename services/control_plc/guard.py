@@ -98,6 +98,6 @@ def _single(value: float) -> float:
 
 
 def _towards(value: float, target: float) -> float:
-    """Return the single-precision neighbour of `value` on the side of `target`; both are >= 0 here, so bits count up."""
+    """Return the single-precision neighbour of `value` on the side of `target`; both are >= 0, so bits count up."""
     bits: int = struct.unpack(">i", struct.pack(">f", value))[0]
     return float(struct.unpack(">f", struct.pack(">i", bits + (1 if target > value else -1)))[0])

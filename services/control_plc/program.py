@@ -11,7 +11,6 @@ from coldloop.limits import InputLimits
 from coldloop.registers.control_plc import Acknowledgement, Mode, Plan, Process, SequenceRow, Update, Verdict
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.sequence import InputSequence, checksum
-
 from control_plc.guard import OutputGuard
 
 
@@ -120,7 +119,12 @@ class ControlProgram:
     def accept_plan(self, plan: Plan) -> bool:
         """Take the updating period of the last update; tell whether it was acceptable."""
         earliest = self.tick + self._in_scan
-        if self.update is None or self._planned or plan.update != self.update.update or plan.next_update_tick < earliest:
+        if (
+            self.update is None
+            or self._planned
+            or plan.update != self.update.update
+            or plan.next_update_tick < earliest
+        ):
             return False
         self.next_update_tick = plan.next_update_tick
         self._planned = True

@@ -29,14 +29,12 @@ from coldloop.registers.control_plc import (
     SequenceHeader,
     SequenceRow,
     Status,
-    Update,
 )
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.sequence import InputSequence
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
-
 from control_plc.program import ControlProgram
 from control_plc.settings import ControlSettings
 

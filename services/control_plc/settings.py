@@ -2,6 +2,8 @@
 
 from typing import Annotated
 
+from pydantic import BaseModel, ConfigDict, Field
+
 from coldloop.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
 from coldloop.limits import InputLimits
 from coldloop.modbus.settings import ServerSettings
@@ -9,7 +11,6 @@ from coldloop.model_settings import ModelSettings
 from coldloop.registers.codec import WordOrder
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
-from pydantic import BaseModel, ConfigDict, Field
 
 
 class ControlSection(BaseModel):

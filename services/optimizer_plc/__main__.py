@@ -3,7 +3,6 @@
 import sys
 
 from coldloop.service import main
-
 from optimizer_plc.runtime import serve
 from optimizer_plc.settings import OptimizerSettings
 

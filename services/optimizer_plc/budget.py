@@ -7,8 +7,9 @@ slot for the preparation of the problem, hence 4 tau_u - 1 iterations (section V
 import math
 from typing import Annotated
 
-from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+
+from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 
 MAX_PERIOD_TICKS = TICKS_PER_SAMPLE
 

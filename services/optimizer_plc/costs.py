@@ -3,9 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from coldloop.compiled import kernel
 from numpy.typing import NDArray
 
+from coldloop.compiled import kernel
 from optimizer_plc.linear_algebra import apply
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 

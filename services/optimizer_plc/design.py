@@ -3,6 +3,7 @@
 The paper leaves weights and scaling open; `docs/science.md` says why these were chosen.
 """
 
+from itertools import pairwise
 from typing import Annotated, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveFloat, model_validator
@@ -16,7 +17,7 @@ Pair = tuple[float, float]
 
 
 def _rising_instants(instants: tuple[int, ...]) -> tuple[int, ...]:
-    if not instants or instants[0] < 1 or any(b <= a for a, b in zip(instants, instants[1:], strict=False)):
+    if not instants or instants[0] < 1 or any(b <= a for a, b in pairwise(instants)):
         raise ValueError("instants are rising sample numbers from 1 on")
     return instants
 

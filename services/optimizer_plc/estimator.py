@@ -4,12 +4,12 @@ from enum import StrEnum
 from typing import Annotated, NamedTuple, Protocol
 
 import numpy as np
-from coldloop.compiled import kernel
-from coldloop.process import SAMPLING_PERIOD_S, TICK_S
-from coldloop.registers.control_plc import Update
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
+from coldloop.compiled import kernel
+from coldloop.process import SAMPLING_PERIOD_S, TICK_S
+from coldloop.registers.control_plc import Update
 from optimizer_plc.linear_algebra import multiply
 from optimizer_plc.prediction import PredictionModel
 

@@ -4,10 +4,11 @@ The inner loops run along rows, so that they vectorise without changing the orde
 """
 
 import numpy as np
-from coldloop.compiled import kernel
 from numpy.typing import NDArray
 
-Array = NDArray[np.floating]
+from coldloop.compiled import kernel
+
+Array = NDArray[np.float64]
 
 
 @kernel

@@ -8,10 +8,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from coldloop.lti_model import LtiModel
-from coldloop.process import L1, T5, TICK_S, TICKS_PER_SAMPLE
 from numpy.typing import NDArray
 
+from coldloop.lti_model import LtiModel
+from coldloop.process import L1, T5, TICK_S, TICKS_PER_SAMPLE
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.linear_algebra import multiply
 

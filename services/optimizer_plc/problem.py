@@ -8,11 +8,11 @@ before the first knot; Phi and Gamma are constant. No factor 1/2 stands before P
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
 from coldloop.compiled import kernel
 from coldloop.limits import InputLimits
 from coldloop.process import TICKS_PER_SAMPLE
-from numpy.typing import NDArray
-
 from optimizer_plc.design import N_INPUTS, N_SLACKS, ControlDesign
 from optimizer_plc.linear_algebra import apply, multiply
 from optimizer_plc.prediction import PredictionModel, state_weights
@@ -62,7 +62,7 @@ class PredictiveProblem:
         self.bands = np.array([design.output_low, design.output_high, design.violation_weight])
         self.size = (N_INPUTS + N_SLACKS) * self.n_knots
         self._model = prediction
-        self._knots_to_samples = interpolation(design.decision_instants, np.arange(1, design.horizon + 1))
+        self._knots_to_samples = interpolation(design.decision_instants, np.arange(1.0, design.horizon + 1))
         self._input_scale = np.asarray(design.input_scale)
         self._condense()
         self._build_output_rows()
@@ -230,7 +230,6 @@ class PredictiveProblem:
 
 def _transposed(M: Array) -> Array:
     return np.ascontiguousarray(M.T)
-
 
 
 class _Maps(NamedTuple):

@@ -7,6 +7,8 @@ played from its end on. Pure: no sockets, no clock, no sleeping.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel
 from coldloop.process import TICKS_PER_SAMPLE
@@ -14,8 +16,6 @@ from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.sequence import InputSequence, sealed
-from numpy.typing import NDArray
-
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.costs import augmented_cost, indicators
 from optimizer_plc.estimator import Estimate, Estimator, EstimatorKind, KalmanFilter, StateFeedback

@@ -18,7 +18,6 @@ from coldloop.registers.declaration import Block
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, OPTIMIZER_MAP, Optimization, OptimizerSession
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
-
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.settings import OptimizerSettings
 

@@ -3,6 +3,8 @@
 from enum import StrEnum
 from typing import Annotated, Self
 
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
 from coldloop.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.limits import InputLimits
 from coldloop.modbus.settings import ServerSettings
@@ -12,8 +14,6 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
-
 from optimizer_plc.budget import MAX_PERIOD_TICKS, BudgetSettings
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.estimator import EstimatorSettings

@@ -99,7 +99,8 @@ def read_load_file(path: Path) -> LoadProfile:
     missing = {"time_s", "load_w"} - set(reader.fieldnames or ())
     if missing:
         raise LoadFileError(f"{path}: no column {' and '.join(sorted(missing))}; the first line is time_s,load_w")
-    times, watts = [], []
+    times: list[int] = []
+    watts: list[float] = []
     for row in reader:
         time, load = (
             _number(row[column], f"{path}, line {reader.line_num}, {column}") for column in ("time_s", "load_w")

@@ -51,4 +51,4 @@ def _cache_directory() -> Path:
     return Path(tempfile.mkdtemp(prefix="coldloop-kernels-"))
 
 
-numba.config.CACHE_DIR = str(_cache_directory())
+numba.config.CACHE_DIR = str(_cache_directory())  # type: ignore[attr-defined]

@@ -77,32 +77,50 @@ def load_configuration(
         ConfigurationError: One line that names the key, its source and the remedy.
     """
     layers = _Layers()
-    if file is not None:
-        for key, value in _flattened(_read_toml(file)).items():
-            layers.put(key, value, str(file))
-    for name, value in sorted((os.environ if environment is None else environment).items()):
-        if name.startswith(PREFIX):
-            layers.put(name[len(PREFIX) :].lower().replace("__", "."), _parsed(value), name)
-    for assignment in assignments:
-        key, separator, value = assignment.partition("=")
-        if not separator:
-            raise ConfigurationError(f"--set {assignment}: write --set section.key=value")
-        layers.put(key.strip(), _parsed(value), f"--set {key.strip()}")
-    for key, (option, name) in (options or {}).items():
-        layers.put(key, option, name)
-    for section in others:
-        if section not in model.model_fields:
-            layers.values.pop(section, None)
+    for key, value, source in [
+        *_from_file(file),
+        *_from_environment(os.environ if environment is None else environment),
+        *(_assigned(assignment) for assignment in assignments),
+        *((key, value, option) for key, (value, option) in (options or {}).items()),
+    ]:
+        layers.put(key, value, source)
+    for section in set(others) - set(model.model_fields):
+        layers.values.pop(section, None)
     try:
         return Configuration(model.model_validate(layers.values), layers.sources)
     except ValidationError as error:
         raise ConfigurationError(_explained(error, layers.sources)) from None
 
 
+Entry = tuple[str, object, str]
+"""Dotted key, value, source."""
+
+
+def _from_file(file: Path | None) -> list[Entry]:
+    return [] if file is None else [(key, value, str(file)) for key, value in _flattened(_read_toml(file)).items()]
+
+
+def _from_environment(environment: Mapping[str, str]) -> list[Entry]:
+    return [
+        (name[len(PREFIX) :].lower().replace("__", "."), _parsed(value), name)
+        for name, value in sorted(environment.items())
+        if name.startswith(PREFIX)
+    ]
+
+
+def _assigned(assignment: str) -> Entry:
+    key, separator, value = assignment.partition("=")
+    if not separator:
+        raise ConfigurationError(f"--set {assignment}: write --set section.key=value")
+    return key.strip(), _parsed(value), f"--set {key.strip()}"
+
+
 def to_environment(settings: BaseModel) -> dict[str, str]:
     """Return the variables that make a process load these settings."""
     flat = _flattened(settings.model_dump(mode="json"))
-    return {PREFIX + key.upper().replace(".", "__"): json.dumps(value) for key, value in flat.items() if value is not None}
+    return {
+        PREFIX + key.upper().replace(".", "__"): json.dumps(value) for key, value in flat.items() if value is not None
+    }
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

@@ -5,13 +5,14 @@ take one Newton step each; the result is projected into the box. A step that wou
 iteration on a smaller step size, so J never rises (Definition 1 of the paper).
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
-from coldloop.compiled import kernel
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, PositiveFloat
 
+from coldloop.compiled import kernel
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.linear_algebra import cholesky, cholesky_solve
 from optimizer_plc.problem import QuadraticProblem
@@ -60,9 +61,7 @@ class OdeSolver:
     def __init__(self, settings: OdeSettings) -> None:
         self.alpha = settings.alpha
         self.tau_1_s = settings.tau_1_s
-        self._flow = Flow(
-            settings.alpha, settings.cost_scale, settings.tolerance, settings.growth, settings.rejection
-        )
+        self._flow = Flow(settings.alpha, settings.cost_scale, settings.tolerance, settings.growth, settings.rejection)
 
     def start(self, problem: QuadraticProblem, guess: Array) -> None:
         """Begin with `guess` projected into the box, and with the paper's first step size sqrt(1 / |dz/dt|)."""
@@ -139,7 +138,7 @@ def first_step(qp: QuadraticProblem, z: Array, flow: Flow) -> float:
     total = 0.0
     for i in range(v.shape[0]):
         total += v[i] * v[i]
-    return np.sqrt(1.0 / max(np.sqrt(total), 1e-12))
+    return math.sqrt(1.0 / max(math.sqrt(total), 1e-12))
 
 
 @kernel

@@ -134,9 +134,7 @@ class RegisterBank:
             raise IllegalValueError(
                 f"a 32-bit register is written whole or not at all, {address}..{end - 1} halves one"
             )
-        checks = self._checks[
-            bisect_left(self._check_addresses, address) : bisect_left(self._check_addresses, end)
-        ]
+        checks = self._checks[bisect_left(self._check_addresses, address) : bisect_left(self._check_addresses, end)]
         return _Span(
             codec=ValueCodec("".join(kind.letter for _, kind, _, _ in checks), self.order),
             fields=[(field, name) for *_, field, name in checks],

@@ -28,5 +28,4 @@ class Identity(NamedTuple):
     heartbeat: Annotated[int, u16("Rises with every tick or update, and wraps")] = 0
 
 
-
 IDENTITY_BLOCK: Final = Block("identity", 0, Identity, "Who answers, and whether it is alive")

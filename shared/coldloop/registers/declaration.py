@@ -170,7 +170,10 @@ class RegisterMap:
     def digest(self) -> int:
         """32-bit digest of everything a client depends on: addresses, types, units, ranges and writers."""
         layout = [
-            (block.rows, [(r.name, r.address, r.kind.label, r.unit, r.low, r.high, r.writer) for r in block.registers()])
+            (
+                block.rows,
+                [(r.name, r.address, r.kind.label, r.unit, r.low, r.high, r.writer) for r in block.registers()],
+            )
             for block in self.blocks
         ]
         canonical = json.dumps([self.service, self.version, layout]).encode()

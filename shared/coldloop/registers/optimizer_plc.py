@@ -30,13 +30,12 @@ class Optimization(NamedTuple):
     j_delivered: Annotated[float, f32("Ĵ_{i+1}: the delivered profile, at the predicted state")]
     j_dev: Annotated[float, f32("Predicted deviation cost of the delivered profile")]
     j_cst: Annotated[float, f32("Predicted constraint violation cost of the delivered profile")]
-    violation: Annotated[float, f32("Largest violated row, max(Γp - γ, 0), of the delivered profile")]
+    violation: Annotated[float, f32("Largest violated row, max(Gamma p - gamma, 0), of the delivered profile")]
     efficiency: Annotated[float, f32("E^r of Algorithm 1")]
     mismatch: Annotated[float, f32("D^r of Algorithm 1")]
     contraction: Annotated[float, f32("K^r of Algorithm 1")]
     gamma: Annotated[float, f32("Γ of Algorithm 1, the gradient that decides the next step in q")]
     load_mismatch: Annotated[float, f32("Estimated load mismatch", unit="W")]
-
 
 
 OPTIMIZER_MAP: Final = RegisterMap(

@@ -13,7 +13,7 @@ LOAD_ROWS: Final = 2048
 class Actuators(NamedTuple):
     """Outputs of the control PLC for one tick."""
 
-    tick: Annotated[int, u32("Tick that these outputs are for; in lock-step writing the present one moves the plant on")]
+    tick: Annotated[int, u32("Tick of these outputs; in lock-step writing the present one moves the plant on")]
     cv155: Annotated[float, f32("Opening of the Joule-Thomson valve", unit="%", low=0, high=100)]
     ncr22: Annotated[float, f32("Actuator part of the bath heater's power", unit="W", low=0, high=1000)]
     cv156: Annotated[float, f32("Opening of the turbine valve", unit="%", low=0, high=100)]
