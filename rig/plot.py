@@ -57,7 +57,8 @@ def _inputs(axes: Axes, hours: Series, recording: Recording) -> None:
         lines += place.plot(hours, recording.u[:, i], color=colour, linewidth=1, label=name)
     axes.set_ylabel("(d) valves (%)")
     heater.set_ylabel("heater (W)")
-    axes.legend(handles=lines, loc="upper right", frameon=False, ncols=3)
+    axes.legend(handles=lines, loc="lower right", bbox_to_anchor=(1, 0.98), frameon=False, ncols=3, borderaxespad=0)
+    axes.margins(y=0.1)
 
 
 def _updates(axes: Axes, recording: Recording) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.lti_model import LtiModel
-from coldloop.process import L1, T5, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process import L1, T5, TICKS_PER_SAMPLE
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.linear_algebra import multiply
 
@@ -45,8 +45,7 @@ class PredictionModel:
 
     def __init__(self, model: LtiModel) -> None:
         self.model = model
-        discrete = model.discretised(TICK_S)
-        tick = Transition(*(np.array(M, order="C") for M in (discrete.A, discrete.B, discrete.F[:, None])))
+        tick = Transition(*(np.array(M, order="C") for M in (model.A_tick, model.B_tick, model.F_tick[:, None])))
         self.C, self.D, self.G = np.array(model.C), np.array(model.D), np.array(model.G[:, None])
         self.transitions = {1: tick}
         for ticks in range(2, TICKS_PER_SAMPLE + 1):

@@ -22,18 +22,8 @@ from plant.components.valve import Valve, valve_mass_flow
 from plant.helium.properties import Helium, isobar_enthalpy_and_density, saturation, vapour_temperature
 from plant.numeric import Array, at_least
 
-INPUT_NAMES = ("CV155", "NCR22_A", "CV156")
-INPUT_UNITS = ("%", "W", "%")
 LOAD_NAME, LOAD_UNIT = "NCR22_HL", "W"
-OUTPUT_NAMES = ("L1", "V1", *(f"T{i}" for i in range(1, 11)), *(f"P{i}" for i in range(1, 11)))
-OUTPUT_UNITS = ("%", "Hz", *["K"] * 10, *["bar"] * 10)
-CELLS = (8, 6, 12)  # of NEF1, NEF2, NEF34
-STATE_NAMES = (
-    "P1",
-    "V_l",
-    *(f"T_{name}_{i + 1}" for name, n in zip(("nef1", "nef2", "nef34"), CELLS, strict=True) for i in range(n)),
-)
-STATE_UNITS = ("Pa", "m3", *["K"] * sum(CELLS))
+CELLS = (8, 6, 12)  # of NEF1, NEF2, NEF34; the states are named in coldloop.process
 PA_PER_BAR = 1e5
 
 

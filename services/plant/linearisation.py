@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plant.cold_box import OUTPUT_NAMES, ColdBox, derivative, outputs
+from coldloop.process import OUTPUT_NAMES
+from plant.cold_box import ColdBox, derivative, outputs
 from plant.helium.properties import Helium
 from plant.numeric import Array, RealArray
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from coldloop.lti_model import LtiModel
+from coldloop import process
+from coldloop.lti_model import LtiModel, discretise
 from plant import cold_box
 from plant.cold_box import REFERENCE, ColdBox
 from plant.equilibrium import find_equilibrium
@@ -27,18 +28,22 @@ def build_model(box: ColdBox = REFERENCE) -> LtiModel:
     helium = load_helium()
     rest = find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, box, helium)
     linear = linearise(rest.x, rest.u, rest.w, box, helium)
+    tick = discretise(linear.A, linear.B, linear.F, process.TICK_S)
     return LtiModel(
         **linear._asdict(),
+        A_tick=tick.A,
+        B_tick=tick.B,
+        F_tick=tick.F,
         x0=rest.x,
         u0=rest.u,
         w0=rest.w,
         y0=rest.y,
-        state_names=cold_box.STATE_NAMES,
-        state_units=cold_box.STATE_UNITS,
-        input_names=cold_box.INPUT_NAMES,
-        input_units=cold_box.INPUT_UNITS,
-        output_names=cold_box.OUTPUT_NAMES,
-        output_units=cold_box.OUTPUT_UNITS,
+        state_names=process.STATE_NAMES,
+        state_units=process.STATE_UNITS,
+        input_names=process.INPUT_NAMES,
+        input_units=process.INPUT_UNITS,
+        output_names=process.OUTPUT_NAMES,
+        output_units=process.OUTPUT_UNITS,
         load_name=cold_box.LOAD_NAME,
         load_unit=cold_box.LOAD_UNIT,
         parameters_digest=parameters_digest(box, helium),

@@ -7,7 +7,8 @@ from math import inf, isfinite
 
 import numpy as np
 
-from plant.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, ColdBox, outputs
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from plant.cold_box import ColdBox, outputs
 from plant.helium.properties import load_helium
 from plant.integrator import advance_and_read, plain_tuples
 from plant.numeric import RealArray

@@ -21,7 +21,7 @@ from coldloop.model_file import (
 
 RealArray: TypeAlias = NDArray[np.float64]
 
-MATRICES = ("A", "B", "F", "C", "D", "G")
+MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +60,12 @@ class LtiModel:
     """Shape (p, m)."""
     G: RealArray
     """Shape (p,)."""
+    A_tick: RealArray
+    """Shape (n, n): the transition over one tick, inputs and load held. PLCs compose longer periods from it."""
+    B_tick: RealArray
+    """Shape (n, m)."""
+    F_tick: RealArray
+    """Shape (n,)."""
     x0: RealArray
     """Shape (n,)."""
     u0: RealArray
@@ -84,6 +90,7 @@ class LtiModel:
         if (len(self.state_units), len(self.input_units), len(self.output_units)) != (n, m, p):
             raise ValueError("names and units differ in number")
         shapes = {"A": (n, n), "B": (n, m), "F": (n,), "C": (p, n), "D": (p, m), "G": (p,)}
+        shapes |= {"A_tick": (n, n), "B_tick": (n, m), "F_tick": (n,)}
         shapes |= {"x0": (n,), "u0": (m,), "y0": (p,)}
         for name, shape in shapes.items():
             array = np.array(getattr(self, name), dtype=np.float64)
@@ -116,15 +123,7 @@ class LtiModel:
         Raises:
             ValueError: the period is not positive and finite.
         """
-        from scipy.linalg import expm  # noqa: PLC0415 - only who discretises needs scipy
-
-        if not (np.isfinite(period_s) and period_s > 0.0):
-            raise ValueError(f"a sampling period is positive, not {period_s} s")
-        n, m = self.B.shape
-        augmented = np.zeros((n + m + 1, n + m + 1))
-        augmented[:n] = np.hstack([self.A, self.B, self.F[:, np.newaxis]]) * period_s
-        held = expm(augmented)
-        return DiscreteModel(A=held[:n, :n], B=held[:n, n : n + m], F=held[:n, n + m], period_s=period_s)
+        return discretise(self.A, self.B, self.F, period_s)
 
     def _document(self) -> dict[str, Any]:
         document: dict[str, Any] = {"format": FORMAT}
@@ -135,6 +134,23 @@ class LtiModel:
             else:
                 document[field.name] = list(value) if isinstance(value, tuple) else value
         return document
+
+
+def discretise(A: RealArray, B: RealArray, F: RealArray, period_s: float) -> DiscreteModel:
+    """Return dx/dt = A x + B u + F w sampled every `period_s` (s, positive), inputs and load held in between.
+
+    Raises:
+        ValueError: the period is not positive and finite.
+    """
+    from scipy.linalg import expm  # noqa: PLC0415 - only who discretises needs scipy
+
+    if not (np.isfinite(period_s) and period_s > 0.0):
+        raise ValueError(f"a sampling period is positive, not {period_s} s")
+    n, m = B.shape
+    augmented = np.zeros((n + m + 1, n + m + 1))
+    augmented[:n] = np.hstack([A, B, F[:, np.newaxis]]) * period_s
+    held = expm(augmented)
+    return DiscreteModel(A=held[:n, :n], B=held[:n, n : n + m], F=held[:n, n + m], period_s=period_s)
 
 
 def load(path: Path) -> LtiModel:

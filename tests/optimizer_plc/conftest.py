@@ -1,0 +1,172 @@
+"""The controller's problem, random situations to solve, exact optima, and jumps recorded from the closed loop."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import daqp
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import optimizer_plc.program
+from coldloop.limits import InputLimits
+from coldloop.lti_model import LtiModel, load
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.registers.codec import as_transmitted
+from coldloop.registers.control_plc import Verdict
+from coldloop.registers.plant import Measurement
+from coldloop.sequence import InputSequence
+from control_plc.program import ControlProgram
+from optimizer_plc.design import ControlDesign
+from optimizer_plc.prediction import PredictionModel
+from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
+from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.settings import ProgramSettings
+from optimizer_plc.solvers import make_solver
+from optimizer_plc.solvers.interface import Solver
+from plant.cold_box import REFERENCE
+from plant.load import find_load
+from plant.program import PlantProgram
+
+Array = NDArray[np.float64]
+Situations = Callable[[np.random.Generator], Situation]
+Optimum = Callable[[QuadraticProblem], Array]
+PenalisedOptimum = Callable[[QuadraticProblem, float], Array]
+
+UNBOUNDED = 1e30
+
+
+class Jump(NamedTuple):
+    """What the solver was given in the updating period that began just after a load jump."""
+
+    problem: QuadraticProblem
+    guess: Array
+
+
+@pytest.fixture(scope="session")
+def model() -> LtiModel:
+    return load(DEFAULT_MODEL_FILE)
+
+
+@pytest.fixture(scope="session")
+def prediction(model: LtiModel) -> PredictionModel:
+    return PredictionModel(model)
+
+
+@pytest.fixture(scope="session")
+def problem(prediction: PredictionModel) -> PredictiveProblem:
+    return PredictiveProblem(prediction, ControlDesign(), InputLimits())
+
+
+@pytest.fixture(scope="session")
+def situations(model: LtiModel) -> Situations:
+    """Draw situations: states some kPa, % and K away, loads and inputs anywhere in reach."""
+    scale = np.full(len(model.x0), 1.0)
+    scale[0], scale[1] = 2000.0, 1.0 / model.C[0, 1]
+
+    def draw(rng: np.random.Generator) -> Situation:
+        x = scale * rng.normal(size=len(scale)) * rng.choice([0.2, 0.5, 1.0])
+        return Situation(x, float(rng.uniform(-150, 200)), rng.uniform([-8, -60, -8], [8, 60, 8]))
+
+    return draw
+
+
+def solved_by_daqp(H: Array, f: Array, A: Array, low: Array, high: Array) -> Array:
+    """Minimise z' H z / 2 + f' z; the bounds of the first variables, then of the rows of A."""
+    low, high = np.maximum(low, -UNBOUNDED), np.minimum(high, UNBOUNDED)
+    sense = np.zeros(len(high), dtype=np.int32)
+    H, A = np.ascontiguousarray(H), np.ascontiguousarray(A)
+    z, _, flag, _ = daqp.solve(H, f.copy(), A, high, low, sense, primal_tol=1e-9)
+    assert flag == 1
+    return np.array(z)
+
+
+@pytest.fixture(scope="session")
+def optimum() -> Optimum:
+    """Solve an instance under its hard constraints."""
+
+    def solve(qp: QuadraticProblem) -> Array:
+        low = np.concatenate([qp.low, np.full(len(qp.gamma), -np.inf)])
+        return solved_by_daqp(2.0 * qp.Phi, qp.phi, qp.Gamma, low, np.concatenate([qp.high, qp.gamma]))
+
+    return solve
+
+
+@pytest.fixture(scope="session")
+def penalised_optimum() -> PenalisedOptimum:
+    """Minimise the augmented cost over the box; each penalty is a variable s >= 0 with Gamma z - s <= gamma."""
+
+    def solve(qp: QuadraticProblem, alpha: float) -> Array:
+        n, m = len(qp.phi), len(qp.gamma)
+        H = np.zeros((n + m, n + m))
+        H[:n, :n], H[n:, n:] = 2.0 * qp.Phi, 2.0 * alpha * np.eye(m)
+        low = np.concatenate([qp.low, np.zeros(m), np.full(m, -np.inf)])
+        high = np.concatenate([qp.high, np.full(m, np.inf), qp.gamma])
+        rows = np.hstack([qp.Gamma, -np.eye(m)])
+        z = solved_by_daqp(H, np.concatenate([qp.phi, np.zeros(m)]), rows, low, high)[:n]
+        return np.clip(z, qp.low, qp.high)
+
+    return solve
+
+
+class Recorder:
+    """A solver that remembers what it was started with."""
+
+    def __init__(self, solver: Solver) -> None:
+        self._solver = solver
+        self.alpha, self.tau_1_s = solver.alpha, solver.tau_1_s
+        self.started: Jump | None = None
+
+    def start(self, problem: QuadraticProblem, guess: Array) -> None:
+        copied = [np.array(part) for part in problem[:-1]]
+        self.started = Jump(QuadraticProblem(*copied, problem.constant), guess.copy())
+        self._solver.start(problem, guess)
+
+    def iterate(self) -> None:
+        self._solver.iterate()
+
+    @property
+    def solution(self) -> Array:
+        return self._solver.solution
+
+    @property
+    def cost(self) -> float:
+        return self._solver.cost
+
+
+def recorded_jumps(model: LtiModel, hour: str, minutes: float) -> list[Jump]:
+    """Run the closed loop at an updating period of 5 s; return what followed each load jump of more than 40 W."""
+    recorder = Recorder(make_solver(ProgramSettings()))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(optimizer_plc.program, "make_solver", lambda _settings: recorder)
+        optimizer = OptimizerProgram(model, ProgramSettings(updating_period_s=5.0), InputLimits())
+    control = ControlProgram(
+        limits=InputLimits(), model_digest=model.short_digest, initial_inputs=tuple(model.u0.tolist())
+    )
+    control.restart(session=1)
+    plant = PlantProgram(
+        box=REFERENCE, x0=model.x0.tolist(), u0=model.u0.tolist(), load=find_load(hour, model.w0), noise=None
+    )
+    jumps: list[Jump] = []
+    jumped, load_before = False, model.w0
+    for _ in range(round(minutes * 240)):
+        if control.awaiting_sequence:
+            header, rows = optimizer.solve()
+            if jumped and recorder.started:
+                jumps.append(recorder.started)
+            answer = control.offer(InputSequence(header, [as_transmitted(row) for row in rows]))
+            assert answer.verdict == Verdict.ACCEPTED
+        plant.apply(as_transmitted(control.begin_scan())[1:])
+        measurement = as_transmitted(Measurement(plant.tick, plant.load, plant.measure(), plant.state))
+        plant.advance()
+        update = control.end_scan(measurement)
+        if update is not None:
+            assert control.accept_plan(optimizer.plan(as_transmitted(update)))
+            jumped, load_before = abs(update.load - load_before) > 40, update.load
+    return jumps
+
+
+@pytest.fixture(scope="session")
+def harsh_jumps(model: LtiModel) -> list[Jump]:
+    """Every jump of more than 40 W of the two densest hours."""
+    return recorded_jumps(model, "e", 60) + recorded_jumps(model, "f", 60)
