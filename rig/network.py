@@ -73,6 +73,7 @@ class NetworkRig:
             LinkError: The rig stopped moving, or went faster than it could be recorded.
         """
         session = await self._start(scenario)
+        recorder.begin()
         updates = _UpdateReader(self._optimizer, recorder, session)
         quiet_since = time.monotonic()
         pause_s = 20 * TICK_S / scenario.factor if scenario.realtime else 0.001

@@ -34,6 +34,7 @@ class OneProcessRig:
         plant = make_program(self._header, self._settings.plant.sensors, load_table, scenario.seed)
         self.optimizer.restart(scenario.updating_period_s)
         self.control.restart(session=1)
+        recorder.begin()
         for _ in range(scenario.ticks):
             if self.control.awaiting_sequence:
                 self._deliver(recorder)

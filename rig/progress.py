@@ -29,12 +29,7 @@ class RunProgress:
             auto_refresh=False,
         )
         self._task = self._bar.add_task("", total=ticks, clock="0:00:00", speed="", line="")
-        self._started = self._shown = time.monotonic()
-
-    @property
-    def seconds(self) -> float:
-        """Real time from the first tick to the last one shown."""
-        return self._shown - self._started
+        self._shown = time.monotonic()
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -47,8 +42,6 @@ class RunProgress:
     def __call__(self, recorder: Recorder) -> None:
         """Show where the run is, a few times a second."""
         done = len(recorder.samples)
-        if done == 1:
-            self._started = time.monotonic()
         if done % 8 and done != recorder.ticks:
             return
         now = time.monotonic()
@@ -56,7 +49,7 @@ class RunProgress:
             return
         self._shown = now
         seconds = done * TICK_S
-        speed = seconds / max(now - self._started, 1e-9)
+        speed = seconds / max(recorder.wall_seconds, 1e-9)
         hours, rest = divmod(int(seconds), 3600)
         self._bar.update(
             self._task,

@@ -1,6 +1,7 @@
 """What a run leaves behind: the physical trace, tick by tick, and what the optimiser did, update by update."""
 
 import hashlib
+import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -31,10 +32,21 @@ class Recorder:
         self.updates: list[Optimization] = []
         self.link = LinkStatistics()
         self._progress = progress
+        self._began = self._last = time.monotonic()
+
+    def begin(self) -> None:
+        """Begin to count real time: the first tick is about to be done."""
+        self._began = self._last = time.monotonic()
+
+    @property
+    def wall_seconds(self) -> float:
+        """Real time from the beginning to the last sample."""
+        return self._last - self._began
 
     def sample(self, sample: PlantSample) -> None:
         """Take the next tick."""
         self.samples.append(sample)
+        self._last = time.monotonic()
         if self._progress is not None:
             self._progress(self)
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from coldloop.errors import UsageError
+from coldloop.errors import ModelFileError, UsageError
 from coldloop.lti_model import LtiModel, load
-from coldloop.process import L1, SAMPLING_PERIOD_S, T5
+from coldloop.process import L1, T5
 from coldloop.service import add_configuration_options
 from plant.cold_box import REFERENCE
 from plant.equilibrium import Equilibrium, find_equilibrium
@@ -36,13 +36,12 @@ def execute(options: argparse.Namespace) -> int:
     rest = find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, REFERENCE, helium)
     model = build_model(REFERENCE)
     error = linearisation_error(rest.x, rest.u, rest.w, REFERENCE, helium)
-    in_use = load(settings.model.file)
     lines = [
         *_equilibrium_lines(model, rest),
         *_eigenvalue_lines(model, error),
         *_gain_lines(model),
         f"model      sha256 {model.digest}",
-        f"in use     sha256 {in_use.digest} ({settings.model.file})",
+        _in_use_line(settings.model.file),
     ]
     sys.stdout.write("\n".join(lines) + "\n")
     if options.out is not None:
@@ -52,6 +51,13 @@ def execute(options: argparse.Namespace) -> int:
             raise UsageError(f"{options.out}: {error_.strerror}; name a file that can be written with --out") from None
         sys.stdout.write(f"written to {options.out}\n")
     return 0
+
+
+def _in_use_line(file: Path) -> str:
+    try:
+        return f"in use     sha256 {load(file).digest} ({file})"
+    except ModelFileError as error:
+        return f"in use     {error}"
 
 
 def _equilibrium_lines(model: LtiModel, rest: Equilibrium) -> list[str]:
@@ -87,4 +93,4 @@ def _gain_lines(model: LtiModel) -> list[str]:
     return [
         f"after {HORIZON_S:g} s of +1 {unit} {name}: L1 {effects[L1, i]:+.5f} %, T5 {effects[T5, i]:+.5f} K"
         for i, (name, unit) in enumerate(zip(names, units, strict=True))
-    ] + [f"sampling period {SAMPLING_PERIOD_S:g} s"]
+    ]

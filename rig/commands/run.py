@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-import time
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -59,12 +58,10 @@ def execute(options: argparse.Namespace) -> int:
     scenario = make_scenario(options, settings)
     out = options.out or Path("runs") / f"{Path(settings.plant.load).stem}-{datetime.now():%Y%m%d-%H%M%S}"  # noqa: DTZ005
     prepare_folder(out)
-    started = time.monotonic()
     with RunProgress(scenario.ticks) as progress:
         recorder = Recorder(scenario.ticks, progress)
         _perform(options, settings, scenario, recorder, out)
-    wall = progress.seconds or time.monotonic() - started
-    summary = _write(out, effective, options, recorder.recording(), wall)
+    summary = _write(out, effective, options, recorder.recording(), recorder.wall_seconds)
     _tell(out, summary)
     return 0
 
