@@ -23,7 +23,7 @@ AHEAD = HISTORY_ROWS - 32
 """Ticks that the control PLC may be ahead of the recording, so that the history still has them."""
 QUIET_S = 20.0
 """A rig on which nothing happens for this long is given up."""
-BATCH = 16
+BATCH = 64
 """Ticks to wait for before reading, in lock-step."""
 
 

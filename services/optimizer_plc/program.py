@@ -191,7 +191,7 @@ class OptimizerProgram:
         return segments
 
     def _sequence(self, period: _Period, z: Array) -> InputSequence:
-        length = self.settings.sequence_ticks
+        length = max(self.settings.sequence_ticks, 2 * period.ticks)
         samples = -(-length // TICKS_PER_SAMPLE)
         inputs = [as_transmitted(SequenceRow(*row)) for row in self._problem.inputs(z, samples).tolist()]
         rows = [inputs[tick // TICKS_PER_SAMPLE] for tick in range(length)]

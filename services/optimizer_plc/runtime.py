@@ -23,6 +23,8 @@ from optimizer_plc.settings import OptimizerSettings
 
 log = logging.getLogger("coldloop.optimizer_plc")
 
+ROWS_WITH_HEADER = 18
+"""Rows that fit into one request with the header that commits them."""
 STRANGER = AwaitUpdate(session=0, update=0)
 """Asks for a fresh update, whatever the session."""
 
@@ -105,8 +107,9 @@ class OptimizerPlc:
         if self._pace.realtime:
             ready = asked_at + program.answer_after_s() / self._pace.factor
             await asyncio.sleep(max(0.0, ready - time.monotonic()))
-        await self._control.write_rows(sequence.rows)
-        answer = await self._control.exchange(sequence.header, Acknowledgement)
+        rows = sequence.rows
+        await self._control.write_rows(rows[ROWS_WITH_HEADER:], start=ROWS_WITH_HEADER)
+        answer = await self._control.exchange(sequence.header, Acknowledgement, rows=rows[:ROWS_WITH_HEADER])
         verdict = Verdict(answer.verdict)
         if verdict is not Verdict.ACCEPTED:
             log.warning("sequence rejected", extra={"update": update.update, "verdict": verdict.name.lower()})

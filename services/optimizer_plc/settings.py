@@ -56,8 +56,9 @@ class ProgramSettings(BaseModel):
     solver: SolverName = SolverName.ODE
     updating_period_s: Annotated[float, Field(ge=0, le=MAX_PERIOD_TICKS * TICK_S)] = ADAPTIVE
     """Fixed updating period, a multiple of 0.25 s; 0 is adaptive."""
-    sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 20
-    """Length of the sequences sent; 20 rows, the longest updating period, fit into one Modbus request."""
+    sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 18
+    """Shortest sequence sent; 18 rows fit into one Modbus request with their header. It is never shorter than two
+    updating periods: one to be played, one in case the next sequence is late."""
     adaptive: AdaptiveSettings = AdaptiveSettings()
     design: ControlDesign = ControlDesign()
     budget: BudgetSettings = BudgetSettings()

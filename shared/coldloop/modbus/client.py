@@ -144,17 +144,25 @@ class RegisterClient:
             if answer != head[: _READ.size]:
                 raise self._nonsense(block)
 
-    async def exchange(self, record: tuple[Any, ...], answer: type[R], *, patience_s: float | None = None) -> R:
+    async def exchange(
+        self,
+        record: tuple[Any, ...],
+        answer: type[R],
+        *,
+        rows: Sequence[tuple[Any, ...]] = (),
+        patience_s: float | None = None,
+    ) -> R:
         """Write `record`, then read `answer`, in one request.
 
         Args:
             record: What to write.
             answer: What to read.
+            rows: First rows of the block that follows the record's in the map, written with it.
             patience_s: How long the answer may take when the server lets it wait; `timeout_s` by default.
         """
         block, codec = self._places[type(record)]
         answer_block, answer_codec = self._places[answer]
-        data = codec.encode(record)
+        data = codec.encode(record) + b"".join([self._places[type(row)][1].encode(row) for row in rows])
         head = _READ_WRITE.pack(answer_block.address, answer_codec.size // 2, block.address, len(data) // 2, len(data))
         raw = await self._transact(RawPdu(READ_WRITE_REGISTERS, head + data), block, patience_s)
         return cast("R", answer_codec.decode(self._checked(raw, answer_codec.size, answer_block), 1))

@@ -100,7 +100,10 @@ class Acknowledgement(NamedTuple):
 
 
 class SequenceHeader(NamedTuple):
-    """Describes the sequence in the spare buffer; writing it commits the sequence."""
+    """Describes the sequence in the spare buffer; writing it commits the sequence.
+
+    It stands right before the buffer: header and rows of a short sequence fit into one request.
+    """
 
     number: Annotated[int, u32("Number of the sequence, rising")]
     update: Annotated[int, u32("Update that the sequence answers")]
@@ -144,9 +147,9 @@ CONTROL_MAP: Final = RegisterMap(
         Block("await update", 400, AwaitUpdate, "Lets a read of the latch wait for a new update", Role.OPTIMIZER),
         Block("plan", 410, Plan, "Decided updating period", Role.OPTIMIZER),
         Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence"),
-        Block("sequence header", 430, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
         Block("session", 450, ControlSession, "Start of a session", Role.OPERATOR),
         Block("grant", 460, Grant, "How far to go in lock-step", Role.OPERATOR),
+        Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
         Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
     ),
 )

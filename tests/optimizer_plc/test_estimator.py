@@ -1,0 +1,140 @@
+import numpy as np
+import pytest
+import scipy.linalg
+from numpy.typing import NDArray
+
+from coldloop.lti_model import LtiModel
+from coldloop.registers.control_plc import Update
+from optimizer_plc.estimator import EstimatorSettings, KalmanFilter, StateFeedback, stationary_gain
+from optimizer_plc.prediction import PredictionModel
+
+Array = NDArray[np.float64]
+
+SETTINGS = EstimatorSettings()
+
+
+def noise(settings: EstimatorSettings, ticks: int) -> tuple[Array, Array]:
+    """Return the variances of the 29 states in so many ticks, and of the 22 sensors, from the settings."""
+    walk = np.full(29, settings.temperature_noise_k)
+    walk[0], walk[1], walk[28] = settings.pressure_noise_pa, settings.volume_noise_m3, settings.load_walk_w
+    sensors = np.concatenate(
+        [
+            [settings.level_sensor, settings.speed_sensor],
+            np.full(10, settings.temperature_sensor),
+            np.full(10, settings.pressure_sensor),
+        ]
+    )
+    return walk**2 * ticks / 20, sensors**2
+
+
+def augmented(model: LtiModel, seconds: float) -> tuple[Array, Array]:
+    """Return the transition of states and load mismatch, and the outputs of both."""
+    discrete = model.discretised(seconds)
+    A = np.eye(29)
+    A[:28, :28], A[:28, 28] = discrete.A, discrete.F
+    return A, np.hstack([model.C, model.G[:, None]])
+
+
+@pytest.mark.parametrize("ticks", [2, 5, 10, 20])
+def test_the_stationary_gain_is_that_of_the_riccati_equation(model: LtiModel, ticks: int) -> None:
+    A, C = augmented(model, ticks * 0.25)
+    process, sensors = noise(SETTINGS, ticks)
+    P = scipy.linalg.solve_discrete_are(A.T, C.T, np.diag(process), np.diag(sensors))
+    expected = P @ C.T @ np.linalg.inv(C @ P @ C.T + np.diag(sensors))
+    gain = stationary_gain(np.ascontiguousarray(A), np.ascontiguousarray(C), process, sensors, 4000)
+    # pressures in Pa and volumes in m3 are 12 orders of magnitude apart: each row is measured by its own largest gain
+    size = np.abs(expected).max(axis=1, keepdims=True)
+    assert np.abs((gain - expected) / size).max() < 1e-6
+
+
+class World:
+    """A plant that is the model itself under a load that no sensor sees."""
+
+    def __init__(self, model: LtiModel, ticks: int, unseen: float) -> None:
+        self._model = model
+        self._discrete = model.discretised(ticks * 0.25)
+        self._ticks = ticks
+        self._unseen = unseen
+        self.x = np.zeros(28)
+        self._number = 0
+
+    def measured(self, u: Array, known: float, u_before: Array) -> Update:
+        m = self._model
+        y = m.C @ self.x + m.D @ u_before + m.G * (known + self._unseen) + m.y0
+        return Update(
+            session=1,
+            update=self._number,
+            tick=self._number * self._ticks,
+            playing=0,
+            load=known + m.w0,
+            u_before=tuple((u_before + m.u0).tolist()),
+            u=tuple((u + m.u0).tolist()),
+            y=tuple(y.tolist()),
+            x=tuple((self.x + m.x0).tolist()),
+        )
+
+    def move(self, u: Array, known: float) -> None:
+        d = self._discrete
+        self.x = d.A @ self.x + d.B @ u + d.F * (known + self._unseen)
+        self._number += 1
+
+
+@pytest.mark.parametrize("ticks", [5, 20])
+@pytest.mark.parametrize("unseen", [40.0, -25.0])
+def test_a_load_that_no_sensor_sees_is_found_and_leaves_no_offset(
+    model: LtiModel, prediction: PredictionModel, ticks: int, unseen: float
+) -> None:
+    rng = np.random.default_rng(21)
+    world, estimator = World(model, ticks, unseen), KalmanFilter(prediction, SETTINGS)
+    u_before = np.zeros(3)
+    known = 0.0
+    for step in range(8000 // ticks):
+        u, known = rng.uniform(-1, 1, 3), 60.0 if step % 40 < 20 else -30.0
+        estimate = estimator.correct(world.measured(u, known, u_before))
+        world.move(u, known)
+        predicted = estimator.predict([(u, ticks)])
+        u_before = u
+    assert estimate.mismatch == pytest.approx(unseen, rel=1e-2)
+    assert estimate.w == pytest.approx(known + estimate.mismatch)
+    scale = np.concatenate([[2000.0, 0.002], np.ones(26)])
+    assert np.abs((predicted - world.x) / scale).max() < 0.02
+
+
+def test_without_noise_and_mismatch_the_estimate_is_the_truth_from_the_first_instant(
+    model: LtiModel, prediction: PredictionModel
+) -> None:
+    world, estimator = World(model, 20, 0.0), KalmanFilter(prediction, SETTINGS)
+    u = np.array([1.0, 5.0, -1.0])
+    before = np.zeros(3)
+    for _ in range(50):
+        estimate = estimator.correct(world.measured(u, 20.0, before))
+        assert estimate.mismatch == pytest.approx(0.0, abs=1e-6)
+        assert np.allclose(estimate.x, world.x, rtol=1e-9, atol=1e-7)
+        world.move(u, 20.0)
+        estimator.predict([(u, 20)])
+        before = u
+
+
+def test_state_feedback_returns_the_state_and_believes_the_known_load(
+    model: LtiModel, prediction: PredictionModel
+) -> None:
+    world, estimator = World(model, 10, 30.0), StateFeedback(prediction)
+    u = np.array([0.5, 0.0, -0.5])
+    for _ in range(5):
+        estimate = estimator.correct(world.measured(u, 15.0, u))
+        assert np.allclose(estimate.x, world.x, rtol=1e-12, atol=1e-9)
+        assert (estimate.w, estimate.mismatch) == (pytest.approx(15.0), 0.0)
+        world.move(u, 15.0)
+    assert np.allclose(estimator.predict([(u, 10)]), prediction.advance(estimate.x, u, estimate.w, 10))
+
+
+def test_a_prediction_may_be_cut_into_segments_of_any_length(model: LtiModel, prediction: PredictionModel) -> None:
+    rng = np.random.default_rng(22)
+    x, u, w = rng.normal(size=28) * [2000.0, 0.002, *np.ones(26)], rng.normal(size=3), 50.0
+    whole = model.discretised(7.75)
+    expected = whole.A @ x + whole.B @ u + whole.F * w
+    for cut in ([31], [20, 11], [1] * 31, [3, 25, 3]):
+        estimator = StateFeedback(prediction)
+        estimator.correct(World(model, 1, 0.0).measured(u, w, u)._replace(x=tuple((x + model.x0).tolist())))
+        reached = estimator.predict([(u, ticks) for ticks in cut])
+        assert np.allclose(reached, expected, rtol=1e-9, atol=1e-9)

@@ -1,0 +1,145 @@
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from optimizer_plc.updating_period import Algorithm1, FixedPeriod, Observation, assess
+
+RULE = Algorithm1(q_first=9, q_min=2, q_max=19, delta=2)
+
+costs = st.floats(1.0, 1e8)
+rules = st.builds(
+    lambda bounds, delta: Algorithm1(q_first=bounds[0], q_min=bounds[0], q_max=bounds[1], delta=delta),
+    st.tuples(st.integers(1, 20), st.integers(1, 20)).map(lambda pair: (min(pair), max(pair))),
+    st.integers(1, 20),
+)
+observations = st.builds(
+    Observation,
+    iterations=st.integers(1, 20),
+    effective_before=costs,
+    hot_start=costs,
+    last_but_one=costs,
+    delivered=costs,
+    effective=costs,
+)
+
+
+def contracting(**changed: float) -> Observation:
+    """K = 0.45: from J+ = 200 over 104 to 100 in 4 iterations at the predicted state; 90 where the plant really is."""
+    base = Observation(
+        iterations=4, effective_before=200.0, hot_start=200.0, last_but_one=104.0, delivered=100.0, effective=90.0
+    )
+    return replace(base, **changed)  # type: ignore[arg-type]
+
+
+def test_the_quantities_are_those_that_the_paper_defines() -> None:
+    a = assess(contracting(effective_before=160.0))
+    assert a.efficiency == 0.5  # 100 / 200
+    assert a.mismatch == 1.125  # 90 * 200 / (100 * 160)
+    assert a.contraction == 0.5625  # 90 / 160
+    assert a.mismatch_increment == pytest.approx(0.03125)  # (1.125 - 1) / 4
+    assert a.efficiency_increment == pytest.approx(-0.02)  # (100 - 104) / 200
+    assert a.contraction_increment == pytest.approx(-0.006875)  # 0.5 * 0.03125 - 1.125 * 0.02
+    # (-ln 0.5625 + 4 / 0.5625 * -0.006875) / ln(0.5625)^2 = (0.575364 - 0.048889) / 0.331044
+    assert a.response_increment == pytest.approx(1.590349, rel=1e-5)
+    assert a.gamma == a.response_increment
+
+
+def test_a_contraction_that_the_last_iteration_hardly_helped_makes_the_period_shorter() -> None:
+    q, a = RULE.next(contracting(effective_before=160.0))
+    assert a.gamma > 0
+    assert q == 2
+
+
+def test_a_contraction_that_still_gains_with_the_last_iteration_makes_the_period_longer() -> None:
+    q, a = RULE.next(contracting(last_but_one=180.0))
+    assert a.contraction < 1
+    assert a.gamma < 0
+    assert q == 6
+
+
+def test_without_contraction_the_sign_of_the_contractions_increment_decides() -> None:
+    # K = 260 / 200; D = 2.6: dK = 0.5 * 1.6 / 4 + 2.6 * dE is 0.2 - 0.052 with 104 before, 0.2 - 1.04 with 180
+    shorter, better = RULE.next(contracting(effective=260.0)), RULE.next(contracting(effective=260.0, last_but_one=180))
+    assert (shorter[1].gamma, better[1].gamma) == pytest.approx((0.148, -0.84))
+    assert (shorter[0], better[0]) == (2, 6)
+
+
+def test_a_contraction_of_exactly_1_counts_as_none() -> None:
+    at_one = contracting(effective=200.0)
+    q, a = RULE.next(at_one)
+    assert a.contraction == 1.0
+    assert math.isinf(a.response_increment)
+    assert a.gamma == a.contraction_increment == pytest.approx(0.5 * 1.0 / 4 - 2.0 * 0.02)
+    assert q == 2
+    assert RULE.next(replace(at_one, last_but_one=180.0))[0] == 6
+
+
+def test_a_zero_gradient_changes_nothing() -> None:
+    still = Observation(
+        iterations=7, effective_before=5.0, hot_start=5.0, last_but_one=5.0, delivered=5.0, effective=5.0
+    )
+    q, a = RULE.next(still)
+    assert (q, a.gamma) == (7, 0.0)
+
+
+@given(rule=rules, observation=observations)
+def test_q_moves_by_delta_against_the_gradient_or_is_clipped(rule: Algorithm1, observation: Observation) -> None:
+    q, a = rule.next(observation)
+    assert rule.q_min <= q <= rule.q_max
+    sign = (a.gamma > 0) - (a.gamma < 0)
+    wanted = observation.iterations - rule.delta * sign
+    assert q == min(rule.q_max, max(rule.q_min, wanted))
+    assert not math.isnan(a.gamma)
+
+
+@given(observation=observations)
+def test_the_branch_depends_on_whether_the_cost_contracts(observation: Observation) -> None:
+    a = assess(observation)
+    assert a.contraction == pytest.approx(observation.effective / observation.effective_before, rel=1e-9)
+    assert a.gamma == (a.contraction_increment if a.contraction >= 1 else a.response_increment)
+
+
+@given(observation=observations, exponent=st.integers(-20, 20))
+def test_multiplying_all_costs_by_a_constant_changes_nothing(observation: Observation, exponent: int) -> None:
+    factor = 2.0**exponent  # exact in binary, so that rounding cannot change the decision
+    scaled = Observation(
+        iterations=observation.iterations,
+        effective_before=observation.effective_before * factor,
+        hot_start=observation.hot_start * factor,
+        last_but_one=observation.last_but_one * factor,
+        delivered=observation.delivered * factor,
+        effective=observation.effective * factor,
+    )
+    assert RULE.next(scaled) == RULE.next(observation)
+
+
+@given(observation=observations)
+def test_the_response_increment_is_the_derivative_of_the_response_time(observation: Observation) -> None:
+    """t_r(q) = -q / log K(q), with K moving at its increment (`docs/science.md`, ruling 10)."""
+    a, q = assess(observation), observation.iterations
+    if not 1e-6 < a.contraction < 0.99:
+        return
+    h = 1e-6 * a.contraction / max(abs(a.contraction_increment), a.contraction)
+
+    def response(step: float) -> float:
+        return -(q + step) / math.log(a.contraction + step * a.contraction_increment)
+
+    numerical = (response(h) - response(-h)) / (2 * h)
+    scale = abs(a.contraction_increment / a.contraction) * q / math.log(a.contraction) ** 2
+    assert a.response_increment == pytest.approx(numerical, rel=1e-3, abs=1e-3 * scale + 1e-6)
+
+
+@given(observation=observations, iterations=st.integers(1, 19))
+def test_a_fixed_period_is_fixed_but_tells_the_quantities_all_the_same(
+    observation: Observation, iterations: int
+) -> None:
+    rule = FixedPeriod(iterations)
+    assert rule.first == iterations
+    assert rule.next(observation) == (iterations, assess(observation))
+
+
+def test_the_first_period_is_the_one_configured() -> None:
+    assert RULE.first == 9
