@@ -43,11 +43,11 @@ class LocalServices:
     async def __aenter__(self) -> Self:
         """Start them."""
         self._logs.mkdir(parents=True, exist_ok=True)
-        # A process group of their own: a Ctrl-C is the rig's to answer, in good order.
+        # A session of their own: a Ctrl-C is the rig's to answer, in good order.
         for service in SERVICES:
             with self._log(service).open("wb") as log:
                 self._processes[service] = await asyncio.create_subprocess_exec(
-                    sys.executable, "-m", service, env=self._environment, process_group=0,
+                    sys.executable, "-m", service, env=self._environment, start_new_session=True,
                     stdin=asyncio.subprocess.DEVNULL, stdout=log, stderr=log,
                 )  # fmt: skip
         return self
