@@ -195,6 +195,7 @@ class RegisterClient:
             except asyncio.CancelledError:
                 client.close()
                 raise
+        _raise_lost_cancellation()
         if not isinstance(response, RawPdu) or response.function_code & 0x7F != request.function_code:
             raise self._nonsense(block)
         if response.function_code != request.function_code:
@@ -244,3 +245,10 @@ class RegisterClient:
         return PeerUnreachableError(
             f"{self.peer} answered a request for block '{block.name}' with something else: check host and port"
         )
+
+
+def _raise_lost_cancellation() -> None:
+    """Raise the cancellation that `asyncio.wait_for` loses before Python 3.12 when it meets the answer."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
