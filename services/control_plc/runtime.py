@@ -15,7 +15,7 @@ from coldloop.errors import PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import read_header
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, TICK_S
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import (
@@ -40,6 +40,7 @@ from control_plc.settings import ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
 
+TICKS_PER_SECOND = round(1 / TICK_S)
 LONGEST_WAIT_S = 1.0
 """Longest time that a read of the latch waits for an update; the optimiser then asks again."""
 
@@ -132,9 +133,10 @@ class ControlPlc:
         update = program.end_scan(measurement)
         if program.process is not None:
             self.bank.put(program.process)
+        if update is not None or program.tick % TICKS_PER_SECOND == 0:
+            self._publish_status()
         if update is not None:
             self.bank.put(update)
-            self._publish_status()
             self._news.set()
             self._news = asyncio.Event()
         self._publish_identity()

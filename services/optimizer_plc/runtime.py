@@ -62,13 +62,12 @@ class OptimizerPlc:
         while True:
             update = await self._control.exchange(wanted, Update)
             asked_at = time.monotonic()
-            if not self._is_news(update, wanted):
-                wanted = STRANGER if update.session else wanted
-                continue
-            if update.session != self._session:
-                self._start(update.session)
-            await self._optimise(update, asked_at)
-            wanted = AwaitUpdate(update.session, update.update + 1)
+            if self._is_news(update, wanted):
+                verdict = await self._optimise(update, asked_at)
+                lost = verdict is Verdict.WRONG_UPDATE  # the plan came too late: this update leads to no other
+                wanted = STRANGER if lost else AwaitUpdate(update.session, update.update + 1)
+            elif update.session != wanted.session:
+                wanted = STRANGER
 
     async def _same_model(self) -> None:
         theirs = (await self._control.read(Identity)).model_digest
@@ -99,9 +98,11 @@ class OptimizerPlc:
         self._publish_identity(0)
         log.info("session started", extra={"session": session, "updating_period_s": period_s})
 
-    async def _optimise(self, update: Update, asked_at: float) -> None:
+    async def _optimise(self, update: Update, asked_at: float) -> Verdict:
         """Plan, solve and deliver; in real time, not before the PLC would have the answer."""
         program = self._program
+        if update.session != self._session:
+            self._start(update.session)
         await self._control.write(program.plan(update))
         sequence = program.solve()
         if self._pace.realtime:
@@ -116,6 +117,7 @@ class OptimizerPlc:
         self._last = program.report(verdict)
         self.bank.put(self._last, update.update % HISTORY_ROWS)
         self._publish_identity(update.tick)
+        return verdict
 
     def on_write(self, block: Block) -> None:
         """Session settings are read when the session begins."""

@@ -64,7 +64,7 @@ def test_the_broker_keeps_what_each_service_tells(rig: "ComposedRig") -> None:
     messages = retained(rig, *[f"coldloop/{name}/{what}" for name in names for what in ("state", "telemetry")])
     assert all(messages[f"coldloop/{name}/state"] == {"state": "online"} for name in names)
     assert messages["coldloop/control_plc/telemetry"]["session"] == 1
-    assert messages["coldloop/control_plc/telemetry"]["mode"] == "mpc"
+    assert messages["coldloop/control_plc/telemetry"]["tick"] > 0
 
 
 @pytest.mark.parametrize("service", SERVICES)

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from coldloop.lti_model import LtiModel
 from coldloop.registers.control_plc import Update
-from optimizer_plc.estimator import EstimatorSettings, KalmanFilter, StateFeedback, stationary_gain
+from optimizer_plc.estimator import EstimatorSettings, KalmanFilter, StateFeedback
 from optimizer_plc.prediction import PredictionModel
 
 Array = NDArray[np.float64]
@@ -35,13 +35,40 @@ def augmented(model: LtiModel, seconds: float) -> tuple[Array, Array]:
     return A, np.hstack([model.C, model.G[:, None]])
 
 
+def told(model: LtiModel, x: Array, u: Array, y: Array, load: float, number: int = 0) -> Update:
+    """Return an update with everything given as deviations from the operating point."""
+    inputs = tuple((u + model.u0).tolist())
+    return Update(
+        session=1,
+        update=number,
+        tick=number,
+        playing=0,
+        load=load + model.w0,
+        u_before=inputs,
+        u=inputs,
+        y=tuple((y + model.y0).tolist()),
+        x=tuple((x + model.x0).tolist()),
+    )
+
+
 @pytest.mark.parametrize("ticks", [2, 5, 10, 20])
-def test_the_stationary_gain_is_that_of_the_riccati_equation(model: LtiModel, ticks: int) -> None:
+def test_the_stationary_gain_is_that_of_the_riccati_equation(
+    model: LtiModel, prediction: PredictionModel, ticks: int
+) -> None:
     A, C = augmented(model, ticks * 0.25)
     process, sensors = noise(SETTINGS, ticks)
     P = scipy.linalg.solve_discrete_are(A.T, C.T, np.diag(process), np.diag(sensors))
     expected = P @ C.T @ np.linalg.inv(C @ P @ C.T + np.diag(sensors))
-    gain = stationary_gain(np.ascontiguousarray(A), np.ascontiguousarray(C), process, sensors, 4000)
+    nothing = np.zeros(3)
+    gain = np.zeros_like(expected)
+    estimator = KalmanFilter(prediction, SETTINGS)
+    mismatch = 0.0
+    for output, seen in enumerate(np.eye(22)):
+        x = estimator.predict([(nothing, ticks)])
+        y = prediction.output(x, nothing, mismatch) + seen
+        estimate = estimator.correct(told(model, np.zeros(28), nothing, y, 0.0))
+        gain[:, output] = np.append(estimate.x - x, estimate.mismatch - mismatch)
+        mismatch = estimate.mismatch
     # pressures in Pa and volumes in m3 are 12 orders of magnitude apart: each row is measured by its own largest gain
     size = np.abs(expected).max(axis=1, keepdims=True)
     assert np.abs((gain - expected) / size).max() < 1e-6
@@ -60,18 +87,9 @@ class World:
 
     def measured(self, u: Array, known: float, u_before: Array) -> Update:
         m = self._model
-        y = m.C @ self.x + m.D @ u_before + m.G * (known + self._unseen) + m.y0
-        return Update(
-            session=1,
-            update=self._number,
-            tick=self._number * self._ticks,
-            playing=0,
-            load=known + m.w0,
-            u_before=tuple((u_before + m.u0).tolist()),
-            u=tuple((u + m.u0).tolist()),
-            y=tuple(y.tolist()),
-            x=tuple((self.x + m.x0).tolist()),
-        )
+        y = m.C @ self.x + m.D @ u_before + m.G * (known + self._unseen)
+        update = told(m, self.x, u, y, known, self._number)
+        return update._replace(u_before=tuple((u_before + m.u0).tolist()))
 
     def move(self, u: Array, known: float) -> None:
         d = self._discrete

@@ -1,0 +1,94 @@
+"""A control PLC on the bench: scans by hand, and sequences that are right unless told otherwise."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+
+from coldloop.limits import InputLimits
+from coldloop.registers.codec import as_transmitted
+from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, SequenceRow, Update, Verdict
+from coldloop.registers.plant import Actuators, Measurement
+from coldloop.sequence import InputSequence, sealed
+from control_plc.program import ControlProgram
+
+MODEL = 0xC01D1005
+INITIAL = SequenceRow(43.0, 75.0, 36.0)
+
+
+class Bench:
+    """A control program in its first session, driven scan by scan."""
+
+    def __init__(self, limits: InputLimits) -> None:
+        self.program = ControlProgram(limits=limits, model_digest=MODEL, initial_inputs=INITIAL)
+        self.program.restart(session=1)
+        self.number = 0
+
+    def scan(self) -> tuple[SequenceRow, Update | None]:
+        """Do one scan; return what was applied and the update if one was latched."""
+        actuators = self.program.begin_scan()
+        return SequenceRow(*actuators[1:]), self.program.end_scan(self.measurement(actuators))
+
+    def measurement(self, actuators: Actuators) -> Measurement:
+        y = tuple(float(actuators.tick + i) for i in range(22))
+        return Measurement(actuators.tick, 384.0, y, tuple(float(i) for i in range(28)))
+
+    def scans(self, number: int) -> list[SequenceRow]:
+        return [self.scan()[0] for _ in range(number)]
+
+    def plan(self, ticks: int) -> bool:
+        """Plan the next updating instant so many ticks after the last one."""
+        update = self.program.update
+        assert update is not None
+        return self.program.accept_plan(Plan(update.update, update.tick + ticks))
+
+    def sequence(self, rows: Sequence[SequenceRow], **changed: Any) -> InputSequence:
+        """Return a sealed answer to the last update, with header fields changed before it is sealed."""
+        update = self.program.update
+        assert update is not None
+        first = self.program.next_update_tick or 0
+        self.number += 1
+        header = SequenceHeader(
+            number=self.number,
+            update=update.update,
+            first_tick=first,
+            length=len(rows),
+            tau_u=max(0, first - update.tick),
+            model_digest=MODEL,
+            crc=0,
+        )
+        return sealed(header._replace(**changed), [as_transmitted(row) for row in rows])
+
+    def play(self, rows: Sequence[SequenceRow], ticks: int) -> list[SequenceRow]:
+        """Plan an update `ticks` after the last one, answer it, and scan up to it; return what was applied."""
+        assert self.plan(ticks)
+        offered = self.offer(self.sequence(rows))
+        assert offered.verdict == Verdict.ACCEPTED, Verdict(offered.verdict).name
+        assert self.program.next_update_tick is not None
+        return self.scans(self.program.next_update_tick - self.program.tick)
+
+    def offer(self, sequence: InputSequence) -> Acknowledgement:
+        return self.program.offer(sequence)
+
+
+def moved(cv155: float = 0.0, ncr22: float = 0.0, cv156: float = 0.0) -> SequenceRow:
+    """Return the initial inputs, moved."""
+    return SequenceRow(INITIAL.cv155 + cv155, INITIAL.ncr22 + ncr22, INITIAL.cv156 + cv156)
+
+
+@pytest.fixture(scope="session")
+def at() -> Callable[..., SequenceRow]:
+    return moved
+
+
+@pytest.fixture(scope="session")
+def new_bench() -> Callable[[InputLimits], Bench]:
+    return Bench
+
+
+@pytest.fixture
+def bench() -> Bench:
+    """A control PLC whose first update (at tick 0) has been latched."""
+    made = Bench(InputLimits())
+    made.scan()
+    return made
