@@ -4,9 +4,11 @@ import csv
 import io
 import json
 from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 from typing import Final
 
 from coldloop.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
+from coldloop.modbus.requests import MAX_READ_WORDS
 from coldloop.registers.control_plc import CONTROL_MAP
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
@@ -101,16 +103,12 @@ def _block_markdown(service: str, block: Block) -> str:
 
 
 def mbpoll_line(service: str, block: Block) -> str:
-    """Return the mbpoll command that reads the longest run of equal types at the end of a block's first row."""
-    registers = list(block.registers())
-    last = registers[-1].kind
-    run = [registers[-1]]
-    for register in reversed(registers[:-1]):
-        if register.kind is not last or len(run) * last.words >= 124:
-            break
-        run.append(register)
-    kind = {Kind.F32: "4:float -B", Kind.U32: "4:int -B", Kind.U16: "4"}[last]
-    return f"mbpoll -0 -1 -m tcp -p {PORTS[service]} -t {kind} -r {run[-1].address} -c {len(run)} 127.0.0.1"
+    """Return the mbpoll command that reads a run of equal types in a block's first row: of floats where it has any."""
+    runs = [(kind, list(group)) for kind, group in groupby(block.registers(), key=lambda register: register.kind)]
+    kind, run = max(runs, key=lambda item: (item[0] is Kind.F32, len(item[1])))
+    options = {Kind.F32: "4:float -B", Kind.U32: "4:int -B", Kind.U16: "4"}[kind]
+    count = min(len(run), MAX_READ_WORDS // kind.words)
+    return f"mbpoll -0 -1 -m tcp -p {PORTS[service]} -t {options} -r {run[0].address} -c {count} 127.0.0.1"
 
 
 FORMATS: Final[dict[str, Callable[[Sequence[RegisterMap]], str]]] = {
