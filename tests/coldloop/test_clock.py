@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coldloop import clock
 from coldloop.clock import BIN_S, BINS, LatenessRecord, Pacer, Schedule
 
 LONGEST_S = BINS * BIN_S
@@ -31,7 +30,7 @@ class FakeClock:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
     made = FakeClock(0.125)
-    monkeypatch.setattr(clock.asyncio, "sleep", made.sleep)
+    monkeypatch.setattr("coldloop.clock.asyncio.sleep", made.sleep)
     return made
 
 

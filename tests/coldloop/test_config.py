@@ -3,7 +3,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -133,8 +133,10 @@ def test_a_value_that_is_no_toml_is_text(text: str, value: str) -> None:
 
 
 def test_values_are_read_as_toml() -> None:
-    settings = loaded(environment={"COLDLOOP__SOLVER__INSTANTS": "[1, 5]"}, assignments=("solver.alpha=1e2",)).settings
-    assert (settings.solver.instants, settings.solver.alpha) == ((1, 5), 100.0)
+    solver = loaded(
+        environment={"COLDLOOP__SOLVER__INSTANTS": "[1, 5]"}, assignments=("solver.alpha=1e2",)
+    ).settings.solver
+    assert (solver.instants, solver.alpha) == ((1, 5), 100.0)
 
 
 def test_other_variables_of_the_environment_are_not_ours() -> None:
@@ -150,12 +152,12 @@ def test_sections_of_other_services_are_skipped_and_unknown_ones_are_not(write: 
 
 @pytest.mark.parametrize("model", [ControlSettings, OptimizerSettings])
 def test_a_service_started_with_the_environment_of_its_settings_has_the_same_settings(model: type[BaseModel]) -> None:
-    settings = load_configuration(
+    wanted = load_configuration(
         model,
         environment={"COLDLOOP__LIMITS__RATE_REFERENCE": "elapsed", "COLDLOOP__SESSION__FACTOR": "60"},
         assignments=["telemetry.broker=broker.example"],
     ).settings
-    assert load_configuration(model, environment=to_environment(settings)).settings == settings
+    assert load_configuration(model, environment=to_environment(wanted)).settings == wanted
 
 
 # -- refusals ---------------------------------------------------------------------------------------------------------
@@ -201,7 +203,7 @@ def test_a_contradiction_between_keys_names_the_section_and_a_source() -> None:
     message = refused(assignments=("bounds.low=2",))
     assert "--set bounds.low" in message
     assert "bounds" in message
-    assert "each low is below its high" in message
+    assert "Each low is below its high" in message
 
 
 def test_an_assignment_without_a_value_says_how_to_write_it() -> None:
@@ -235,18 +237,26 @@ def test_a_file_that_is_no_text_is_named(tmp_path: Path) -> None:
     assert refused(file) == f"{file}: not UTF-8 text; save it as UTF-8"
 
 
-@given(text=st.text(max_size=30))
+def refusal(assignment: str) -> str:
+    """Return why an assignment is refused, or nothing."""
+    try:
+        loaded(assignments=(assignment,))
+    except ConfigurationError as error:
+        return str(error)
+    return ""
+
+
+@settings(max_examples=50, deadline=None)
+@given(text=st.text(max_size=20))
 def test_whatever_stands_behind_the_equals_sign_is_a_value_or_a_refusal_in_one_line(text: str) -> None:
-    try:
-        loaded(assignments=(f"solver.alpha={text}",))
-    except ConfigurationError as error:
-        assert "\n" not in str(error)
-        assert "--set solver.alpha" in str(error)
+    reason = refusal(f"solver.alpha={text}")
+    assert "\n" not in reason
+    assert not reason or reason.startswith("--set solver.alpha")
 
 
-@given(text=st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=30))
-def test_whatever_stands_before_the_equals_sign_is_a_key_or_a_refusal_in_one_line(text: str) -> None:
-    try:
-        loaded(assignments=(f"{text}=3",))
-    except ConfigurationError as error:
-        assert len(str(error).splitlines()) <= 1 or len(text.splitlines()) > 1
+@settings(max_examples=50, deadline=None)
+@given(key=st.text(st.characters(categories=["L", "N", "P", "S"]), min_size=1, max_size=20))
+def test_whatever_stands_before_the_equals_sign_is_a_key_or_a_refusal_in_one_line(key: str) -> None:
+    reason = refusal(f"{key}=3")
+    assert "\n" not in reason
+    assert reason.startswith("--set ")

@@ -24,6 +24,10 @@ def stream() -> Iterator[io.StringIO]:
     logging.getLogger("pymodbus").setLevel(pymodbus)
 
 
+def fail(message: str) -> None:
+    raise ValueError(message)
+
+
 def lines(stream: io.StringIO) -> list[dict[str, Any]]:
     return [json.loads(line) for line in stream.getvalue().splitlines()]
 
@@ -50,7 +54,7 @@ def test_a_record_is_one_json_object_on_one_line(stream: io.StringIO) -> None:
 def test_an_exception_stays_on_the_line_of_its_event(stream: io.StringIO) -> None:
     set_up_logs("plant", "info", stream)
     try:
-        raise ValueError("first line\nsecond line")
+        fail("first line\nsecond line")
     except ValueError:
         logging.getLogger("coldloop.plant").exception("integration failed")
     (line,) = lines(stream)

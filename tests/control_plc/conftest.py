@@ -1,7 +1,6 @@
 """A control PLC on the bench: scans by hand, and sequences that are right unless told otherwise."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import pytest
 
@@ -42,7 +41,7 @@ class Bench:
         assert update is not None
         return self.program.accept_plan(Plan(update.update, update.tick + ticks))
 
-    def sequence(self, rows: Sequence[SequenceRow], **changed: Any) -> InputSequence:
+    def sequence(self, rows: Sequence[SequenceRow], **changed: int) -> InputSequence:
         """Return a sealed answer to the last update, with header fields changed before it is sealed."""
         update = self.program.update
         assert update is not None

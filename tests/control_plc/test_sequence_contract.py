@@ -1,6 +1,6 @@
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given, settings
@@ -29,7 +29,7 @@ def playing(bench: "Bench", at: At) -> "Bench":
 def wrong(bench: "Bench", at: At, fault: str) -> InputSequence:
     """Return a sequence with one fault."""
     rows = [at(0.4)] * 20
-    header_faults: dict[str, dict[str, Any]] = {
+    header_faults: dict[str, dict[str, int]] = {
         "a length that is not that of the rows": {"length": 19},
         "another model": {"model_digest": 0xBAD},
         "a number that was played before": {"number": 1},
@@ -53,21 +53,20 @@ def wrong(bench: "Bench", at: At, fault: str) -> InputSequence:
         "a heater's jump": at(0.4, ncr22=10.1),
         "a turbine valve's jump": at(0.4, cv156=0.11),
     }
-    if fault in header_faults:
-        return bench.sequence(rows, **header_faults[fault])
-    if fault in row_faults:
-        return bench.sequence([*rows[:10], row_faults[fault], *rows[11:]])
-    if fault == "no rows":
-        return bench.sequence([])
-    if fault == "steps whose sum is a jump":
-        return bench.sequence([at(0.4), at(0.75), at(0.81)])
-    header, sent = bench.sequence(rows)
+    listed = {
+        "no rows": [],
+        "steps whose sum is a jump": [at(0.4), at(0.75), at(0.81)],
+        **{name: [*rows[:10], row, *rows[11:]] for name, row in row_faults.items()},
+    }
+    header, sent = sequence = bench.sequence(listed.get(fault, rows), **header_faults.get(fault, {}))
     if fault == "torn rows":
         return InputSequence(header, [*sent[:10], *[as_transmitted(at(0.3))] * 10])
     if fault == "a CRC with one bit wrong":
         return InputSequence(header._replace(crc=header.crc ^ 0x10000), sent)
-    assert fault == "a header changed after it was sealed"
-    return InputSequence(header._replace(first_tick=13), sent)
+    if fault == "a header changed after it was sealed":
+        return InputSequence(header._replace(first_tick=13), sent)
+    assert fault in header_faults | listed
+    return sequence
 
 
 FAULTS = {
@@ -205,7 +204,7 @@ def test_a_sequence_is_judged_against_the_last_row_when_the_one_before_will_have
 def test_with_elapsed_rates_a_missed_deadline_does_not_widen_what_is_accepted(
     new_bench: "Callable[[InputLimits], Bench]", at: At
 ) -> None:
-    """A window begins anew at tick 24, 20 ticks after the last sequence, so that an update at 29 has a quarter of it."""
+    """A window begins anew at tick 24, 20 ticks after the last sequence: an update at tick 29 has a quarter of it."""
     bench = new_bench(InputLimits(rate_reference=RateReference.ELAPSED))
     bench.scan()
     bench.play([at()] * 60, ticks=4)

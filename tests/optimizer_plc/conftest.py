@@ -1,6 +1,7 @@
 """The controller's problem, random situations to solve, exact optima, and jumps recorded from the closed loop."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from typing import NamedTuple
 
 import daqp
@@ -118,8 +119,7 @@ class Recorder:
         self.started: Jump | None = None
 
     def start(self, problem: QuadraticProblem, guess: Array) -> None:
-        copied = [np.array(part) for part in problem[:-1]]
-        self.started = Jump(QuadraticProblem(*copied, problem.constant), guess.copy())
+        self.started = Jump(deepcopy(problem), guess.copy())
         self._solver.start(problem, guess)
 
     def iterate(self) -> None:

@@ -1,26 +1,32 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from optimizer_plc.linear_algebra import apply, cholesky, cholesky_solve, multiply
+
+Array = NDArray[Any]
+Precision = type[np.float64] | type[np.float32]
 
 seeds = st.integers(0, 2**32 - 1)
 sizes = st.integers(1, 30)
 each_precision = pytest.mark.parametrize(("precision", "tolerance"), [(np.float64, 1e-12), (np.float32, 1e-4)])
 
 
-def matrix(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def matrix(rng: np.random.Generator, rows: int, columns: int, precision: Precision = np.float64) -> Array:
     """Return a matrix some of whose elements are 0, which the kernels skip."""
-    return rng.normal(size=(rows, columns)) * (rng.random((rows, columns)) < 0.8)
+    return np.asarray(rng.normal(size=(rows, columns)) * (rng.random((rows, columns)) < 0.8), dtype=precision)
 
 
 @each_precision
 @settings(max_examples=60, deadline=None)
 @given(n=sizes, k=sizes, m=sizes, seed=seeds)
-def test_a_product_is_numpys(precision: type, tolerance: float, n: int, k: int, m: int, seed: int) -> None:
+def test_a_product_is_numpys(precision: Precision, tolerance: float, n: int, k: int, m: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    A, B = matrix(rng, n, k).astype(precision), matrix(rng, k, m).astype(precision)
+    A, B = matrix(rng, n, k, precision), matrix(rng, k, m, precision)
     product = multiply(A, B)
     assert product.dtype == precision
     assert np.allclose(product, A @ B, rtol=tolerance, atol=tolerance)
@@ -30,10 +36,11 @@ def test_a_product_is_numpys(precision: type, tolerance: float, n: int, k: int, 
 @settings(max_examples=60, deadline=None)
 @given(n=sizes, k=sizes, seed=seeds)
 def test_applying_a_transposed_matrix_adds_to_the_result(
-    precision: type, tolerance: float, n: int, k: int, seed: int
+    precision: Precision, tolerance: float, n: int, k: int, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    A, x, start = (part.astype(precision) for part in (matrix(rng, k, n), rng.normal(size=k), rng.normal(size=n)))
+    A = matrix(rng, k, n, precision)
+    x, start = np.asarray(rng.normal(size=k), dtype=precision), np.asarray(rng.normal(size=n), dtype=precision)
     result = start.copy()
     apply(A, x, result)
     assert np.allclose(result, start + A.T @ x, rtol=tolerance, atol=tolerance)
@@ -42,11 +49,11 @@ def test_applying_a_transposed_matrix_adds_to_the_result(
 @each_precision
 @settings(max_examples=60, deadline=None)
 @given(n=sizes, seed=seeds)
-def test_the_factor_is_numpys_and_solves_its_system(precision: type, tolerance: float, n: int, seed: int) -> None:
+def test_the_factor_is_numpys_and_solves_its_system(precision: Precision, tolerance: float, n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     root = matrix(rng, n, n)
-    S = (root @ root.T + np.eye(n)).astype(precision)
-    b = rng.normal(size=n).astype(precision)
+    S: Array = np.asarray(root @ root.T + np.eye(n), dtype=precision)
+    b: Array = np.asarray(rng.normal(size=n), dtype=precision)
     U, x = S.copy(), b.copy()
     cholesky(U)
     assert np.allclose(np.triu(U), np.linalg.cholesky(S).T, rtol=100 * tolerance, atol=100 * tolerance)

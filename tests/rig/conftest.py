@@ -1,0 +1,260 @@
+"""Rigs: in one process, on the bus in one event loop, as three processes; and the command line."""
+
+import asyncio
+import contextlib
+import inspect
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from contextlib import AbstractAsyncContextManager
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import pytest
+from pydantic import BaseModel
+
+import control_plc.runtime
+import optimizer_plc.runtime
+import plant.runtime
+from coldloop.config import PREFIX, to_environment
+from coldloop.endpoints import Endpoint
+from coldloop.model_file import read_header
+from coldloop.registers.codec import WordOrder
+from control_plc.settings import ControlSettings
+from optimizer_plc.settings import OptimizerSettings
+from plant.load import find_load
+from plant.program import LoadProfile
+from plant.settings import PlantSettings
+from rig import cli
+from rig.network import NetworkRig, RigEndpoints
+from rig.one_process import OneProcessRig
+from rig.recording import Recorder, Recording
+from rig.scenario import Scenario
+from rig.settings import Settings
+
+PATIENCE_S = 120.0
+"""A test on the bus has failed when it takes longer; the first one may have to compile the kernels."""
+
+S = TypeVar("S", bound=BaseModel)
+
+SERVICES = ("plant", "control_plc", "optimizer_plc")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test that is a coroutine, in a loop of its own and within `PATIENCE_S`."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    arguments = {name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters}
+
+    async def story() -> None:
+        async with asyncio.timeout(PATIENCE_S):
+            await pyfuncitem.obj(**arguments)
+
+    asyncio.run(story())
+    return True
+
+
+@pytest.fixture(autouse=True)
+def _no_configuration_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in tuple(os.environ):
+        if name.startswith(PREFIX):
+            monkeypatch.delenv(name)
+
+
+# -- scenarios and the rig in one process ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def mean_load() -> float:
+    """The load of the operating point, W."""
+    return read_header(Settings().model.file).w0
+
+
+@pytest.fixture(scope="session")
+def load_a(mean_load: float) -> LoadProfile:
+    return find_load("a", mean_load)
+
+
+Simulate = Callable[..., Recording]
+
+
+@pytest.fixture(scope="session")
+def simulate() -> Simulate:
+    """Run a scenario in one process, with settings that differ from the defaults in the sections named."""
+    rigs: dict[str, OneProcessRig] = {}
+
+    def run(scenario: Scenario, **sections: BaseModel) -> Recording:
+        settings = Settings(**sections)  # type: ignore[arg-type]
+        key = settings.model_dump_json()
+        if key not in rigs:
+            rigs[key] = OneProcessRig(settings)
+        recorder = Recorder(scenario.ticks)
+        rigs[key].run(scenario, recorder)
+        return recorder.recording()
+
+    return run
+
+
+# -- rigs on the bus ---------------------------------------------------------------------------------------------------
+
+
+def free_ports(count: int) -> list[int]:
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
+        return [one.getsockname()[1] for one in sockets]
+
+
+def wired(settings: Settings, order: WordOrder = WordOrder.HIGH_FIRST) -> tuple[Settings, RigEndpoints]:
+    """Return the settings with each server on a free port and each client pointed at it; and where they are."""
+    ends = RigEndpoints(*(Endpoint(port=port, word_order=order, patience_s=PATIENCE_S) for port in free_ports(3)))
+    sections: dict[str, BaseModel] = {}
+    for name, end in zip(SERVICES, ends, strict=True):
+        section = getattr(settings, name)
+        server = section.server.model_copy(update={"port": end.port})
+        sections[name] = section.model_copy(update={"server": server, "word_order": order})
+    sections["control_plc"] = sections["control_plc"].model_copy(update={"plant": ends.plant})
+    sections["optimizer_plc"] = sections["optimizer_plc"].model_copy(update={"control_plc": ends.control_plc})
+    return settings.model_copy(update=sections), ends
+
+
+def part(kind: type[S], settings: Settings) -> S:
+    """Return what one service reads of the whole configuration."""
+    return kind.model_validate({name: getattr(settings, name) for name in kind.model_fields})
+
+
+class Bus(NamedTuple):
+    """Services that are up, and what they were told."""
+
+    endpoints: RigEndpoints
+    settings: Settings
+
+    async def record(self, scenario: Scenario) -> Recording:
+        """Run a session; return what was recorded."""
+        recorder = Recorder(scenario.ticks)
+        rig = NetworkRig(self.endpoints, self.settings)
+        try:
+            await rig.connect(PATIENCE_S)
+            await rig.run(scenario, recorder)
+        finally:
+            rig.close()
+        return recorder.recording()
+
+
+OnTheBus = Callable[..., AbstractAsyncContextManager[Bus]]
+
+
+@contextlib.asynccontextmanager
+async def services_in_this_loop(
+    settings: Settings | None = None,
+    *,
+    order: WordOrder = WordOrder.HIGH_FIRST,
+    services: tuple[str, ...] = SERVICES,
+) -> AsyncIterator[Bus]:
+    """Serve on free ports; a service that ends by an error fails the test."""
+    settings, endpoints = wired(settings or Settings(), order)
+    serving: dict[str, Callable[[], Awaitable[None]]] = {
+        "plant": lambda: plant.runtime.serve(part(PlantSettings, settings)),
+        "control_plc": lambda: control_plc.runtime.serve(part(ControlSettings, settings)),
+        "optimizer_plc": lambda: optimizer_plc.runtime.serve(part(OptimizerSettings, settings)),
+    }
+    tasks = [asyncio.ensure_future(serving[name]()) for name in services]
+    try:
+        yield Bus(endpoints, settings)
+    finally:
+        for task in tasks:
+            task.cancel()
+        ends = await asyncio.gather(*tasks, return_exceptions=True)
+    for end in ends:
+        if end is not None and not isinstance(end, asyncio.CancelledError):
+            raise end
+
+
+@pytest.fixture
+def on_the_bus() -> OnTheBus:
+    return services_in_this_loop
+
+
+Start = Callable[[str, Settings], "subprocess.Popen[bytes]"]
+
+
+@contextlib.contextmanager
+def processes() -> Iterator[Start]:
+    """Start services as processes; they end with the context."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(service: str, settings: Settings) -> subprocess.Popen[bytes]:
+        environment = {name: value for name, value in os.environ.items() if not name.startswith(PREFIX)}
+        started.append(
+            subprocess.Popen(
+                [sys.executable, "-m", service, "--log-level", "error"],
+                env={**environment, **to_environment(settings)}, stdin=subprocess.DEVNULL,
+            )
+        )  # fmt: skip
+        return started[-1]
+
+    try:
+        yield start
+    finally:
+        for process in started:
+            process.terminate()
+        for process in started:
+            process.wait(10)
+
+
+@pytest.fixture
+def start_service() -> Iterator[Start]:
+    with processes() as start:
+        yield start
+
+
+@pytest.fixture(scope="session")
+def three_processes() -> Iterator[Bus]:
+    """One rig of three processes for all tests; each test runs sessions of its own on it."""
+    settings, endpoints = wired(Settings())
+    with processes() as start:
+        for service in SERVICES:
+            start(service, settings)
+        yield Bus(endpoints, settings)
+
+
+# -- the command line --------------------------------------------------------------------------------------------------
+
+
+class Outcome(NamedTuple):
+    """What a command left behind."""
+
+    code: int
+    out: str
+    complaints: list[str]
+    """Lines on standard error."""
+
+
+Coldloop = Callable[..., Outcome]
+
+
+@pytest.fixture
+def coldloop(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Coldloop:
+    """`coldloop` with its arguments, in this process: what it does not report as its own error fails the test."""
+
+    def run(*arguments: object, environment: Mapping[str, str] | None = None) -> Outcome:
+        with monkeypatch.context() as context:
+            for name, value in (environment or {}).items():
+                context.setenv(name, value)
+            capsys.readouterr()
+            try:
+                code: Any = cli.main([str(argument) for argument in arguments])
+            except SystemExit as end:
+                code = end.code
+        out, err = capsys.readouterr()
+        return Outcome(code, out, err.splitlines())
+
+    return run
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """A folder for results, not there yet."""
+    return tmp_path / "results"

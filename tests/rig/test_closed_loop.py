@@ -1,0 +1,129 @@
+"""What the loop does to the plant, tick by tick, in one process."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from coldloop.limits import InputLimits, RateReference
+from coldloop.model_file import read_header
+from coldloop.process import L1, T5, TICKS_PER_SAMPLE
+from coldloop.registers.control_plc import Verdict
+from optimizer_plc.design import ControlDesign
+from plant.program import LoadProfile
+from plant.runtime import make_program
+from plant.settings import SensorSettings
+from rig.recording import Recording
+from rig.scenario import Scenario
+from rig.settings import Settings
+
+if TYPE_CHECKING:
+    from tests.rig.conftest import Simulate
+
+BANDS = ControlDesign()
+HALF_HOUR, TEN_MINUTES, FIVE_MINUTES = 7200, 2400, 1200
+
+
+@pytest.fixture(scope="module")
+def half_hour(load_a: LoadProfile, simulate: "Simulate") -> Recording:
+    """Half an hour of load a under the adaptive updating period."""
+    return simulate(Scenario(HALF_HOUR, load_a, 0.0, seed=1))
+
+
+@pytest.fixture(scope="module")
+def step(mean_load: float) -> LoadProfile:
+    """100 W more after ten seconds."""
+    return LoadProfile((0, 40), (mean_load, mean_load + 100.0))
+
+
+def outside_the_bands(y: "np.ndarray[tuple[int, int], np.dtype[np.float32]]") -> int:
+    constrained = y[:, [L1, T5]]
+    return int(((constrained < BANDS.output_low) | (constrained > BANDS.output_high)).sum())
+
+
+def rate_windows(recording: Recording) -> Iterator[tuple[int, int, int]]:
+    """Yield first tick, end, and ticks since the window before, of the windows that a rate limit holds in."""
+    instants = [0, *(row.tick + row.tau_u for row in recording.updates), len(recording.u)]
+    for start, end in zip(instants, instants[1:], strict=False):
+        for first in range(start, end, TICKS_PER_SAMPLE):
+            yield first, min(end, first + TICKS_PER_SAMPLE), start - (instants[instants.index(start) - 1])
+
+
+def assert_inside_limits(recording: Recording, limits: InputLimits) -> None:
+    """Hold every tick against bounds and rates, without any tolerance."""
+    u = recording.u.astype(float)
+    assert (u >= limits.low).all()
+    assert (u <= limits.high).all()
+    before = np.array(read_header(Settings().model.file).u0, dtype=np.float32).astype(float)
+    for first, end, elapsed in rate_windows(recording):
+        anchor = u[first - 1] if first else before
+        reach = np.array(limits.rate) * limits.rate_share(elapsed or TICKS_PER_SAMPLE)
+        assert (np.abs(u[first:end] - anchor) <= reach).all(), f"a rate is broken in ticks {first}..{end - 1}"
+
+
+def test_level_and_temperature_stay_in_their_bands_under_load_a(half_hour: Recording) -> None:
+    assert np.ptp(half_hour.load) > 50
+    assert outside_the_bands(half_hour.y) == 0
+
+
+def test_without_control_a_step_of_100_w_drives_the_level_out_of_its_band(step: LoadProfile) -> None:
+    plant = make_program(read_header(Settings().model.file), SensorSettings(), step, seed=1)
+    for _ in range(TEN_MINUTES):
+        plant.advance()
+    assert plant.measure()[L1] < BANDS.output_low[0]
+
+
+@pytest.mark.parametrize("period_s", [0.0, 2.5], ids=["adaptive", "fixed"])
+def test_a_step_of_100_w_is_rejected(period_s: float, step: LoadProfile, simulate: "Simulate") -> None:
+    recording = simulate(Scenario(TEN_MINUTES, step, period_s, seed=1))
+    assert outside_the_bands(recording.y) == 0
+    assert recording.u[-1][1] < recording.u[0][1] - 20  # the heater makes room for the load
+
+
+def test_what_is_applied_keeps_bounds_and_rates_at_every_tick(half_hour: Recording) -> None:
+    assert_inside_limits(half_hour, InputLimits())
+
+
+def test_rates_scaled_to_the_elapsed_time_are_kept_too(step: LoadProfile, simulate: "Simulate") -> None:
+    limits = InputLimits(rate_reference=RateReference.ELAPSED)
+    recording = simulate(Scenario(FIVE_MINUTES, step, 0.0, seed=1), limits=limits)
+    assert_inside_limits(recording, limits)
+
+
+def test_narrow_limits_are_kept_when_they_bite(step: LoadProfile, simulate: "Simulate") -> None:
+    u0 = read_header(Settings().model.file).u0
+    low, high = (tuple(value + sign * width for value, width in zip(u0, (1.3, 7.7, 0.31), strict=True))
+                 for sign in (-1, 1))  # fmt: skip
+    limits = InputLimits(low=low, high=high, rate=(0.07, 1.1, 0.013))
+    recording = simulate(Scenario(FIVE_MINUTES, step, 0.0, seed=1), limits=limits)
+    assert_inside_limits(recording, limits)
+    assert (recording.u[-1] == np.float32(low[1])).any()  # it did bite
+
+
+@pytest.mark.parametrize("period_s", [0.0, 0.5, 2.5, 5.0])
+def test_updates_tile_the_time_without_a_gap(period_s: float, step: LoadProfile, simulate: "Simulate") -> None:
+    updates = simulate(Scenario(FIVE_MINUTES, step, period_s, seed=1)).updates
+    tick = 0
+    for number, row in enumerate(updates):
+        assert (row.update, row.tick, row.verdict) == (number, tick, Verdict.ACCEPTED)
+        tick += row.tau_u
+    assert FIVE_MINUTES - 20 <= tick < FIVE_MINUTES
+
+
+@pytest.mark.parametrize("period_s", [0.5, 1.0, 2.5, 5.0])
+def test_a_fixed_period_holds_four_iterations_a_second_but_one(
+    period_s: float, step: LoadProfile, simulate: "Simulate"
+) -> None:
+    updates = simulate(Scenario(FIVE_MINUTES, step, period_s, seed=1)).updates
+    assert {(row.tau_u * 0.25, row.iterations) for row in updates} == {(period_s, 4 * period_s - 1)}
+
+
+def test_the_adaptive_period_roams_within_2_to_19_iterations_by_steps_of_2(half_hour: Recording) -> None:
+    q = np.array([row.iterations for row in half_hour.updates])
+    assert q[0] == 9
+    assert q.min() == 2
+    assert q.max() <= 19
+    assert len(set(q.tolist())) > 5
+    assert (np.abs(np.diff(q)) <= 2).all()
+    assert [row.tau_u for row in half_hour.updates] == (q + 1).tolist()

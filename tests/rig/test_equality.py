@@ -1,0 +1,91 @@
+"""The backbone: a run has one trace, bit for bit, however its three services are connected."""
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from coldloop.registers.codec import WordOrder
+from plant.load import find_load
+from plant.program import LoadProfile
+from plant.settings import PlantSection, SensorSettings
+from rig.scenario import Scenario
+from rig.settings import Settings
+
+if TYPE_CHECKING:
+    from rig.recording import Recording
+    from tests.rig.conftest import Bus, Coldloop, OnTheBus, Simulate
+
+NOISY = PlantSection(sensors=SensorSettings(level=0.02, speed=0.5, temperature=0.02, pressure=0.002))
+
+
+@pytest.fixture
+def lively(mean_load: float) -> LoadProfile:
+    """A load that moves from the first minute on."""
+    e = find_load("e", mean_load)
+    return LoadProfile((0, *(time - e.times[1] + 60 for time in e.times[1:])), e.watts)
+
+
+def three_minutes(load: LoadProfile, period_s: float = 0.0, seed: int = 1) -> Scenario:
+    return Scenario(ticks=720, load=load, updating_period_s=period_s, seed=seed)
+
+
+def assert_same(one: "Recording", other: "Recording") -> None:
+    assert one.updates == other.updates
+    assert one.trace_sha256 == other.trace_sha256
+
+
+@pytest.mark.parametrize("period_s", [0.0, 2.5], ids=["adaptive", "fixed"])
+def test_one_process_and_three_processes_leave_the_same_trace(
+    period_s: float, lively: LoadProfile, simulate: "Simulate", three_processes: "Bus"
+) -> None:
+    scenario = three_minutes(lively, period_s)
+    assert_same(simulate(scenario), asyncio.run(three_processes.record(scenario)))
+
+
+def test_a_second_session_on_the_same_services_repeats_the_first(
+    lively: LoadProfile, three_processes: "Bus"
+) -> None:
+    scenario = replace(three_minutes(lively), ticks=240)
+    first, between, second = (
+        asyncio.run(three_processes.record(one)) for one in (scenario, three_minutes(lively, 1.0), scenario)
+    )
+    assert_same(first, second)
+    assert between.trace_sha256 != first.trace_sha256
+
+
+async def test_noise_and_the_low_word_first_change_nothing_about_the_equality(
+    lively: LoadProfile, simulate: "Simulate", on_the_bus: "OnTheBus"
+) -> None:
+    scenario = three_minutes(lively, seed=20)
+    async with on_the_bus(Settings(plant=NOISY), order=WordOrder.LOW_FIRST) as bus:
+        networked = await bus.record(scenario)
+    assert_same(simulate(scenario, plant=NOISY), networked)
+
+
+def test_the_seed_decides_the_noise_and_so_the_trace(lively: LoadProfile, simulate: "Simulate") -> None:
+    one, same, other = (simulate(three_minutes(lively, seed=seed), plant=NOISY) for seed in (1, 1, 2))
+    assert_same(one, same)
+    assert other.trace_sha256 != one.trace_sha256
+
+
+def test_without_noise_the_seed_decides_nothing(lively: LoadProfile, simulate: "Simulate") -> None:
+    assert_same(simulate(three_minutes(lively, seed=1)), simulate(three_minutes(lively, seed=2)))
+
+
+def test_the_command_starts_three_services_and_gets_the_trace_of_one_process(
+    coldloop: "Coldloop", tmp_path: Path
+) -> None:
+    run = ("run", "--load", "c", "--duration", "30s", "--updating-period", "2.5")
+    traces = []
+    for arguments in (("--in-process", "--out", tmp_path / "one"), ("--out", tmp_path / "three")):
+        outcome = coldloop(*run, *arguments)
+        assert outcome.code == 0, outcome.complaints
+        traces += [line for line in outcome.out.splitlines() if line.startswith("trace")]
+    assert len(traces) == 2
+    assert traces[0] == traces[1]
+    assert {log.name for log in (tmp_path / "three" / "logs").iterdir()} == {
+        "plant.log", "control_plc.log", "optimizer_plc.log"
+    }  # fmt: skip

@@ -1,0 +1,63 @@
+"""Who may import whom."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SERVICES = ("plant", "control_plc", "optimizer_plc")
+PACKAGES = {"coldloop": ROOT / "shared", **dict.fromkeys(SERVICES, ROOT / "services"), "rig": ROOT}
+MAY_IMPORT = {
+    "coldloop": {"coldloop"},
+    **{service: {service, "coldloop"} for service in SERVICES},
+    "rig": {"rig", "coldloop", *SERVICES},
+}
+
+
+def imported_packages(source: Path) -> Iterator[tuple[str, int]]:
+    """Yield the project's packages that a file imports, anywhere in it, with the line."""
+    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"), str(source))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{source}:{node.lineno} imports relatively: the rule could not be read off"
+            names = [node.module or ""]
+        else:
+            continue
+        for name in names:
+            package = name.partition(".")[0]
+            if package in PACKAGES:
+                yield package, node.lineno
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_package_imports_only_what_lies_below_it(package: str) -> None:
+    sources = sorted((PACKAGES[package] / package).rglob("*.py"))
+    assert sources
+    trespasses = [
+        f"{source.relative_to(ROOT)}:{line} imports {other}"
+        for source in sources
+        for other, line in imported_packages(source)
+        if other not in MAY_IMPORT[package]
+    ]
+    assert not trespasses
+
+
+def test_the_control_plc_runs_without_numpy_numba_and_scipy() -> None:
+    modules = [
+        ".".join(source.relative_to(ROOT / "services").with_suffix("").parts).removesuffix(".__init__")
+        for source in (ROOT / "services" / "control_plc").rglob("*.py")
+    ]
+    program = (
+        "import importlib, sys\n"
+        f"for name in {modules!r}: importlib.import_module(name)\n"
+        "print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "control_plc" in loaded
+    assert not loaded & {"numpy", "numba", "scipy", "osqp", "pyarrow", "plant", "optimizer_plc", "rig"}
