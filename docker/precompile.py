@@ -39,7 +39,7 @@ def optimizer_plc() -> None:
         if control.awaiting_sequence:
             control.offer(optimizer.solve())
         tick = control.begin_scan().tick
-        update = control.end_scan(Measurement(tick, header.w0, header.y0, header.x0))
+        update = control.end_scan(Measurement(tick, header.w0, header.y0, header.x0, 1))
         if update is not None:
             control.accept_plan(optimizer.plan(update))
             updates += 1

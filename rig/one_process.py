@@ -49,9 +49,11 @@ class OneProcessRig:
 
     def _scan(self, plant: PlantProgram, recorder: Recorder) -> Update | None:
         actuators = as_transmitted(self.control.begin_scan())
-        u = actuators[1:]
+        u = actuators[1:4]
         plant.apply(u)
-        measurement = as_transmitted(Measurement(plant.tick, plant.load, plant.measure(), plant.state))
+        measurement = as_transmitted(
+            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session)
+        )
         recorder.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
         plant.advance()
         return self.control.end_scan(measurement)

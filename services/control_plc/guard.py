@@ -3,6 +3,7 @@
 import math
 import struct
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from coldloop.limits import InputLimits
 from coldloop.process import TICKS_PER_SAMPLE
@@ -13,23 +14,24 @@ TOLERANCE = 1e-5
 itself allows nothing."""
 
 
-class Window:
+class Window(NamedTuple):
     """The rate window: the inputs may stray from `anchor` by `share` of the rate until the window ends.
 
-    A window lasts one sampling period of 5 s, or until the next sequence begins. `anchor` is the input applied before
-    it began.
+    A window lasts one sampling period of 5 s, or until the next sequence begins. Its share depends on how long ago the
+    inputs last moved.
     """
 
-    def __init__(self, anchor: SequenceRow, start: int, share: float) -> None:
-        self.anchor = anchor
-        self.start = start
-        self.share = share
+    anchor: SequenceRow
+    """Input applied before the window began."""
+    start: int
+    share: float
+    moved: int
+    """Tick of the last change of an input."""
 
-    def next(self, tick: int, applied: SequenceRow, limits: InputLimits, *, update: bool) -> "Window":
+    def at(self, tick: int, applied: SequenceRow, limits: InputLimits, *, update: bool) -> "Window":
         """Return the window that holds at `tick`, where `update` tells that a sequence begins there."""
-        elapsed = tick - self.start
-        if update or elapsed >= TICKS_PER_SAMPLE:
-            return Window(applied, tick, limits.rate_share(elapsed))
+        if update or tick - self.start >= TICKS_PER_SAMPLE:
+            return Window(applied, tick, limits.rate_share(tick - self.moved), self.moved)
         return self
 
 
@@ -39,38 +41,35 @@ class OutputGuard:
     def __init__(self, limits: InputLimits, applied: SequenceRow) -> None:
         self._limits = limits
         self._slack = [TOLERANCE * (high - low) for low, high in zip(limits.low, limits.high, strict=True)]
-        self._window = Window(applied, 0, 1.0)
-        self.applied = applied
-
-    @property
-    def window(self) -> Window:
-        """The rate window at the last scan."""
-        return self._window
+        self.applied = SequenceRow(*map(_inside, applied, limits.low, limits.high))
+        self._window = Window(self.applied, 0, 1.0, -TICKS_PER_SAMPLE)
 
     def admit(self, tick: int, wanted: SequenceRow, *, update: bool) -> SequenceRow:
         """Return what may be applied at `tick`, and remember it as applied."""
-        self._window = self._window.next(tick, self.applied, self._limits, update=update)
-        limits, window = self._limits, self._window
-        self.applied = SequenceRow(
+        limits = self._limits
+        window = self._window = self._window.at(tick, self.applied, limits, update=update)
+        applied = SequenceRow(
             *[
                 _clamped(wanted[i], window.anchor[i], limits.rate[i] * window.share, limits.low[i], limits.high[i])
                 for i in range(len(wanted))
             ]
         )
-        return self.applied
+        if applied != self.applied:
+            self._window = window._replace(moved=tick)
+        self.applied = applied
+        return applied
 
     def exceeds(self, rows: Sequence[SequenceRow], first_tick: int, before: SequenceRow) -> bool:
         """Tell whether a sequence that begins at `first_tick`, after `before`, would break a rate."""
-        limits = self._limits
-        window = self._window.next(first_tick, before, limits, update=True)
-        for offset, row in enumerate(rows):
-            if offset and offset % TICKS_PER_SAMPLE == 0:
-                window = window.next(first_tick + offset, before, limits, update=False)
-            elif offset and row == before:
+        limits, window = self._limits, self._window
+        for tick, row in enumerate(rows, first_tick):
+            window = window.at(tick, before, limits, update=tick == first_tick)
+            if row == before:
                 continue
             for value, anchor, rate, slack in zip(row, window.anchor, limits.rate, self._slack, strict=True):
                 if abs(value - anchor) > rate * window.share + slack:
                     return True
+            window = window._replace(moved=tick)
             before = row
         return False
 
@@ -87,9 +86,18 @@ def _clamped(wanted: float, anchor: float, reach: float, low: float, high: float
     """Return the single-precision value nearest to `wanted` that lies in low..high and within `reach` of `anchor`."""
     if not math.isfinite(wanted):
         wanted = anchor
-    value = _single(min(max(wanted, low, anchor - reach), high, anchor + reach))
-    while abs(value - anchor) > reach:
-        value = _towards(value, anchor)
+    lowest, highest = max(low, anchor - reach), min(high, anchor + reach)
+    value = _single(min(max(wanted, lowest), highest))
+    while value != anchor and not (lowest <= value <= highest and abs(value - anchor) <= reach):
+        value = _neighbour(value, anchor)  # rounding has crossed a limit
+    return value
+
+
+def _inside(value: float, low: float, high: float) -> float:
+    """Return the single-precision value nearest to `value` that lies in low..high."""
+    value = _single(min(max(value, low), high))
+    while not low <= value <= high:
+        value = _neighbour(value, (low + high) / 2)
     return value
 
 
@@ -97,7 +105,10 @@ def _single(value: float) -> float:
     return float(struct.unpack(">f", struct.pack(">f", value))[0])
 
 
-def _towards(value: float, target: float) -> float:
-    """Return the single-precision neighbour of `value` on the side of `target`; both are >= 0, so bits count up."""
+def _neighbour(value: float, target: float) -> float:
+    """Return the next single-precision value from `value` on the way to `target`."""
+    if value == 0.0:
+        return math.copysign(float(struct.unpack(">f", b"\0\0\0\1")[0]), target)
     bits: int = struct.unpack(">i", struct.pack(">f", value))[0]
-    return float(struct.unpack(">f", struct.pack(">i", bits + (1 if target > value else -1)))[0])
+    away_from_zero = (target > value) == (value > 0.0)
+    return float(struct.unpack(">f", struct.pack(">i", bits + (1 if away_from_zero else -1)))[0])

@@ -7,8 +7,19 @@ The fail-safe ladder begins here with its first two rungs: the sequence is playe
 last value holds (HOLD). Further rungs are further modes of `_wanted`.
 """
 
+from coldloop.errors import ConfigurationError
 from coldloop.limits import InputLimits
-from coldloop.registers.control_plc import Acknowledgement, Mode, Plan, Process, SequenceRow, Update, Verdict
+from coldloop.process import TICKS_PER_SAMPLE
+from coldloop.registers.control_plc import (
+    SEQUENCE_ROWS,
+    Acknowledgement,
+    Mode,
+    Plan,
+    Process,
+    SequenceRow,
+    Update,
+    Verdict,
+)
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.sequence import InputSequence, checksum
 from control_plc.guard import OutputGuard
@@ -24,6 +35,11 @@ class ControlProgram:
         self._limits = limits
         self._model_digest = model_digest
         self._initial = SequenceRow(*initial_inputs)
+        if OutputGuard(limits, self._initial).out_of_range([self._initial]):
+            raise ConfigurationError(
+                f"limits: the inputs {self._initial[:]} of the operating point are outside; widen low and high, or "
+                "give another model.file"
+            )
         self.restart(session=0)
 
     def restart(self, session: int) -> None:
@@ -33,7 +49,7 @@ class ControlProgram:
         self.mode = Mode.HOLD
         self.update: Update | None = None
         self.process: Process | None = None
-        self.next_update_tick: int | None = 0
+        self.next_update_tick = 0
         self.acknowledgement = Acknowledgement(0, Verdict.NONE)
         self.accepted = self.rejected = self.deadline_misses = 0
         self._guard = OutputGuard(self._limits, self._initial)
@@ -69,7 +85,7 @@ class ControlProgram:
             self.deadline_misses += 1
         applied = self._guard.admit(self.tick, self._wanted(self.tick), update=update)
         self.mode = Mode.MPC if self.remaining else Mode.HOLD
-        return Actuators(self.tick, *applied)
+        return Actuators(self.tick, *applied, self.session)
 
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
@@ -88,7 +104,7 @@ class ControlProgram:
                 y=measurement.y,
                 x=measurement.x,
             )
-            self.next_update_tick = None
+            self.next_update_tick = self.tick + TICKS_PER_SAMPLE  # until the optimiser has planned another
             self._planned = self._abandoned = False
         self.tick += 1
         self._in_scan = False
@@ -100,6 +116,13 @@ class ControlProgram:
         if playing is None or tick - playing.header.first_tick >= len(playing.rows):
             return self._guard.applied
         return playing.rows[tick - playing.header.first_tick]
+
+    def _applied_before(self, tick: int) -> SequenceRow:
+        """Return what will have been applied just before a tick to come, if nothing else arrives."""
+        playing = self._playing
+        if playing is None or not self.remaining:
+            return self._guard.applied
+        return playing.rows[min(tick - 1 - playing.header.first_tick, len(playing.rows) - 1)]
 
     @property
     def remaining(self) -> int:
@@ -119,12 +142,9 @@ class ControlProgram:
     def accept_plan(self, plan: Plan) -> bool:
         """Take the updating period of the last update; tell whether it was acceptable."""
         earliest = self.tick + self._in_scan
-        if (
-            self.update is None
-            or self._planned
-            or plan.update != self.update.update
-            or plan.next_update_tick < earliest
-        ):
+        if self.update is None or self._planned or plan.update != self.update.update:
+            return False
+        if not earliest <= plan.next_update_tick <= self.update.tick + SEQUENCE_ROWS:
             return False
         self.next_update_tick = plan.next_update_tick
         self._planned = True
@@ -165,7 +185,6 @@ class ControlProgram:
             return Verdict.WRONG_TICK
         if self._guard.out_of_range(rows):
             return Verdict.OUT_OF_RANGE
-        before = self._wanted(max(header.first_tick - 1, self.tick - 1))
-        if self._guard.exceeds(rows, header.first_tick, before):
+        if self._guard.exceeds(rows, header.first_tick, self._applied_before(header.first_tick)):
             return Verdict.RATE_EXCEEDED
         return Verdict.ACCEPTED

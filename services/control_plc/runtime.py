@@ -11,7 +11,6 @@ from collections.abc import Awaitable, Mapping
 
 from coldloop import __version__
 from coldloop.clock import Pacer, Schedule
-from coldloop.errors import PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import read_header
@@ -125,11 +124,9 @@ class ControlPlc:
         program = self._program
         actuators = program.begin_scan()
         measurement = await self._plant.exchange(actuators, Measurement)
-        if measurement.tick != actuators.tick and not self._pace.realtime:
-            raise PeerUnreachableError(
-                f"{self._plant.peer} is at tick {measurement.tick}, not at {actuators.tick}: it was restarted or is "
-                "driven by somebody else; start a new session"
-            )
+        if not self._fits(measurement):
+            self._end_session(measurement)
+            return
         update = program.end_scan(measurement)
         if program.process is not None:
             self.bank.put(program.process)
@@ -140,6 +137,26 @@ class ControlPlc:
             self._news.set()
             self._news = asyncio.Event()
         self._publish_identity()
+
+    def _fits(self, measurement: Measurement) -> bool:
+        """Tell whether the plant is where the session has it; in real time it may be a tick off."""
+        same_tick = measurement.tick == self._program.tick or self._pace.realtime
+        return measurement.session == self._program.session and same_tick
+
+    def _end_session(self, measurement: Measurement) -> None:
+        """Wait for a new session: the plant was restarted, or is driven by somebody else."""
+        self._running = False
+        self._publish_status()
+        self._publish_identity()
+        log.error(
+            "session ended: the plant has left it",
+            extra={
+                "session": self._program.session,
+                "tick": self._program.tick,
+                "plant_session": measurement.session,
+                "plant_tick": measurement.tick,
+            },
+        )
 
     def _start(self, asked: ControlSession) -> None:
         self._asked = None
@@ -218,7 +235,7 @@ class ControlPlc:
             Status(
                 mode=program.mode,
                 update=program.update.update if program.update else 0,
-                next_update_tick=program.next_update_tick or 0,
+                next_update_tick=program.next_update_tick,
                 playing=program.playing,
                 remaining=program.remaining,
                 accepted=program.accepted,

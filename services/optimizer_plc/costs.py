@@ -50,31 +50,43 @@ class Indicators(NamedTuple):
 
 def indicators(problem: PredictiveProblem, qp: QuadraticProblem, z: Array, situation: Situation) -> Indicators:
     """Return the indicators of profile z in a situation (paper, section V); `qp` is the problem's instance there."""
-    slackless = z.copy()
-    slackless[problem.n_inputs :] = 0.0
-    j_dev = float(quadratic_cost(qp.Phi, qp.phi, slackless)) + qp.constant
-    outputs = np.tile(problem.y0, problem.outputs_z.shape[0])
+    outputs = problem.resting_outputs.copy()
     apply(problem.stacked_outputs_z, z, outputs)
-    apply(problem.stacked_outputs_s, np.append(situation.x, situation.w), outputs)
-    rows = -qp.gamma
-    apply(problem.Gamma_transposed, z, rows)
-    return Indicators(j_dev, _violation_cost(outputs, problem.bands), _largest(rows, problem.row_gains))
+    apply(problem.stacked_outputs_x, situation.x, outputs)
+    j_cst = violation_cost(outputs, problem.stacked_outputs_w, situation.w, problem.bands)
+    j_dev = deviation_cost(qp, z, problem.n_inputs) + qp.constant
+    return Indicators(j_dev, j_cst, largest_violation(qp, z, problem.row_gains))
 
 
 @kernel
-def _violation_cost(outputs: Array, bands: Array) -> float:
-    """Return the weighted squares of what outputs (2 N, L1 and T5 in turn) miss bands (3, 2: low, high, weight) by."""
+def deviation_cost(qp: QuadraticProblem, z: Array, n_inputs: int) -> float:
+    """Return J_0 of the inputs alone, without slacks and without the constant."""
+    slackless = z.copy()
+    slackless[n_inputs:] = 0.0
+    return quadratic_cost(qp.Phi, qp.phi, slackless)
+
+
+@kernel
+def violation_cost(outputs: Array, through_w: Array, w: float, bands: Array) -> float:
+    """Return the weighted squares of what outputs + through_w w miss their bands by.
+
+    Outputs (2 N) are L1 and T5 in turn; bands (3, 2) are low, high and weight.
+    """
     total = 0.0
     for i in range(outputs.shape[0]):
-        low, high, weight = bands[0, i % 2], bands[1, i % 2], bands[2, i % 2]
-        miss = max(outputs[i] - high, 0.0) + max(low - outputs[i], 0.0)
-        total += weight * miss * miss
+        y = outputs[i] + through_w[i] * w
+        miss = max(y - bands[1, i % 2], 0.0) + max(bands[0, i % 2] - y, 0.0)
+        total += bands[2, i % 2] * miss * miss
     return total
 
 
 @kernel
-def _largest(rows: Array, gains: Array) -> float:
+def largest_violation(qp: QuadraticProblem, z: Array, gains: Array) -> float:
+    """Return max(Gamma z - gamma, 0) over the rows, each divided by its gain."""
     largest = 0.0
-    for i in range(rows.shape[0]):
-        largest = max(largest, rows[i] / gains[i])
+    for r in range(qp.Gamma.shape[0]):
+        excess = -qp.gamma[r]
+        for j in range(z.shape[0]):
+            excess += qp.Gamma[r, j] * z[j]
+        largest = max(largest, excess / gains[r])
     return largest

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 from coldloop.compiled import kernel
 from coldloop.process import SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.control_plc import Update
-from optimizer_plc.linear_algebra import multiply
+from optimizer_plc.linear_algebra import apply, multiply
 from optimizer_plc.prediction import PredictionModel
 
 Array = NDArray[np.float64]
@@ -108,7 +108,8 @@ class KalmanFilter:
         u = np.asarray(update.u_before) - m.u0
         known = update.load - m.w0
         innovation = np.asarray(update.y) - m.y0 - self._model.output(self._x, u, known + self._mismatch)
-        correction = multiply(self._gains[min(self._since, len(self._gains))], innovation[:, None])[:, 0]
+        correction = np.zeros(len(self._x) + 1)
+        apply(self._gains[min(self._since, len(self._gains))], innovation, correction)
         self._x = self._x + correction[:-1]
         self._mismatch += float(correction[-1])
         self._estimate = Estimate(self._x, known + self._mismatch, self._mismatch)
@@ -122,7 +123,7 @@ class KalmanFilter:
 
 
 def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> dict[int, Array]:
-    """Return the gain (n + 1, n_y) of every updating period, in ticks; the last row is that of the load mismatch."""
+    """Return the gain of every updating period, in ticks, transposed: (n_y, n + 1); the load mismatch comes last."""
     nx = prediction.n_states
     C = np.ascontiguousarray(np.hstack([prediction.C, prediction.G]))
     drift = np.full(nx + 1, settings.temperature_noise_k)
@@ -135,7 +136,8 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
         A = np.eye(nx + 1)
         A[:nx, :nx], A[:nx, nx] = step.A, step.F[:, 0]
         process = drift**2 * (ticks * TICK_S / SAMPLING_PERIOD_S)
-        gains[ticks] = stationary_gain(A, C, process, sensors**2, P, settings.longest_riccati)
+        gain = stationary_gain(A, C, process, sensors**2, P, settings.longest_riccati)
+        gains[ticks] = np.ascontiguousarray(gain.T)
     return gains
 
 
@@ -180,15 +182,23 @@ def stationary_gain(A: Array, C: Array, process: Array, sensors: Array, P: Array
             P[i, i] += process[i]
         for output in range(m):
             _measure(P, C, sensors[output], output, columns[output])
-        change, size = 0.0, 0.0
-        for output in range(m):
-            for i in range(n):
-                change = max(change, abs(columns[output, i] - previous[output, i]))
-                size = max(size, abs(columns[output, i]))
-                previous[output, i] = columns[output, i]
-        if change <= 1e-9 * size:
+        if _settled(columns, previous):
             break
     return _joint_gain(columns, C)
+
+
+@kernel
+def _settled(columns: Array, previous: Array) -> bool:
+    """Tell whether no state's gains (a column each) have changed by more than 1e-10 of its largest; remember them."""
+    settled = True
+    for i in range(columns.shape[1]):
+        change, size = 0.0, 0.0
+        for output in range(columns.shape[0]):
+            change = max(change, abs(columns[output, i] - previous[output, i]))
+            size = max(size, abs(columns[output, i]))
+            previous[output, i] = columns[output, i]
+        settled = settled and change <= 1e-10 * size
+    return settled
 
 
 @kernel

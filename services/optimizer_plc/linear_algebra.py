@@ -35,6 +35,20 @@ def apply(A: Array, x: Array, result: Array) -> None:
 
 
 @kernel
+def respond(A: Array, B: Array, F: Array, x: Array, u: Array, w: float) -> Array:
+    """Return A x + B u + F w for A (n, k), B (n, m), F (n, 1)."""
+    result = np.empty(A.shape[0], A.dtype)
+    for i in range(A.shape[0]):
+        total = F[i, 0] * w
+        for j in range(A.shape[1]):
+            total += A[i, j] * x[j]
+        for j in range(B.shape[1]):
+            total += B[i, j] * u[j]
+        result[i] = total
+    return result
+
+
+@kernel
 def cholesky(M: Array) -> None:
     """Overwrite the upper triangle of the symmetric positive definite M (n, n) by U with U' U = M."""
     n = M.shape[0]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from coldloop.lti_model import LtiModel
 from coldloop.process import L1, T5, TICKS_PER_SAMPLE
 from optimizer_plc.design import ControlDesign
-from optimizer_plc.linear_algebra import multiply
+from optimizer_plc.linear_algebra import multiply, respond
 
 Array = NDArray[np.float64]
 
@@ -66,13 +66,13 @@ class PredictionModel:
         while ticks > 0:
             step = min(ticks, TICKS_PER_SAMPLE)
             A, B, F = self.transitions[step]
-            x = multiply(A, x[:, None])[:, 0] + multiply(B, u[:, None])[:, 0] + F[:, 0] * w
+            x = respond(A, B, F, x, u, w)
             ticks -= step
         return x
 
     def output(self, x: Array, u: Array, w: float) -> Array:
         """Return the deviation of the measured output, shape (22,)."""
-        return multiply(self.C, x[:, None])[:, 0] + multiply(self.D, u[:, None])[:, 0] + self.G[:, 0] * w
+        return respond(self.C, self.D, self.G, x, u, w)
 
 
 def state_weights(model: LtiModel, design: ControlDesign) -> Array:

@@ -64,11 +64,11 @@ class PredictiveProblem:
         self._model = prediction
         self._knots_to_samples = interpolation(design.decision_instants, np.arange(1.0, design.horizon + 1))
         self._input_scale = np.asarray(design.input_scale)
+        self._u0, self._rate = np.array(prediction.model.u0), np.asarray(limits.rate)
         self._condense()
         self._build_output_rows()
         self._build_rate_rows()
         self.Gamma = np.ascontiguousarray(np.vstack([self._output_rows, self._rate_rows]))
-        self.Gamma_transposed = _transposed(self.Gamma)
         self._maps = self._make_maps()
         self._shifts: dict[int, Array] = {}
 
@@ -103,8 +103,10 @@ class PredictiveProblem:
         self._phi_map, self._constant_map = cross, constant
         self.outputs_z, self.outputs_s = np.array(outputs_z), np.array(outputs_s)
         self.stacked_outputs_z = _transposed(self.outputs_z.reshape(-1, n))
-        self.stacked_outputs_s = _transposed(self.outputs_s.reshape(-1, nx + 1))
+        self.stacked_outputs_x = _transposed(self.outputs_s.reshape(-1, nx + 1)[:, :nx])
+        self.stacked_outputs_w = np.array(self.outputs_s.reshape(-1, nx + 1)[:, nx])
         self.y0 = model.model.y0[list(model.constrained)]
+        self.resting_outputs = np.tile(self.y0, design.horizon)
         self.Phi = np.ascontiguousarray(Phi + self._slack_weights())
 
     def _input_map(self, weights: Array) -> Array:
@@ -206,22 +208,21 @@ class PredictiveProblem:
     def shifted(self, z: Array, ticks: int) -> Array:
         """Return the profile z shifted by `ticks` ticks."""
         if ticks not in self._shifts:
-            self._shifts[ticks] = shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE)
-        S = self._shifts[ticks]
-        inputs, slacks = z[: self.n_inputs].reshape(-1, N_INPUTS), z[self.n_inputs :].reshape(-1, N_SLACKS)
-        return np.concatenate([multiply(S, inputs).ravel(), multiply(S, slacks).ravel()])
+            S = shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE).T
+            whole = np.zeros((self.size, self.size))
+            whole[: self.n_inputs, : self.n_inputs] = np.kron(S, np.eye(N_INPUTS))
+            whole[self.n_inputs :, self.n_inputs :] = np.kron(S, np.eye(N_SLACKS))
+            self._shifts[ticks] = whole
+        result = np.zeros(self.size)
+        apply(self._shifts[ticks], z, result)
+        return result
 
     def inputs(self, z: Array, samples: int) -> Array:
         """Return the inputs of the first `samples` sampling periods, shape (samples, 3), in physical units.
 
         The rates between knots are rows of the problem, which a truncated solution may break; what is sent keeps them.
         """
-        knots = z[: self.n_inputs].reshape(-1, N_INPUTS) * self._input_scale
-        u: Array = multiply(self._knots_to_samples[:samples], knots) + self._model.model.u0
-        rate = np.asarray(self.limits.rate)
-        for sample in range(1, samples):
-            u[sample] = np.clip(u[sample], u[sample - 1] - rate, u[sample - 1] + rate)
-        return u
+        return _inputs(self._knots_to_samples[:samples], z, self._input_scale, self._u0, self._rate)
 
     def hold(self, u: Array) -> Array:
         """Return the profile that keeps the input deviation u, without slack."""
@@ -283,3 +284,18 @@ def _instance(
     for i in range(s.shape[0]):
         constant += s[i] * weighted[i]
     return phi, gamma, low, high, constant
+
+
+@kernel
+def _inputs(weights: Array, z: Array, scale: Array, u0: Array, rate: Array) -> Array:
+    samples, m = weights.shape[0], scale.shape[0]
+    u = np.empty((samples, m))
+    for sample in range(samples):
+        for i in range(m):
+            value = 0.0
+            for knot in range(weights.shape[1]):
+                value += weights[sample, knot] * z[m * knot + i]
+            u[sample, i] = value * scale[i] + u0[i]
+            if sample:
+                u[sample, i] = min(max(u[sample, i], u[sample - 1, i] - rate[i]), u[sample - 1, i] + rate[i])
+    return u

@@ -12,8 +12,10 @@ from typing import Final, NamedTuple
 
 from coldloop.errors import LoadFileError
 from coldloop.process import TICK_S
+from coldloop.registers.plant import LOAD_ROWS, MAX_LOAD_W, LoadStep
 from plant.program import LoadProfile
 
+MAX_TICK: Final = 2**32
 HOUR_TICKS: Final = int(3600 / TICK_S)
 
 
@@ -96,30 +98,37 @@ def read_load_file(path: Path) -> LoadProfile:
     except OSError as error:
         raise LoadFileError(f"{path}: {error.strerror}; name a readable CSV file") from None
     reader = csv.DictReader(text.splitlines())
-    missing = {"time_s", "load_w"} - set(reader.fieldnames or ())
-    if missing:
-        raise LoadFileError(f"{path}: no column {' and '.join(sorted(missing))}; the first line is time_s,load_w")
-    times: list[int] = []
-    watts: list[float] = []
-    for row in reader:
-        time, load = (
-            _number(row[column], f"{path}, line {reader.line_num}, {column}") for column in ("time_s", "load_w")
-        )
-        tick = round(time / TICK_S)
-        where = f"{path}, line {reader.line_num}"
-        if abs(tick * TICK_S - time) > 1e-6:
-            raise LoadFileError(f"{where}: {time:g} s is not a multiple of {TICK_S} s")
-        if load < 0:
-            raise LoadFileError(f"{where}: a load of {load:g} W is negative; loads are heat into the bath, 0 W or more")
-        if tick != 0 and not times:
-            raise LoadFileError(f"{where}: the first step is at {time:g} s; begin at 0 s")
-        if times and tick <= times[-1]:
-            raise LoadFileError(f"{where}: {time:g} s does not come after {times[-1] * TICK_S:g} s; sort by time_s")
-        times.append(tick)
-        watts.append(load)
-    if not times:
+    try:
+        missing = {"time_s", "load_w"} - set(reader.fieldnames or ())
+        if missing:
+            raise LoadFileError(f"{path}: no column {' and '.join(sorted(missing))}; the first line is time_s,load_w")
+        steps: list[LoadStep] = []
+        for row in reader:
+            steps.append(_step(row, steps, f"{path}, line {reader.line_num}"))
+    except csv.Error as error:
+        raise LoadFileError(f"{path}, line {reader.line_num + 1}: {error}; write two numbers a line") from None
+    if not steps:
         raise LoadFileError(f"{path}: no steps; add a line such as 0,385")
-    return LoadProfile(tuple(times), tuple(watts))
+    return LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
+
+
+def _step(row: dict[str, str | None], before: list[LoadStep], where: str) -> LoadStep:
+    """Return the step that a line tells, if it may follow those before."""
+    time, load = (_number(row[column], f"{where}, {column}") for column in ("time_s", "load_w"))
+    if not 0 <= time < MAX_TICK * TICK_S:
+        raise LoadFileError(f"{where}: {time:g} s is outside 0 to {MAX_TICK * TICK_S:g} s")
+    if not 0 <= load <= MAX_LOAD_W:
+        raise LoadFileError(f"{where}: {load:g} W is outside 0 to {MAX_LOAD_W:g} W; loads are heat into the bath")
+    tick = round(time / TICK_S)
+    if abs(tick * TICK_S - time) > 1e-6:
+        raise LoadFileError(f"{where}: {time:g} s is not a multiple of {TICK_S} s")
+    if not before and tick != 0:
+        raise LoadFileError(f"{where}: the first step is at {time:g} s; begin at 0 s")
+    if before and tick <= before[-1].tick:
+        raise LoadFileError(f"{where}: {time:g} s does not come after {before[-1].tick * TICK_S:g} s; sort by time_s")
+    if len(before) >= LOAD_ROWS:
+        raise LoadFileError(f"{where}: more than {LOAD_ROWS} steps, which is what the plant holds; split the file")
+    return LoadStep(tick, load)
 
 
 def _number(text: str | None, where: str) -> float:

@@ -86,6 +86,8 @@ class PlantRack:
     # -- exchange ------------------------------------------------------------------------------------------------------
 
     def _exchange(self, asked: Actuators) -> None:
+        if asked.session != self._session:
+            return
         if self._moving:  # the next request came in before the plant had moved on
             self._advance()
         self._applied = (asked.cv155, asked.ncr22, asked.cv156)
@@ -124,7 +126,7 @@ class PlantRack:
 
     def _measurement(self) -> Measurement:
         program = self._program
-        return Measurement(program.tick, program.load, program.measure(), program.state)
+        return Measurement(program.tick, program.load, program.measure(), program.state, self._session)
 
     def _publish(self) -> None:
         program = self._program

@@ -158,4 +158,5 @@ def _explained(error: ValidationError, sources: Mapping[str, str]) -> str:
     where = f"{source}: {key}" if source and not source.endswith(key) else source or key or "configuration"
     if first["type"] == "extra_forbidden":
         return f"{where}: no such key; `coldloop config` lists the keys"
-    return f"{where}: {first['msg'][0].lower()}{first['msg'][1:]} (got {first['input']!r})"
+    message = first["msg"].removeprefix("Value error, ")
+    return f"{where}: {message[0].lower()}{message[1:]} (got {first['input']!r})"

@@ -203,7 +203,7 @@ def test_a_contradiction_between_keys_names_the_section_and_a_source() -> None:
     message = refused(assignments=("bounds.low=2",))
     assert "--set bounds.low" in message
     assert "bounds" in message
-    assert "Each low is below its high" in message
+    assert "each low is below its high" in message
 
 
 def test_an_assignment_without_a_value_says_how_to_write_it() -> None:

@@ -26,11 +26,11 @@ class Bench:
     def scan(self) -> tuple[SequenceRow, Update | None]:
         """Do one scan; return what was applied and the update if one was latched."""
         actuators = self.program.begin_scan()
-        return SequenceRow(*actuators[1:]), self.program.end_scan(self.measurement(actuators))
+        return SequenceRow(*actuators[1:4]), self.program.end_scan(self.measurement(actuators))
 
     def measurement(self, actuators: Actuators) -> Measurement:
         y = tuple(float(actuators.tick + i) for i in range(22))
-        return Measurement(actuators.tick, 384.0, y, tuple(float(i) for i in range(28)))
+        return Measurement(actuators.tick, 384.0, y, tuple(float(i) for i in range(28)), actuators.session)
 
     def scans(self, number: int) -> list[SequenceRow]:
         return [self.scan()[0] for _ in range(number)]

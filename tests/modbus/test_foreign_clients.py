@@ -24,6 +24,7 @@ MEASURED = Measurement(
     load=0.0,
     y=tuple(KELVIN if position == T5 else 1.0 for position in range(len(OUTPUT_NAMES))),
     x=(0.0,) * 28,
+    session=1,
 )
 
 LIBMODBUS_PROGRAM = r"""

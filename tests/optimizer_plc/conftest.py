@@ -156,8 +156,8 @@ def recorded_jumps(model: LtiModel, hour: str, minutes: float) -> list[Jump]:
                 jumps.append(recorder.started)
             answer = control.offer(InputSequence(header, [as_transmitted(row) for row in rows]))
             assert answer.verdict == Verdict.ACCEPTED
-        plant.apply(as_transmitted(control.begin_scan())[1:])
-        measurement = as_transmitted(Measurement(plant.tick, plant.load, plant.measure(), plant.state))
+        plant.apply(as_transmitted(control.begin_scan())[1:4])
+        measurement = as_transmitted(Measurement(plant.tick, plant.load, plant.measure(), plant.state, 1))
         plant.advance()
         update = control.end_scan(measurement)
         if update is not None:

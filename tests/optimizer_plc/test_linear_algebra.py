@@ -40,7 +40,8 @@ def test_applying_a_transposed_matrix_adds_to_the_result(
 ) -> None:
     rng = np.random.default_rng(seed)
     A = matrix(rng, k, n, precision)
-    x, start = np.asarray(rng.normal(size=k), dtype=precision), np.asarray(rng.normal(size=n), dtype=precision)
+    x: Array = np.asarray(rng.normal(size=k), dtype=precision)
+    start: Array = np.asarray(rng.normal(size=n), dtype=precision)
     result = start.copy()
     apply(A, x, result)
     assert np.allclose(result, start + A.T @ x, rtol=tolerance, atol=tolerance)

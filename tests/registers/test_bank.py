@@ -114,7 +114,7 @@ def test_a_range_with_one_end_is_checked_and_named() -> None:
 def test_the_ends_of_a_range_belong_to_it() -> None:
     bank = RegisterBank(PLANT_MAP)
     bank.write(100, struct.pack(">Ifff", 1, 0.0, 1000.0, 100.0))
-    assert bank.get(Actuators) == Actuators(1, 0.0, 1000.0, 100.0)
+    assert bank.get(Actuators) == Actuators(1, 0.0, 1000.0, 100.0, 0)
     bank.write(403, struct.pack(">f", 0.01))  # in single precision this is less than 0.01
 
 

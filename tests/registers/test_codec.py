@@ -78,4 +78,4 @@ def test_a_value_that_fits_no_register_is_an_error(record: tuple[float, ...]) ->
 def test_an_array_of_the_wrong_length_is_an_error() -> None:
     block = BLOCKS["plant: measurement"]
     with pytest.raises(struct.error):
-        codec_of(block).encode(Measurement(0, 0.0, (1.0,) * 21, (1.0,) * 28))
+        codec_of(block).encode(Measurement(0, 0.0, (1.0,) * 21, (1.0,) * 28, 1))

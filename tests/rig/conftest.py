@@ -78,6 +78,11 @@ def load_a(mean_load: float) -> LoadProfile:
     return find_load("a", mean_load)
 
 
+@pytest.fixture(scope="session")
+def load_e(mean_load: float) -> LoadProfile:
+    return find_load("e", mean_load)
+
+
 Simulate = Callable[..., Recording]
 
 
@@ -131,12 +136,12 @@ class Bus(NamedTuple):
     endpoints: RigEndpoints
     settings: Settings
 
-    async def record(self, scenario: Scenario) -> Recording:
+    async def record(self, scenario: Scenario, patience_s: float = PATIENCE_S) -> Recording:
         """Run a session; return what was recorded."""
         recorder = Recorder(scenario.ticks)
         rig = NetworkRig(self.endpoints, self.settings)
         try:
-            await rig.connect(PATIENCE_S)
+            await rig.connect(patience_s)
             await rig.run(scenario, recorder)
         finally:
             rig.close()

@@ -45,9 +45,7 @@ def test_one_process_and_three_processes_leave_the_same_trace(
     assert_same(simulate(scenario), asyncio.run(three_processes.record(scenario)))
 
 
-def test_a_second_session_on_the_same_services_repeats_the_first(
-    lively: LoadProfile, three_processes: "Bus"
-) -> None:
+def test_a_second_session_on_the_same_services_repeats_the_first(lively: LoadProfile, three_processes: "Bus") -> None:
     scenario = replace(three_minutes(lively), ticks=240)
     first, between, second = (
         asyncio.run(three_processes.record(one)) for one in (scenario, three_minutes(lively, 1.0), scenario)

@@ -123,7 +123,6 @@ def assert_told(load: Path, *parts: str) -> None:
         ),
     ],
 )  # fmt: skip
-@pytest.mark.xfail(strict=True, reason="the reader does not know the limits of the load table: traceback, or exit 1 late")
 def test_a_load_that_the_plant_cannot_hold_is_told_when_it_is_read(content: str, place: str, write: Write) -> None:
     path = write(content)
     assert_told(path, str(path), place)

@@ -66,10 +66,8 @@ class OdeSolver:
     def start(self, problem: QuadraticProblem, guess: Array) -> None:
         """Begin with `guess` projected into the box, and with the paper's first step size sqrt(1 / |dz/dt|)."""
         self._problem = problem
-        self._z = np.clip(guess, problem.low, problem.high)
-        self._cost = augmented_cost(problem, self._z, self.alpha)
         self._stiff = np.zeros_like(problem.gamma)
-        self._dt = first_step(problem, self._z, self._flow)
+        self._z, self._cost, self._dt = begin(problem, guess, self._flow)
 
     def iterate(self) -> None:
         """Take one step."""
@@ -131,14 +129,17 @@ def release(M: Array, held: Array) -> None:
 
 
 @kernel
-def first_step(qp: QuadraticProblem, z: Array, flow: Flow) -> float:
-    """Return sqrt(1 / |dz/dt|)."""
+def begin(qp: QuadraticProblem, guess: Array, flow: Flow) -> tuple[Array, float, float]:
+    """Return the guess inside the box, its cost, and the first step size sqrt(1 / |dz/dt|) there."""
+    z = np.empty_like(guess)
+    for i in range(z.shape[0]):
+        z[i] = min(max(guess[i], qp.low[i]), qp.high[i])
     v = np.empty_like(z)
     velocity(qp, z, flow, v, np.empty_like(qp.gamma))
     total = 0.0
     for i in range(v.shape[0]):
         total += v[i] * v[i]
-    return math.sqrt(1.0 / max(math.sqrt(total), 1e-12))
+    return z, augmented_cost(qp, z, flow.alpha), math.sqrt(1.0 / max(math.sqrt(total), 1e-12))
 
 
 @kernel

@@ -47,7 +47,9 @@ class Status(NamedTuple):
 
     mode: Annotated[int, u16("0 hold, 1 MPC")]
     update: Annotated[int, u32("Last update latched")]
-    next_update_tick: Annotated[int, u32("Tick of the next updating instant; 0 while it is not known")]
+    next_update_tick: Annotated[
+        int, u32("Tick of the next updating instant; the latest possible one until it is planned")
+    ]
     playing: Annotated[int, u32("Number of the sequence being played; 0 is none")]
     remaining: Annotated[int, u16("Ticks of that sequence still to be played")]
     accepted: Annotated[int, u32("Sequences accepted")]

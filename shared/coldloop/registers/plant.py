@@ -8,15 +8,17 @@ from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_ar
 
 HISTORY_ROWS: Final = 256
 LOAD_ROWS: Final = 2048
+MAX_LOAD_W: Final = 10_000.0
 
 
 class Actuators(NamedTuple):
-    """Outputs of the control PLC for one tick."""
+    """Outputs of the control PLC for one tick. Those of another session than the plant's are answered, not applied."""
 
     tick: Annotated[int, u32("Tick of these outputs; in lock-step writing the present one moves the plant on")]
     cv155: Annotated[float, f32("Opening of the Joule-Thomson valve", unit="%", low=0, high=100)]
     ncr22: Annotated[float, f32("Actuator part of the bath heater's power", unit="W", low=0, high=1000)]
     cv156: Annotated[float, f32("Opening of the turbine valve", unit="%", low=0, high=100)]
+    session: Annotated[int, u32("Session that these outputs belong to")]
 
 
 class Measurement(NamedTuple):
@@ -26,6 +28,7 @@ class Measurement(NamedTuple):
     load: Annotated[float, f32("Heat load NCR22_HL (the same heater, so it is known)", unit="W")]
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
     x: Annotated[tuple[float, ...], f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS)]
+    session: Annotated[int, u32("Session")]
 
 
 class PlantSession(NamedTuple):
@@ -42,7 +45,7 @@ class LoadStep(NamedTuple):
     """One step of the load table, held until the next one."""
 
     tick: Annotated[int, u32("First tick of the step", unit="0.25 s")]
-    watts: Annotated[float, f32("Heat load", unit="W", low=-10_000, high=10_000)]
+    watts: Annotated[float, f32("Heat load", unit="W", low=0, high=MAX_LOAD_W)]
 
 
 class PlantSample(NamedTuple):

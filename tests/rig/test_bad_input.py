@@ -1,0 +1,306 @@
+"""Whatever is asked for wrongly: one line on standard error, the right exit code, no results half written."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import rig.commands.run
+from coldloop.model_file import read_document, write_document
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+
+if TYPE_CHECKING:
+    from tests.rig.conftest import Coldloop, Outcome
+
+USAGE, FAILURE = 2, 1
+
+RUN = ("run", "--in-process", "--duration", "2s")
+
+
+def assert_refused(outcome: "Outcome", code: int, *parts: str) -> None:
+    assert outcome.code == code
+    assert len(outcome.complaints) == 1, outcome.complaints
+    for part in parts:
+        assert part in outcome.complaints[0]
+
+
+def assert_no_results(folder: Path) -> None:
+    assert not folder.exists() or not [path for path in folder.rglob("*") if path.is_file()]
+
+
+# -- configuration -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("assignment", "parts"),
+    [
+        ("plant.sead=1", ["plant.sead", "no such key", "coldloop config"]),
+        ("boiler.level=1", ["boiler", "no such key"]),
+        ("plant.seed", ["plant.seed", "section.key=value"]),
+        ("plant.seed=-1", ["plant.seed", "greater than or equal to 0", "-1"]),
+        ("plant.seed=soon", ["plant.seed", "integer", "soon"]),
+        ("limits.low=[1,2]", ["limits.low"]),
+        ("limits.low=[70,0,20]", ["limits", "below its high"]),
+        ("session.factor=0", ["session.factor", "0.01"]),
+        ("optimizer_plc.program.updating_period_s=0.6", ["updating_period_s", "multiple of 0.25"]),
+        ("control_plc.server.port=99999", ["control_plc.server.port", "65535"]),
+        ("telemetry.prefix=a/#", ["telemetry.prefix"]),
+    ],
+)
+def test_a_wrong_key_or_value_on_the_command_line_is_named(
+    assignment: str, parts: list[str], coldloop: "Coldloop", results: Path
+) -> None:
+    assert_refused(coldloop(*RUN, "--set", assignment, "--out", results), USAGE, "--set", *parts)
+    assert not results.exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "parts"),
+    [
+        (b"[plant]\nsead = 1\n", ["plant.sead", "no such key"]),
+        (b"[plant]\nseed = 1.5\n", ["plant.seed", "integer"]),
+        (b"[plant\n", ["not TOML", "line 1"]),
+        (b"\xff\xfe", ["not UTF-8", "save it as UTF-8"]),
+    ],
+)
+def test_a_wrong_configuration_file_is_named(
+    content: bytes, parts: list[str], coldloop: "Coldloop", tmp_path: Path
+) -> None:
+    file = tmp_path / "rig.toml"
+    file.write_bytes(content)
+    assert_refused(coldloop(*RUN, "--config", file), USAGE, str(file), *parts)
+
+
+def test_a_configuration_file_that_is_not_there_is_named(coldloop: "Coldloop", tmp_path: Path) -> None:
+    for file in (tmp_path, tmp_path / "absent.toml"):
+        assert_refused(coldloop(*RUN, "--config", file), USAGE, str(file), "--config")
+
+
+def test_a_wrong_key_in_the_environment_is_named(coldloop: "Coldloop") -> None:
+    outcome = coldloop(*RUN, environment={"COLDLOOP__PLANT__SEAD": "1"})
+    assert_refused(outcome, USAGE, "COLDLOOP__PLANT__SEAD", "no such key")
+
+
+# -- options -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["run", "--duration=-5s"], ["--duration", "-5s", "not positive"]),
+        (["run", "--duration", "0"], ["--duration", "not positive"]),
+        (["run", "--duration", "0.1s"], ["--duration", "multiple of 0.25 s"]),
+        (["run", "--duration", "soon"], ["--duration", "2h"]),
+        (["run", "--duration", "nan"], ["--duration", "2h"]),
+        (["run", "--solver", "simplex"], ["--solver", "simplex", "'ode'"]),
+        (["run", "--updating-period", "9"], ["--updating-period", "0.5 to 5"]),
+        (["run", "--updating-period", "0.6"], ["--updating-period", "multiple of 0.25 s"]),
+        (["run", "--mode", "dream"], ["--mode", "lockstep"]),
+        (["run", "--factor", "nan"], ["--factor", "nan"]),
+        (["run", "--seed", "-1"], ["--seed", "-1"]),
+        (["run", "--attach", "here", "there", "elsewhere"], ["--attach", "HOST:PORT"]),
+        (["run", "--attach", "a:1", "b:2", "c:70000"], ["--attach", "HOST:PORT"]),
+        (["run", "--in-process", "--mode", "realtime"], ["--in-process", "--mode realtime"]),
+        (["run", "--in-process", "--attach", "a:1", "b:2", "c:3"], ["--in-process", "--attach"]),
+        (["run", "--nonsense"], ["--nonsense"]),
+        (["fly"], ["fly", "run"]),
+        (["registers", "--format", "xml"], ["--format", "xml", "markdown"]),
+        (["registers", "--service", "boiler"], ["--service", "control_plc"]),
+    ],
+)
+def test_a_wrong_option_is_told_with_what_would_be_right(
+    arguments: list[str], parts: list[str], coldloop: "Coldloop"
+) -> None:
+    assert_refused(coldloop(*arguments), USAGE, *parts)
+
+
+def test_a_bad_load_is_told_before_anything_is_made(coldloop: "Coldloop", results: Path, tmp_path: Path) -> None:
+    load = tmp_path / "load.csv"
+    load.write_text("time_s,load_w\n0,385\n5,nan\n")
+    assert_refused(coldloop(*RUN, "--load", load, "--out", results), USAGE, str(load), "line 3", "finite")
+    assert not results.exists()
+
+
+@pytest.mark.parametrize("name", ["file", "file/results"])
+def test_a_place_where_no_results_can_be_written_is_told(name: str, coldloop: "Coldloop", tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("precious")
+    assert_refused(coldloop(*RUN, "--out", tmp_path / name), USAGE, str(tmp_path / name), "--out")
+    assert (tmp_path / "file").read_text() == "precious"
+
+
+# -- model files -------------------------------------------------------------------------------------------------------
+
+
+def other_names(document: dict[str, Any]) -> None:
+    document["state_names"][0] = "P_of_another_plant"
+
+
+def fewer_states(document: dict[str, Any]) -> None:
+    n = len(document["x0"]) - 1
+    for name in ("A", "A_tick"):
+        document[name] = [row[:n] for row in document[name][:n]]
+    for name in ("B", "F", "B_tick", "F_tick", "state_names", "state_units", "x0"):
+        document[name] = document[name][:n]
+    document["C"] = [row[:n] for row in document["C"]]
+
+
+def fewer_outputs(document: dict[str, Any]) -> None:
+    for name in ("output_names", "output_units", "y0", "C", "D", "G"):
+        document[name] = document[name][:-1]
+
+
+def other_parameters(document: dict[str, Any]) -> None:
+    document["parameters_digest"] = "0" * 64
+
+
+def missing_row(document: dict[str, Any]) -> None:
+    document["A"] = document["A"][:-1]
+
+
+def missing_matrix(document: dict[str, Any]) -> None:
+    del document["B"]
+
+
+def newer_format(document: dict[str, Any]) -> None:
+    document["format"] = 99
+
+
+Change = Callable[[dict[str, Any]], None]
+ANOTHER_PLANT = pytest.mark.xfail(strict=True, reason="nobody compares the model with the plant: it runs, or a traceback")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        missing_row, missing_matrix, newer_format,
+        pytest.param(other_names, marks=ANOTHER_PLANT), pytest.param(fewer_states, marks=ANOTHER_PLANT),
+        pytest.param(fewer_outputs, marks=ANOTHER_PLANT), pytest.param(other_parameters, marks=ANOTHER_PLANT),
+    ],
+)  # fmt: skip
+def test_a_model_that_is_not_of_this_plant_is_refused(
+    change: Change, coldloop: "Coldloop", results: Path, tmp_path: Path
+) -> None:
+    document = read_document(DEFAULT_MODEL_FILE)
+    change(document)
+    file = tmp_path / "model.json"
+    write_document(file, document)
+    assert_refused(coldloop(*RUN, "--set", f"model.file={file}", "--out", results), FAILURE, str(file))
+    assert_no_results(results)
+
+
+@pytest.mark.parametrize(
+    ("content", "part"),
+    [
+        (b"", "not a readable model file"),
+        (b"junk", "not a readable model file"),
+        (b"\xff\xfe\x00", "not a readable model file"),
+        (b"[" * 100_000, "not a readable model file"),
+        (b"{}", "format"),
+        (DEFAULT_MODEL_FILE.read_bytes()[:5000], "not a readable model file"),
+        (DEFAULT_MODEL_FILE.read_bytes().replace(b'"w0": ', b'"w0": 1'), "digest mismatch"),
+    ],
+    ids=["empty", "junk", "binary", "deep", "no model", "half", "changed"],
+)
+def test_a_damaged_model_file_is_refused(
+    content: bytes, part: str, coldloop: "Coldloop", results: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "model.json"
+    file.write_bytes(content)
+    outcome = coldloop(*RUN, "--set", f"model.file={file}", "--out", results)
+    assert_refused(outcome, FAILURE, str(file), part, "python -m plant.model")
+    assert not results.exists()
+
+
+def test_a_model_file_that_is_not_there_is_named(coldloop: "Coldloop", tmp_path: Path) -> None:
+    for file in (tmp_path, tmp_path / "absent.json"):
+        assert_refused(coldloop(*RUN, "--set", f"model.file={file}"), FAILURE, str(file))
+
+
+# -- the link ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig.commands.run, "ATTACH_PATIENCE_S", 0.1)
+
+
+@pytest.fixture
+def web_server() -> Iterator[int]:
+    """The port of something that answers, but not in Modbus."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            while True:
+                try:
+                    connection, _ = server.accept()
+                except OSError:
+                    return
+                with connection:
+                    connection.recv(1000)
+                    connection.sendall(b"HTTP/1.0 400 Bad Request\r\n\r\n")
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        yield server.getsockname()[1]
+        server.shutdown(socket.SHUT_RDWR)
+        thread.join()
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_rig_that_is_not_there_is_told(coldloop: "Coldloop", results: Path) -> None:
+    with socket.socket() as bound_but_deaf:
+        bound_but_deaf.bind(("127.0.0.1", 0))
+        nobody = f"127.0.0.1:{bound_but_deaf.getsockname()[1]}"
+        outcome = coldloop("run", "--duration", "2s", "--attach", nobody, nobody, nobody, "--out", results)
+    assert outcome.code == FAILURE
+    assert outcome.complaints[-1] == f"coldloop: nobody listens as plant at {nobody}: start it, or check host and port"
+    assert_no_results(results)
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_rig_that_is_something_else_is_told(coldloop: "Coldloop", results: Path, web_server: int) -> None:
+    other = f"127.0.0.1:{web_server}"
+    outcome = coldloop("run", "--duration", "2s", "--attach", other, other, other, "--out", results)
+    assert outcome.code == FAILURE
+    assert f"plant at {other}" in outcome.complaints[-1]
+    assert "check" in outcome.complaints[-1]
+    assert_no_results(results)
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.xfail(strict=True, reason="the empty progress bar is printed before the error")
+def test_a_run_that_fails_says_nothing_but_why(coldloop: "Coldloop", results: Path, web_server: int) -> None:
+    other = f"127.0.0.1:{web_server}"
+    assert_refused(coldloop("run", "--attach", other, other, other, "--out", results), FAILURE, other)
+
+
+# -- as programs of their own ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["run", "--solver", "simplex"], USAGE),
+        (["run", "--set", "model.file=absent.json"], FAILURE),
+    ],
+)
+def test_the_program_ends_with_the_code_and_one_line(arguments: list[str], code: int, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "rig.cli", *arguments], cwd=tmp_path, env=os.environ, check=False, capture_output=True,
+        text=True,
+    )  # fmt: skip
+    assert done.returncode == code
+    assert len(done.stderr.splitlines()) == 1
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_bad_value_is_shown_on_one_line(coldloop: "Coldloop") -> None:
+    assert_refused(coldloop(*RUN, "--set", f"plant.load={json.dumps('one' + chr(10) + 'two')}"), USAGE, "neither a file")

@@ -1,0 +1,190 @@
+"""Real time: everyone paces on the clock, what is late is counted, and the plant is held meanwhile."""
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import pytest
+
+import rig.network
+from coldloop.limits import InputLimits
+from coldloop.modbus.client import RegisterClient
+from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Mode, Plan, Process, Status, Verdict
+from coldloop.registers.declaration import RegisterMap
+from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
+from coldloop.registers.plant import PLANT_MAP, LoadStep, PlantSession
+from plant.program import LoadProfile
+from rig.scenario import Scenario
+
+if TYPE_CHECKING:
+    from rig.recording import Recording
+    from tests.rig.conftest import Bus, OnTheBus, Simulate, Start
+
+T = TypeVar("T")
+
+LIMITS = InputLimits()
+PROMPT_S = 5.0
+"""Long for something that takes milliseconds."""
+
+
+@asynccontextmanager
+async def client(register_map: RegisterMap, port: int) -> AsyncIterator[RegisterClient]:
+    one = RegisterClient(register_map, host="127.0.0.1", port=port, timeout_s=PROMPT_S)
+    await one.connect(60)
+    try:
+        yield one
+    finally:
+        one.close()
+
+
+async def until(read: Callable[[], Awaitable[T]], wanted: Callable[[T], bool], within_s: float = PROMPT_S) -> T:
+    """Return the first value read that is as wanted."""
+    deadline = time.monotonic() + within_s
+    while not wanted(value := await read()):
+        assert time.monotonic() < deadline, f"still {value} after {within_s} s"
+        await asyncio.sleep(0.005)
+    return value
+
+
+def in_bounds(u: tuple[float, ...]) -> bool:
+    return all(low <= value <= high for low, value, high in zip(LIMITS.low, u, LIMITS.high, strict=True))
+
+
+def assert_consistent(recording: "Recording", lock_step: "Recording") -> None:
+    """Whatever was late: it is counted, and the plant was kept in its bounds. If nothing was, all is as in lock-step."""
+    verdicts = Counter(Verdict(row.verdict) for row in recording.updates)
+    assert set(verdicts) <= {Verdict.ACCEPTED, Verdict.LATE}
+    assert recording.link.deadline_misses >= verdicts[Verdict.LATE]
+    assert 0 < recording.link.lateness_p99_ms <= recording.link.lateness_max_ms
+    assert all(in_bounds(tuple(u)) for u in recording.u.tolist())
+    if not recording.link.deadline_misses and not recording.link.overruns:
+        assert recording.updates == lock_step.updates
+        assert recording.trace_sha256 == lock_step.trace_sha256
+
+
+async def test_a_run_in_real_time_without_a_miss_has_the_trace_of_lock_step(
+    load_a: LoadProfile, simulate: "Simulate", on_the_bus: "OnTheBus"
+) -> None:
+    scenario = Scenario(ticks=120, load=load_a, updating_period_s=0.0, seed=1, realtime=True, factor=20.0)
+    async with on_the_bus() as bus:
+        began = time.monotonic()
+        recording = await bus.record(scenario)
+        seconds = time.monotonic() - began
+    assert seconds >= 119 * 0.25 / 20
+    assert_consistent(recording, simulate(scenario))
+
+
+async def test_sessions_in_real_time_and_in_lock_step_follow_each_other(
+    load_a: LoadProfile, simulate: "Simulate", on_the_bus: "OnTheBus"
+) -> None:
+    lock_step = Scenario(ticks=60, load=load_a, updating_period_s=0.0, seed=1)
+    real_time = Scenario(ticks=60, load=load_a, updating_period_s=0.0, seed=1, realtime=True, factor=20.0)
+    async with on_the_bus() as bus:
+        before = await bus.record(lock_step)
+        between = await bus.record(real_time)
+        after = await bus.record(lock_step)
+    assert before.trace_sha256 == after.trace_sha256 == simulate(lock_step).trace_sha256
+    assert_consistent(between, before)
+
+
+async def start_real_time(bus: "Bus", factor: float, *, session: int = 1, optimizer: bool = True) -> None:
+    """Start a session in real time as an operator does."""
+    ends = bus.endpoints
+    async with client(PLANT_MAP, ends.plant.port) as rack, client(CONTROL_MAP, ends.control_plc.port) as plc:
+        if optimizer:
+            async with client(OPTIMIZER_MAP, ends.optimizer_plc.port) as diagnostics:
+                await diagnostics.write(OptimizerSession(session, 1, factor, 0))
+        await rack.write_rows([LoadStep(0, 385.0)])
+        await rack.write(PlantSession(session, 1, factor, 1, 1))
+        await plc.write(ControlSession(session, 1, factor))
+
+
+async def test_a_killed_optimiser_leaves_the_plant_held_and_a_new_one_takes_over_again(
+    on_the_bus: "OnTheBus", start_service: "Start"
+) -> None:
+    async with on_the_bus(services=("plant", "control_plc")) as bus:
+        optimiser = start_service("optimizer_plc", bus.settings)
+        await start_real_time(bus, factor=5.0)
+        async with client(CONTROL_MAP, bus.endpoints.control_plc.port) as plc:
+
+            def status() -> Awaitable[Status]:
+                return plc.read(Status)
+
+            await until(lambda: plc.read(Plan), lambda now: now.update >= 4, 60)
+            optimiser.kill()  # it has said when its sequence is due, and is at work on it
+            optimiser.wait()
+
+            held = await until(status, lambda now: now.mode == Mode.HOLD and now.remaining == 0)
+            assert held.deadline_misses > 0
+            first = await plc.read(Process)
+            later = await until(lambda: plc.read(Process), lambda now: now.tick >= first.tick + 20)
+            assert first.u == later.u
+            assert in_bounds(later.u)
+            assert later.y != first.y
+
+            start_service("optimizer_plc", bus.settings)
+            back = await until(status, lambda now: now.mode == Mode.MPC and now.accepted >= held.accepted + 5, 60)
+            assert back.update > held.update
+            assert in_bounds((await plc.read(Process)).u)
+
+
+async def test_without_an_optimiser_the_operating_inputs_hold_from_the_start(on_the_bus: "OnTheBus") -> None:
+    async with on_the_bus(services=("plant", "control_plc")) as bus:
+        await start_real_time(bus, factor=100.0, optimizer=False)
+        async with client(CONTROL_MAP, bus.endpoints.control_plc.port) as plc:
+            process = await until(lambda: plc.read(Process), lambda now: now.tick >= 40)
+            assert process.u == (43.0, 75.0, 36.0)
+            assert (await plc.read(Status)).mode == Mode.HOLD
+
+
+async def test_the_silence_of_an_optimiser_counts_as_a_miss_whenever_it_begins(on_the_bus: "OnTheBus") -> None:
+    async with on_the_bus(services=("plant", "control_plc")) as bus:
+        await start_real_time(bus, factor=100.0, optimizer=False)
+        async with client(CONTROL_MAP, bus.endpoints.control_plc.port) as plc:
+            await until(lambda: plc.read(Process), lambda now: now.tick >= 100)  # five of the longest periods
+            assert (await plc.read(Status)).deadline_misses > 0
+
+
+async def test_a_plan_that_comes_too_late_costs_an_update_and_not_the_session(
+    on_the_bus: "OnTheBus", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_once = RegisterClient.write
+
+    async def dawdling(self: RegisterClient, record: tuple[Any, ...]) -> None:
+        if isinstance(record, Plan) and record.update == 3:
+            await until(lambda: self.read(Identity), lambda now: now.tick > record.next_update_tick)
+        await at_once(self, record)
+
+    monkeypatch.setattr(RegisterClient, "write", dawdling)
+    async with on_the_bus() as bus:
+        await start_real_time(bus, factor=20.0)
+        async with client(CONTROL_MAP, bus.endpoints.control_plc.port) as plc:
+            status = await until(lambda: plc.read(Status), lambda now: now.update >= 8)
+            assert status.rejected >= 1
+
+
+async def test_a_slow_run_is_not_given_up_while_it_moves(
+    load_a: LoadProfile, on_the_bus: "OnTheBus", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rig.network, "QUIET_S", 1.0)  # factor 10 and 1 s for factor 0.5 and 20 s
+    async with on_the_bus() as bus:
+        recording = await bus.record(Scenario(ticks=80, load=load_a, updating_period_s=0.0, seed=1, realtime=True,
+                                              factor=10.0))  # fmt: skip
+    assert len(recording.load) == 80
+
+
+async def test_a_run_in_real_time_takes_over_from_another_one(
+    load_a: LoadProfile, simulate: "Simulate", on_the_bus: "OnTheBus"
+) -> None:
+    scenario = Scenario(ticks=60, load=load_a, updating_period_s=0.0, seed=1, realtime=True, factor=20.0)
+    async with on_the_bus() as bus:
+        await start_real_time(bus, factor=20.0)
+        async with client(CONTROL_MAP, bus.endpoints.control_plc.port) as plc:
+            await until(lambda: plc.read(Process), lambda now: now.u != (43.0, 75.0, 36.0))
+        recording = await bus.record(scenario)
+    assert recording.u[0].tolist() == [43.0, 75.0, 36.0]
+    assert_consistent(recording, simulate(scenario))
