@@ -47,8 +47,8 @@ class LocalServices:
         for service in SERVICES:
             with self._log(service).open("wb") as log:
                 self._processes[service] = await asyncio.create_subprocess_exec(
-                    sys.executable, "-m", service, env=self._environment, start_new_session=True,
-                    stdin=asyncio.subprocess.DEVNULL, stdout=log, stderr=log,
+                    sys.executable, "-m", service, "--with-parent", env=self._environment, start_new_session=True,
+                    stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
                 )  # fmt: skip
         return self
 

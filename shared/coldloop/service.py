@@ -36,6 +36,9 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
     """Run a service until it is told to stop; return its exit code."""
     parser = argparse.ArgumentParser(prog=f"python -m {name}", description=f"Coldloop: the {name} service.")
     add_configuration_options(parser)
+    parser.add_argument(
+        "--with-parent", action="store_true", help="end when standard input is closed: for programs that start services"
+    )
     parser.add_argument("--version", action="version", version=__version__)
     options = parser.parse_args(arguments)
     set_up_logs(name, options.log_level)
@@ -43,7 +46,7 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
         configuration = load_configuration(
             settings, file=options.config, assignments=options.assignments, others=SECTIONS
         )
-        return run_event_loop(lambda: _until_signal(serve(configuration.settings)))
+        return run_event_loop(lambda: _until_told(serve(configuration.settings), with_parent=options.with_parent))
     except ColdloopError as error:
         sys.stderr.write(f"{name}: {error}\n")
         return error.exit_code
@@ -61,10 +64,14 @@ def run_event_loop(start: Callable[[], Any]) -> int:
         return int(runner.run(start()))
 
 
-async def _until_signal(service: Awaitable[None]) -> int:
-    """Run the service; SIGTERM and SIGINT end it in good order."""
+async def _until_told(service: Awaitable[None], *, with_parent: bool) -> int:
+    """Run the service; SIGTERM, SIGINT or the parent's end end it in good order."""
     loop = asyncio.get_running_loop()
     task = asyncio.ensure_future(service)
+    if with_parent:
+        farewell = asyncio.StreamReader()
+        await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(farewell), sys.stdin)
+        asyncio.ensure_future(farewell.read()).add_done_callback(lambda _: task.cancel())
     for number in (signal.SIGTERM, signal.SIGINT):
         with contextlib.suppress(NotImplementedError):  # Windows
             loop.add_signal_handler(number, task.cancel)

@@ -136,6 +136,14 @@ class Bus(NamedTuple):
     endpoints: RigEndpoints
     settings: Settings
 
+    async def ready(self) -> None:
+        """Wait until all three serve."""
+        rig = NetworkRig(self.endpoints, self.settings)
+        try:
+            await rig.connect(PATIENCE_S)
+        finally:
+            rig.close()
+
     async def record(self, scenario: Scenario, patience_s: float = PATIENCE_S) -> Recording:
         """Run a session; return what was recorded."""
         recorder = Recorder(scenario.ticks)

@@ -1,6 +1,6 @@
 """Whatever is asked for wrongly: one line on standard error, the right exit code, no results half written."""
 
-import json
+import asyncio
 import os
 import socket
 import subprocess
@@ -17,7 +17,7 @@ from coldloop.model_file import read_document, write_document
 from coldloop.model_settings import DEFAULT_MODEL_FILE
 
 if TYPE_CHECKING:
-    from tests.rig.conftest import Coldloop, Outcome
+    from tests.rig.conftest import Bus, Coldloop, Outcome
 
 USAGE, FAILURE = 2, 1
 
@@ -274,6 +274,22 @@ def test_a_rig_that_is_something_else_is_told(coldloop: "Coldloop", results: Pat
     assert_no_results(results)
 
 
+def test_a_rig_that_runs_another_model_is_told(
+    coldloop: "Coldloop", results: Path, tmp_path: Path, three_processes: "Bus"
+) -> None:
+    document = read_document(DEFAULT_MODEL_FILE)
+    document["B"][0][0] *= 1.001
+    file = tmp_path / "model.json"
+    write_document(file, document)
+    ends = [f"{end.host}:{end.port}" for end in three_processes.endpoints]
+    asyncio.run(three_processes.ready())
+    outcome = coldloop("run", "--attach", *ends, "--set", f"model.file={file}", "--out", results)
+    assert outcome.code == FAILURE
+    assert f"plant at {ends[0]} runs model" in outcome.complaints[-1]
+    assert "the same model" in outcome.complaints[-1]
+    assert_no_results(results)
+
+
 @pytest.mark.usefixtures("impatient")
 @pytest.mark.xfail(strict=True, reason="the empty progress bar is printed before the error")
 def test_a_run_that_fails_says_nothing_but_why(coldloop: "Coldloop", results: Path, web_server: int) -> None:
@@ -300,7 +316,3 @@ def test_the_program_ends_with_the_code_and_one_line(arguments: list[str], code:
     assert len(done.stderr.splitlines()) == 1
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
-
-
-def test_a_bad_value_is_shown_on_one_line(coldloop: "Coldloop") -> None:
-    assert_refused(coldloop(*RUN, "--set", f"plant.load={json.dumps('one' + chr(10) + 'two')}"), USAGE, "neither a file")

@@ -81,7 +81,7 @@ def test_a_csv_file_as_spreadsheets_save_it_is_read(content: str | bytes, write:
         ("time_s,load_w\n0\n", "line 2", "number"),
         ("time_s,load_w\n0,1\n10,2\n5,3\n", "line 4", "sort"),
         ("time_s,load_w\n0,1\n0,2\n", "line 3", "sort"),
-        ("time_s,load_w\n0,-5\n", "line 2", "0 W or more"),
+        ("time_s,load_w\n0,-5\n", "line 2", "outside 0 to"),
         ("time_s,load_w\n0,5\n0.3,5\n", "line 3", "multiple of 0.25"),
         ("time_s,load_w\n5,385\n", "line 2", "begin at 0 s"),
         ("time_s,load\n0,385\n", "load_w", "time_s,load_w"),

@@ -1,0 +1,211 @@
+"""Services as processes, and brokers to publish to."""
+
+import asyncio
+import contextlib
+import inspect
+import json
+import os
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AbstractAsyncContextManager
+from pathlib import Path
+from typing import Any, Protocol
+
+import aiomqtt
+import pytest
+
+from coldloop.config import PREFIX
+
+PATIENCE_S = 60.0
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test that is a coroutine, in a loop of its own and within `PATIENCE_S`."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    arguments = {name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters}
+
+    async def story() -> None:
+        async with asyncio.timeout(PATIENCE_S):
+            await pyfuncitem.obj(**arguments)
+
+    asyncio.run(story())
+    return True
+
+
+@pytest.fixture
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as one:
+        return int(one.getsockname()[1])
+
+
+# -- processes ---------------------------------------------------------------------------------------------------------
+
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Start a service with `--set` assignments; what is still running at the end of the test is killed."""
+    started: list[subprocess.Popen[str]] = []
+
+    def one(service: str, *assignments: str, level: str = "error") -> subprocess.Popen[str]:
+        started.append(
+            subprocess.Popen(
+                [sys.executable, "-m", service, "--log-level", level, *[f"--set={text}" for text in assignments]],
+                env={name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
+                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            )
+        )  # fmt: skip
+        return started[-1]
+
+    yield one
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+# -- brokers -----------------------------------------------------------------------------------------------------------
+
+
+class Broker(Protocol):
+    """What a test sees of a broker."""
+
+    async def retained(self, topic: str) -> Any:  # noqa: ANN401 - JSON
+        """Return what the broker keeps on a topic, read strictly as JSON; None is nothing."""
+
+
+Serve = Callable[[int], AbstractAsyncContextManager[Broker]]
+
+
+def strict_json(payload: bytes) -> Any:  # noqa: ANN401 - JSON
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is not JSON")
+
+    return json.loads(payload, parse_constant=refuse)
+
+
+class SmallBroker:
+    """As much of MQTT 3.1.1 as a publisher needs: retained messages, acknowledgements, last wills."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, bytes] = {}
+        self._connections: set[asyncio.Task[None]] = set()
+
+    async def retained(self, topic: str) -> Any:  # noqa: ANN401 - JSON
+        return strict_json(self._kept[topic]) if topic in self._kept else None
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        will: tuple[str, bytes] | None = None
+        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionResetError):
+            while True:
+                kind, body = await self._packet(reader)
+                if kind >> 4 == 1:
+                    will = self._will(body)
+                    writer.write(b"\x20\x02\0\0")
+                elif kind >> 4 == 3:
+                    self._publish(kind, body, writer)
+                elif kind >> 4 == 12:
+                    writer.write(b"\xd0\0")
+                elif kind >> 4 == 14:
+                    will = None
+                    break
+        if will is not None:
+            self._kept[will[0]] = will[1]
+        writer.close()
+
+    async def _packet(self, reader: asyncio.StreamReader) -> tuple[int, bytes]:
+        kind = (await reader.readexactly(1))[0]
+        length = shift = 0
+        while True:
+            digit = (await reader.readexactly(1))[0]
+            length |= (digit & 0x7F) << shift
+            shift += 7
+            if digit < 0x80:
+                return kind, await reader.readexactly(length)
+
+    def _publish(self, kind: int, body: bytes, writer: asyncio.StreamWriter) -> None:
+        topic, rest = self._text(body)
+        if kind & 0x06:
+            writer.write(b"\x40\x02" + rest[:2])
+            rest = rest[2:]
+        if kind & 0x01:
+            self._kept[topic.decode()] = rest
+
+    def _will(self, body: bytes) -> tuple[str, bytes] | None:
+        _, rest = self._text(body)
+        flags = rest[1]
+        _, rest = self._text(rest[4:])
+        if not flags & 0x04:
+            return None
+        assert flags & 0x20, "a last will that is not retained tells nobody who comes later"
+        topic, rest = self._text(rest)
+        return topic.decode(), self._text(rest)[0]
+
+    @staticmethod
+    def _text(data: bytes) -> tuple[bytes, bytes]:
+        (length,) = struct.unpack_from(">H", data)
+        return data[2 : 2 + length], data[2 + length :]
+
+
+@contextlib.asynccontextmanager
+async def small_broker(port: int) -> AsyncIterator[SmallBroker]:
+    broker = SmallBroker()
+    server = await asyncio.start_server(broker.serve, "127.0.0.1", port)
+    async with server:
+        yield broker
+
+
+class Mosquitto:
+    """A real broker, asked by a client that comes later."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+
+    async def retained(self, topic: str) -> Any:  # noqa: ANN401 - JSON
+        async with aiomqtt.Client("127.0.0.1", self._port) as client:
+            await client.subscribe(topic, qos=1)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(0.2):
+                    async for message in client.messages:
+                        if message.retain:
+                            return strict_json(bytes(message.payload))
+        return None
+
+
+@contextlib.asynccontextmanager
+async def mosquitto(port: int, program: str, folder: Path) -> AsyncIterator[Mosquitto]:
+    settings = folder / "mosquitto.conf"
+    settings.write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nuser root\n")
+    process = await asyncio.create_subprocess_exec(
+        program, "-c", settings, stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL
+    )
+    try:
+        while True:
+            assert process.returncode is None, "mosquitto has ended"
+            with contextlib.suppress(OSError):
+                _, writer = await asyncio.open_connection("127.0.0.1", port)
+                writer.close()
+                break
+            await asyncio.sleep(0.02)
+        yield Mosquitto(port)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.terminate()
+        await process.wait()
+
+
+@pytest.fixture(params=["small", "mosquitto"])
+def broker(request: pytest.FixtureRequest, tmp_path: Path) -> Serve:
+    """Each story is told to a small broker of our own, and to a real one where there is one."""
+    if request.param == "small":
+        return small_broker
+    program = shutil.which("mosquitto", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
+    if program is None:
+        pytest.skip("no mosquitto here")
+    return lambda port: mosquitto(port, program, tmp_path)

@@ -1,0 +1,73 @@
+"""Services as programs of their own: how they end when they cannot begin, and when they are told to."""
+
+import signal
+import socket
+import subprocess
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from coldloop.model_file import read_document, write_document
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+
+if TYPE_CHECKING:
+    from tests.services.conftest import Start
+
+USAGE, FAILURE = 2, 1
+SERVICES = ("plant", "control_plc", "optimizer_plc")
+
+
+def assert_ended(process: "subprocess.Popen[str]", code: int, *parts: str) -> None:
+    """Wait for the end; one line on standard error has all the parts."""
+    _, complaint = process.communicate(timeout=60)
+    assert process.returncode == code, complaint
+    assert len(complaint.splitlines()) == 1, complaint
+    for part in parts:
+        assert part in complaint
+
+
+def test_each_service_names_a_wrong_key_and_leaves_the_sections_of_others_alone(start: "Start") -> None:
+    others = [f"{service}.nonsense=1" for service in SERVICES]
+    started = {service: start(service, *others) for service in SERVICES}
+    for service, process in started.items():
+        assert_ended(process, USAGE, f"{service}.nonsense", "no such key")
+
+
+def test_a_port_in_use_is_named_with_what_to_do(start: "Start") -> None:
+    with socket.create_server(("127.0.0.1", 0)) as holder:
+        port = holder.getsockname()[1]
+        process = start("plant", f"plant.server.port={port}")
+        assert_ended(process, FAILURE, f"127.0.0.1:{port}", "in use", "another port")
+
+
+def test_a_control_plc_without_a_plant_gives_up_after_its_patience(start: "Start", free_port: int) -> None:
+    process = start(
+        "control_plc", "control_plc.server.port=0", f"control_plc.plant.port={free_port}",
+        "control_plc.plant.patience_s=0.2",
+    )  # fmt: skip
+    assert_ended(process, FAILURE, f"plant at 127.0.0.1:{free_port}", "start it")
+
+
+def test_an_optimiser_refuses_a_control_plc_with_another_model(
+    start: "Start", free_port: int, tmp_path: Path
+) -> None:
+    document = read_document(DEFAULT_MODEL_FILE)
+    document["B"][0][0] *= 1.001
+    other = tmp_path / "model.json"
+    write_document(other, document)
+    start("control_plc", f"control_plc.server.port={free_port}", f"model.file={other}")
+    process = start("optimizer_plc", "optimizer_plc.server.port=0", f"optimizer_plc.control_plc.port={free_port}")
+    digests = [f"{read_document(file)['digest'][:8]}" for file in (DEFAULT_MODEL_FILE, other)]
+    assert_ended(process, FAILURE, "same model.file", *digests)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_service_that_is_told_to_stop_ends_in_good_order(number: signal.Signals, start: "Start") -> None:
+    process = start("control_plc", "control_plc.server.port=0", level="info")
+    assert process.stderr is not None
+    assert '"event": "serving"' in process.stderr.readline()
+    process.send_signal(number)
+    _, complaint = process.communicate(timeout=20)
+    assert process.returncode == 0
+    assert "Traceback" not in complaint

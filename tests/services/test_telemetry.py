@@ -1,0 +1,103 @@
+"""Telemetry: what a broker knows of a service, and that control never waits for it."""
+
+import asyncio
+import contextlib
+import math
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from coldloop.telemetry import Telemetry, TelemetrySettings
+
+if TYPE_CHECKING:
+    from tests.services.conftest import Broker, Serve, Start
+
+ONLINE, OFFLINE = {"state": "online"}, {"state": "offline"}
+
+
+async def until(read: Callable[[], Awaitable[Any]], wanted: Callable[[Any], bool]) -> Any:  # noqa: ANN401 - JSON
+    deadline = time.monotonic() + 20
+    while not wanted(value := await read()):
+        assert time.monotonic() < deadline, f"still {value}"
+        await asyncio.sleep(0.01)
+    return value
+
+
+async def keeps(broker: "Broker", topic: str, value: object) -> None:
+    await until(lambda: broker.retained(topic), lambda now: now == value)
+
+
+@contextlib.asynccontextmanager
+async def publishing(
+    port: int, snapshot: Callable[[], Mapping[str, object]], **settings: Any  # noqa: ANN401 - any setting
+) -> AsyncIterator["asyncio.Task[None]"]:
+    chosen = TelemetrySettings(**{"broker": "127.0.0.1", "port": port, "period_s": 0.02, "timeout_s": 0.2, **settings})
+    task = asyncio.create_task(Telemetry(chosen, "plant", snapshot).run())
+    try:
+        yield task
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_a_service_is_online_shows_itself_and_goes_offline_in_good_order(
+    broker: "Serve", free_port: int
+) -> None:
+    ticks = iter(range(1000))
+    async with broker(free_port) as known:
+        async with publishing(free_port, lambda: {"tick": next(ticks), "inputs": {"CV155": 43.0}}):
+            await keeps(known, "coldloop/plant/state", ONLINE)
+            first = await until(lambda: known.retained("coldloop/plant/telemetry"), lambda now: now is not None)
+            assert first["inputs"] == {"CV155": 43.0}
+            await until(lambda: known.retained("coldloop/plant/telemetry"), lambda now: now["tick"] > first["tick"])
+        assert await known.retained("coldloop/plant/state") == OFFLINE
+
+
+async def test_a_service_that_is_killed_leaves_its_last_will(
+    broker: "Serve", free_port: int, start: "Start"
+) -> None:
+    async with broker(free_port) as known:
+        service = start(
+            "control_plc", "control_plc.server.port=0", "telemetry.broker=127.0.0.1", f"telemetry.port={free_port}",
+            "telemetry.prefix=hall-3",
+        )  # fmt: skip
+        await keeps(known, "hall-3/control_plc/state", ONLINE)
+        telemetry = await until(lambda: known.retained("hall-3/control_plc/telemetry"), lambda now: now is not None)
+        assert telemetry["mode"] == "hold"
+        assert set(telemetry["inputs"]) == {"CV155", "NCR22_A", "CV156"}
+        service.kill()
+        await keeps(known, "hall-3/control_plc/state", OFFLINE)
+
+
+async def test_a_broker_that_comes_late_gets_the_newest_snapshots(broker: "Serve", free_port: int) -> None:
+    taken = 0
+
+    def snapshot() -> dict[str, object]:
+        nonlocal taken
+        taken += 1
+        return {"number": taken}
+
+    async def number() -> int:
+        return taken
+
+    async with publishing(free_port, snapshot, queue=3) as task:
+        await until(number, lambda now: now > 10)
+        assert not task.done()
+        async with broker(free_port) as known:
+            shown = await until(lambda: known.retained("coldloop/plant/telemetry"), lambda now: now is not None)
+            assert shown["number"] > 10 - 3
+
+
+async def test_without_a_broker_in_the_configuration_nothing_is_sampled() -> None:
+    def snapshot() -> dict[str, object]:
+        raise AssertionError
+
+    await Telemetry(TelemetrySettings(), "plant", snapshot).run()
+
+
+@pytest.mark.xfail(strict=True, raises=ValueError, reason="json.dumps writes Infinity and NaN, which are not JSON")
+async def test_what_is_published_is_json_whatever_the_numbers(broker: "Serve", free_port: int) -> None:
+    async with broker(free_port) as known, publishing(free_port, lambda: {"gamma": math.inf}):
+        await until(lambda: known.retained("coldloop/plant/telemetry"), lambda now: now is not None)
