@@ -95,7 +95,8 @@ class SmallBroker:
 
     def __init__(self) -> None:
         self._kept: dict[str, bytes] = {}
-        self._connections: set[asyncio.Task[None]] = set()
+        self.frozen = False
+        """It takes what comes, and answers nothing."""
 
     async def retained(self, topic: str) -> Any:  # noqa: ANN401 - JSON
         return strict_json(self._kept[topic]) if topic in self._kept else None
@@ -105,6 +106,8 @@ class SmallBroker:
         with contextlib.suppress(asyncio.IncompleteReadError, ConnectionResetError):
             while True:
                 kind, body = await self._packet(reader)
+                if self.frozen:
+                    continue
                 if kind >> 4 == 1:
                     will = self._will(body)
                     writer.write(b"\x20\x02\0\0")
@@ -161,6 +164,9 @@ async def small_broker(port: int) -> AsyncIterator[SmallBroker]:
         yield broker
 
 
+ServeFrozen = Callable[[int], AbstractAsyncContextManager[SmallBroker]]
+
+
 class Mosquitto:
     """A real broker, asked by a client that comes later."""
 
@@ -198,6 +204,12 @@ async def mosquitto(port: int, program: str, folder: Path) -> AsyncIterator[Mosq
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
         await process.wait()
+
+
+@pytest.fixture
+def frozen_broker() -> ServeFrozen:
+    """A broker that can be frozen."""
+    return small_broker
 
 
 @pytest.fixture(params=["small", "mosquitto"])

@@ -1,0 +1,64 @@
+"""Ticks a second of the networked loop in lock-step, against the bare exchange with the plant's rack."""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+from coldloop.lti_model import load
+from coldloop.modbus.client import RegisterClient
+from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
+from coldloop.service import run_event_loop
+from plant.load import find_load
+from rig.local_services import LocalServices
+from rig.network import NetworkRig
+from rig.recording import Recorder
+from rig.scenario import Scenario
+from rig.settings import Settings
+
+
+async def bare_exchanges(port: int, count: int) -> float:
+    """Return exchanges a second with a rack that answers without moving: they are of another session than its own."""
+    client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=port, timeout_s=5.0)
+    await client.connect(10.0)
+    nothing = Actuators(0, 43.0, 75.0, 36.0, session=0xFFFF_FFFF)
+    start = time.perf_counter()
+    for _ in range(count):
+        await client.exchange(nothing, Measurement)
+    elapsed = time.perf_counter() - start
+    client.close()
+    return count / elapsed
+
+
+async def measure(ticks: int, period_s: float) -> int:
+    """Measure both on one rig, and print."""
+    settings = Settings()
+    mean = load(settings.model.file).w0
+    scenario = Scenario(ticks, find_load("2h", mean), period_s, seed=1)
+    with tempfile.TemporaryDirectory() as folder:
+        async with LocalServices(settings, Path(folder)) as services:
+            rig = NetworkRig(services.endpoints, settings)
+
+            async def work() -> tuple[float, float]:
+                await rig.connect(90.0)
+                bare = await bare_exchanges(services.endpoints.plant.port, ticks)
+                recorder = Recorder(ticks)
+                await rig.run(scenario, recorder)
+                return bare, ticks / recorder.wall_seconds
+
+            bare, loop = await services.during(work())
+    print(f"bare exchange {bare:.0f}/s, lock-step {loop:.0f} ticks/s: ratio {loop / bare:.2f}")
+    return 0
+
+
+def main() -> None:
+    """Read the options, and measure."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--ticks", type=int, default=14400)
+    parser.add_argument("--updating-period", type=float, default=0.0, help="s; 0 is adaptive")
+    options = parser.parse_args()
+    run_event_loop(lambda: measure(options.ticks, options.updating_period))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+"""The documentation says what is so."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from rig.cli import make_parser
+from rig.register_listing import FORMATS, MAPS
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def test_the_register_page_is_what_the_command_prints() -> None:
+    page = (ROOT / "docs" / "registers.md").read_text(encoding="utf-8")
+    assert page.endswith(FORMATS["markdown"](list(MAPS.values())))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_every_coldloop_command_in_the_readme_is_understood() -> None:
+    blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    lines = [line for block in blocks for line in block.splitlines() if line.startswith("coldloop ")]
+    assert len(lines) > 5
+    for line in lines:
+        make_parser().parse_args(shlex.split(line, comments=True)[1:])
+
+
+def test_every_mbpoll_line_in_the_readme_reads_declared_floats() -> None:
+    lines = re.findall(r"mbpoll .* -p (\d+) -t 4:float -B -r (\d+) -c 1", (ROOT / "README.md").read_text("utf-8"))
+    assert len(lines) >= 3
+    ports = {"5020": "plant", "5021": "control_plc", "5022": "optimizer_plc"}
+    for port, address in lines:
+        registers = [register for block in MAPS[ports[port]].blocks for register in block.registers()]
+        assert any(r.address == int(address) and r.kind.label == "float32" for r in registers), (port, address)
