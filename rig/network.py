@@ -7,7 +7,6 @@ from typing import NamedTuple
 from coldloop.endpoints import Endpoint
 from coldloop.errors import LinkError, ModelFileError
 from coldloop.modbus.client import RegisterClient
-from coldloop.model_file import read_header
 from coldloop.process import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, Status
@@ -15,6 +14,7 @@ from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, Optimization, OptimizerSession
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, LoadStep, PlantSample, PlantSession
+from plant.runtime import own_header
 from rig.recording import LinkStatistics, Recorder
 from rig.scenario import Scenario
 from rig.settings import Settings
@@ -52,7 +52,7 @@ class NetworkRig:
             ModelFileError: One runs another model.
         """
         file = self._settings.model.file
-        ours = read_header(file).short_digest
+        ours = own_header(file).short_digest
         for client in (self._plant, self._control, self._optimizer):
             await client.connect(patience_s)
             theirs = (await client.read(Identity)).model_digest

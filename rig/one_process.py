@@ -1,14 +1,13 @@
 """The three programs in one process, by direct calls; what would cross the bus is rounded as the bus would round it."""
 
 from coldloop.lti_model import load
-from coldloop.model_file import read_header
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
 from coldloop.registers.plant import LoadStep, Measurement, PlantSample
 from control_plc.program import ControlProgram
 from optimizer_plc.program import OptimizerProgram
 from plant.program import LoadProfile, PlantProgram
-from plant.runtime import make_program
+from plant.runtime import make_program, own_header
 from rig.recording import Recorder
 from rig.scenario import Scenario
 from rig.settings import Settings
@@ -18,7 +17,7 @@ class OneProcessRig:
     """Plant, control PLC and optimiser PLC, connected by calls."""
 
     def __init__(self, settings: Settings) -> None:
-        header = read_header(settings.model.file)
+        header = own_header(settings.model.file)
         self._settings = settings
         self._header = header
         program = settings.optimizer_plc.program

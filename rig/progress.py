@@ -32,12 +32,12 @@ class RunProgress:
         self._shown = time.monotonic()
 
     def __enter__(self) -> Self:
-        self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bar.refresh()
-        self._bar.stop()
+        if self._bar.live.is_started:
+            self._bar.refresh()
+            self._bar.stop()
 
     def __call__(self, recorder: Recorder) -> None:
         """Show where the run is, a few times a second."""
@@ -48,6 +48,7 @@ class RunProgress:
         if now - self._shown < REFRESH_S and done != recorder.ticks:
             return
         self._shown = now
+        self._bar.start()  # not before there is something to show: an error then stands alone
         seconds = done * TICK_S
         speed = seconds / max(recorder.wall_seconds, 1e-9)
         hours, rest = divmod(int(seconds), 3600)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from coldloop.config import Configuration
-from coldloop.errors import UsageError
+from coldloop.errors import ResultsError, UsageError
 from coldloop.lti_model import load as load_model
 from coldloop.process import TICK_S
 from coldloop.service import add_configuration_options, run_event_loop
@@ -61,7 +61,10 @@ def execute(options: argparse.Namespace) -> int:
     with RunProgress(scenario.ticks) as progress:
         recorder = Recorder(scenario.ticks, progress)
         _perform(options, settings, scenario, recorder, out)
-    summary = _write(out, effective, options, recorder.recording(), recorder.wall_seconds)
+    try:
+        summary = _write(out, effective, options, recorder.recording(), recorder.wall_seconds)
+    except OSError as error:
+        raise ResultsError(f"{out}: {error.strerror}; no summary was written, choose another --out") from None
     _tell(out, summary)
     return 0
 

@@ -74,6 +74,10 @@ class ControlPlc:
         self._publish_status()
         self._publish_identity()
 
+    def close(self) -> None:
+        """Let go of the plant."""
+        self._plant.close()
+
     def _new_pacer(self) -> Pacer:
         return Pacer(Schedule(time.monotonic(), self._pace.factor))
 
@@ -287,4 +291,5 @@ async def serve(settings: ControlSettings) -> None:
             tasks.create_task(plc.run(), name="scan cycle")
             tasks.create_task(Telemetry(settings.telemetry, "control_plc", plc.snapshot).run(), name="telemetry")
     finally:
+        plc.close()
         await server.close()

@@ -13,14 +13,26 @@ from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
 
 
+class ControlServer(ServerSettings):
+    """The control PLC's server."""
+
+    port: Annotated[int, Field(ge=0, le=0xFFFF)] = CONTROL_PORT
+
+
+class PlantEndpoint(Endpoint):
+    """Where the plant's rack is."""
+
+    port: Annotated[int, Field(ge=1, le=0xFFFF)] = PLANT_PORT
+
+
 class ControlSection(BaseModel):
     """Section `control_plc` of the configuration."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    server: ServerSettings = ServerSettings(port=CONTROL_PORT)
+    server: ControlServer = ControlServer()
     word_order: WordOrder = WordOrder.HIGH_FIRST
-    plant: Endpoint = Endpoint(port=PLANT_PORT)
+    plant: PlantEndpoint = PlantEndpoint()
     scan_tolerance_ms: Annotated[float, Field(gt=0)] = 5.0
     """Lateness of a scan, in real time, that counts as an overrun."""
 

@@ -49,6 +49,10 @@ class OptimizerPlc:
         self._last: Optimization | None = None
         self._publish_identity(0)
 
+    def close(self) -> None:
+        """Let go of the control PLC."""
+        self._control.close()
+
     async def run(self) -> None:
         """Serve one update after the other until cancelled.
 
@@ -152,4 +156,5 @@ async def serve(settings: OptimizerSettings) -> None:
             tasks.create_task(plc.run(), name="optimiser")
             tasks.create_task(Telemetry(settings.telemetry, "optimizer_plc", plc.snapshot).run(), name="telemetry")
     finally:
+        plc.close()
         await server.close()

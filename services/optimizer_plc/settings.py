@@ -73,14 +73,26 @@ class ProgramSettings(BaseModel):
         return value
 
 
+class OptimizerServer(ServerSettings):
+    """The optimiser PLC's server."""
+
+    port: Annotated[int, Field(ge=0, le=0xFFFF)] = OPTIMIZER_PORT
+
+
+class ControlEndpoint(Endpoint):
+    """Where the control PLC is."""
+
+    port: Annotated[int, Field(ge=1, le=0xFFFF)] = CONTROL_PORT
+
+
 class OptimizerSection(BaseModel):
     """Section `optimizer_plc` of the configuration."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    server: ServerSettings = ServerSettings(port=OPTIMIZER_PORT)
+    server: OptimizerServer = OptimizerServer()
     word_order: WordOrder = WordOrder.HIGH_FIRST
-    control_plc: Endpoint = Endpoint(port=CONTROL_PORT)
+    control_plc: ControlEndpoint = ControlEndpoint()
     program: ProgramSettings = ProgramSettings()
 
 

@@ -8,12 +8,15 @@ import asyncio
 import logging
 import time
 from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
 
 from coldloop import __version__
 from coldloop.clock import Pacer, Schedule
+from coldloop.errors import ModelFileError
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import ModelHeader, read_header
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.declaration import Block
@@ -29,11 +32,31 @@ from coldloop.registers.plant import (
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
 from plant.cold_box import REFERENCE
+from plant.helium.properties import load_helium
 from plant.load import find_load
+from plant.model import parameters_digest
 from plant.program import LoadProfile, MeasurementNoise, PlantProgram
 from plant.settings import PlantSettings, SensorSettings
 
 log = logging.getLogger("coldloop.plant")
+
+
+def own_header(file: Path) -> ModelHeader:
+    """Return the header of a model file of this very plant.
+
+    Raises:
+        ModelFileError: The file cannot be read, or the model was made from another plant.
+    """
+    header = read_header(file)
+    names = (header.state_names, header.input_names, header.output_names)
+    if header.parameters_digest != _own_parameters_digest() or names != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
+        raise ModelFileError(f"{file}: a model of another plant; make one with `coldloop model --out FILE`")
+    return header
+
+
+@cache
+def _own_parameters_digest() -> str:
+    return parameters_digest(REFERENCE, load_helium())
 
 
 def make_program(header: ModelHeader, sensors: SensorSettings, load: LoadProfile, seed: int) -> PlantProgram:
@@ -48,7 +71,7 @@ class PlantRack:
 
     def __init__(self, settings: PlantSettings) -> None:
         self._settings = settings
-        self._header = read_header(settings.model.file)
+        self._header = own_header(settings.model.file)
         self.bank = RegisterBank(PLANT_MAP, settings.plant.word_order)
         load = find_load(settings.plant.load, self._header.w0)
         self._begin(1 if settings.session.autostart else 0, self._configured_pace(), load, settings.plant.seed)

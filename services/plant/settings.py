@@ -34,12 +34,18 @@ class SensorSettings(BaseModel):
         return (self.level, self.speed, *[self.temperature] * 10, *[self.pressure] * 10)
 
 
+class PlantServer(ServerSettings):
+    """The rack's server."""
+
+    port: Annotated[int, Field(ge=0, le=0xFFFF)] = PLANT_PORT
+
+
 class PlantSection(BaseModel):
     """Section `plant` of the configuration."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    server: ServerSettings = ServerSettings(port=PLANT_PORT)
+    server: PlantServer = PlantServer()
     word_order: WordOrder = WordOrder.HIGH_FIRST
     load: str = "2h"
     """Named load or CSV file."""

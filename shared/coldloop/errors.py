@@ -4,6 +4,7 @@
     ├── UsageError                  exit code 2: what the caller asked for cannot be done
     │   ├── ConfigurationError      a key, a value or a configuration file
     │   └── LoadFileError           a load profile
+    ├── ResultsError                the files of a run cannot be written
     ├── ModelFileError              a prediction model that is missing, damaged or of another plant
     └── LinkError                   the bus: a port, a peer, an answer
         ├── PortInUseError
@@ -32,6 +33,10 @@ class ConfigurationError(UsageError):
 
 class LoadFileError(UsageError):
     """A load profile cannot be read."""
+
+
+class ResultsError(ColdloopError):
+    """The files of a run cannot be written."""
 
 
 class ModelFileError(ColdloopError):

@@ -6,8 +6,10 @@ Topics, under `prefix` (default `coldloop`):
 """
 
 import asyncio
+import contextlib
 import json
 import logging
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Annotated
@@ -16,6 +18,9 @@ import aiomqtt
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
 log = logging.getLogger("coldloop.telemetry")
+
+FAREWELL_S = 1.0
+"""How long a service that ends waits for its broker."""
 
 Snapshot = Callable[[], Mapping[str, object]]
 
@@ -56,7 +61,7 @@ class Telemetry:
 
     async def _sample(self) -> None:
         while True:
-            self._waiting.append(json.dumps(self._snapshot()))
+            self._waiting.append(json.dumps(_finite(self._snapshot())))
             self._arrived.set()
             await asyncio.sleep(self._settings.period_s)
 
@@ -76,7 +81,9 @@ class Telemetry:
             try:
                 await self._forward(client)
             except asyncio.CancelledError:  # a clean end calls for no last will
-                await client.publish(f"{self._topic}/state", offline.payload, qos=1, retain=True)
+                with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
+                    async with asyncio.timeout(FAREWELL_S):
+                        await client.publish(f"{self._topic}/state", offline.payload, qos=1, retain=True)
                 raise
 
     async def _forward(self, client: aiomqtt.Client) -> None:
@@ -86,3 +93,12 @@ class Telemetry:
             while self._waiting:
                 await client.publish(f"{self._topic}/telemetry", self._waiting[0], qos=1, retain=True)
                 self._waiting.popleft()
+
+
+def _finite(value: object) -> object:
+    """Return the value with null for each number that JSON does not know."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    return value

@@ -44,7 +44,7 @@ def outside_the_bands(y: "np.ndarray[tuple[int, int], np.dtype[np.float32]]") ->
 
 
 def rate_windows(recording: Recording) -> Iterator[slice]:
-    """Yield the ticks in which the inputs may stray by one rate limit from where they were before: an update, or 5 s."""
+    """Yield the ticks, of an update or of 5 s, in which inputs may stray by one rate limit from where they were."""
     instants = [0, *(row.tick + row.tau_u for row in recording.updates), len(recording.u)]
     for start, end in pairwise(instants):
         for first in range(start, end, TICKS_PER_SAMPLE):
@@ -105,7 +105,8 @@ def test_narrow_limits_are_kept_when_they_bite(
     widths: tuple[float, float, float], step: LoadProfile, simulate: "Simulate"
 ) -> None:
     u0 = read_header(Settings().model.file).u0
-    low, high = (tuple(value + sign * width for value, width in zip(u0, widths, strict=True)) for sign in (-1, 1))
+    low = (u0[0] - widths[0], u0[1] - widths[1], u0[2] - widths[2])
+    high = (u0[0] + widths[0], u0[1] + widths[1], u0[2] + widths[2])
     limits = InputLimits(low=low, high=high, rate=(0.07, 1.1, 0.013))
     recording = simulate(Scenario(FIVE_MINUTES, step, 0.0, seed=1), limits=limits)
     assert_inside_limits(recording, limits)

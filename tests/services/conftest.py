@@ -97,12 +97,19 @@ class SmallBroker:
         self._kept: dict[str, bytes] = {}
         self.frozen = False
         """It takes what comes, and answers nothing."""
+        self._connections: dict[asyncio.StreamWriter, asyncio.Task[object] | None] = {}
+
+    async def hang_up(self) -> None:
+        for writer in self._connections:
+            writer.transport.abort()
+        await asyncio.gather(*(task for task in self._connections.values() if task))
 
     async def retained(self, topic: str) -> Any:  # noqa: ANN401 - JSON
         return strict_json(self._kept[topic]) if topic in self._kept else None
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         will: tuple[str, bytes] | None = None
+        self._connections[writer] = asyncio.current_task()
         with contextlib.suppress(asyncio.IncompleteReadError, ConnectionResetError):
             while True:
                 kind, body = await self._packet(reader)
@@ -161,7 +168,10 @@ async def small_broker(port: int) -> AsyncIterator[SmallBroker]:
     broker = SmallBroker()
     server = await asyncio.start_server(broker.serve, "127.0.0.1", port)
     async with server:
-        yield broker
+        try:
+            yield broker
+        finally:
+            await broker.hang_up()
 
 
 ServeFrozen = Callable[[int], AbstractAsyncContextManager[SmallBroker]]

@@ -49,9 +49,7 @@ def test_a_control_plc_without_a_plant_gives_up_after_its_patience(start: "Start
     assert_ended(process, FAILURE, f"plant at 127.0.0.1:{free_port}", "start it")
 
 
-def test_an_optimiser_refuses_a_control_plc_with_another_model(
-    start: "Start", free_port: int, tmp_path: Path
-) -> None:
+def test_an_optimiser_refuses_a_control_plc_with_another_model(start: "Start", free_port: int, tmp_path: Path) -> None:
     document = read_document(DEFAULT_MODEL_FILE)
     document["B"][0][0] *= 1.001
     other = tmp_path / "model.json"
