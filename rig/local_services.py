@@ -31,8 +31,12 @@ class LocalServices:
     """
 
     def __init__(self, settings: Settings, log_folder: Path) -> None:
-        ports = _free_ports(len(SERVICES))
-        self.endpoints = RigEndpoints(*(Endpoint(port=port, patience_s=START_PATIENCE_S) for port in ports))
+        self.endpoints = RigEndpoints(
+            *[
+                Endpoint(port=port, patience_s=START_PATIENCE_S, word_order=getattr(settings, service).word_order)
+                for service, port in zip(SERVICES, _free_ports(len(SERVICES)), strict=True)
+            ]
+        )
         self._environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
             **to_environment(_wired(settings, self.endpoints)),
@@ -98,23 +102,21 @@ def _wired(settings: Settings, endpoints: RigEndpoints) -> Settings:
     def server(section: str, endpoint: Endpoint) -> object:
         return getattr(settings, section).server.model_copy(update={"host": endpoint.host, "port": endpoint.port})
 
-    order = {"word_order": endpoints.plant.word_order}
     return settings.model_copy(
         update={
             "session": settings.session.model_copy(update={"autostart": False}),
-            "plant": settings.plant.model_copy(update={"server": server("plant", endpoints.plant), **order}),
+            "plant": settings.plant.model_copy(update={"server": server("plant", endpoints.plant)}),
             "control_plc": settings.control_plc.model_copy(
-                update={"server": server("control_plc", endpoints.control_plc), "plant": endpoints.plant, **order}
+                update={"server": server("control_plc", endpoints.control_plc), "plant": endpoints.plant}
             ),
             "optimizer_plc": settings.optimizer_plc.model_copy(
                 update={
                     "server": server("optimizer_plc", endpoints.optimizer_plc),
                     "control_plc": endpoints.control_plc,
-                    **order,
                 }
             ),
         }
-    )  # fmt: skip
+    )
 
 
 def _free_ports(count: int) -> list[int]:

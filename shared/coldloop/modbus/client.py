@@ -204,7 +204,9 @@ class RegisterClient:
 
     async def _open(self) -> None:
         self._client.ctx.comm_params.timeout_connect = self._timeout_s
-        if not await self._client.connect():
+        connected = await self._client.connect()
+        _raise_lost_cancellation()
+        if not connected:
             raise PeerUnreachableError(f"nobody listens as {self.peer}: start it, or check host and port")
 
     @cached_property
@@ -248,7 +250,7 @@ class RegisterClient:
 
 
 def _raise_lost_cancellation() -> None:
-    """Raise the cancellation that `asyncio.wait_for` loses before Python 3.12 when it meets the answer."""
+    """Raise the cancellation that `asyncio.wait_for` loses before Python 3.12 when it meets what is waited for."""
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError
