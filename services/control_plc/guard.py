@@ -48,6 +48,8 @@ class OutputGuard:
         """Return what may be applied at `tick`, and remember it as applied."""
         limits = self._limits
         window = self._window = self._window.at(tick, self.applied, limits, update=update)
+        if wanted == self.applied:  # it was admitted before, and a new window begins with it
+            return wanted
         applied = SequenceRow(
             *[
                 _clamped(wanted[i], window.anchor[i], limits.rate[i] * window.share, limits.low[i], limits.high[i])
