@@ -37,9 +37,9 @@ def main() -> None:
     qp = problem.at(Situation(np.zeros(prediction.n_states), 150.0, np.zeros(3)))
     solver = OdeSolver(OdeSettings())
     solver.start(qp, np.zeros(problem.size))
-    solver.iterate()
+    solver.iterate(1)
     matrix = np.asfortranarray(problem.Phi + np.eye(problem.size))
-    iteration = microseconds(solver.iterate, rounds)
+    iteration = microseconds(lambda: solver.iterate(1), rounds)
     cholesky = microseconds(lambda: lapack.dpotrf(matrix), rounds)
     print(f"ODE iteration {iteration:.1f} us, LAPACK Cholesky {cholesky:.1f} us (n = {problem.size}): "
           f"ratio {iteration / cholesky:.2f}")  # fmt: skip

@@ -82,6 +82,7 @@ class OptimizerProgram:
         """Forget everything and begin a session at the operating point; 0 s is the adaptive updating period."""
         self._rule = self._make_rule(updating_period_s)
         self._estimator.reset()
+        self._solver.reset()
         nothing = Situation(np.zeros(self._prediction.n_states), 0.0, np.zeros(3))
         self._playing = Delivery(self._problem.hold(np.zeros(3)), nothing, 0, None)
         self._sent: Delivery | None = None
@@ -160,10 +161,10 @@ class OptimizerProgram:
         situation = Situation(x, period.estimate.w, segments[-1][0], period.ticks)
         qp = self._problem.at(situation)
         self._solver.start(qp, self._problem.shifted(self._playing.z, period.ticks))
-        hot_start = last_but_one = self._solver.cost
-        for _ in range(period.iterations):
-            last_but_one = self._solver.cost
-            self._solver.iterate()
+        hot_start = self._solver.cost
+        self._solver.iterate(period.iterations - 1)
+        last_but_one = self._solver.cost
+        self._solver.iterate(1)
         z = self._solver.solution
         floor = qp.constant + self.settings.adaptive.cost_floor
         sequence = self._sequence(period, z)

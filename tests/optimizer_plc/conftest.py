@@ -122,8 +122,11 @@ class Recorder:
         self.started = Jump(deepcopy(problem), guess.copy())
         self._solver.start(problem, guess)
 
-    def iterate(self) -> None:
-        self._solver.iterate()
+    def reset(self) -> None:
+        self._solver.reset()
+
+    def iterate(self, count: int) -> None:
+        self._solver.iterate(count)
 
     @property
     def solution(self) -> Array:

@@ -60,7 +60,7 @@ def descend(qp: QuadraticProblem, guess: Array, chosen: OdeSettings, iterations:
     before = solver.cost
     size = abs(before) + 1.0
     for _ in range(iterations):
-        solver.iterate()
+        solver.iterate(1)
         z = solver.solution
         assert solver.cost <= before
         assert ((qp.low <= z) & (z <= qp.high)).all()
@@ -106,7 +106,7 @@ def test_an_iteration_is_a_step_of_tr_bdf2_with_the_papers_first_step_size() -> 
         z = rng.normal(size=n)
         solver = OdeSolver(chosen)
         solver.start(qp, z)
-        solver.iterate()
+        solver.iterate(1)
         A, b = -0.1 * 2 * qp.Phi, -0.1 * qp.phi
         h = 1 / np.sqrt(np.linalg.norm(A @ z + b))
         g = 2 - np.sqrt(2)
@@ -128,7 +128,7 @@ def test_it_stays_put_at_an_optimum(
         solver.start(qp, best)
         at_first = solver.cost
         for _ in range(30):
-            solver.iterate()
+            solver.iterate(1)
         assert solver.solution == pytest.approx(best, abs=1e-5)
         assert solver.cost == pytest.approx(at_first, rel=1e-9, abs=1e-6)
 
@@ -153,14 +153,14 @@ def test_the_same_start_gives_the_same_bits_whatever_was_solved_before(
         solver.start(qp, guess)
         visited = []
         for _ in range(30):
-            solver.iterate()
+            solver.iterate(1)
             visited.append(solver.solution.tobytes() + np.float64(solver.cost).tobytes())
         return visited
 
     fresh, used = OdeSolver(OdeSettings()), OdeSolver(OdeSettings())
     used.start(other, np.zeros(49))
     for _ in range(7):
-        used.iterate()
+        used.iterate(1)
     assert path(fresh) == path(used) == path(fresh)
 
 
@@ -172,7 +172,7 @@ def test_a_solution_that_was_handed_out_does_not_change_any_more(
     solution = solver.solution
     copied = solution.copy()
     for _ in range(5):
-        solver.iterate()
+        solver.iterate(1)
     assert (solution == copied).all()
     assert (solver.solution != copied).any()
 
@@ -189,7 +189,7 @@ def test_after_harsh_load_jumps_few_iterations_come_near_the_optimum(
         solver.start(qp, guess)
         costs = [solver.cost]
         for _ in range(40):
-            solver.iterate()
+            solver.iterate(1)
             costs.append(solver.cost)
         ratios.append((np.array(costs) + qp.constant) / best)
     median = np.median(ratios, axis=0)

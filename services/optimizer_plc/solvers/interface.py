@@ -20,11 +20,14 @@ class Solver(Protocol):
     tau_1_s: float
     alpha: float
 
+    def reset(self) -> None:
+        """Forget earlier problems: a session begins."""
+
     def start(self, problem: QuadraticProblem, guess: Array) -> None:
         """Begin with `guess` (n,), which is projected into the box."""
 
-    def iterate(self) -> None:
-        """Do one iteration."""
+    def iterate(self, count: int) -> None:
+        """Do this many iterations, or fewer when they would change nothing any more."""
 
     @property
     def solution(self) -> Array:

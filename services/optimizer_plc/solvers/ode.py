@@ -63,15 +63,19 @@ class OdeSolver:
         self.tau_1_s = settings.tau_1_s
         self._flow = Flow(settings.alpha, settings.cost_scale, settings.tolerance, settings.growth, settings.rejection)
 
+    def reset(self) -> None:
+        """Nothing is kept from one problem to the next."""
+
     def start(self, problem: QuadraticProblem, guess: Array) -> None:
         """Begin with `guess` projected into the box, and with the paper's first step size sqrt(1 / |dz/dt|)."""
         self._problem = problem
         self._stiff = np.zeros_like(problem.gamma)
         self._z, self._cost, self._dt = begin(problem, guess, self._flow)
 
-    def iterate(self) -> None:
-        """Take one step."""
-        self._dt, self._cost = step(self._problem, self._z, self._stiff, self._cost, self._dt, self._flow)
+    def iterate(self, count: int) -> None:
+        """Take `count` steps."""
+        for _ in range(count):
+            self._dt, self._cost = step(self._problem, self._z, self._stiff, self._cost, self._dt, self._flow)
 
     @property
     def solution(self) -> Array:
