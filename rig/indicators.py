@@ -20,7 +20,8 @@ class Indicators(NamedTuple):
     J_cst: float
     """Sum over the problems of the predicted violation cost."""
     J_open_mean: float
-    """Mean of J_dev + J_cst per unit of time: comparable between updating periods."""
+    """Mean of J_dev + J_cst per unit of time: comparable between updating periods. A problem weighs by the time since
+    the last delivery, which counts the time lost by an interrupted one."""
     J_BF: float
     """Closed-loop cost: sum of the instantaneous cost over the sampling periods of 5 s."""
     c1: float
@@ -54,11 +55,13 @@ def evaluate(recording: Recording, model: LtiModel, design: ControlDesign) -> In
     open_loop = np.array([[update.j_dev, update.j_cst] for update in updates], dtype=float).reshape(-1, 2)
     violations = np.array([update.violation for update in updates], dtype=float)
     tau = np.array([update.tau_u for update in updates], dtype=float)
+    delivered = np.array([update.tick + update.tau_u for update in updates], dtype=float)
+    since = np.diff(delivered, prepend=float(updates[0].tick)) if updates else delivered
     outside = _outside_pct(recording, design)
     return Indicators(
         J_dev=float(open_loop[:, 0].sum()),
         J_cst=float(open_loop[:, 1].sum()),
-        J_open_mean=float(np.average(open_loop.sum(axis=1), weights=tau)) if updates else 0.0,
+        J_open_mean=float(np.average(open_loop.sum(axis=1), weights=since)) if updates else 0.0,
         J_BF=float(instantaneous_cost(recording, model, design).sum() / TICKS_PER_SAMPLE),
         c1=float(violations.max(initial=0.0)),
         c2=float(violations.mean()) if updates else 0.0,

@@ -55,12 +55,20 @@ class Recorder:
         self.updates.append(update)
 
     def recording(self) -> "Recording":
-        """Return what was recorded, with the updates whose sequence was played within the run."""
+        """Return what was recorded, with the updates whose sequence was played within the run.
+
+        An update that a load step has cut off is not among them.
+        """
         load, u, y, x = (
             np.array([getattr(sample, name) for sample in self.samples], dtype=np.float32)
             for name in ("load", "u", "y", "x")
         )
-        played = [update for update in self.updates if update.tick + update.tau_u < self.ticks]
+        ends = [later.tick for later in self.updates[1:]] + [self.ticks]
+        played = [
+            update
+            for update, end in zip(self.updates, ends, strict=False)
+            if update.tick + update.tau_u <= end and update.tick + update.tau_u < self.ticks
+        ]
         return Recording(load, u, y, x, played, self.link)
 
 

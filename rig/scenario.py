@@ -2,7 +2,12 @@
 
 from dataclasses import dataclass
 
+from coldloop.process import TICK_S
+from plant.load import HOUR_TICKS, named_families
 from plant.program import LoadProfile
+
+BEHIND_LAST_STEP = round(300 / TICK_S)
+"""How long a run goes on after the last step of a load file, unless told otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,3 +21,9 @@ class Scenario:
     seed: int
     realtime: bool = False
     factor: float = 1.0
+
+
+def natural_ticks(name: str, load: LoadProfile) -> int:
+    """Return how long a run under the load of this name or file goes on when nobody says."""
+    families = named_families(name)
+    return len(families) * HOUR_TICKS if families else load.times[-1] + BEHIND_LAST_STEP

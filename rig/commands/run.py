@@ -12,7 +12,7 @@ from coldloop.lti_model import load as load_model
 from coldloop.process import TICK_S
 from coldloop.service import add_configuration_options, run_event_loop
 from coldloop.session import TimeMode
-from plant.load import HOUR_TICKS, NAMED, find_load
+from plant.load import NAMED, find_load
 from rig.commands.options import configuration, duration, endpoint, updating_period
 from rig.indicators import evaluate, instantaneous_cost
 from rig.local_services import LocalServices
@@ -22,11 +22,9 @@ from rig.plot import plot_run
 from rig.progress import RunProgress
 from rig.recording import Recorder, Recording
 from rig.results import manifest, prepare_folder, write_json, write_trace, write_updates
-from rig.scenario import Scenario
+from rig.scenario import Scenario, natural_ticks
 from rig.settings import Settings
 
-BEHIND_LAST_STEP = round(300 / TICK_S)
-"""How long a run goes on after the last step of a load file, unless --duration says so."""
 ATTACH_PATIENCE_S = 5.0
 
 
@@ -40,7 +38,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument("--attach", nargs=3, type=endpoint, metavar="HOST:PORT",
                         help="use a rig that is up: plant, control PLC, optimiser PLC")  # fmt: skip
     parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s (default: that of the load)")
-    parser.add_argument("--load", help=f"{', '.join(NAMED)} or a CSV file time_s,load_w (default: 2h)")
+    parser.add_argument(
+        "--load", help=f"{', '.join(NAMED)}, another draw such as a@2, or a CSV file time_s,load_w (default: 2h)"
+    )
     parser.add_argument("--solver", help="default: ode")
     parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
                         help="default: adaptive")  # fmt: skip
@@ -73,9 +73,8 @@ def make_scenario(options: argparse.Namespace, settings: Settings) -> Scenario:
     """Return what the options and the configuration ask for."""
     name = settings.plant.load
     load = find_load(name, load_model(settings.model.file).w0)
-    length = len(NAMED[name]) * HOUR_TICKS if name in NAMED else load.times[-1] + BEHIND_LAST_STEP
     return Scenario(
-        ticks=options.duration or length,
+        ticks=options.duration or natural_ticks(name, load),
         load=load,
         updating_period_s=settings.optimizer_plc.program.updating_period_s,
         seed=settings.plant.seed,

@@ -56,8 +56,10 @@ class ControlProgram:
         self._before = self._initial
         self._playing: InputSequence | None = None
         self._spare: InputSequence | None = None
+        self._load_step = 0.0
         self._planned = False
         self._abandoned = False
+        self._refused = False
         self._in_scan = False
 
     # -- what a lock-step runtime waits for ----------------------------------------------------------------------------
@@ -69,8 +71,10 @@ class ControlProgram:
 
     @property
     def awaiting_sequence(self) -> bool:
-        """An updating instant has come and its sequence has not."""
-        return self.tick == self.next_update_tick and self.tick > 0 and self._spare is None and not self._abandoned
+        """An updating instant has come and its sequence has not; one that a load step may cut off is due at once."""
+        due = self.tick == self.next_update_tick and self.tick > 0
+        wanted = due or (self._planned and self._load_step > 0)
+        return wanted and self._spare is None and not self._abandoned and not self._refused
 
     # -- scan ----------------------------------------------------------------------------------------------------------
 
@@ -91,6 +95,9 @@ class ControlProgram:
         """Take the measurement of this tick; return the update if it was latched here."""
         applied = tuple(self._guard.applied)
         self.process = Process(self.tick, measurement.load, applied, measurement.y)
+        if self._interrupted_by(measurement.load):
+            self._spare = None
+            self.next_update_tick = self.tick
         latched = None
         if self.tick == self.next_update_tick:
             latched = self.update = Update(
@@ -105,10 +112,16 @@ class ControlProgram:
                 x=measurement.x,
             )
             self.next_update_tick = self.tick + TICKS_PER_SAMPLE  # until the optimiser has planned another
-            self._planned = self._abandoned = False
+            self._planned = self._abandoned = self._refused = False
         self.tick += 1
         self._in_scan = False
         return latched
+
+    def _interrupted_by(self, load: float) -> bool:
+        """Tell whether the load has left the one that the update under way was latched with."""
+        if self.update is None or not self._planned or not self._load_step:
+            return False
+        return abs(load - self.update.load) > self._load_step
 
     def _wanted(self, tick: int) -> SequenceRow:
         """Return what the player asks for: its row, or what is applied when it has none."""
@@ -147,6 +160,7 @@ class ControlProgram:
         if not earliest <= plan.next_update_tick <= self.update.tick + SEQUENCE_ROWS:
             return False
         self.next_update_tick = plan.next_update_tick
+        self._load_step = plan.load_step
         self._planned = True
         return True
 
@@ -164,6 +178,7 @@ class ControlProgram:
             self.accepted += 1
         else:
             self.rejected += 1
+            self._refused = self.update is not None and sequence.header.update == self.update.update
         self.acknowledgement = Acknowledgement(sequence.header.number, verdict)
         return self.acknowledgement
 

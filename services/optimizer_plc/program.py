@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel
-from coldloop.process import TICKS_PER_SAMPLE
+from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import Optimization
@@ -21,9 +21,16 @@ from optimizer_plc.costs import augmented_cost, indicators
 from optimizer_plc.estimator import Estimate, Estimator, EstimatorKind, KalmanFilter, StateFeedback
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
-from optimizer_plc.settings import ProgramSettings
+from optimizer_plc.settings import ProgramSettings, RuleName
 from optimizer_plc.solvers import make_solver
-from optimizer_plc.updating_period import Algorithm1, Assessment, FixedPeriod, Observation, UpdatingRule
+from optimizer_plc.updating_period import (
+    Algorithm1,
+    Assessment,
+    ContractionRule,
+    FixedPeriod,
+    Observation,
+    UpdatingRule,
+)
 
 Array = NDArray[np.float64]
 
@@ -93,6 +100,8 @@ class OptimizerProgram:
         adaptive = self.settings.adaptive
         if updating_period_s:
             return FixedPeriod(self._budget.iterations(round(updating_period_s * TICKS_PER_SAMPLE / 5)))
+        if adaptive.rule is RuleName.CONTRACTION:
+            return ContractionRule(**adaptive.contraction.model_dump())
         return Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta)
 
     def _make_estimator(self) -> Estimator:
@@ -104,16 +113,29 @@ class OptimizerProgram:
 
     def plan(self, update: Update) -> Plan:
         """Take the update latched at t_i and decide the updating period that begins there."""
+        interrupted = self._return_to(update)
         estimate = self._estimator.correct(update)
         self._follow(update)
         self._sequences = max(self._sequences, update.playing)
         played = self._playing
         here = played.situation._replace(x=estimate.x, w=estimate.w)
         effective = self._cost(self._problem.at(here), played.z)
-        iterations, assessment = self._decide(effective, update)
+        iterations, assessment = self._decide(effective, update, interrupted=interrupted)
         ticks = self._budget.period(iterations)
         self._last = _Period(update, estimate, iterations, ticks, effective, assessment)
-        return Plan(update.update, update.tick + ticks)
+        # a load that keeps moving must not keep the control PLC waiting for ever
+        load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
+        return Plan(update.update, update.tick + ticks, load_step)
+
+    def _return_to(self, update: Update) -> bool:
+        """Predict to this instant if another one was planned; tell whether a load step has cut the period off."""
+        last = self._last
+        if last is None:
+            return False
+        elapsed = update.tick - last.update.tick
+        if elapsed != last.ticks:
+            self._estimator.predict(self._segments(last.update, elapsed))
+        return elapsed < last.ticks
 
     def _follow(self, update: Update) -> None:
         """Find out which profile the control PLC plays from this instant on."""
@@ -129,15 +151,23 @@ class OptimizerProgram:
                 self._playing.sequence,
             )
 
-    def _decide(self, effective: float, update: Update) -> tuple[int, Assessment]:
+    def _decide(self, effective: float, update: Update, *, interrupted: bool) -> tuple[int, Assessment]:
         """Step (4): the rule decides, unless the last sequence never took effect."""
         last, played = self._last, self._playing
         if last is None:
             return self._rule.first, UNDECIDED
+        if interrupted:
+            return self._rule.after_interruption, UNDECIDED
         if played is not self._sent or played.first_tick != update.tick:
             return last.iterations, UNDECIDED
         observation = Observation(
-            last.iterations, last.effective, played.hot_start, played.last_but_one, played.delivered, effective
+            last.iterations,
+            last.ticks * TICK_S,
+            last.effective,
+            played.hot_start,
+            played.last_but_one,
+            played.delivered,
+            effective,
         )
         return self._rule.next(observation)
 
@@ -156,7 +186,7 @@ class OptimizerProgram:
     def solve(self) -> InputSequence:
         """Predict the state at t_{i+1}, shift the profile, do q iterations; return the sequence to play from there."""
         period = self._period
-        segments = self._segments(period)
+        segments = self._segments(period.update, period.ticks)
         x = self._estimator.predict(segments)
         situation = Situation(x, period.estimate.w, segments[-1][0], period.ticks)
         qp = self._problem.at(situation)
@@ -174,15 +204,15 @@ class OptimizerProgram:
         )  # fmt: skip
         return sequence
 
-    def _segments(self, period: _Period) -> list[tuple[Array, int]]:
-        """Return the inputs played during the period as (deviation, ticks), runs of equal inputs joined."""
+    def _segments(self, update: Update, ticks: int) -> list[tuple[Array, int]]:
+        """Return the inputs played from an update on as (deviation, ticks), runs of equal inputs joined."""
         u0 = self._prediction.model.u0
         sequence = self._playing.sequence
         if sequence is None:
-            return [(np.asarray(period.update.u) - u0, period.ticks)]
+            return [(np.asarray(update.u) - u0, ticks)]
         segments: list[tuple[Array, int]] = []
         previous: SequenceRow | None = None
-        for tick in range(period.update.tick, period.update.tick + period.ticks):
+        for tick in range(update.tick, update.tick + ticks):
             row = sequence.rows[min(tick - self._playing.first_tick, len(sequence.rows) - 1)]
             if row == previous:
                 segments[-1] = (segments[-1][0], segments[-1][1] + 1)

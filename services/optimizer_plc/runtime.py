@@ -13,9 +13,10 @@ from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process import TICK_S
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
-from coldloop.registers.control_plc import CONTROL_MAP, Acknowledgement, AwaitUpdate, Update, Verdict
+from coldloop.registers.control_plc import CONTROL_MAP, Acknowledgement, AwaitUpdate, Status, Update, Verdict
 from coldloop.registers.declaration import Block
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, OPTIMIZER_MAP, Optimization, OptimizerSession
+from coldloop.sequence import InputSequence
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
 from optimizer_plc.program import OptimizerProgram
@@ -68,7 +69,8 @@ class OptimizerPlc:
             asked_at = time.monotonic()
             if self._is_news(update, wanted):
                 verdict = await self._optimise(update, asked_at)
-                lost = verdict is Verdict.WRONG_UPDATE  # the plan came too late: this update leads to no other
+                # a plan that came too late: this update leads to no other, unless a load step has led to one
+                lost = verdict is Verdict.WRONG_UPDATE and not await self._interrupted(update)
                 wanted = STRANGER if lost else AwaitUpdate(update.session, update.update + 1)
             elif update.session != wanted.session:
                 wanted = STRANGER
@@ -107,20 +109,38 @@ class OptimizerPlc:
         program = self._program
         if update.session != self._session:
             self._start(update.session)
-        await self._control.write(program.plan(update))
+        plan = program.plan(update)
+        await self._control.write(plan)
         sequence = program.solve()
-        if self._pace.realtime:
-            ready = asked_at + program.answer_after_s() / self._pace.factor
-            await asyncio.sleep(max(0.0, ready - time.monotonic()))
+        verdict = Verdict.NONE
+        ready = asked_at + program.answer_after_s() / self._pace.factor
+        if not self._pace.realtime or await self._computed(ready, update, interruptible=plan.load_step > 0):
+            verdict = await self._deliver(sequence)
+        self._last = program.report(verdict)
+        self.bank.put(self._last, update.update % HISTORY_ROWS)
+        self._publish_identity(update.tick)
+        return verdict
+
+    async def _computed(self, ready: float, update: Update, *, interruptible: bool) -> bool:
+        """Wait until the PLC would have its answer; tell whether no load step has cut it off before."""
+        while (remaining := ready - time.monotonic()) > 0.0:
+            await asyncio.sleep(min(remaining, TICK_S / self._pace.factor) if interruptible else remaining)
+            if interruptible and await self._interrupted(update):
+                return False
+        return True
+
+    async def _interrupted(self, update: Update) -> bool:
+        """Tell whether the control PLC has latched another update since."""
+        return (await self._control.read(Status)).update > update.update
+
+    async def _deliver(self, sequence: InputSequence) -> Verdict:
+        """Send a sequence, the header that commits it last; return what the control PLC thinks of it."""
         rows = sequence.rows
         await self._control.write_rows(rows[ROWS_WITH_HEADER:], start=ROWS_WITH_HEADER)
         answer = await self._control.exchange(sequence.header, Acknowledgement, rows=rows[:ROWS_WITH_HEADER])
         verdict = Verdict(answer.verdict)
         if verdict is not Verdict.ACCEPTED:
-            log.warning("sequence rejected", extra={"update": update.update, "verdict": verdict.name.lower()})
-        self._last = program.report(verdict)
-        self.bank.put(self._last, update.update % HISTORY_ROWS)
-        self._publish_identity(update.tick)
+            log.warning("sequence rejected", extra={"update": sequence.header.update, "verdict": verdict.name.lower()})
         return verdict
 
     def on_write(self, block: Block) -> None:

@@ -28,10 +28,36 @@ class SolverName(StrEnum):
     ODE = "ode"
 
 
-class AdaptiveSettings(BaseModel):
-    """Parameters of Algorithm 1."""
+class RuleName(StrEnum):
+    """Rules of the adaptive updating period."""
+
+    ALGORITHM_1 = "algorithm-1"
+    CONTRACTION = "contraction"
+
+
+class ContractionSettings(BaseModel):
+    """Parameters of the contraction rule."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    q_busy: Annotated[int, Field(ge=1)] = 4
+    q_quiet: Annotated[int, Field(ge=1)] = 11
+    q_step: Annotated[int, Field(ge=1)] = 13
+    rate: Annotated[float, Field(gt=0)] = 0.05
+    """Contraction of the delivered cost, 1/s, at which the period is shortest."""
+    memory: Annotated[float, Field(ge=0, le=1)] = 0.95
+    """Share of a contraction that is still felt a second later."""
+    surprise: Annotated[float, Field(gt=1)] = 2.0
+    """Cost reached over cost predicted from which on the next solve is a long one."""
+
+
+class AdaptiveSettings(BaseModel):
+    """Which rule adapts the updating period, and its parameters; those by their names are Algorithm 1's."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rule: RuleName = RuleName.ALGORITHM_1
+    contraction: ContractionSettings = ContractionSettings()
 
     q_first: Annotated[int, Field(ge=1)] = 9
     """q(t_0); 9 iterations are an updating period of 2.5 s."""
@@ -56,6 +82,8 @@ class ProgramSettings(BaseModel):
     solver: SolverName = SolverName.ODE
     updating_period_s: Annotated[float, Field(ge=0, le=MAX_PERIOD_TICKS * TICK_S)] = ADAPTIVE
     """Fixed updating period, a multiple of 0.25 s; 0 is adaptive."""
+    interrupting_load_step_w: Annotated[float, Field(ge=0)] = 0.0
+    """A load step of more than this ends an updating period at once, whatever decides its length; 0 is never."""
     sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 18
     """Shortest sequence sent; 18 rows fit into one Modbus request with their header. It is never shorter than two
     updating periods: one to be played, one in case the next sequence is late."""

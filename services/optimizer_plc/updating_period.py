@@ -1,6 +1,7 @@
 """How long the next updating period is: rules for q(t_{k+1}), the number of iterations of the next period.
 
-`Algorithm1` is the paper's rule (section II), literally as printed; `FixedPeriod` is what it is compared with.
+`Algorithm1` is the paper's rule (section II), literally as printed; `FixedPeriod` is what it is compared with;
+`ContractionRule` is this project's own (`docs/updating-period.md`).
 """
 
 import math
@@ -14,6 +15,8 @@ class Observation:
 
     iterations: int
     """q(t_k)."""
+    period_s: float
+    """t_{k+1} - t_k."""
     effective_before: float
     """J_k: p(t_k) at the state reached at t_k."""
     hot_start: float
@@ -69,6 +72,10 @@ class UpdatingRule(Protocol):
     def first(self) -> int:
         """Iterations of the first period, q(t_0)."""
 
+    @property
+    def after_interruption(self) -> int:
+        """Iterations of the period that begins with a load step."""
+
     def next(self, observation: Observation) -> tuple[int, Assessment]:
         """Return q(t_{k+1}) and the quantities it was, or could have been, decided by."""
 
@@ -81,6 +88,11 @@ class FixedPeriod:
 
     @property
     def first(self) -> int:
+        """The fixed number."""
+        return self.iterations
+
+    @property
+    def after_interruption(self) -> int:
         """The fixed number."""
         return self.iterations
 
@@ -103,9 +115,59 @@ class Algorithm1:
         """q(t_0)."""
         return self.q_first
 
+    @property
+    def after_interruption(self) -> int:
+        """q(t_0): what was learnt of the problem before the step says nothing of the one after."""
+        return self.q_first
+
     def next(self, observation: Observation) -> tuple[int, Assessment]:
         """Return max(q_min, min(q_max, q - delta sign(Gamma)))."""
         assessment = assess(observation)
         sign = (assessment.gamma > 0) - (assessment.gamma < 0)
         q = observation.iterations - self.delta * sign
         return max(self.q_min, min(self.q_max, q)), assessment
+
+
+@dataclass(slots=True)
+class ContractionRule:
+    """This project's rule: short periods while the delivered cost contracts, longer ones in quiet.
+
+    With g = max(0, ln(J-hat_k / J-hat_{k+1})) / tau_u the rate at which successive profiles improve, and v its decaying
+    maximum, q goes from `q_quiet` at v = 0 down to `q_busy` at v = `rate`. A profile that turns out worse than
+    `surprise` times what was predicted, and a load step, are answered by one long solve of `q_step` iterations.
+    """
+
+    q_busy: int
+    q_quiet: int
+    q_step: int
+    rate: float
+    """Contraction, 1/s, from which on the period is shortest."""
+    memory: float
+    """What is left of v after a second."""
+    surprise: float
+    _contraction: float = 0.0
+    _delivered: float = 0.0
+
+    @property
+    def first(self) -> int:
+        """Iterations in quiet."""
+        return self.q_quiet
+
+    @property
+    def after_interruption(self) -> int:
+        """One long solve."""
+        self._delivered = 0.0  # another load is another problem: its cost says nothing of contraction
+        return self.q_step
+
+    def next(self, observation: Observation) -> tuple[int, Assessment]:
+        """Return q(t_{k+1}): about a dozen operations."""
+        o = observation
+        improvement = math.log(self._delivered / o.delivered) / o.period_s if self._delivered else 0.0
+        recent = self.memory**o.period_s * self._contraction
+        self._contraction = max(min(improvement, 2.0 * self.rate), recent)
+        self._delivered = o.delivered
+        assessment = assess(o)
+        if o.effective > self.surprise * o.delivered:
+            return self.q_step, assessment
+        busy = min(1.0, self._contraction / self.rate)
+        return round(self.q_quiet - (self.q_quiet - self.q_busy) * busy), assessment

@@ -1,7 +1,8 @@
 """Heat loads: named scenarios and CSV files.
 
 The paper does not print its load profiles. The six hours a to f are random telegraphs about the load of the operating
-point, each of another family; `docs/science.md` says how they were chosen.
+point, each of another family; `docs/science.md` says how they were chosen. `a@2` is a second
+draw of the family of hour a.
 """
 
 import csv
@@ -47,6 +48,10 @@ NAMED: Final = {
 }
 
 
+DRAW_SEEDS: Final = 1000
+"""Between the seed of a family's draw and that of the next."""
+
+
 def telegraph(family: Family, mean_w: float) -> LoadProfile:
     """Return one hour of a family about `mean_w`, in whole ticks, starting and ending at the mean."""
     draw = random.Random(family.seed).random  # noqa: S311 not for secrets; the one generator stable over versions
@@ -71,14 +76,30 @@ def concatenated(hours: list[LoadProfile]) -> LoadProfile:
     return LoadProfile(tuple(times), tuple(watts))
 
 
+def named_families(name: str) -> list[Family] | None:
+    """Return the family of each hour of a load's name, such as `2h` or `2h@3` for its third draw; None for others.
+
+    Raises:
+        LoadFileError: The draw is not a number from 1 on.
+    """
+    base, at, draw = name.partition("@")
+    if base not in NAMED:
+        return None
+    if at and not (draw.isdecimal() and 1 <= int(draw) <= 10**6):
+        raise LoadFileError(f"load {name}: '{draw}' is no draw; write {base}@2 for the second one")
+    seeds = DRAW_SEEDS * (int(draw) - 1 if at else 0)
+    return [HOURS[hour]._replace(seed=HOURS[hour].seed + seeds) for hour in NAMED[base]]
+
+
 def find_load(name: str, mean_w: float) -> LoadProfile:
-    """Return the load of a scenario's name or of a CSV file.
+    """Return the load of a name or of a CSV file.
 
     Raises:
         LoadFileError: There is neither such a name nor a file that can be read.
     """
-    if name in NAMED:
-        return concatenated([telegraph(HOURS[hour], mean_w) for hour in NAMED[name]])
+    families = named_families(name)
+    if families is not None:
+        return concatenated([telegraph(family, mean_w) for family in families])
     path = Path(name)
     if not path.exists():
         raise LoadFileError(f"load {name}: neither a file nor one of {', '.join(NAMED)}")

@@ -22,6 +22,7 @@ class Bench:
         self.program = ControlProgram(limits=limits, model_digest=MODEL, initial_inputs=INITIAL)
         self.program.restart(session=1)
         self.number = 0
+        self.load = 384.0
 
     def scan(self) -> tuple[SequenceRow, Update | None]:
         """Do one scan; return what was applied and the update if one was latched."""
@@ -30,16 +31,16 @@ class Bench:
 
     def measurement(self, actuators: Actuators) -> Measurement:
         y = tuple(float(actuators.tick + i) for i in range(22))
-        return Measurement(actuators.tick, 384.0, y, tuple(float(i) for i in range(28)), actuators.session)
+        return Measurement(actuators.tick, self.load, y, tuple(float(i) for i in range(28)), actuators.session)
 
     def scans(self, number: int) -> list[SequenceRow]:
         return [self.scan()[0] for _ in range(number)]
 
-    def plan(self, ticks: int) -> bool:
-        """Plan the next updating instant so many ticks after the last one."""
+    def plan(self, ticks: int, load_step: float = 0.0) -> bool:
+        """Plan the next updating instant so many ticks after the last one, or at a load step."""
         update = self.program.update
         assert update is not None
-        return self.program.accept_plan(Plan(update.update, update.tick + ticks))
+        return self.program.accept_plan(Plan(update.update, update.tick + ticks, load_step))
 
     def sequence(self, rows: Sequence[SequenceRow], **changed: int) -> InputSequence:
         """Return a sealed answer to the last update, with header fields changed before it is sealed."""

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optimizer_plc.updating_period import Algorithm1, FixedPeriod, Observation, assess
+from optimizer_plc.updating_period import Algorithm1, ContractionRule, FixedPeriod, Observation, assess
 
 RULE = Algorithm1(q_first=9, q_min=2, q_max=19, delta=2)
 
@@ -18,6 +18,7 @@ rules = st.builds(
 observations = st.builds(
     Observation,
     iterations=st.integers(1, 20),
+    period_s=st.floats(0.5, 5.0),
     effective_before=costs,
     hot_start=costs,
     last_but_one=costs,
@@ -29,7 +30,13 @@ observations = st.builds(
 def contracting(**changed: float) -> Observation:
     """K = 0.45: from J+ = 200 over 104 to 100 in 4 iterations at the predicted state; 90 where the plant really is."""
     base = Observation(
-        iterations=4, effective_before=200.0, hot_start=200.0, last_but_one=104.0, delivered=100.0, effective=90.0
+        iterations=4,
+        period_s=1.25,
+        effective_before=200.0,
+        hot_start=200.0,
+        last_but_one=104.0,
+        delivered=100.0,
+        effective=90.0,
     )
     return replace(base, **changed)  # type: ignore[arg-type]
 
@@ -79,7 +86,7 @@ def test_a_contraction_of_exactly_1_counts_as_none() -> None:
 
 def test_a_zero_gradient_changes_nothing() -> None:
     still = Observation(
-        iterations=7, effective_before=5.0, hot_start=5.0, last_but_one=5.0, delivered=5.0, effective=5.0
+        iterations=7, period_s=2.0, effective_before=5.0, hot_start=5.0, last_but_one=5.0, delivered=5.0, effective=5.0
     )
     q, a = RULE.next(still)
     assert (q, a.gamma) == (7, 0.0)
@@ -107,6 +114,7 @@ def test_multiplying_all_costs_by_a_constant_changes_nothing(observation: Observ
     factor = 2.0**exponent  # exact in binary, so that rounding cannot change the decision
     scaled = Observation(
         iterations=observation.iterations,
+        period_s=observation.period_s,
         effective_before=observation.effective_before * factor,
         hot_start=observation.hot_start * factor,
         last_but_one=observation.last_but_one * factor,
@@ -143,3 +151,38 @@ def test_a_fixed_period_is_fixed_but_tells_the_quantities_all_the_same(
 
 def test_the_first_period_is_the_one_configured() -> None:
     assert RULE.first == 9
+
+
+def own_rule() -> ContractionRule:
+    return ContractionRule(q_busy=2, q_quiet=9, q_step=13, rate=0.05, memory=0.9, surprise=2.0)
+
+
+def delivered(cost: float, *, surprise: float = 1.0) -> Observation:
+    return contracting(period_s=2.0, delivered=cost, effective=cost * surprise)
+
+
+def test_the_own_rule_keeps_long_periods_in_quiet() -> None:
+    rule = own_rule()
+    assert [rule.next(delivered(100.0))[0] for _ in range(5)] == [9] * 5
+
+
+def test_the_own_rule_shortens_while_the_delivered_cost_contracts_and_then_forgets() -> None:
+    rule = own_rule()
+    contracting_costs = [1000.0, 500.0, 250.0, 125.0]
+    assert [rule.next(delivered(cost))[0] for cost in contracting_costs] == [9, 2, 2, 2]
+    after = [rule.next(delivered(125.0))[0] for _ in range(30)]
+    assert after == sorted(after)
+    assert after[-1] == 9
+
+
+def test_a_surprise_is_answered_by_one_long_solve() -> None:
+    rule = own_rule()
+    assert rule.next(delivered(100.0, surprise=2.1))[0] == 13
+    assert rule.next(delivered(100.0, surprise=1.9))[0] == 9
+
+
+@given(observed=st.lists(observations, max_size=20))
+def test_the_own_rule_stays_between_its_numbers(observed: list[Observation]) -> None:
+    rule = own_rule()
+    assert all(2 <= rule.next(one)[0] <= 13 for one in observed)
+    assert rule.after_interruption == 13

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.registers.codec import WordOrder
+from optimizer_plc.settings import AdaptiveSettings, OptimizerSection, ProgramSettings, RuleName
 from plant.load import find_load
 from plant.program import LoadProfile
 from plant.settings import PlantSection, SensorSettings
@@ -52,6 +53,22 @@ def test_a_second_session_on_the_same_services_repeats_the_first(lively: LoadPro
     )
     assert_same(first, second)
     assert between.trace_sha256 != first.trace_sha256
+
+
+@pytest.mark.parametrize("period_s", [0.0, 2.5], ids=["adaptive", "fixed"])
+async def test_load_steps_that_interrupt_change_nothing_about_the_equality(
+    period_s: float, lively: LoadProfile, simulate: "Simulate", on_the_bus: "OnTheBus"
+) -> None:
+    scenario = three_minutes(lively, period_s)
+    adaptive = AdaptiveSettings(rule=RuleName.CONTRACTION)
+    section = OptimizerSection(program=ProgramSettings(interrupting_load_step_w=10.0, adaptive=adaptive))
+    async with on_the_bus(Settings(optimizer_plc=section)) as bus:
+        networked = await bus.record(scenario)
+    alone = simulate(scenario, optimizer_plc=section)
+    assert_same(alone, networked)
+    steps = [time for time in lively.times[1:] if time < 700]
+    assert all(any(row.tick == step for row in alone.updates) for step in steps), "each step began an update"
+    assert steps
 
 
 async def test_noise_and_the_low_word_first_change_nothing_about_the_equality(

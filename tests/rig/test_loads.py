@@ -141,3 +141,16 @@ def test_a_file_that_may_not_be_read_is_told(write: Write) -> None:
     path = write("time_s,load_w\n0,385\n")
     path.chmod(0)
     assert_told(path, str(path), "ermission", "readable")
+
+
+def test_another_draw_is_of_the_same_family_at_other_instants(mean_load: float) -> None:
+    first, again, second = (find_load(name, mean_load) for name in ("c", "c@1", "c@2"))
+    assert first == again
+    assert second.times != first.times
+    assert set(second.watts) == set(first.watts)
+
+
+@pytest.mark.parametrize("name", ["c@", "c@0", "c@-1", "c@two"])
+def test_a_draw_is_a_number_from_1_on(name: str, mean_load: float) -> None:
+    with pytest.raises(LoadFileError, match="write c@2"):
+        find_load(name, mean_load)

@@ -86,6 +86,10 @@ class Plan(NamedTuple):
 
     update: Annotated[int, u32("Update that is planned")]
     next_update_tick: Annotated[int, u32("Tick of the next updating instant t_{i+1}")]
+    load_step: Annotated[
+        float,
+        f32("An update is latched at once when the load has moved by more than this; 0 is never", unit="W", low=0),
+    ] = 0.0
 
 
 class Acknowledgement(NamedTuple):
