@@ -27,8 +27,8 @@ class PiSettings(BaseModel):
     """K, in the unit of the input per unit of the output."""
     integral_time_s: PositiveFloat
     """T_i, s."""
-    setpoint: FiniteFloat | None = None
-    """In the unit of the output; None is its value at the operating point of the model file."""
+    setpoint_offset: FiniteFloat = 0.0
+    """Setpoint less the output at the operating point of the model file, in the unit of the output."""
 
 
 class TemperatureLoop(PiSettings):
@@ -117,14 +117,14 @@ class ClassicalLoops:
     Args:
         settings: Tuning.
         limits: Bounds and rates of the inputs.
-        operating_outputs: The 22 outputs at the operating point, for setpoints that are not given.
+        operating_outputs: The 22 outputs at the operating point, from which setpoints count.
     """
 
     def __init__(self, settings: ClassicalSettings, limits: InputLimits, operating_outputs: Sequence[float]) -> None:
         def loop(tuning: PiSettings, output: int, actuator: int) -> PiController:
             return PiController(
                 tuning,
-                setpoint=operating_outputs[output] if tuning.setpoint is None else tuning.setpoint,
+                setpoint=operating_outputs[output] + tuning.setpoint_offset,
                 period_s=settings.period_s,
                 low=limits.low[actuator],
                 high=limits.high[actuator],

@@ -2,19 +2,21 @@
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coldloop.errors import ConfigurationError
 from coldloop.limits import InputLimits, RateReference
+from coldloop.lti_model import load as load_model
 from coldloop.model_file import read_header
 from coldloop.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process import L1, T5
+from coldloop.process import L1, T5, TICK_S
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Mode, SequenceRow
 from coldloop.registers.plant import Measurement
-from control_plc.classical import ClassicalLoops, ClassicalSettings, LevelLoop, PiController, PiSettings
+from control_plc.classical import CV156, NCR22, ClassicalLoops, ClassicalSettings, LevelLoop, PiController, PiSettings
 from control_plc.program import ControlProgram
 from control_plc.runtime import make_program
 from control_plc.settings import ControlSection, Driver
@@ -142,8 +144,8 @@ def test_a_warm_turbine_gets_more_gas_and_a_cold_one_less(move: float) -> None:
     assert (wanted.cv155, wanted.ncr22) == (REST.cv155, REST.ncr22)
 
 
-def test_setpoints_may_be_given() -> None:
-    tuning = ClassicalSettings(level=LevelLoop(setpoint=HEADER.y0[L1] + 0.5))
+def test_setpoints_may_be_moved_from_the_operating_point() -> None:
+    tuning = ClassicalSettings(level=LevelLoop(setpoint_offset=0.5))
     assert loops(tuning).wanted(0, outputs(level=0.5), REST) == REST
 
 
@@ -158,6 +160,27 @@ def test_between_executions_the_loops_ask_for_what_is_applied() -> None:
 def test_a_period_that_fits_neither_ticks_nor_rate_windows_is_refused(period_s: float) -> None:
     with pytest.raises(ValueError, match="period_s"):
         ClassicalSettings(period_s=period_s)
+
+
+def test_on_the_linear_model_the_peak_sensitivity_of_each_loop_is_below_2_with_the_other_closed() -> None:
+    model, tuning = load_model(DEFAULT_MODEL_FILE), ClassicalSettings()
+    peaks = []
+    for omega in np.logspace(-4, -0.3, 400):
+        s = 1j * omega
+        response = model.C @ np.linalg.solve(s * np.eye(len(model.x0)) - model.A, model.B) + model.D
+        delay = np.exp(-s * (tuning.period_s / 2 + TICK_S))  # the hold between executions, and the measurement's age
+        level, temperature = (
+            pi.gain * (1 + 1 / (s * pi.integral_time_s)) * delay for pi in (tuning.level, tuning.temperature)
+        )
+        g = response[np.ix_([L1, T5], [NCR22, CV156])]
+        across = g[0, 1] * g[1, 0]
+        peaks.append(
+            (
+                abs(1 / (1 + level * (g[0, 0] - across * temperature / (1 + temperature * g[1, 1])))),
+                abs(1 / (1 + temperature * (g[1, 1] - across * level / (1 + level * g[0, 0])))),
+            )
+        )
+    assert np.max(peaks) < 2.0
 
 
 # -- in the control PLC ------------------------------------------------------------------------------------------------
