@@ -9,7 +9,7 @@ from coldloop.errors import LinkError, ModelFileError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process import TICK_S
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, Status
+from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, Mode, Status
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, Optimization, OptimizerSession
@@ -89,8 +89,10 @@ class NetworkRig:
                     "see the logs of the control PLC and of the optimiser"
                 )
             await asyncio.sleep(min(max(pause_s, 0.001), 0.2))
-        await updates.read_until(scenario.ticks)
         status = await self._control.read(Status)
+        if status.mode != Mode.CLASSICAL:  # the loops ask for no updates
+            await updates.read_until(scenario.ticks)
+            status = await self._control.read(Status)
         recorder.link = LinkStatistics(
             status.deadline_misses, status.overruns, status.lateness_max, status.lateness_p99
         )

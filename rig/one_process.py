@@ -4,7 +4,7 @@ from coldloop.lti_model import load
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
 from coldloop.registers.plant import LoadStep, Measurement, PlantSample
-from control_plc.program import ControlProgram
+from control_plc.runtime import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
 from plant.program import LoadProfile, PlantProgram
 from plant.runtime import make_program, own_header
@@ -22,9 +22,7 @@ class OneProcessRig:
         self._header = header
         program = settings.optimizer_plc.program
         self.optimizer = OptimizerProgram(load(settings.model.file), program, settings.limits)
-        self.control = ControlProgram(
-            limits=settings.limits, model_digest=header.short_digest, initial_inputs=header.u0
-        )
+        self.control = make_control_program(header, settings.control_plc, settings.limits)
 
     def run(self, scenario: Scenario, recorder: Recorder) -> None:
         """Run a scenario from the operating point, in lock-step."""

@@ -12,6 +12,7 @@ from coldloop.lti_model import load as load_model
 from coldloop.process import TICK_S
 from coldloop.service import add_configuration_options, run_event_loop
 from coldloop.session import TimeMode
+from control_plc.settings import Driver
 from plant.load import NAMED, find_load
 from rig.commands.options import configuration, duration, endpoint, updating_period
 from rig.indicators import evaluate, instantaneous_cost
@@ -144,16 +145,24 @@ def _write(
     write_json(
         out / "manifest.json", manifest({key: value for key, value, _ in effective.effective()}, arguments, hashes)
     )
-    period = settings.optimizer_plc.program.updating_period_s
-    title = f"load {settings.plant.load}, tau_u {f'{period:g} s' if period else 'adaptive'}"
-    plot_run(out / "run.png", recording, design, title, cost)
+    plot_run(out / "run.png", recording, design, f"load {settings.plant.load}, {_driven_by(settings)}", cost)
     write_json(out / "summary.json", summary)
     return summary
 
 
+def _driven_by(settings: Settings) -> str:
+    if settings.control_plc.driver is Driver.CLASSICAL:
+        return "classical loops"
+    period = settings.optimizer_plc.program.updating_period_s
+    return f"tau_u {period:g} s" if period else "tau_u adaptive"
+
+
 def _tell(out: Path, summary: dict[str, Any]) -> None:
+    updates = "no updates"
+    if summary["updates"]:
+        updates = f"{summary['updates']} updates, tau_u {summary['tau_u_mean']:.2f} s on average"
     sys.stdout.write(
-        f"{summary['ticks']} ticks, {summary['updates']} updates, tau_u {summary['tau_u_mean']:.2f} s on average, "
+        f"{summary['ticks']} ticks, {updates}, "
         f"{summary['realtime_factor']:,.0f} x real time\n"
         f"outside the bands: L1 {summary['L1_outside_band_pct']:.2f} %, T5 {summary['T5_outside_band_pct']:.2f} %; "
         f"J_BF {summary['J_BF']:.4g}; deadline misses {summary['deadline_misses']}\n"

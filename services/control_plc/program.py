@@ -4,7 +4,8 @@ Pure: no sockets, no clock, no sleeping. A scan is `begin_scan` (decide the outp
 rack, `end_scan` (take the measurement, latch an update at an updating instant).
 
 The fail-safe ladder begins here with its first two rungs: the sequence is played (MPC), and when it has run out its
-last value holds (HOLD). Further rungs are further modes of `_wanted`.
+last value holds (HOLD). Further rungs are further modes of `_wanted`. Or the classical loops drive (CLASSICAL), from
+tick 0 to the end; then no update is latched.
 """
 
 from coldloop.errors import ConfigurationError
@@ -22,17 +23,27 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.sequence import InputSequence, checksum
+from control_plc.classical import ClassicalLoops
 from control_plc.guard import OutputGuard
 
 
 class ControlProgram:
     """One session of the control PLC, from tick 0 on.
 
-    `tick` is the tick of the next scan, or of the one in progress.
+    `tick` is the tick of the next scan, or of the one in progress. `classical`, when given, drives instead of
+    sequences.
     """
 
-    def __init__(self, *, limits: InputLimits, model_digest: int, initial_inputs: tuple[float, ...]) -> None:
+    def __init__(
+        self,
+        *,
+        limits: InputLimits,
+        model_digest: int,
+        initial_inputs: tuple[float, ...],
+        classical: ClassicalLoops | None = None,
+    ) -> None:
         self._limits = limits
+        self._classical = classical
         self._model_digest = model_digest
         self._initial = SequenceRow(*initial_inputs)
         if OutputGuard(limits, self._initial).out_of_range([self._initial]):
@@ -46,7 +57,7 @@ class ControlProgram:
         """Begin a session at tick 0 with the initial inputs applied."""
         self.session = session
         self.tick = 0
-        self.mode = Mode.HOLD
+        self.mode = Mode.CLASSICAL if self._classical else Mode.HOLD
         self.update: Update | None = None
         self.process: Process | None = None
         self.next_update_tick = 0
@@ -61,6 +72,8 @@ class ControlProgram:
         self._abandoned = False
         self._refused = False
         self._in_scan = False
+        if self._classical is not None:
+            self._classical.restart()
 
     # -- what a lock-step runtime waits for ----------------------------------------------------------------------------
 
@@ -88,7 +101,8 @@ class ControlProgram:
         elif self.tick == self.next_update_tick and self.tick > 0:
             self.deadline_misses += 1
         applied = self._guard.admit(self.tick, self._wanted(self.tick), update=update)
-        self.mode = Mode.MPC if self.remaining else Mode.HOLD
+        if self._classical is None:
+            self.mode = Mode.MPC if self.remaining else Mode.HOLD
         return Actuators(self.tick, *applied, self.session)
 
     def end_scan(self, measurement: Measurement) -> Update | None:
@@ -99,7 +113,7 @@ class ControlProgram:
             self._spare = None
             self.next_update_tick = self.tick
         latched = None
-        if self.tick == self.next_update_tick:
+        if self.tick == self.next_update_tick and self._classical is None:
             latched = self.update = Update(
                 session=self.session,
                 update=self.update.update + 1 if self.update else 0,
@@ -124,7 +138,9 @@ class ControlProgram:
         return abs(load - self.update.load) > self._load_step
 
     def _wanted(self, tick: int) -> SequenceRow:
-        """Return what the player asks for: its row, or what is applied when it has none."""
+        """Return what is asked for: by the loops when they drive, else by the player, else what is applied."""
+        if self._classical is not None and self.process is not None:
+            return self._classical.wanted(tick, self.process.y, self._guard.applied)
         playing = self._playing
         if playing is None or tick - playing.header.first_tick >= len(playing.rows):
             return self._guard.applied

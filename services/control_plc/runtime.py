@@ -11,9 +11,10 @@ from collections.abc import Awaitable, Mapping
 
 from coldloop import __version__
 from coldloop.clock import Pacer, Schedule
+from coldloop.limits import InputLimits
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
-from coldloop.model_file import read_header
+from coldloop.model_file import ModelHeader, read_header
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, TICK_S
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
@@ -34,14 +35,23 @@ from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.sequence import InputSequence
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
+from control_plc.classical import ClassicalLoops
 from control_plc.program import ControlProgram
-from control_plc.settings import ControlSettings
+from control_plc.settings import ControlSection, ControlSettings, Driver
 
 log = logging.getLogger("coldloop.control_plc")
 
 TICKS_PER_SECOND = round(1 / TICK_S)
 LONGEST_WAIT_S = 1.0
 """Longest time that a read of the latch waits for an update; the optimiser then asks again."""
+
+
+def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:
+    """Return the program that the configuration asks for, at the operating point of its model file."""
+    classical = ClassicalLoops(section.classical, limits, header.y0) if section.driver is Driver.CLASSICAL else None
+    return ControlProgram(
+        limits=limits, model_digest=header.short_digest, initial_inputs=header.u0, classical=classical
+    )
 
 
 class ControlPlc:
@@ -52,9 +62,7 @@ class ControlPlc:
         section = settings.control_plc
         self._settings = settings
         self._model_digest = header.short_digest
-        self._program = ControlProgram(
-            limits=settings.limits, model_digest=header.short_digest, initial_inputs=header.u0
-        )
+        self._program = make_program(header, section, settings.limits)
         self._plant = RegisterClient(
             PLANT_MAP,
             host=section.plant.host,

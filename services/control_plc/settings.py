@@ -1,5 +1,6 @@
 """Configuration of the control PLC, checked when it is made and immutable after."""
 
+from enum import StrEnum
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -11,6 +12,7 @@ from coldloop.model_settings import ModelSettings
 from coldloop.registers.codec import WordOrder
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
+from control_plc.classical import ClassicalSettings
 
 
 class ControlServer(ServerSettings):
@@ -25,6 +27,15 @@ class PlantEndpoint(Endpoint):
     port: Annotated[int, Field(ge=1, le=0xFFFF)] = PLANT_PORT
 
 
+class Driver(StrEnum):
+    """Who drives the inputs."""
+
+    MPC = "mpc"
+    """The optimiser's sequences."""
+    CLASSICAL = "classical"
+    """The classical loops; no update is latched, and the optimiser idles."""
+
+
 class ControlSection(BaseModel):
     """Section `control_plc` of the configuration."""
 
@@ -35,6 +46,8 @@ class ControlSection(BaseModel):
     plant: PlantEndpoint = PlantEndpoint()
     scan_tolerance_ms: Annotated[float, Field(gt=0)] = 5.0
     """Lateness of a scan, in real time, that counts as an overrun."""
+    driver: Driver = Driver.MPC
+    classical: ClassicalSettings = ClassicalSettings()
 
 
 class ControlSettings(BaseModel):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.registers.codec import WordOrder
+from control_plc.settings import ControlSection, Driver
 from optimizer_plc.settings import AdaptiveSettings, OptimizerSection, ProgramSettings, RuleName
 from plant.load import find_load
 from plant.program import LoadProfile
@@ -88,6 +89,19 @@ def test_the_seed_decides_the_noise_and_so_the_trace(lively: LoadProfile, simula
 
 def test_without_noise_the_seed_decides_nothing(lively: LoadProfile, simulate: "Simulate") -> None:
     assert_same(simulate(three_minutes(lively, seed=1)), simulate(three_minutes(lively, seed=2)))
+
+
+async def test_the_classical_loops_leave_one_trace_too_and_no_updates(
+    lively: LoadProfile, simulate: "Simulate", on_the_bus: "OnTheBus"
+) -> None:
+    section = ControlSection(driver=Driver.CLASSICAL)
+    scenario = three_minutes(lively)
+    async with on_the_bus(Settings(control_plc=section)) as bus:
+        first, second = await bus.record(scenario), await bus.record(scenario)
+    assert first.updates == []
+    assert_same(first, second)
+    assert_same(simulate(scenario, control_plc=section), first)
+    assert first.trace_sha256 != simulate(scenario).trace_sha256
 
 
 def test_the_command_starts_three_services_and_gets_the_trace_of_one_process(

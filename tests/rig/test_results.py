@@ -168,3 +168,18 @@ def test_a_recording_keeps_the_updates_whose_sequence_was_played() -> None:
         recorder.update(row._replace(update=number, tick=tick, tau_u=tau_u))
     assert [kept.update for kept in recorder.recording().updates] == [0, 1]
     assert recorder.recording().link == LinkStatistics()
+
+
+def test_a_run_without_updates_leaves_all_files_too(coldloop: "Coldloop", results: Path) -> None:
+    outcome = coldloop(
+        "run", "--in-process", "--load", "e", "--duration", "60s", "--set", "control_plc.driver=classical",
+        "--set", "control_plc.classical.level.setpoint_offset=0.5", "--out", results,
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.complaints
+    assert "no updates" in outcome.out
+    summary = json.loads((results / "summary.json").read_text(encoding="utf-8"))
+    assert (summary["updates"], summary["iterations_total"], summary["tau_u_mean"]) == (0, 0, 0.0)
+    assert summary["J_BF"] > 0.0
+    assert pq.read_table(results / "updates.parquet").num_rows == 0
+    assert pq.read_table(results / "trace.parquet").num_rows == TICKS
+    assert (results / "run.png").read_bytes().startswith(b"\x89PNG")

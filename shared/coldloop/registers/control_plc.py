@@ -11,10 +11,11 @@ SEQUENCE_ROWS: Final = 240
 
 
 class Mode(IntEnum):
-    """Who decides the outputs: the rungs of the fail-safe ladder that exist so far."""
+    """Who decides the outputs: the rungs of the fail-safe ladder that exist so far, and the classical loops."""
 
     HOLD = 0
     MPC = 1
+    CLASSICAL = 2
 
 
 class Verdict(IntEnum):
@@ -45,7 +46,7 @@ class Process(NamedTuple):
 class Status(NamedTuple):
     """State of the sequence player and of the scan cycle."""
 
-    mode: Annotated[int, u16("0 hold, 1 MPC")]
+    mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops")]
     update: Annotated[int, u32("Last update latched")]
     next_update_tick: Annotated[
         int, u32("Tick of the next updating instant; the latest possible one until it is planned")

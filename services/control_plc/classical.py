@@ -1,0 +1,154 @@
+"""The classical control of the cold box: two PI loops and a valve held constant (paper, section IV-A).
+
+T5 is controlled by the turbine valve CV156, the level L1 by the actuator part of the heater NCR22, and CV155 stands
+where it is. Pure: measured outputs and applied inputs in, wanted inputs out. The output guard has the last word.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
+
+from coldloop.limits import InputLimits
+from coldloop.process import INPUT_NAMES, L1, SAMPLING_PERIOD_S, T5, TICK_S
+from coldloop.registers.control_plc import SequenceRow
+
+NCR22 = INPUT_NAMES.index("NCR22_A")
+CV156 = INPUT_NAMES.index("CV156")
+
+
+class PiSettings(BaseModel):
+    """One PI loop, u = gain (e + 1/T_i integral of e) with e = setpoint - y: the gain has the sign of the process."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    gain: FiniteFloat
+    """K, in the unit of the input per unit of the output."""
+    integral_time_s: PositiveFloat
+    """T_i, s."""
+    setpoint_offset: FiniteFloat = 0.0
+    """Setpoint less the output at the operating point of the model file, in the unit of the output."""
+
+
+class TemperatureLoop(PiSettings):
+    """T5 (K) by CV156 (%): gain in % per K."""
+
+    gain: FiniteFloat = -5.0
+    integral_time_s: PositiveFloat = 240.0
+
+
+class LevelLoop(PiSettings):
+    """L1 (%) by NCR22_A (W): gain in W per %."""
+
+    gain: FiniteFloat = -100.0
+    integral_time_s: PositiveFloat = 300.0
+
+
+class ClassicalSettings(BaseModel):
+    """The classical loops; `docs/science.md` says how they were tuned."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    temperature: TemperatureLoop = TemperatureLoop()
+    level: LevelLoop = LevelLoop()
+    period_s: Annotated[float, Field(ge=TICK_S, le=SAMPLING_PERIOD_S)] = SAMPLING_PERIOD_S
+    """How often the loops are executed: a whole number of ticks, and no longer than the window of the rate limits."""
+
+    @property
+    def period_ticks(self) -> int:
+        """The period, in ticks."""
+        return round(self.period_s / TICK_S)
+
+    @model_validator(mode="after")
+    def _whole_ticks(self) -> Self:
+        if self.period_ticks * TICK_S != self.period_s:
+            raise ValueError(f"period_s is a multiple of the tick, {TICK_S} s")
+        return self
+
+
+class PiController:
+    """A discrete PI controller for an input with bounds and a rate limit.
+
+    It computes what to add to the input that is really applied: du = K (e_k - e_{k-1} + T/T_i e_k). This is the PI
+    whose integral is set anew before each execution such that its last output is the applied input (tracking with the
+    shortest time constant; Astrom and Murray, Feedback Systems, section on anti-windup). So nothing winds up,
+    whatever limits the input, and a start from any input is bumpless.
+
+    Args:
+        settings: Gain K, integral time T_i.
+        setpoint: Wanted output.
+        period_s: Time T between executions, s.
+        low: Lower bound of the input.
+        high: Upper bound of the input.
+        reach: Largest change of the input in one execution, up or down.
+    """
+
+    def __init__(
+        self, settings: PiSettings, *, setpoint: float, period_s: float, low: float, high: float, reach: float
+    ) -> None:
+        self._gain = settings.gain
+        self._share = period_s / settings.integral_time_s
+        self._setpoint = setpoint
+        self._low, self._high, self._reach = low, high, reach
+        self._error: float | None = None
+
+    def restart(self) -> None:
+        """Forget the last error: the next execution continues from the input applied, without proportional kick."""
+        self._error = None
+
+    def execute(self, measured: float, applied: float) -> float:
+        """Return the wanted input for a measured output, `applied` being what is applied until now.
+
+        An output that is no number leaves the input as it is.
+        """
+        if not math.isfinite(measured):
+            self.restart()
+            return applied
+        error = self._setpoint - measured
+        change = self._gain * (error - (error if self._error is None else self._error) + self._share * error)
+        self._error = error
+        return min(max(applied + change, applied - self._reach, self._low), applied + self._reach, self._high)
+
+
+class ClassicalLoops:
+    """Both loops, and CV155 held.
+
+    Args:
+        settings: Tuning.
+        limits: Bounds and rates of the inputs.
+        operating_outputs: The 22 outputs at the operating point, from which setpoints count.
+    """
+
+    def __init__(self, settings: ClassicalSettings, limits: InputLimits, operating_outputs: Sequence[float]) -> None:
+        def loop(tuning: PiSettings, output: int, actuator: int) -> PiController:
+            return PiController(
+                tuning,
+                setpoint=operating_outputs[output] + tuning.setpoint_offset,
+                period_s=settings.period_s,
+                low=limits.low[actuator],
+                high=limits.high[actuator],
+                reach=limits.rate[actuator] * settings.period_s / SAMPLING_PERIOD_S,
+            )
+
+        self._period = settings.period_ticks
+        self._level = loop(settings.level, L1, NCR22)
+        self._temperature = loop(settings.temperature, T5, CV156)
+
+    def restart(self) -> None:
+        """Forget what was measured: the loops take over from whatever is applied next."""
+        self._level.restart()
+        self._temperature.restart()
+
+    def wanted(self, tick: int, y: Sequence[float], applied: SequenceRow) -> SequenceRow:
+        """Return the inputs wanted at `tick`, from the newest outputs y (22) and the inputs applied until now.
+
+        Between executions they are the applied ones. Executions are at multiples of the period, so that with 5 s and
+        no sequence before each of them has a rate window of its own and may use it in full.
+        """
+        if tick % self._period:
+            return applied
+        return applied._replace(
+            ncr22=self._level.execute(y[L1], applied.ncr22),
+            cv156=self._temperature.execute(y[T5], applied.cv156),
+        )
