@@ -17,7 +17,11 @@ from coldloop.telemetry import TelemetrySettings
 from optimizer_plc.budget import MAX_PERIOD_TICKS, BudgetSettings
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.estimator import EstimatorSettings
+from optimizer_plc.solvers.daqp import DaqpSettings
+from optimizer_plc.solvers.fast_gradient import FastGradientSettings
 from optimizer_plc.solvers.ode import OdeSettings
+from optimizer_plc.solvers.osqp import OsqpSettings
+from optimizer_plc.solvers.qpoases import QpoasesSettings
 
 ADAPTIVE = 0
 
@@ -26,6 +30,10 @@ class SolverName(StrEnum):
     """Solvers that can be asked for."""
 
     ODE = "ode"
+    QPOASES = "qpoases"
+    OSQP = "osqp"
+    FAST_GRADIENT = "fast_gradient"
+    DAQP = "daqp"
 
 
 class RuleName(StrEnum):
@@ -92,6 +100,10 @@ class ProgramSettings(BaseModel):
     budget: BudgetSettings = BudgetSettings()
     estimator: EstimatorSettings = EstimatorSettings()
     ode: OdeSettings = OdeSettings()
+    qpoases: QpoasesSettings = QpoasesSettings()
+    osqp: OsqpSettings = OsqpSettings()
+    fast_gradient: FastGradientSettings = FastGradientSettings()
+    daqp: DaqpSettings = DaqpSettings()
 
     @field_validator("updating_period_s")
     @classmethod

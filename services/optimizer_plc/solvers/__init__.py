@@ -3,8 +3,12 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from optimizer_plc.solvers.daqp import DaqpSolver
+from optimizer_plc.solvers.fast_gradient import FastGradientSolver
 from optimizer_plc.solvers.interface import Solver
 from optimizer_plc.solvers.ode import OdeSolver
+from optimizer_plc.solvers.osqp import OsqpSolver
+from optimizer_plc.solvers.qpoases import QpoasesSolver
 
 if TYPE_CHECKING:
     from optimizer_plc.settings import ProgramSettings
@@ -13,6 +17,10 @@ __all__ = ["Solver", "make_solver"]
 
 _MAKERS: "dict[str, Callable[[ProgramSettings], Solver]]" = {
     "ode": lambda settings: OdeSolver(settings.ode),
+    "qpoases": lambda settings: QpoasesSolver(settings.qpoases),
+    "osqp": lambda settings: OsqpSolver(settings.osqp),
+    "fast_gradient": lambda settings: FastGradientSolver(settings.fast_gradient),
+    "daqp": lambda settings: DaqpSolver(settings.daqp),
 }
 
 

@@ -6,8 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.solution import Solution
 
 Array = NDArray[np.float64]
+
+PENALTY_WEIGHT = 3000.0
+"""alpha that all solvers are judged by unless told otherwise: 30 times the weight of a band violation."""
 
 
 class Solver(Protocol):
@@ -36,3 +40,6 @@ class Solver(Protocol):
     @property
     def cost(self) -> float:
         """Augmented cost of `solution`, without the problem's constant."""
+
+    def judged(self) -> Solution:
+        """Return `solution` with its residuals; nothing is computed for them before."""

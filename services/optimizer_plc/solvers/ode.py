@@ -16,6 +16,7 @@ from coldloop.compiled import kernel
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.linear_algebra import cholesky, cholesky_solve
 from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.solution import Solution, judge, penalty_multipliers
 
 Array = NDArray[np.float64]
 
@@ -86,6 +87,11 @@ class OdeSolver:
     def cost(self) -> float:
         """Augmented cost at the present point."""
         return self._cost
+
+    def judged(self) -> Solution:
+        """Return `solution` with its residuals; its multipliers are the slopes of the penalties."""
+        z = self.solution
+        return judge(self._problem, z, self.alpha, penalty_multipliers(self._problem, z, self.alpha))
 
 
 @kernel
