@@ -25,11 +25,13 @@ def optimizer_plc() -> None:
     from coldloop.limits import InputLimits  # noqa: PLC0415
     from coldloop.lti_model import load  # noqa: PLC0415
     from control_plc.program import ControlProgram  # noqa: PLC0415
+    from optimizer_plc.arithmetic import Arithmetic  # noqa: PLC0415
     from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
     from optimizer_plc.settings import ProgramSettings  # noqa: PLC0415
 
     model = load(DEFAULT_MODEL_FILE)
     limits = InputLimits()
+    OptimizerProgram(model, ProgramSettings(arithmetic=Arithmetic.FLOAT32), limits)
     optimizer = OptimizerProgram(model, ProgramSettings(), limits)
     control = ControlProgram(limits=limits, model_digest=optimizer.model_digest, initial_inputs=model.u0)
     control.restart(1)

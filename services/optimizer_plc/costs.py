@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 @kernel
 def quadratic_cost(Phi: Array, phi: Array, z: Array) -> float:
     """Return z' Phi z + z' phi."""
-    total = 0.0
+    total = z.dtype.type(0.0)
     for i in range(z.shape[0]):
         row = phi[i]
         for j in range(z.shape[0]):
@@ -27,12 +27,13 @@ def quadratic_cost(Phi: Array, phi: Array, z: Array) -> float:
 @kernel
 def augmented_cost(qp: QuadraticProblem, z: Array, alpha: float) -> float:
     """Return J(z) = J_0(z) + alpha sum max(Gamma z - gamma, 0)^2, without the constant, for z inside its box."""
-    penalty = 0.0
+    zero = z.dtype.type(0.0)
+    penalty = zero
     for i in range(qp.Gamma.shape[0]):
         excess = -qp.gamma[i]
         for j in range(z.shape[0]):
             excess += qp.Gamma[i, j] * z[j]
-        if excess > 0.0:
+        if excess > zero:
             penalty += excess * excess
     return quadratic_cost(qp.Phi, qp.phi, z) + alpha * penalty
 
@@ -62,7 +63,7 @@ def indicators(problem: PredictiveProblem, qp: QuadraticProblem, z: Array, situa
 def deviation_cost(qp: QuadraticProblem, z: Array, n_inputs: int) -> float:
     """Return J_0 of the inputs alone, without slacks and without the constant."""
     slackless = z.copy()
-    slackless[n_inputs:] = 0.0
+    slackless[n_inputs:] = z.dtype.type(0.0)
     return quadratic_cost(qp.Phi, qp.phi, slackless)
 
 
@@ -72,10 +73,11 @@ def violation_cost(outputs: Array, through_w: Array, w: float, bands: Array) -> 
 
     Outputs (2 N) are L1 and T5 in turn; bands (3, 2) are low, high and weight.
     """
-    total = 0.0
+    zero = outputs.dtype.type(0.0)
+    total = zero
     for i in range(outputs.shape[0]):
         y = outputs[i] + through_w[i] * w
-        miss = max(y - bands[1, i % 2], 0.0) + max(bands[0, i % 2] - y, 0.0)
+        miss = max(y - bands[1, i % 2], zero) + max(bands[0, i % 2] - y, zero)
         total += bands[2, i % 2] * miss * miss
     return total
 
@@ -83,7 +85,7 @@ def violation_cost(outputs: Array, through_w: Array, w: float, bands: Array) -> 
 @kernel
 def largest_violation(qp: QuadraticProblem, z: Array, gains: Array) -> float:
     """Return max(Gamma z - gamma, 0) over the rows, each divided by its gain."""
-    largest = 0.0
+    largest = z.dtype.type(0.0)
     for r in range(qp.Gamma.shape[0]):
         excess = -qp.gamma[r]
         for j in range(z.shape[0]):

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 from coldloop.compiled import kernel
 from coldloop.process import SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.control_plc import Update
+from optimizer_plc.arithmetic import DOUBLE, Real
 from optimizer_plc.linear_algebra import apply, multiply
 from optimizer_plc.prediction import PredictionModel
 
@@ -68,18 +69,19 @@ class Estimator(Protocol):
 class StateFeedback:
     """Believes the simulated state; not free of offset, for it does not know why the model is wrong."""
 
-    def __init__(self, prediction: PredictionModel) -> None:
-        self._model = prediction
+    def __init__(self, prediction: PredictionModel, real: Real = DOUBLE) -> None:
+        self._model = prediction.rounded(real)
         self.reset()
 
     def reset(self) -> None:
         """Begin at the operating point."""
-        self._estimate = Estimate(np.zeros(self._model.n_states), 0.0, 0.0)
+        real = self._model.real
+        self._estimate = Estimate(np.zeros(self._model.n_states, real), real(0.0), real(0.0))
 
     def correct(self, update: Update) -> Estimate:
         """Take the simulated state."""
-        m = self._model.model
-        self._estimate = Estimate(np.asarray(update.x) - m.x0, update.load - m.w0, 0.0)
+        m = self._model
+        self._estimate = Estimate(np.asarray(update.x, m.real) - m.x0, m.real(update.load) - m.w0, m.real(0.0))
         return self._estimate
 
     def predict(self, segments: list[tuple[Array, int]]) -> Array:
@@ -90,28 +92,30 @@ class StateFeedback:
 class KalmanFilter:
     """Stationary Kalman filter on the LTI model with one slow load-mismatch state; the known load is fed in."""
 
-    def __init__(self, prediction: PredictionModel, settings: EstimatorSettings) -> None:
-        self._model = prediction
-        self._gains = stationary_gains(prediction, settings)
+    def __init__(self, prediction: PredictionModel, settings: EstimatorSettings, real: Real = DOUBLE) -> None:
+        self._model = prediction.rounded(real)
+        gains = stationary_gains(prediction, settings)
+        self._gains = {ticks: gain.astype(real, copy=False) for ticks, gain in gains.items()}
         self.reset()
 
     def reset(self) -> None:
         """Begin at the operating point."""
-        self._x = np.zeros(self._model.n_states)
-        self._mismatch = 0.0
-        self._estimate = Estimate(self._x, 0.0, 0.0)
+        real = self._model.real
+        self._x = np.zeros(self._model.n_states, real)
+        self._mismatch = real(0.0)
+        self._estimate = Estimate(self._x, real(0.0), real(0.0))
         self._since = 1
 
     def correct(self, update: Update) -> Estimate:
         """Correct the predicted state by the measurement, with the gain of the period that just ended."""
-        m = self._model.model
-        u = np.asarray(update.u_before) - m.u0
-        known = update.load - m.w0
-        innovation = np.asarray(update.y) - m.y0 - self._model.output(self._x, u, known + self._mismatch)
-        correction = np.zeros(len(self._x) + 1)
+        m = self._model
+        u = np.asarray(update.u_before, m.real) - m.u0
+        known = m.real(update.load) - m.w0
+        innovation = np.asarray(update.y, m.real) - m.y0 - m.output(self._x, u, known + self._mismatch)
+        correction = np.zeros(len(self._x) + 1, m.real)
         apply(self._gains[min(self._since, len(self._gains))], innovation, correction)
         self._x = self._x + correction[:-1]
-        self._mismatch += float(correction[-1])
+        self._mismatch += correction[-1]
         self._estimate = Estimate(self._x, known + self._mismatch, self._mismatch)
         return self._estimate
 

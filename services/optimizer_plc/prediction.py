@@ -4,6 +4,7 @@ One matrix triple for a tick comes with the model file; those of longer periods 
 exponential is needed on line.
 """
 
+from copy import copy
 from functools import cached_property
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from coldloop.lti_model import LtiModel
 from coldloop.process import L1, T5, TICKS_PER_SAMPLE
+from optimizer_plc.arithmetic import DOUBLE, Real
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.linear_algebra import multiply, respond
 
@@ -47,9 +49,24 @@ class PredictionModel:
         self.model = model
         tick = Transition(*(np.array(M, order="C") for M in (model.A_tick, model.B_tick, model.F_tick[:, None])))
         self.C, self.D, self.G = np.array(model.C), np.array(model.D), np.array(model.G[:, None])
+        self.x0, self.u0, self.y0 = model.x0, model.u0, model.y0
+        self.w0 = DOUBLE(model.w0)
+        self.real = DOUBLE
         self.transitions = {1: tick}
         for ticks in range(2, TICKS_PER_SAMPLE + 1):
             self.transitions[ticks] = self.transitions[ticks - 1].then(tick)
+
+    def rounded(self, real: Real) -> "PredictionModel":
+        """Return this model in another floating-point type, rounded once."""
+        twin = copy(self)
+        twin.C, twin.D, twin.G, twin.x0, twin.u0, twin.y0 = (
+            M.astype(real, copy=False) for M in (self.C, self.D, self.G, self.x0, self.u0, self.y0)
+        )
+        twin.w0, twin.real = real(self.w0), real
+        twin.transitions = {
+            ticks: Transition(*(M.astype(real, copy=False) for M in step)) for ticks, step in self.transitions.items()
+        }
+        return twin
 
     @property
     def n_states(self) -> int:

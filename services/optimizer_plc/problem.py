@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from coldloop.compiled import kernel
 from coldloop.limits import InputLimits
 from coldloop.process import TICKS_PER_SAMPLE
+from optimizer_plc.arithmetic import DOUBLE, Real
 from optimizer_plc.design import N_INPUTS, N_SLACKS, ControlDesign
 from optimizer_plc.linear_algebra import apply, multiply
 from optimizer_plc.prediction import PredictionModel, state_weights
@@ -54,7 +55,9 @@ class PredictiveProblem:
     Sizes: n = 7 decision instants x 7 = 49 variables; m = 56 output rows and 38 rate rows with the paper's instants.
     """
 
-    def __init__(self, prediction: PredictionModel, design: ControlDesign, limits: InputLimits) -> None:
+    def __init__(
+        self, prediction: PredictionModel, design: ControlDesign, limits: InputLimits, real: Real = DOUBLE
+    ) -> None:
         self.design = design
         self.limits = limits
         self.n_knots = len(design.decision_instants)
@@ -69,8 +72,10 @@ class PredictiveProblem:
         self._build_output_rows()
         self._build_rate_rows()
         self.Gamma = np.ascontiguousarray(np.vstack([self._output_rows, self._rate_rows]))
-        self._maps = self._make_maps()
+        self._maps = _Maps(*(M.astype(real, copy=False) for M in self._make_maps()))
         self._shifts: dict[int, Array] = {}
+        self._real = real
+        self._round()
 
     # -- construction ------------------------------------------------------------------------------------------------
 
@@ -177,13 +182,19 @@ class PredictiveProblem:
         self._rate_before = np.ascontiguousarray((np.array(before) * gains[:, None]).T)
         self.row_gains = np.concatenate([np.ones(len(self._output_rows)), gains])
 
+    def _round(self) -> None:
+        """Round every array to the type of the on-line arithmetic."""
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(self, name, value.astype(self._real, copy=False))
+
     # -- instances ---------------------------------------------------------------------------------------------------
 
     def at(self, situation: Situation) -> QuadraticProblem:
         """Return the instance of the problem for a situation."""
-        share = self.limits.rate_share(situation.elapsed_ticks)
+        share = self._real(self.limits.rate_share(situation.elapsed_ticks))
         phi, gamma, low, high, constant = _instance(self._maps, situation.x, situation.w, situation.u_before, share)
-        return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, constant)
+        return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, self._real(constant))
 
     def _make_maps(self) -> "_Maps":
         low_u = (np.asarray(self.limits.low) - self._model.model.u0) / self._input_scale
@@ -209,11 +220,11 @@ class PredictiveProblem:
         """Return the profile z shifted by `ticks` ticks."""
         if ticks not in self._shifts:
             S = shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE).T
-            whole = np.zeros((self.size, self.size))
+            whole = np.zeros((self.size, self.size), self._real)
             whole[: self.n_inputs, : self.n_inputs] = np.kron(S, np.eye(N_INPUTS))
             whole[self.n_inputs :, self.n_inputs :] = np.kron(S, np.eye(N_SLACKS))
             self._shifts[ticks] = whole
-        result = np.zeros(self.size)
+        result = np.zeros(self.size, self._real)
         apply(self._shifts[ticks], z, result)
         return result
 
@@ -226,7 +237,9 @@ class PredictiveProblem:
 
     def hold(self, u: Array) -> Array:
         """Return the profile that keeps the input deviation u, without slack."""
-        return np.concatenate([np.tile(u / self._input_scale, self.n_knots), np.zeros(N_SLACKS * self.n_knots)])
+        return np.concatenate(
+            [np.tile(u / self._input_scale, self.n_knots), np.zeros(N_SLACKS * self.n_knots, self._real)]
+        )
 
 
 def _transposed(M: Array) -> Array:
@@ -260,16 +273,19 @@ def _instance(
     maps: _Maps, x: Array, w: float, u_before: Array, share: float
 ) -> tuple[Array, Array, Array, Array, float]:
     """Return phi, gamma, low, high and the constant of the cost."""
-    s = np.empty(x.shape[0] + 1)
-    s[:-1] = x
-    s[-1] = w
-    phi = np.zeros(maps.phi.shape[1])
+    zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
+    s = np.empty(x.shape[0] + 1, x.dtype)
+    for i in range(x.shape[0]):
+        s[i] = x[i]
+    s[x.shape[0]] = w
+    phi = np.zeros(maps.phi.shape[1], x.dtype)
     apply(maps.phi, s, phi)
     outputs, rates = maps.output_bounds.shape[0], maps.rate_bounds.shape[0]
-    gamma = np.empty(outputs + rates)
-    gamma[:outputs] = maps.output_bounds
+    gamma = np.empty(outputs + rates, x.dtype)
+    for r in range(outputs):
+        gamma[r] = maps.output_bounds[r]
     for r in range(rates):
-        gamma[outputs + r] = maps.rate_bounds[r] * (share if maps.rate_first[r] > 0.0 else 1.0)
+        gamma[outputs + r] = maps.rate_bounds[r] * (share if maps.rate_first[r] > zero else one)
     apply(maps.outputs, s, gamma[:outputs])
     apply(maps.rate_before, u_before, gamma[outputs:])
     low, high = maps.low.copy(), maps.high.copy()
@@ -278,9 +294,9 @@ def _instance(
         reach = maps.rate[i] * share
         low[i] = min(max(start - reach, maps.low[i]), maps.high[i])
         high[i] = min(max(start + reach, maps.low[i]), maps.high[i])
-    weighted = np.zeros(s.shape[0])
+    weighted = np.zeros(s.shape[0], x.dtype)
     apply(maps.constant, s, weighted)
-    constant = 0.0
+    constant = zero
     for i in range(s.shape[0]):
         constant += s[i] * weighted[i]
     return phi, gamma, low, high, constant
@@ -289,10 +305,10 @@ def _instance(
 @kernel
 def _inputs(weights: Array, z: Array, scale: Array, u0: Array, rate: Array) -> Array:
     samples, m = weights.shape[0], scale.shape[0]
-    u = np.empty((samples, m))
+    u = np.empty((samples, m), z.dtype)
     for sample in range(samples):
         for i in range(m):
-            value = 0.0
+            value = z.dtype.type(0.0)
             for knot in range(weights.shape[1]):
                 value += weights[sample, knot] * z[m * knot + i]
             u[sample, i] = value * scale[i] + u0[i]

@@ -69,11 +69,13 @@ class OptimizerProgram:
     def __init__(self, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
         self.settings = settings
         self.model_digest = model.short_digest
+        self._real = settings.arithmetic.real
         self._prediction = PredictionModel(model)
-        self._problem = PredictiveProblem(self._prediction, settings.design, limits)
+        self._problem = PredictiveProblem(self._prediction, settings.design, limits, self._real)
         self._solver = make_solver(settings)
         self._budget = PlcBudget(settings.budget, self._solver.tau_1_s)
         self._estimator = self._make_estimator()
+        self._prediction = self._prediction.rounded(self._real)
         self._compile_kernels(model)
         self.restart(settings.updating_period_s)
 
@@ -90,8 +92,9 @@ class OptimizerProgram:
         self._rule = self._make_rule(updating_period_s)
         self._estimator.reset()
         self._solver.reset()
-        nothing = Situation(np.zeros(self._prediction.n_states), 0.0, np.zeros(3))
-        self._playing = Delivery(self._problem.hold(np.zeros(3)), nothing, 0, None)
+        at_rest = np.zeros(3, self._real)
+        nothing = Situation(np.zeros(self._prediction.n_states, self._real), self._real(0.0), at_rest)
+        self._playing = Delivery(self._problem.hold(at_rest), nothing, 0, None)
         self._sent: Delivery | None = None
         self._last: _Period | None = None
         self._sequences = 0
@@ -106,8 +109,8 @@ class OptimizerProgram:
 
     def _make_estimator(self) -> Estimator:
         if self.settings.estimator.kind is EstimatorKind.STATE_FEEDBACK:
-            return StateFeedback(self._prediction)
-        return KalmanFilter(self._prediction, self.settings.estimator)
+            return StateFeedback(self._prediction, self._real)
+        return KalmanFilter(self._prediction, self.settings.estimator, self._real)
 
     # -- steps (4), (5) and (2): at an updating instant ---------------------------------------------------------------
 
@@ -196,20 +199,19 @@ class OptimizerProgram:
         last_but_one = self._solver.cost
         self._solver.iterate(1)
         z = self._solver.solution
-        floor = qp.constant + self.settings.adaptive.cost_floor
         sequence = self._sequence(period, z)
         self._sent = Delivery(
             z, situation, sequence.header.first_tick, sequence, qp,
-            hot_start + floor, last_but_one + floor, self._solver.cost + floor,
+            self._whole(hot_start, qp), self._whole(last_but_one, qp), self._whole(self._solver.cost, qp),
         )  # fmt: skip
         return sequence
 
     def _segments(self, update: Update, ticks: int) -> list[tuple[Array, int]]:
         """Return the inputs played from an update on as (deviation, ticks), runs of equal inputs joined."""
-        u0 = self._prediction.model.u0
+        u0 = self._prediction.u0
         sequence = self._playing.sequence
         if sequence is None:
-            return [(np.asarray(update.u) - u0, ticks)]
+            return [(np.asarray(update.u, self._real) - u0, ticks)]
         segments: list[tuple[Array, int]] = []
         previous: SequenceRow | None = None
         for tick in range(update.tick, update.tick + ticks):
@@ -217,7 +219,7 @@ class OptimizerProgram:
             if row == previous:
                 segments[-1] = (segments[-1][0], segments[-1][1] + 1)
             else:
-                segments.append((np.asarray(row) - u0, 1))
+                segments.append((np.asarray(row, self._real) - u0, 1))
             previous = row
         return segments
 
@@ -239,8 +241,12 @@ class OptimizerProgram:
         return sealed(header, rows)
 
     def _cost(self, qp: QuadraticProblem, z: Array) -> float:
-        floor = qp.constant + self.settings.adaptive.cost_floor
-        return float(augmented_cost(qp, z, self._solver.alpha)) + floor
+        return self._whole(augmented_cost(qp, z, self._real(self._solver.alpha)), qp)
+
+    def _whole(self, cost: float, qp: QuadraticProblem) -> float:
+        """Return J with its constant and its floor; rounding, in single precision, must not take it below the floor."""
+        floor = self._real(self.settings.adaptive.cost_floor)
+        return max(self._real(cost) + (qp.constant + floor), floor)
 
     # -- diagnostics --------------------------------------------------------------------------------------------------
 
@@ -253,7 +259,8 @@ class OptimizerProgram:
         a = period.assessment
         return Optimization(
             update=period.update.update, tick=period.update.tick, tau_u=period.ticks, iterations=period.iterations,
-            verdict=verdict, j_effective=period.effective, j_hot_start=sent.hot_start, j_delivered=sent.delivered,
-            j_dev=predicted.j_dev, j_cst=predicted.j_cst, violation=predicted.violation, efficiency=a.efficiency,
-            mismatch=a.mismatch, contraction=a.contraction, gamma=a.gamma, load_mismatch=period.estimate.mismatch,
+            verdict=verdict, j_effective=float(period.effective), j_hot_start=float(sent.hot_start),
+            j_delivered=float(sent.delivered), j_dev=predicted.j_dev, j_cst=predicted.j_cst,
+            violation=predicted.violation, efficiency=float(a.efficiency), mismatch=float(a.mismatch),
+            contraction=float(a.contraction), gamma=float(a.gamma), load_mismatch=float(period.estimate.mismatch),
         )  # fmt: skip

@@ -14,6 +14,7 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
+from optimizer_plc.arithmetic import Arithmetic
 from optimizer_plc.budget import MAX_PERIOD_TICKS, BudgetSettings
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.estimator import EstimatorSettings
@@ -88,6 +89,8 @@ class ProgramSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     solver: SolverName = SolverName.ODE
+    arithmetic: Arithmetic = Arithmetic.FLOAT64
+    """Floating-point type of all that is computed on line; the PLC of the paper has float32 only."""
     updating_period_s: Annotated[float, Field(ge=0, le=MAX_PERIOD_TICKS * TICK_S)] = ADAPTIVE
     """Fixed updating period, a multiple of 0.25 s; 0 is adaptive."""
     interrupting_load_step_w: Annotated[float, Field(ge=0)] = 0.0

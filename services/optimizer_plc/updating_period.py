@@ -123,7 +123,7 @@ class Algorithm1:
     def next(self, observation: Observation) -> tuple[int, Assessment]:
         """Return max(q_min, min(q_max, q - delta sign(Gamma)))."""
         assessment = assess(observation)
-        sign = (assessment.gamma > 0) - (assessment.gamma < 0)
+        sign = int(assessment.gamma > 0) - int(assessment.gamma < 0)
         q = observation.iterations - self.delta * sign
         return max(self.q_min, min(self.q_max, q)), assessment
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, PositiveFloat
 
 from coldloop.compiled import kernel
+from optimizer_plc.arithmetic import Real
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.linear_algebra import cholesky, cholesky_solve
 from optimizer_plc.problem import QuadraticProblem
@@ -54,15 +55,29 @@ class Flow(NamedTuple):
     tolerance: float
     growth: float
     rejection: float
+    longest: float
+    """Step size that is never exceeded, far below the largest number there is: its products stay finite."""
+
+
+def flow_in(settings: OdeSettings, real: Real) -> Flow:
+    """Return the constants as scalars of a floating-point type."""
+    return Flow(
+        alpha=real(settings.alpha),
+        cost_scale=real(settings.cost_scale),
+        tolerance=real(settings.tolerance),
+        growth=real(settings.growth),
+        rejection=real(settings.rejection),
+        longest=real(np.sqrt(np.finfo(real).max)),
+    )
 
 
 class OdeSolver:
-    """TR-BDF2 on the gradient flow, one step an iteration."""
+    """TR-BDF2 on the gradient flow, one step an iteration, in the floating-point type of the problem."""
 
     def __init__(self, settings: OdeSettings) -> None:
         self.alpha = settings.alpha
         self.tau_1_s = settings.tau_1_s
-        self._flow = Flow(settings.alpha, settings.cost_scale, settings.tolerance, settings.growth, settings.rejection)
+        self._settings = settings
 
     def reset(self) -> None:
         """Nothing is kept from one problem to the next."""
@@ -70,13 +85,16 @@ class OdeSolver:
     def start(self, problem: QuadraticProblem, guess: Array) -> None:
         """Begin with `guess` projected into the box, and with the paper's first step size sqrt(1 / |dz/dt|)."""
         self._problem = problem
+        self._real = problem.phi.dtype.type
+        self._flow = flow_in(self._settings, self._real)
         self._stiff = np.zeros_like(problem.gamma)
         self._z, self._cost, self._dt = begin(problem, guess, self._flow)
 
     def iterate(self, count: int) -> None:
         """Take `count` steps."""
         for _ in range(count):
-            self._dt, self._cost = step(self._problem, self._z, self._stiff, self._cost, self._dt, self._flow)
+            cost, dt = self._real(self._cost), self._real(self._dt)
+            self._dt, self._cost = step(self._problem, self._z, self._stiff, cost, dt, self._flow)
 
     @property
     def solution(self) -> Array:
@@ -98,19 +116,20 @@ class OdeSolver:
 def velocity(qp: QuadraticProblem, z: Array, flow: Flow, result: Array, active: Array) -> None:
     """Write dz/dt = -cost_scale dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0."""
     n = z.shape[0]
+    zero, one, two = z.dtype.type(0.0), z.dtype.type(1.0), z.dtype.type(2.0)
     for i in range(n):
-        slope = 0.0
+        slope = zero
         for j in range(n):
             slope += qp.Phi[i, j] * z[j]
-        result[i] = 2.0 * slope + qp.phi[i]
+        result[i] = two * slope + qp.phi[i]
     for r in range(qp.Gamma.shape[0]):
         excess = -qp.gamma[r]
         for j in range(n):
             excess += qp.Gamma[r, j] * z[j]
-        active[r] = 0.0
-        if excess > 0.0:
-            active[r] = 1.0
-            factor = 2.0 * flow.alpha * excess
+        active[r] = zero
+        if excess > zero:
+            active[r] = one
+            factor = two * flow.alpha * excess
             for j in range(n):
                 result[j] += factor * qp.Gamma[r, j]
     for i in range(n):
@@ -120,11 +139,12 @@ def velocity(qp: QuadraticProblem, z: Array, flow: Flow, result: Array, active: 
 @kernel
 def hold_at_bounds(qp: QuadraticProblem, z: Array, v: Array) -> Array:
     """Stop the components of v that would leave the box at z; return which ones (1.0) as a mask (n,)."""
+    zero, one = z.dtype.type(0.0), z.dtype.type(1.0)
     held = np.zeros_like(z)
     for i in range(z.shape[0]):
-        if (z[i] <= qp.low[i] and v[i] < 0.0) or (z[i] >= qp.high[i] and v[i] > 0.0):
-            held[i] = 1.0
-            v[i] = 0.0
+        if (z[i] <= qp.low[i] and v[i] < zero) or (z[i] >= qp.high[i] and v[i] > zero):
+            held[i] = one
+            v[i] = zero
     return held
 
 
@@ -132,10 +152,11 @@ def hold_at_bounds(qp: QuadraticProblem, z: Array, v: Array) -> Array:
 def release(M: Array, held: Array) -> None:
     """Make the rows and columns of held components those of the identity, so that a solve leaves them alone."""
     n = M.shape[0]
+    zero, one = M.dtype.type(0.0), M.dtype.type(1.0)
     for i in range(n):
         for j in range(i, n):
-            if held[i] + held[j] > 0.0:
-                M[i, j] = 1.0 if i == j else 0.0
+            if held[i] + held[j] > zero:
+                M[i, j] = one if i == j else zero
 
 
 @kernel
@@ -146,10 +167,11 @@ def begin(qp: QuadraticProblem, guess: Array, flow: Flow) -> tuple[Array, float,
         z[i] = min(max(guess[i], qp.low[i]), qp.high[i])
     v = np.empty_like(z)
     velocity(qp, z, flow, v, np.empty_like(qp.gamma))
-    total = 0.0
+    total = z.dtype.type(0.0)
     for i in range(v.shape[0]):
         total += v[i] * v[i]
-    return z, augmented_cost(qp, z, flow.alpha), math.sqrt(1.0 / max(math.sqrt(total), 1e-12))
+    speed = max(math.sqrt(total), z.dtype.type(1e-12))
+    return z, augmented_cost(qp, z, flow.alpha), math.sqrt(z.dtype.type(1.0) / speed)
 
 
 @kernel
@@ -157,16 +179,17 @@ def stage_matrix(qp: QuadraticProblem, stiff: Array, dt: float, flow: Flow) -> A
     """Return I + (gamma / 2) dt Hess(cost_scale J), upper triangle, with the rows that `stiff` (m,) names."""
     n = qp.phi.shape[0]
     M = np.empty((n, n), qp.phi.dtype)
-    weight = D * dt * flow.cost_scale * 2.0
+    zero, one = M.dtype.type(0.0), M.dtype.type(1.0)
+    weight = M.dtype.type(D) * dt * flow.cost_scale * M.dtype.type(2.0)
     for i in range(n):
         for j in range(i, n):
             M[i, j] = weight * qp.Phi[i, j]
-        M[i, i] += 1.0
+        M[i, i] += one
     for r in range(qp.Gamma.shape[0]):
-        if stiff[r] > 0.0:
+        if stiff[r] > zero:
             for i in range(n):
                 factor = weight * flow.alpha * qp.Gamma[r, i]
-                if factor != 0.0:
+                if factor != zero:
                     for j in range(i, n):
                         M[i, j] += factor * qp.Gamma[r, j]
     return M
@@ -175,7 +198,7 @@ def stage_matrix(qp: QuadraticProblem, stiff: Array, dt: float, flow: Flow) -> A
 @kernel
 def step(qp: QuadraticProblem, z: Array, stiff: Array, cost: float, dt: float, flow: Flow) -> tuple[float, float]:
     """Move z by one TR-BDF2 step of size dt, or not at all; return the next step size and the cost at z."""
-    n = z.shape[0]
+    n, real = z.shape[0], z.dtype.type
     v0, vg, v1 = np.empty_like(z), np.empty_like(z), np.empty_like(z)
     active, ahead = np.empty_like(qp.gamma), np.empty_like(qp.gamma)
     velocity(qp, z, flow, v0, active)
@@ -185,23 +208,24 @@ def step(qp: QuadraticProblem, z: Array, stiff: Array, cost: float, dt: float, f
     M = stage_matrix(qp, stiff, dt, flow)
     release(M, held)
     cholesky(M)
-    change = G * dt * v0
+    change = real(G) * dt * v0
     cholesky_solve(M, change)
     zg = z + change
     velocity(qp, zg, flow, vg, ahead)
     for r in range(active.shape[0]):
         stiff[r] = ahead[r]
     for i in range(n):
-        vg[i] *= 1.0 - held[i]
-    change = C1 * zg - C0 * z - zg + D * dt * vg
+        vg[i] *= real(1.0) - held[i]
+    change = real(C1) * zg - real(C0) * z - zg + real(D) * dt * vg
     cholesky_solve(M, change)
     candidate = zg + change
     velocity(qp, candidate, flow, v1, active)
     for i in range(n):
-        v1[i] *= 1.0 - held[i]
-    error = 0.0
+        v1[i] *= real(1.0) - held[i]
+    error = real(0.0)
     for i in range(n):
-        local = 2.0 * ERROR_CONSTANT * dt * (v0[i] / G - vg[i] / (G * (1.0 - G)) + v1[i] / (1.0 - G))
+        curvature = v0[i] / real(G) - vg[i] / real(G * (1.0 - G)) + v1[i] / real(1.0 - G)
+        local = real(2.0 * ERROR_CONSTANT) * dt * curvature
         error = max(error, abs(local))
         candidate[i] = min(max(candidate[i], qp.low[i]), qp.high[i])
     reached = augmented_cost(qp, candidate, flow.alpha)
@@ -209,5 +233,5 @@ def step(qp: QuadraticProblem, z: Array, stiff: Array, cost: float, dt: float, f
         return dt * flow.rejection, cost
     for i in range(n):
         z[i] = candidate[i]
-    wanted = (flow.tolerance / max(error, 1e-12)) ** (1.0 / 3.0)
-    return dt * min(flow.growth, max(flow.rejection, wanted)), reached
+    wanted = (flow.tolerance / max(error, real(1e-12))) ** real(1.0 / 3.0)
+    return min(dt * min(flow.growth, max(flow.rejection, wanted)), flow.longest), reached
