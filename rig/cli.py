@@ -5,13 +5,19 @@ import logging
 import platform
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from importlib import import_module
+from typing import Final, NoReturn
 
 from coldloop import __version__
 from coldloop.errors import ColdloopError
-from rig.commands import config, model, registers, run
 
-COMMANDS = (run, registers, model, config)
+COMMANDS: Final = {
+    "run": "run the loop and record it",
+    "study": "do the runs of a study and draw its figure",
+    "registers": "the register maps",
+    "model": "the prediction model",
+    "config": "the effective configuration and where each value comes from",
+}
 INTERRUPTED = 130
 
 
@@ -23,13 +29,17 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
-def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands."""
+def make_parser(chosen: str | None) -> argparse.ArgumentParser:
+    """Return the parser of all commands, with the options of the chosen one; what others need is not even imported."""
     parser = OneLineParser(prog="coldloop", description="A networked PLC rig for fast MPC on a helium refrigerator.")
     parser.set_defaults(execute=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=OneLineParser)
-    for command in COMMANDS:
-        command.add_parser(commands)
+    for name, summary in COMMANDS.items():
+        command = commands.add_parser(name, help=summary)
+        if name == chosen:
+            module = import_module(f"rig.commands.{name}")
+            command.description = module.__doc__
+            module.declare(command)
     version = commands.add_parser("version", help="the version")
     version.set_defaults(execute=_print_version)
     return parser
@@ -42,8 +52,9 @@ def _print_version(_: argparse.Namespace) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; return its exit code: 0 done, 1 failed, 2 asked for wrongly."""
-    parser = make_parser()
-    options = parser.parse_args(arguments)
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    parser = make_parser(given[0] if given else None)
+    options = parser.parse_args(given)
     if options.execute is None:
         parser.print_help()
         return 0

@@ -8,9 +8,8 @@ from coldloop.service import add_configuration_options
 from rig.commands.options import configuration
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare the command."""
-    parser = commands.add_parser("config", help="the effective configuration", description=__doc__)
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_configuration_options(parser)
     parser.set_defaults(execute=execute)
 

@@ -21,9 +21,8 @@ HORIZON_S = 100.0
 """Time after which the gains are given: the level integrates, so there are no final ones."""
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare the command."""
-    parser = commands.add_parser("model", help="equilibrium, eigenvalues, gains, hash", description=__doc__)
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_configuration_options(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the model file, for model.file")
     parser.set_defaults(execute=execute)

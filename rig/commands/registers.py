@@ -6,9 +6,8 @@ import sys
 from rig.register_listing import FORMATS, MAPS
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare the command."""
-    parser = commands.add_parser("registers", help="list the Modbus registers", description=__doc__)
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("--format", choices=sorted(FORMATS), default="table")
     parser.add_argument("--service", choices=sorted(MAPS), help="default: all")
     parser.set_defaults(execute=execute)

@@ -29,9 +29,8 @@ from rig.settings import Settings
 ATTACH_PATIENCE_S = 5.0
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare the command."""
-    parser = commands.add_parser("run", help="run the loop and record it", description=__doc__)
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_configuration_options(parser)
     parser.add_argument("--mode", choices=[mode.value for mode in TimeMode], help="default: lockstep")
     parser.add_argument("--factor", type=float, help="in real time: seconds of plant time in a second (default: 1)")

@@ -89,7 +89,8 @@ class OptimizerProgram:
 
     def restart(self, updating_period_s: float) -> None:
         """Forget everything and begin a session at the operating point; 0 s is the adaptive updating period."""
-        self._rule = self._make_rule(updating_period_s)
+        self._fixed_ticks = round(updating_period_s / TICK_S)
+        self._rule = self._make_rule()
         self._estimator.reset()
         self._solver.reset()
         at_rest = np.zeros(3, self._real)
@@ -99,10 +100,10 @@ class OptimizerProgram:
         self._last: _Period | None = None
         self._sequences = 0
 
-    def _make_rule(self, updating_period_s: float) -> UpdatingRule:
+    def _make_rule(self) -> UpdatingRule:
         adaptive = self.settings.adaptive
-        if updating_period_s:
-            return FixedPeriod(self._budget.iterations(round(updating_period_s * TICKS_PER_SAMPLE / 5)))
+        if self._fixed_ticks:
+            return FixedPeriod(self._budget.iterations(self._fixed_ticks))
         if adaptive.rule is RuleName.CONTRACTION:
             return ContractionRule(**adaptive.contraction.model_dump())
         return Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta)
@@ -124,7 +125,7 @@ class OptimizerProgram:
         here = played.situation._replace(x=estimate.x, w=estimate.w)
         effective = self._cost(self._problem.at(here), played.z)
         iterations, assessment = self._decide(effective, update, interrupted=interrupted)
-        ticks = self._budget.period(iterations)
+        ticks = self._fixed_ticks or self._budget.period(iterations)
         self._last = _Period(update, estimate, iterations, ticks, effective, assessment)
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w

@@ -5,6 +5,7 @@
     │   ├── ConfigurationError      a key, a value or a configuration file
     │   └── LoadFileError           a load profile
     ├── ResultsError                the files of a run cannot be written
+    ├── StudyError                  a run of a study failed
     ├── ModelFileError              a prediction model that is missing, damaged or of another plant
     └── LinkError                   the bus: a port, a peer, an answer
         ├── PortInUseError
@@ -37,6 +38,10 @@ class LoadFileError(UsageError):
 
 class ResultsError(ColdloopError):
     """The files of a run cannot be written."""
+
+
+class StudyError(ColdloopError):
+    """A run of a study failed."""
 
 
 class ModelFileError(ColdloopError):

@@ -29,6 +29,10 @@ D = G / 2.0
 ERROR_CONSTANT = (-3.0 * G * G + 4.0 * G - 2.0) / (12.0 * (2.0 - G))
 
 
+STALLED = 20
+"""Steps in a row without a fall of J after which there is nothing left to win: they have become 1e-6 as long."""
+
+
 class OdeSettings(BaseModel):
     """Settings of the ODE-based solver."""
 
@@ -89,12 +93,16 @@ class OdeSolver:
         self._flow = flow_in(self._settings, self._real)
         self._stiff = np.zeros_like(problem.gamma)
         self._z, self._cost, self._dt = begin(problem, guess, self._flow)
+        self._stalled = 0
 
     def iterate(self, count: int) -> None:
-        """Take `count` steps."""
+        """Take `count` steps, or fewer once the cost does not fall any more."""
         for _ in range(count):
+            if self._stalled == STALLED:
+                break
             cost, dt = self._real(self._cost), self._real(self._dt)
             self._dt, self._cost = step(self._problem, self._z, self._stiff, cost, dt, self._flow)
+            self._stalled = self._stalled + 1 if self._cost == cost else 0
 
     @property
     def solution(self) -> Array:

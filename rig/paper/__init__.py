@@ -1,0 +1,45 @@
+"""The points of the paper's figures, as far as its source holds them."""
+
+import csv
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Series = NDArray[np.float64]
+Columns = Mapping[str, Series]
+
+FOLDER = Path(__file__).parent
+
+
+def _columns(name: str, key: str | None = None) -> dict[str, dict[str, Series]]:
+    """Return the numeric columns of a file, by the value of the column `key`."""
+    with (FOLDER / name).open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    groups: dict[str, list[dict[str, str]]] = {}
+    for row in rows:
+        groups.setdefault(row.pop(key) if key else "", []).append(row)
+    return {
+        group: {column: np.array([float(row[column]) for row in members]) for column in members[0]}
+        for group, members in groups.items()
+    }
+
+
+@cache
+def cholesky() -> Columns:
+    """Return size, plc_ms and laptop_us of the figure `performance_automate`."""
+    return _columns("fig_cholesky.csv")[""]
+
+
+@cache
+def solver_comparison() -> Mapping[str, Columns]:
+    """Return normalized_power, J_dev, J_cst, J_total, c1, c2 and J_BF of `ode` and `qpoases` (figure `solv_cmp`)."""
+    return _columns("fig_solver_comparison.csv", "solver")
+
+
+@cache
+def updating_period() -> Mapping[str, Columns]:
+    """Return tau_u_s, cost_fixed_pct and cost_adaptive_pct of the scenarios a to f (figure `tu_opt`)."""
+    return _columns("fig_updating_period.csv", "scenario")

@@ -1,0 +1,168 @@
+"""Claims, what is asked of them, and the verdicts."""
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Final, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict
+
+from rig import paper
+from rig.studies.solver_comparison import measures
+
+TOLERANCES: Final = Path(__file__).with_name("tolerances.toml")
+FROM_POINTS: Final = "points"
+
+
+def _limits(value: object) -> object:
+    """Read "-" as no limit."""
+    if isinstance(value, list) and len(value) == 2:
+        return tuple(limit if open_end != "-" else limit * math.inf for limit, open_end in
+                     ((-1.0 if v == "-" and i == 0 else 1.0 if v == "-" else v, v) for i, v in enumerate(value)))  # fmt: skip
+    return value
+
+
+Range = Annotated[tuple[float, float], BeforeValidator(_limits)]
+
+
+class Verdict(StrEnum):
+    """What became of a claim."""
+
+    REPRODUCED = "reproduced"
+    PARTLY = "partly"
+    NOT_REPRODUCED = "not reproduced"
+    NO_DATA = "no data in the paper"
+
+
+class Claim(BaseModel):
+    """A claim of the paper, or an aim of this project."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    study: str
+    value: str
+    figure: str
+    says: str
+    of_paper: str
+    why: str
+    reproduced: Range | None = None
+    partly: Range | None = None
+
+
+class Judged(NamedTuple):
+    """A claim with what was found."""
+
+    claim: Claim
+    values: tuple[float, ...]
+    """One a draw; empty where the study gave none."""
+    of_paper: float | None
+    """From the points of the paper's figures."""
+    verdict: Verdict | None
+    """None where the study gave no value: it was cut short."""
+
+
+@cache
+def claims() -> tuple[Claim, ...]:
+    """Return all claims, in the order of the paper."""
+    return tuple(Claim.model_validate(one) for one in tomllib.loads(TOLERANCES.read_text(encoding="utf-8"))["claim"])
+
+
+def judge(values: Mapping[str, Sequence[float]]) -> list[Judged]:
+    """Return every claim of which the studies gave values, judged."""
+    return [_judged(claim, tuple(values[claim.value])) for claim in claims() if claim.value in values]
+
+
+def _judged(claim: Claim, values: tuple[float, ...]) -> Judged:
+    of_paper = paper_values().get(claim.value) if claim.of_paper == FROM_POINTS else None
+    return Judged(claim, values, of_paper, verdict(claim, values))
+
+
+def verdict(claim: Claim, values: tuple[float, ...]) -> Verdict:
+    """Return the verdict on a claim, given one value a draw."""
+    if claim.reproduced is None or claim.partly is None:
+        return Verdict.NO_DATA
+    if all(_within(claim.reproduced, value) for value in values):
+        return Verdict.REPRODUCED
+    mean = float(np.mean(values))
+    if _within(claim.reproduced, mean) or all(_within(claim.partly, value) for value in values):
+        return Verdict.PARTLY
+    return Verdict.NOT_REPRODUCED
+
+
+def _within(limits: tuple[float, float], value: float) -> bool:
+    return limits[0] <= value <= limits[1]
+
+
+@cache
+def paper_values() -> Mapping[str, float]:
+    """Return what the points of the paper's figures give, by the formulas that ours are computed with."""
+    comparison = paper.solver_comparison()
+    powers = comparison["ode"]["normalized_power"]
+    values = measures(powers, comparison)
+    closed = {solver: points["J_BF"] for solver, points in comparison.items()}
+    one = int(np.argmin(np.abs(powers - 1.0)))
+    values["limited: J_BF"] = float(closed["qpoases"][one] / closed["qpoases"][-1])
+    values["trajectories: J_BF"] = float(closed["ode"][one] / closed["qpoases"][-1])
+    values["trajectories: J_BF of qpOASES over ODE"] = float(closed["qpoases"][one] / closed["ode"][one])
+    return {**values, **_updating_period(), **_cholesky()}
+
+
+def _updating_period() -> dict[str, float]:
+    hours = list(paper.updating_period().values())
+    fixed = np.array([hour["cost_fixed_pct"] for hour in hours])
+    adaptive = np.array([hour["cost_adaptive_pct"][0] for hour in hours])
+    best, argbest = fixed.min(axis=1), fixed.argmin(axis=1)
+    literal = "Algorithm 1, hours"
+    return {
+        "interior optimum from 1 to 5 s, share of hours": float(
+            ((argbest > 0) & (argbest < fixed.shape[1] - 1)).mean()
+        ),
+        "worst end over best, smallest of hours": float((np.maximum(fixed[:, 0], fixed[:, -1]) / best).min()),
+        f"better than the mean fixed period, share: {literal}": float((adaptive < fixed.mean(axis=1)).mean()),
+        f"best of all, share: {literal}": float((adaptive < best).mean()),
+        f"within 2 % of the best fixed period, share: {literal}": float((adaptive <= 1.02 * best).mean()),
+        f"cost over that of the best fixed period, geometric mean: {literal}": float(
+            np.exp(np.log(adaptive / best).mean())
+        ),
+    }
+
+
+def _cholesky() -> dict[str, float]:
+    points = paper.cholesky()
+    size, seconds = points["size"], points["plc_ms"] / 1e3
+    large = size >= 50
+    many = size >= 40
+    return {
+        "Mflop/s from n = 50 on": float((size**3 / 3 / seconds / 1e6)[large].mean()),
+        "slow-down against the laptop, sizes 40 to 125": float(
+            (points["plc_ms"] * 1e3 / points["laptop_us"])[many].mean()
+        ),
+    }
+
+
+def counts(judged: Sequence[Judged]) -> dict[str, int]:
+    """Return how often each verdict was given."""
+    return {one.value: sum(j.verdict is one for j in judged) for one in Verdict}
+
+
+def as_json(judged: Sequence[Judged]) -> list[dict[str, Any]]:
+    """Return the scorecard as plain data."""
+    return [
+        {
+            **j.claim.model_dump(exclude={"reproduced", "partly"}),
+            "reproduced": _plain(j.claim.reproduced),
+            "partly": _plain(j.claim.partly),
+            "paper": j.of_paper,
+            "values": list(j.values),
+            "verdict": j.verdict,
+        }
+        for j in judged
+    ]
+
+
+def _plain(limits: tuple[float, float] | None) -> list[float | None] | None:
+    return [limit if math.isfinite(limit) else None for limit in limits] if limits else None

@@ -1,0 +1,28 @@
+"""Studies: questions that take many runs, by name. One file each; `study.py` says what a study is."""
+
+from typing import Final
+
+from rig.studies.classical import ClassicalStudy
+from rig.studies.experiments import ADAPTIVE_2H, PLC_2H
+from rig.studies.single_precision import SinglePrecision
+from rig.studies.solver_comparison import SolverComparison
+from rig.studies.study import Study
+from rig.studies.trade_off import TradeOff
+from rig.studies.trajectories import LIMITED_STUDY, TRAJECTORIES_STUDY, UNLIMITED_STUDY
+from rig.studies.updating_period import UpdatingPeriodStudy
+
+_ALL: Final[tuple[Study, ...]] = (
+    UNLIMITED_STUDY,
+    LIMITED_STUDY,
+    SolverComparison(),
+    TRAJECTORIES_STUDY,
+    UpdatingPeriodStudy(),
+    PLC_2H,
+    ADAPTIVE_2H,
+    TradeOff(),
+    ClassicalStudy(),
+    SinglePrecision(),
+)
+
+STUDIES: Final = {study.name: study for study in _ALL}
+"""In the order of the paper."""

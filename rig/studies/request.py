@@ -1,0 +1,178 @@
+"""One run of a study: what it is asked to do, and what is kept of it. Both travel between processes as plain data."""
+
+import asyncio
+import hashlib
+import json
+import tempfile
+from dataclasses import asdict, dataclass
+from functools import cached_property, lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.config import load_configuration
+from coldloop.lti_model import load as load_model
+from coldloop.process import L1, T5, TICK_S
+from plant.program import LoadProfile
+from rig.indicators import Indicators, evaluate, instantaneous_cost
+from rig.local_services import LocalServices
+from rig.network import NetworkRig
+from rig.one_process import OneProcessRig
+from rig.recording import Recorder, Recording
+from rig.scenario import Scenario
+from rig.settings import Settings
+
+Series = NDArray[np.float64]
+
+PROGRAM_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc")
+UPDATE_COLUMNS = (
+    "tick", "tau_u", "iterations", "j_effective", "j_hot_start", "j_delivered", "j_dev", "j_cst", "violation",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """A run that any worker can do, and that is done once: its digest names its result."""
+
+    load: str
+    """Name of the load, for people."""
+    times: tuple[int, ...]
+    watts: tuple[float, ...]
+    ticks: int
+    updating_period_s: float
+    """0 is adaptive."""
+    assignments: tuple[str, ...] = ()
+    """Configuration that differs from the defaults, as `section.key=value`."""
+    draw: int = 1
+    """Which draw of a named load this is; of a load file, which draw of the sensors' noise."""
+    networked: bool = False
+    """Three services on the bus instead of one process."""
+    trace_ticks: int = 0
+    """Every so many ticks of the trace are kept; 0 is none."""
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of the request and of the programs that will do it."""
+        content = json.dumps([asdict(self), programs_digest()], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:20]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run left behind."""
+
+    programs: str
+    """Digest of the programs that did it."""
+    indicators: Indicators
+    trace_sha256: str
+    deadline_misses: int
+    updates: dict[str, list[float]]
+    """Columns of the updates, by name."""
+    trace: dict[str, list[float]]
+    """Columns of the trace, by name; empty unless it was asked for."""
+
+    def column(self, name: str) -> Series:
+        """Return a column of the updates."""
+        return np.asarray(self.updates[name], dtype=float)
+
+    def series(self, name: str) -> Series:
+        """Return a column of the trace."""
+        return np.asarray(self.trace[name], dtype=float)
+
+    def to_json(self) -> str:
+        """Return the outcome as one JSON document."""
+        return json.dumps({**asdict(self), "indicators": self.indicators._asdict()})
+
+    @classmethod
+    def from_json(cls, text: str) -> "Outcome":
+        """Return the outcome of a document.
+
+        Raises:
+            ValueError: It is not one.
+        """
+        try:
+            content = json.loads(text)
+            return cls(**{**content, "indicators": Indicators(**content["indicators"])})
+        except (TypeError, KeyError) as error:
+            raise ValueError(str(error)) from None
+
+
+@lru_cache(maxsize=1)
+def programs_digest() -> str:
+    """Return a digest of the sources that decide what a run gives."""
+    digest = hashlib.sha256()
+    for package in PROGRAM_PACKAGES:
+        spec = find_spec(package)
+        for folder in (spec.submodule_search_locations or ()) if spec else ():
+            for source in sorted(Path(folder).rglob("*.py")):
+                digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def perform(request: RunRequest) -> str:
+    """Do a run; return its outcome as JSON."""
+    settings = settings_of(request.assignments)
+    scenario = Scenario(
+        request.ticks, LoadProfile(request.times, request.watts), request.updating_period_s, request.draw
+    )
+    recorder = Recorder(request.ticks)
+    if request.networked:
+        asyncio.run(_on_the_bus(settings, scenario, recorder))
+    else:
+        _rig(request.assignments).run(scenario, recorder)
+    return _outcome(recorder.recording(), settings, request.trace_ticks).to_json()
+
+
+@lru_cache(maxsize=4)
+def settings_of(assignments: tuple[str, ...]) -> Settings:
+    """Return the settings of a request; those of the environment do not count."""
+    return load_configuration(Settings, environment={}, assignments=assignments).settings
+
+
+@lru_cache(maxsize=1)
+def _rig(assignments: tuple[str, ...]) -> OneProcessRig:
+    return OneProcessRig(settings_of(assignments))
+
+
+async def _on_the_bus(settings: Settings, scenario: Scenario, recorder: Recorder) -> None:
+    with tempfile.TemporaryDirectory(prefix="coldloop-logs-") as logs:
+        async with LocalServices(settings, Path(logs)) as services:
+            rig = NetworkRig(services.endpoints, settings)
+
+            async def work() -> None:
+                await rig.connect(services.endpoints.plant.patience_s)
+                await rig.run(scenario, recorder)
+
+            try:
+                await services.during(work())
+            finally:
+                rig.close()
+
+
+def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outcome:
+    model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
+    return Outcome(
+        programs=programs_digest(),
+        indicators=evaluate(recording, model, design),
+        trace_sha256=recording.trace_sha256,
+        deadline_misses=recording.link.deadline_misses,
+        updates={name: [float(getattr(row, name)) for row in recording.updates] for name in UPDATE_COLUMNS},
+        trace=_trace(recording, instantaneous_cost(recording, model, design), trace_ticks) if trace_ticks else {},
+    )
+
+
+def _trace(recording: Recording, cost: Series, every: int) -> dict[str, list[float]]:
+    kept: dict[str, Any] = {
+        "time_s": np.arange(len(recording.load)) * TICK_S,
+        "load": recording.load,
+        "L1": recording.y[:, L1],
+        "T5": recording.y[:, T5],
+        "CV155": recording.u[:, 0],
+        "NCR22_A": recording.u[:, 1],
+        "CV156": recording.u[:, 2],
+        "cost": cost,
+    }
+    return {name: [float(value) for value in column[::every]] for name, column in kept.items()}

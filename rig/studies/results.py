@@ -1,0 +1,73 @@
+"""The files of a study: a table of all runs, its figures, and its section of the report."""
+
+import csv
+import io
+from functools import partial
+from pathlib import Path
+
+from coldloop.errors import ResultsError
+from rig.results import prepare_folder, whole_file
+from rig.studies.execution import Store, Workers, perform_all
+from rig.studies.study import Cell, Study, StudyOptions, StudyResult
+
+RUNS = "runs"
+"""Folder, beside those of the studies, in which runs are kept: studies share them."""
+
+
+def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path) -> StudyResult:
+    """Do what is missing of a study and write its files to `folder / study.name`.
+
+    Raises:
+        ColdloopError: A run failed, or a file cannot be written.
+    """
+    prepare_folder(folder / study.name)
+    outcomes = perform_all(study.requests(options), Store(folder / RUNS), workers, study.name)
+    result = study.evaluate(options, outcomes)
+    try:
+        _write(study, result, folder / study.name)
+    except OSError as error:
+        raise ResultsError(f"{folder / study.name}: {error.strerror}; choose another --out") from None
+    return result
+
+
+def _write(study: Study, result: StudyResult, folder: Path) -> None:
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(result.columns)
+    writer.writerows(result.rows)
+    whole_file(folder / "results.csv", lambda draft: draft.write_text(table.getvalue(), encoding="utf-8"))
+    for name, figure in result.figures.items():
+        whole_file(folder / figure_file(name), partial(figure.savefig, dpi=110, format="png"))
+    text = f"# {study.title}\n\n{section(result)}"
+    whole_file(folder / "section.md", lambda draft: draft.write_text(text, encoding="utf-8"))
+
+
+def figure_file(name: str) -> str:
+    """Return the file name of a figure."""
+    return f"{name.replace(' ', '-')}.png"
+
+
+LONGEST_TABLE = 24
+"""Rows that a section shows; the file has them all."""
+
+
+def section(result: StudyResult, folder: str = "") -> str:
+    """Return figures, remarks and, if it is short, the table as Markdown; figures are looked for in `folder`."""
+    parts = [f"![{name}]({folder}{figure_file(name)})" for name in result.figures]
+    parts += result.remarks
+    if result.rows and len(result.rows) <= LONGEST_TABLE:
+        parts.append(markdown_table(result.columns, result.rows))
+    return "\n\n".join(parts) + "\n"
+
+
+def markdown_table(columns: tuple[str, ...], rows: list[tuple[Cell, ...]]) -> str:
+    """Return a table."""
+    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+    lines += ["| " + " | ".join(_cell(value) for value in row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def _cell(value: Cell) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return f"{value[:12]}…" if isinstance(value, str) and len(value) == 64 else str(value)

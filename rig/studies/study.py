@@ -1,0 +1,120 @@
+"""What a study is: runs that are asked for, and what is made of their outcomes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from matplotlib.figure import Figure
+
+from coldloop.lti_model import load as load_model
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+from plant.load import find_load, named_families
+from plant.program import LoadProfile
+from rig.scenario import natural_ticks
+from rig.studies.request import Outcome, RunRequest
+
+Outcomes = Mapping[RunRequest, Outcome]
+Cell = str | float | int
+
+QUICK_TICKS = 2400
+"""Longest run of a quick study: ten minutes."""
+NOISE = (
+    "plant.sensors.level=0.01",
+    "plant.sensors.speed=1.0",
+    "plant.sensors.temperature=0.02",
+    "plant.sensors.pressure=0.001",
+)
+"""Measurement noise of the size that the Kalman filter reckons with."""
+PROGRAM = "optimizer_plc.program."
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """How much of a study is asked for."""
+
+    seeds: int = 3
+    """Draws of each named load; of a load file, draws of the sensors' noise."""
+    ticks: int | None = None
+    """Length of each run, if not that of its load."""
+    loads: tuple[str, ...] = ()
+    """Names or files, instead of the study's own."""
+    quick: bool = False
+    """One seed, ten minutes, fewer points: to see that it works."""
+
+    @property
+    def draws(self) -> range:
+        """Numbers of the draws."""
+        return range(1, (1 if self.quick else self.seeds) + 1)
+
+
+@dataclass(frozen=True)
+class Load:
+    """One draw of a load, and how long it is run."""
+
+    name: str
+    draw: int
+    profile: LoadProfile
+    ticks: int
+    noise: tuple[str, ...] = ()
+
+    def request(
+        self,
+        updating_period_s: float,
+        *assignments: str,
+        networked: bool = False,
+        trace_ticks: int = 0,
+    ) -> RunRequest:
+        """Return the request for a run under this load."""
+        return RunRequest(
+            self.name, self.profile.times, self.profile.watts, self.ticks, updating_period_s,
+            (*self.noise, *assignments), self.draw, networked, trace_ticks,
+        )  # fmt: skip
+
+
+def draw_of(name: str, draw: int, options: StudyOptions) -> Load:
+    """Return a draw of a load; the draws of a file differ by their noise, which there is when there are several."""
+    named = named_families(name) is not None
+    drawn = f"{name}@{draw}" if named and draw > 1 and "@" not in name else name
+    profile = find_load(drawn, load_model(DEFAULT_MODEL_FILE).w0)
+    ticks = options.ticks or natural_ticks(drawn, profile)
+    if options.quick:
+        ticks = min(ticks, QUICK_TICKS)
+    noise = NOISE if not named and options.seeds > 1 else ()
+    return Load(drawn, draw, profile, ticks, noise)
+
+
+def loads(options: StudyOptions, *names: str) -> dict[str, list[Load]]:
+    """Return the draws of the loads asked for, or else of these, by name."""
+    return {name: [draw_of(name, draw, options) for draw in options.draws] for name in options.loads or names}
+
+
+@dataclass
+class StudyResult:
+    """What a study found."""
+
+    columns: tuple[str, ...]
+    rows: list[tuple[Cell, ...]]
+    figures: dict[str, Figure]
+    """By name; drawn in the manner of the paper's."""
+    values: dict[str, list[float]] = field(default_factory=dict)
+    """What the claims are judged by: one value for each draw, by claim."""
+    remarks: list[str] = field(default_factory=list)
+    """Paragraphs for the report."""
+
+
+class Study(Protocol):
+    """A question, its runs, and its answer."""
+
+    @property
+    def name(self) -> str:
+        """What the command calls it."""
+
+    @property
+    def title(self) -> str:
+        """Heading of its section in the report."""
+
+    def requests(self, options: StudyOptions) -> Sequence[RunRequest]:
+        """Return the runs that are needed."""
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Return what the outcomes say."""

@@ -1,0 +1,316 @@
+"""Cost against updating period, fixed and adapted (paper, figure `tu_opt`), and what the literal rule needs to work."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from rig import paper as published
+from rig.plot import ACCENT, INK, THIRD
+from rig.studies.drawing import COLOURS, panels
+from rig.studies.request import Outcome, RunRequest, Series
+from rig.studies.study import NOISE, PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.studies.trajectories import seconds_since_step
+
+NINE: Final = tuple(published.updating_period()["a"]["tau_u_s"].tolist())
+"""Periods of the paper, s."""
+SHORTER: Final = (0.5, 0.75)
+"""Below the paper's, where the optimum of a fast solver may lie."""
+FEW: Final = (1.0, 2.5, 5.0)
+ADAPTIVE: Final = 0.0
+RULE: Final = f"{PROGRAM}adaptive.rule="
+INTERRUPT: Final = f"{PROGRAM}interrupting_load_step_w=10"
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A way to choose the updating period."""
+
+    label: str
+    period_s: float
+    assignments: tuple[str, ...] = ()
+
+
+LITERAL = Policy("Algorithm 1", ADAPTIVE, (f"{RULE}algorithm-1",))
+OWN = Policy("contraction rule", ADAPTIVE, (f"{RULE}contraction",))
+POLICIES: Final = (
+    LITERAL,
+    Policy("Algorithm 1, interrupt", ADAPTIVE, (f"{RULE}algorithm-1", INTERRUPT)),
+    OWN,
+    Policy("contraction rule, interrupt", ADAPTIVE, (f"{RULE}contraction", INTERRUPT)),
+    Policy("fixed 2.5 s, interrupt", 2.5, (INTERRUPT,)),
+)
+OWN_INTERRUPT = POLICIES[3]
+CONTROL = POLICIES[4]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Another setting in which rules and fixed periods are compared."""
+
+    label: str
+    assignments: tuple[str, ...]
+    periods: tuple[float, ...] = FEW
+    policies: tuple[Policy, ...] = (LITERAL,)
+
+
+VARIANTS: Final = (
+    Variant("rate limit scaled by tau_u / 5 s", ("limits.rate_reference=elapsed",), NINE, (LITERAL, OWN_INTERRUPT)),
+    Variant("measurement noise", NOISE, FEW, POLICIES),
+    Variant("fast gradient", (f"{PROGRAM}solver=fast_gradient", f"{PROGRAM}fast_gradient.tau_1_s=0.25"), FEW),
+    Variant("ODE starting slowly", (f"{PROGRAM}ode.cost_scale=1e-8", f"{PROGRAM}ode.growth=2.0"), FEW),
+)
+
+
+class UpdatingPeriodStudy:
+    """Six hours, nine periods and the rules; further draws of the six families are hours never used for tuning."""
+
+    name = "updating-period"
+    title = "Cost against updating period (figure tu_opt)"
+
+    def requests(self, options: StudyOptions) -> list[RunRequest]:
+        """Return all runs; variants under the first draw only."""
+        hours = _hours(options)
+        main = [request for load in hours for request in _main(load, options)]
+        return main + [
+            request for load in hours if load.draw == 1 for variant in _variants(options)
+            for request in _variant_runs(load, variant)
+        ]  # fmt: skip
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Rank fixed periods and rules in each hour."""
+        result = StudyResult(("variant", "load", "policy", "tau_u mean (s)", "J per time", "J_BF"), [], {})
+        hours = {load.name: _Hour.of(load, options, outcomes) for load in _hours(options)}
+        for name, hour in hours.items():
+            for label, run in hour.runs():
+                indicators = run.indicators
+                result.rows.append(("", name, label, indicators.tau_u_mean, indicators.J_open_mean, indicators.J_BF))
+        for load in _hours(options):
+            for variant in _variants(options) if load.draw == 1 else ():
+                labels = [f"fixed {period:g} s" for period in variant.periods] + [p.label for p in variant.policies]
+                for label, request in zip(labels, _variant_runs(load, variant), strict=True):
+                    one = outcomes[request].indicators
+                    row = (variant.label, load.name, label, one.tau_u_mean, one.J_open_mean, one.J_BF)
+                    result.rows.append(row)
+        first = {name: hour for name, hour in hours.items() if hour.load.draw == 1}
+        fresh = {name: hour for name, hour in hours.items() if hour.load.draw > 1}
+        result.figures["cost against period"] = _figure(first, fresh)
+        result.figures["period after a load step"] = _response_figure(list(hours.values()))
+        _judge(result, "hours", first)
+        if fresh:
+            _judge(result, "fresh hours", fresh)
+        for policy in (LITERAL, OWN_INTERRUPT):
+            after, quiet = _response(list(hours.values()), policy)
+            result.values[f"tau_u just after a load step over that in quiet, {policy.label}"] = [after / quiet]
+        result.remarks += [_table("Hours a to f", first), *([_table("Fresh hours", fresh)] if fresh else [])]
+        result.remarks.append(_variant_table(result))
+        return result
+
+
+def _hours(options: StudyOptions) -> list[Load]:
+    names = ("a", "c", "e") if options.quick else tuple("abcdef")
+    return [load for draws in loads(options, *names).values() for load in draws]
+
+
+def _periods(options: StudyOptions) -> tuple[float, ...]:
+    return FEW if options.quick else (*SHORTER, *NINE)
+
+
+def _variants(options: StudyOptions) -> tuple[Variant, ...]:
+    return () if options.quick else VARIANTS
+
+
+def _main(load: Load, options: StudyOptions) -> list[RunRequest]:
+    fixed = [load.request(period) for period in _periods(options)]
+    return fixed + [load.request(policy.period_s, *policy.assignments) for policy in POLICIES]
+
+
+def _variant_runs(load: Load, variant: Variant) -> list[RunRequest]:
+    fixed = [load.request(period, *variant.assignments) for period in variant.periods]
+    return fixed + [load.request(p.period_s, *variant.assignments, *p.assignments) for p in variant.policies]
+
+
+@dataclass(frozen=True)
+class _Hour:
+    """The outcomes of one hour."""
+
+    load: Load
+    fixed: Mapping[float, Outcome]
+    policies: Mapping[str, Outcome]
+
+    @classmethod
+    def of(cls, load: Load, options: StudyOptions, outcomes: Outcomes) -> "_Hour":
+        runs = [outcomes[request] for request in _main(load, options)]
+        periods = _periods(options)
+        labels = [policy.label for policy in POLICIES]
+        return cls(
+            load,
+            dict(zip(periods, runs[: len(periods)], strict=True)),
+            dict(zip(labels, runs[len(periods) :], strict=True)),
+        )
+
+    def runs(self) -> list[tuple[str, Outcome]]:
+        return [(f"fixed {period:g} s", run) for period, run in self.fixed.items()] + list(self.policies.items())
+
+    def nine(self, indicator: str) -> Series:
+        """Costs of the paper's periods."""
+        return np.array([getattr(run.indicators, indicator) for p, run in self.fixed.items() if p in NINE])
+
+    def cost(self, label: str, indicator: str = "J_open_mean") -> float:
+        return float(getattr(self.policies[label].indicators, indicator))
+
+    def has_interior_optimum(self) -> bool:
+        """Whether neither end of all periods tried is the best."""
+        costs = [run.indicators.J_open_mean for run in self.fixed.values()]
+        return 0 < int(np.argmin(costs)) < len(costs) - 1
+
+    def worst_end(self) -> float:
+        """Cost at the worse end of all periods tried over that of the best of them."""
+        costs = [run.indicators.J_open_mean for run in self.fixed.values()]
+        return max(costs[0], costs[-1]) / min(costs)
+
+
+def _judge(result: StudyResult, which: str, hours: Mapping[str, _Hour]) -> None:
+    """Compute what the claims are judged by, over these hours."""
+    some = list(hours.values())
+    values = result.values
+    values[f"interior optimum from 0.5 to 5 s, share of {which}"] = [_share(h.has_interior_optimum() for h in some)]
+    within_nine = (0 < int(np.argmin(h.nine("J_open_mean"))) < len(h.nine("J_open_mean")) - 1 for h in some)
+    values[f"interior optimum from 1 to 5 s, share of {which}"] = [_share(within_nine)]
+    values[f"worst end over best, smallest of {which}"] = [min(h.worst_end() for h in some)]
+    for policy in POLICIES:
+        costs = np.array([h.cost(policy.label) for h in some])
+        best = np.array([h.nine("J_open_mean").min() for h in some])
+        mean = np.array([h.nine("J_open_mean").mean() for h in some])
+        closed = np.array([h.cost(policy.label, "J_BF") for h in some])
+        usual = np.array([h.fixed[2.5].indicators.J_BF for h in some])
+        of = f"{policy.label}, {which}"
+        values[f"better than the mean fixed period, share: {of}"] = [_share(costs < mean)]
+        values[f"best of all, share: {of}"] = [_share(costs < best)]
+        values[f"within 2 % of the best fixed period, share: {of}"] = [_share(costs <= 1.02 * best)]
+        values[f"cost over that of the best fixed period, geometric mean: {of}"] = [_geometric_mean(costs / best)]
+        values[f"J_BF over that of fixed 2.5 s, all together: {of}"] = [float(closed.sum() / usual.sum())]
+
+
+def _share(which: Iterable[bool]) -> float:
+    return float(np.mean(list(which)))
+
+
+def _geometric_mean(ratios: Series) -> float:
+    return float(np.exp(np.log(ratios).mean()))
+
+
+RESPONSE_EDGES_S: Final = np.array([0.0, 2.5, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0])
+
+
+def _response(hours: Sequence[_Hour], policy: Policy) -> tuple[float, float]:
+    """Return the mean updating period that begins 0 to 5 s after a load step, and beyond 60 s, s."""
+    runs = [(hour.policies[policy.label], hour.load) for hour in hours]
+    since = np.concatenate([seconds_since_step(run, load) for run, load in runs])
+    tau = np.concatenate([run.column("tau_u") for run, _ in runs]) / 4
+    soon, late = tau[since < 5.0], tau[since >= 60.0]
+    return (float(soon.mean()) if len(soon) else 0.0, float(late.mean()) if len(late) else 1.0)
+
+
+def _response_figure(hours: Sequence[_Hour]) -> Figure:
+    with panels(1, 1, (8.0, 3.6)) as (figure, (place,)):
+        for policy, colour in zip((LITERAL, OWN, OWN_INTERRUPT), COLOURS, strict=False):
+            runs = [(hour.policies[policy.label], hour.load) for hour in hours]
+            since = np.concatenate([seconds_since_step(run, load) for run, load in runs])
+            tau = np.concatenate([run.column("tau_u") for run, _ in runs]) / 4
+            bins = np.digitize(since, RESPONSE_EDGES_S)
+            means = [tau[bins == i].mean() if (bins == i).any() else np.nan for i in range(1, len(RESPONSE_EDGES_S))]
+            place.stairs(means, RESPONSE_EDGES_S, color=colour, baseline=None, linewidth=1.4, label=policy.label)
+        place.set_xlabel("time since the load step (s)")
+        place.set_ylabel("mean updating period (s)")
+        place.set_ylim(bottom=0)
+        place.legend()
+    return figure
+
+
+def _figure(first: Mapping[str, _Hour], fresh: Mapping[str, _Hour]) -> Figure:
+    """Draw each hour in % of its worst of the paper's periods, the paper's points beside it."""
+    rows = -(-len(first) // 2)
+    with panels(rows, 2, (9.5, 3.1 * rows)) as (figure, axes):
+        for (name, hour), place in zip(first.items(), axes, strict=False):
+            base = hour.nine("J_open_mean").max() / 100.0
+            periods = list(hour.fixed)
+            costs = [run.indicators.J_open_mean / base for run in hour.fixed.values()]
+            place.plot(periods, costs, color=INK, marker=".", label="fixed, here")
+            place.axhline(hour.cost(LITERAL.label) / base, color=ACCENT, linestyle="--", label="Algorithm 1, here")
+            place.axhline(hour.cost(OWN_INTERRUPT.label) / base, color=THIRD, linestyle="-.",
+                          label="contraction rule, interrupt")  # fmt: skip
+            theirs = published.updating_period().get(name)
+            if theirs:
+                place.plot(theirs["tau_u_s"], theirs["cost_fixed_pct"], ":o", color=INK, markerfacecolor="white",
+                           markersize=4, linewidth=0.8, label="fixed, paper")  # fmt: skip
+                place.plot(
+                    theirs["tau_u_s"], theirs["cost_adaptive_pct"], ":", color=ACCENT, label="Algorithm 1, paper"
+                )
+            others = [other for other in fresh.values() if other.load.name.startswith(f"{name}@")]
+            for other in others:
+                scale = other.nine("J_open_mean").max() / 100.0
+                place.plot(list(other.fixed), [run.indicators.J_open_mean / scale for run in other.fixed.values()],
+                           color=INK, alpha=0.25, linewidth=0.8)  # fmt: skip
+            place.set_title(f"({name})", loc="left")
+            place.set_ylabel("cost (% of the worst)")
+            place.set_yscale("log")
+            place.set_yticks([20, 30, 50, 70, 100], ["20", "30", "50", "70", "100"])
+            place.minorticks_off()
+        axes[0].legend(fontsize=7)
+        for place in axes[-2:]:
+            place.set_xlabel("updating period (s)")
+    return figure
+
+
+def _table(title: str, hours: Mapping[str, _Hour]) -> str:
+    """Return a table: each policy's cost over the best fixed period of the hour, and its rank among the ten."""
+    labels = ["fixed 2.5 s", *(policy.label for policy in POLICIES)]
+    caption = (
+        f"**{title}**: open-loop cost per unit time over that of the best of the nine fixed periods (rank among the "
+        "nine and the policy), then J_BF over that of the best of the nine."
+    )
+    lines = [
+        caption,
+        "",
+        "| hour | best fixed (s) | mean of nine | " + " | ".join(labels) + " |",
+        "|---|---|---|" + "---|" * len(labels),
+    ]
+    for name, hour in hours.items():
+        nine, closed = hour.nine("J_open_mean"), hour.nine("J_BF")
+        runs = {"fixed 2.5 s": hour.fixed[2.5], **hour.policies}
+        cells = [
+            f"{runs[label].indicators.J_open_mean / nine.min():.3f} "
+            f"({1 + int((nine < runs[label].indicators.J_open_mean * (1 - 1e-12)).sum())}) "
+            f"{runs[label].indicators.J_BF / closed.min():.3f}"
+            for label in labels
+        ]
+        periods = [period for period in hour.fixed if period in NINE]
+        best = periods[int(np.argmin(nine))]
+        lines.append(f"| {name} | {best:g} | {nine.mean() / nine.min():.3f} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _variant_table(result: StudyResult) -> str:
+    """Return a table of the variants: policies over the best fixed period tried, geometric means over the hours."""
+    caption = (
+        "**Variants** (first draws): costs over those of the best fixed period tried, geometric mean of the hours."
+    )
+    lines = [caption, "", "| variant | policy | open loop | J_BF | mean tau_u (s) |", "|---|---|---|---|---|"]
+    rows = [row for row in result.rows if row[0]]
+    for variant in dict.fromkeys(row[0] for row in rows):
+        mine = [row for row in rows if row[0] == variant]
+        names = list(dict.fromkeys(row[1] for row in mine))
+        best = {
+            (name, i): min(float(row[i]) for row in mine if row[1] == name and str(row[2]).startswith("fixed")
+                           and "interrupt" not in str(row[2]))
+            for name in names for i in (4, 5)
+        }  # fmt: skip
+        for policy in dict.fromkeys(row[2] for row in mine):
+            ratios = np.array([[float(row[4]) / best[row[1], 4], float(row[5]) / best[row[1], 5], float(row[3])]
+                               for row in mine if row[2] == policy])  # fmt: skip
+            open_loop, closed = np.exp(np.log(ratios[:, :2]).mean(axis=0))
+            lines.append(f"| {variant} | {policy} | {open_loop:.3f} | {closed:.3f} | {ratios[:, 2].mean():.2f} |")
+    return "\n".join(lines)
