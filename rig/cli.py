@@ -9,9 +9,9 @@ from typing import NoReturn
 
 from coldloop import __version__
 from coldloop.errors import ColdloopError
-from rig.commands import config, model, registers, run
+from rig.commands import budget, config, model, registers, run
 
-COMMANDS = (run, registers, model, config)
+COMMANDS = (run, registers, model, config, budget)
 INTERRUPTED = 130
 
 
