@@ -14,6 +14,7 @@ from coldloop.errors import ColdloopError
 COMMANDS: Final = {
     "run": "run the loop and record it",
     "study": "do the runs of a study and draw its figure",
+    "budget": "what the reference PLC can compute, and in which time",
     "registers": "the register maps",
     "model": "the prediction model",
     "config": "the effective configuration and where each value comes from",

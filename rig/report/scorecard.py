@@ -20,10 +20,11 @@ FROM_POINTS: Final = "points"
 
 def _limits(value: object) -> object:
     """Read "-" as no limit."""
-    if isinstance(value, list) and len(value) == 2:
-        return tuple(limit if open_end != "-" else limit * math.inf for limit, open_end in
-                     ((-1.0 if v == "-" and i == 0 else 1.0 if v == "-" else v, v) for i, v in enumerate(value)))  # fmt: skip
-    return value
+    if not isinstance(value, list) or len(value) != 2:
+        return value
+    return tuple(
+        limit if limit != "-" else open_end for limit, open_end in zip(value, (-math.inf, math.inf), strict=True)
+    )
 
 
 Range = Annotated[tuple[float, float], BeforeValidator(_limits)]

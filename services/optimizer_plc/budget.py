@@ -23,8 +23,8 @@ class BudgetSettings(BaseModel):
     """P, relative to the reference PLC."""
     preparation_slots: Annotated[int, Field(ge=0, le=20)] = 1
     """Slots of 0.25 s / P that the preparation is given in an updating period."""
-    preparation_s: Annotated[float, Field(ge=0)] = 0.1
-    """Time that it takes at P = 1: about 40,000 operations (estimator, prediction, gradient) at 0.5 Mflop/s."""
+    preparation_s: Annotated[float, Field(ge=0)] = 0.13
+    """Time that it takes at P = 1: 68,000 operations at 0.53 Mflop/s (`docs/budget.md`)."""
 
 
 class PlcBudget:

@@ -214,6 +214,10 @@ class PredictiveProblem:
             input_scale=self._input_scale,
         )
 
+    def memory(self) -> int:
+        """Return the bytes of the constant arrays that an instance is made of: Phi, Gamma and the maps."""
+        return sum(M.nbytes for M in (self.Phi, self.Gamma, *self._maps))
+
     # -- profiles ----------------------------------------------------------------------------------------------------
 
     def shifted(self, z: Array, ticks: int) -> Array:

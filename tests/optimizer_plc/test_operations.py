@@ -1,0 +1,143 @@
+"""Operations are counted by running the kernels' own Python code on numbers that count."""
+
+import math
+from typing import Any, SupportsFloat
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from optimizer_plc import costs, linear_algebra, operations, problem
+from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.reference_plc import ACTIVE_ROWS, QPOASES_ON_LAPTOP_S, cholesky_times, fitted, residuals, slow_down
+from optimizer_plc.solvers import ode
+from optimizer_plc.solvers.ode import OdeSettings, flow_in
+
+
+class Counted:
+    """A number whose arithmetic is counted, as the convention of `operations` has it."""
+
+    done = 0
+
+    def __init__(self, value: float) -> None:
+        self.value = float(value)
+
+    def _binary(self, value: float) -> "Counted":
+        Counted.done += 1
+        return Counted(value)
+
+    def __add__(self, other: SupportsFloat) -> "Counted":
+        return self._binary(self.value + float(other))
+
+    def __sub__(self, other: SupportsFloat) -> "Counted":
+        return self._binary(self.value - float(other))
+
+    def __rsub__(self, other: SupportsFloat) -> "Counted":
+        return self._binary(float(other) - self.value)
+
+    def __mul__(self, other: SupportsFloat) -> "Counted":
+        if isinstance(other, np.ndarray):
+            return NotImplemented  # element by element
+        return self._binary(self.value * float(other))
+
+    def __truediv__(self, other: SupportsFloat) -> "Counted":
+        return self._binary(self.value / float(other))
+
+    def __rtruediv__(self, other: SupportsFloat) -> "Counted":
+        return self._binary(float(other) / self.value)
+
+    def __pow__(self, other: SupportsFloat) -> "Counted":
+        return self._binary(self.value ** float(other))
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def sqrt(self) -> "Counted":
+        return self._binary(math.sqrt(self.value))
+
+    def __neg__(self) -> "Counted":
+        return Counted(-self.value)
+
+    def __abs__(self) -> "Counted":
+        return Counted(abs(self.value))
+
+    def __float__(self) -> float:
+        return self.value
+
+    def __lt__(self, other: SupportsFloat) -> bool:
+        return self.value < float(other)
+
+    def __gt__(self, other: SupportsFloat) -> bool:
+        return self.value > float(other)
+
+    def __le__(self, other: SupportsFloat) -> bool:
+        return self.value <= float(other)
+
+    def __ge__(self, other: SupportsFloat) -> bool:
+        return self.value >= float(other)
+
+    def __eq__(self, other: object) -> bool:
+        return self.value == float(other)  # type: ignore[arg-type]
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def counted(array: NDArray[np.float64]) -> NDArray[Any]:
+    return np.vectorize(Counted, otypes=[object])(array)
+
+
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let kernels call each other's Python code."""
+    for module in (ode, costs, problem, linear_algebra):
+        for name, value in list(vars(module).items()):
+            if hasattr(value, "py_func"):
+                monkeypatch.setattr(module, name, value.py_func)
+    Counted.done = 0
+
+
+@pytest.mark.usefixtures("plain")
+@pytest.mark.parametrize("n", [1, 2, 7, 20])
+def test_the_cholesky_factorisation_and_solve_are_counted_right(n: int) -> None:
+    rng = np.random.default_rng(n)
+    root = rng.normal(size=(n, n))
+    M, b = counted(root @ root.T + np.eye(n)), counted(rng.normal(size=n))
+    linear_algebra.cholesky(M)
+    assert Counted.done == pytest.approx(operations.cholesky(n).flops)
+    Counted.done = 0
+    linear_algebra.cholesky_solve(M, b)
+    assert Counted.done == operations.cholesky_solve(n).flops
+
+
+@pytest.mark.usefixtures("plain")
+@pytest.mark.parametrize(("n", "m", "active"), [(3, 5, 0), (6, 9, 2), (12, 20, 20), (49, 94, 3)])
+def test_a_step_of_the_ode_solver_is_counted_right(n: int, m: int, active: int) -> None:
+    rng = np.random.default_rng(n)
+    root = rng.normal(size=(n, n))
+    gamma = np.where(np.arange(m) < active, -1e3, 1e3)  # far away: the same rows at all three points
+    qp = QuadraticProblem(
+        counted(root @ root.T + np.eye(n)), counted(rng.normal(size=n)), counted(rng.normal(size=(m, n)) * 1e-2),
+        counted(gamma), np.full(n, -1e9), np.full(n, 1e9), 0.0,
+    )  # fmt: skip
+    flow = ode.Flow(*(Counted(value) for value in flow_in(OdeSettings(), np.float64)))  # type: ignore[arg-type]
+    z = counted(rng.normal(size=n))
+    before = [float(value) for value in z]
+    ode.step(qp, z, np.zeros(m), Counted(1e30), Counted(1e-6), flow)  # type: ignore[arg-type]
+    assert [float(value) for value in z] != before, "the step was accepted"
+    assert Counted.done == pytest.approx(operations.ode(n, m, active).flops)
+
+
+def test_the_curve_fits_the_cholesky_times_within_a_quarter_of_a_percent() -> None:
+    times = cholesky_times()
+    curve = fitted(times)
+    assert len(times.size) == 25
+    assert np.abs(residuals(curve, times)).max() < 0.0025
+    assert 0.5e6 < curve.flops_per_s(49) < 0.55e6
+
+
+def test_an_ode_iteration_takes_a_quarter_of_a_second_within_15_percent() -> None:
+    tau_1 = operations.ode(49, 94, ACTIVE_ROWS.mean).flops / fitted(cholesky_times()).flops_per_s(49)
+    assert tau_1 == pytest.approx(0.25, rel=0.15)
+
+
+def test_the_papers_route_gives_qpoases_about_half_a_second() -> None:
+    assert QPOASES_ON_LAPTOP_S * slow_down(cholesky_times(), 49) == pytest.approx(0.48, rel=0.05)
