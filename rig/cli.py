@@ -14,6 +14,7 @@ from coldloop.errors import ColdloopError
 COMMANDS: Final = {
     "run": "run the loop and record it",
     "study": "do the runs of a study and draw its figure",
+    "reproduce": "all studies of the paper, one report and a scorecard",
     "budget": "what the reference PLC can compute, and in which time",
     "registers": "the register maps",
     "model": "the prediction model",

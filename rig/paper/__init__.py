@@ -1,4 +1,7 @@
-"""The points of the paper's figures, as far as its source holds them."""
+"""The points of the paper's figures, as far as its source holds them.
+
+Those of the PLC's speed are the optimiser's own (`optimizer_plc.reference_plc`).
+"""
 
 import csv
 from collections.abc import Mapping
@@ -14,23 +17,17 @@ Columns = Mapping[str, Series]
 FOLDER = Path(__file__).parent
 
 
-def _columns(name: str, key: str | None = None) -> dict[str, dict[str, Series]]:
+def _columns(name: str, key: str) -> dict[str, dict[str, Series]]:
     """Return the numeric columns of a file, by the value of the column `key`."""
     with (FOLDER / name).open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     groups: dict[str, list[dict[str, str]]] = {}
     for row in rows:
-        groups.setdefault(row.pop(key) if key else "", []).append(row)
+        groups.setdefault(row.pop(key), []).append(row)
     return {
         group: {column: np.array([float(row[column]) for row in members]) for column in members[0]}
         for group, members in groups.items()
     }
-
-
-@cache
-def cholesky() -> Columns:
-    """Return size, plc_ms and laptop_us of the figure `performance_automate`."""
-    return _columns("fig_cholesky.csv")[""]
 
 
 @cache

@@ -11,7 +11,10 @@ from typing import Annotated, Any, Final, NamedTuple
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict
 
+from optimizer_plc.operations import cholesky
+from optimizer_plc.reference_plc import cholesky_times
 from rig import paper
+from rig.studies.cholesky import SLOW_DOWN, SPEED
 from rig.studies.solver_comparison import measures
 
 TOLERANCES: Final = Path(__file__).with_name("tolerances.toml")
@@ -133,16 +136,9 @@ def _updating_period() -> dict[str, float]:
 
 
 def _cholesky() -> dict[str, float]:
-    points = paper.cholesky()
-    size, seconds = points["size"], points["plc_ms"] / 1e3
-    large = size >= 50
-    many = size >= 40
-    return {
-        "Mflop/s from n = 50 on": float((size**3 / 3 / seconds / 1e6)[large].mean()),
-        "slow-down against the laptop, sizes 40 to 125": float(
-            (points["plc_ms"] * 1e3 / points["laptop_us"])[many].mean()
-        ),
-    }
+    size, plc_s, laptop_s = cholesky_times()
+    speed = np.array([cholesky(n).flops for n in size.tolist()]) / plc_s / 1e6
+    return {SPEED: float(speed[size >= 50].mean()), SLOW_DOWN: float((plc_s / laptop_s)[size >= 40].mean())}
 
 
 def counts(judged: Sequence[Judged]) -> dict[str, int]:

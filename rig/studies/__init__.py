@@ -2,6 +2,7 @@
 
 from typing import Final
 
+from rig.studies.cholesky import CholeskyStudy
 from rig.studies.classical import ClassicalStudy
 from rig.studies.experiments import ADAPTIVE_2H, PLC_2H
 from rig.studies.single_precision import SinglePrecision
@@ -12,6 +13,7 @@ from rig.studies.trajectories import LIMITED_STUDY, TRAJECTORIES_STUDY, UNLIMITE
 from rig.studies.updating_period import UpdatingPeriodStudy
 
 _ALL: Final[tuple[Study, ...]] = (
+    CholeskyStudy(),
     UNLIMITED_STUDY,
     LIMITED_STUDY,
     SolverComparison(),

@@ -45,14 +45,14 @@ class RuleName(StrEnum):
 
 
 class ContractionSettings(BaseModel):
-    """Parameters of the contraction rule."""
+    """Parameters of the contraction rule, chosen on the draws 11 and 12 of the six families of hours."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    q_busy: Annotated[int, Field(ge=1)] = 4
-    q_quiet: Annotated[int, Field(ge=1)] = 11
-    q_step: Annotated[int, Field(ge=1)] = 13
-    rate: Annotated[float, Field(gt=0)] = 0.05
+    q_busy: Annotated[int, Field(ge=1)] = 2
+    q_quiet: Annotated[int, Field(ge=1)] = 4
+    q_step: Annotated[int, Field(ge=1)] = 9
+    rate: Annotated[float, Field(gt=0)] = 0.02
     """Contraction of the delivered cost, 1/s, at which the period is shortest."""
     memory: Annotated[float, Field(ge=0, le=1)] = 0.95
     """Share of a contraction that is still felt a second later."""

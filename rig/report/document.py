@@ -1,0 +1,98 @@
+"""The report as Markdown and as one HTML page that holds its pictures."""
+
+import base64
+import html
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from markdown_it import MarkdownIt
+
+from rig.report.scorecard import Claim, Judged, Verdict, counts
+
+STYLE: Final = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1c2733; max-width: 76rem; margin: 2rem auto; padding: 0 1.5rem; }
+h1, h2, h3 { line-height: 1.2; } h2 { margin-top: 3rem; border-bottom: 1px solid #d5dce3; padding-bottom: .3rem; }
+table { border-collapse: collapse; margin: 1rem 0; font-size: 13px; display: block; overflow-x: auto; }
+th, td { border: 1px solid #d5dce3; padding: .3rem .5rem; text-align: left; vertical-align: top; }
+th { background: #eef2f5; } img { max-width: 100%; } code { font-size: 12px; background: #f3f5f7; padding: 0 .2em; }
+td.reproduced { background: #e3f1e6; } td.partly { background: #fdf3d8; } td.not-reproduced { background: #f9e0dc; }
+td.no-data-in-the-paper { background: #eef2f5; }
+"""
+
+
+def verdict_counts(judged: Sequence[Judged]) -> str:
+    """Return how often each verdict was given, in words."""
+    return ", ".join(f"{number} {verdict}" for verdict, number in counts(judged).items())
+
+
+def scorecard_table(judged: Sequence[Judged], commands: Mapping[str, str]) -> str:
+    """Return a row for each claim; `commands` says how each study is repeated."""
+    lines = [
+        "| figure | claim | paper's value | ours (spread over draws) | tolerance and why | verdict | command |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {j.claim.figure} | {j.claim.says}<br>*{j.claim.value}* | {_of_paper(j)} | {_ours(j.values)} "
+        f"| {_tolerance(j.claim)} | {j.verdict} | `{commands[j.claim.study]}` |"
+        for j in judged
+    ]
+    return "\n".join(lines)
+
+
+def deviations(judged: Sequence[Judged], explanations: Mapping[str, str]) -> str:
+    """Return what does not reproduce, each with what is known of why."""
+    lines = []
+    for j in judged:
+        if j.verdict in (Verdict.PARTLY, Verdict.NOT_REPRODUCED):
+            why = explanations.get(j.claim.value, "Not explained yet.")
+            lines.append(f"- **{j.verdict}: {j.claim.value}** ({j.claim.figure}): ours {_ours(j.values)}, "
+                         f"paper {_of_paper(j)}. {why}")  # fmt: skip
+    return "\n".join(lines) or "Everything that has data in the paper is reproduced."
+
+
+def _of_paper(judged: Judged) -> str:
+    return judged.claim.of_paper if judged.of_paper is None else _number(judged.of_paper)
+
+
+def _ours(values: Sequence[float]) -> str:
+    mean = sum(values) / len(values)
+    spread = f" ({_number(min(values))} to {_number(max(values))})" if len(values) > 1 else ""
+    return _number(mean) + spread
+
+
+def _number(value: float) -> str:
+    if math.isnan(value):
+        return "none"
+    return f"{value:.3g}" if abs(value) < 1e5 else f"{value:.3e}"
+
+
+def _tolerance(claim: Claim) -> str:
+    if claim.reproduced is None:
+        return claim.why
+    low, high = claim.reproduced
+    if math.isinf(low):
+        wanted = f"at most {_number(high)}"
+    elif math.isinf(high):
+        wanted = f"at least {_number(low)}"
+    else:
+        wanted = f"{_number(low)} to {_number(high)}"
+    return f"{wanted}: {claim.why}"
+
+
+def as_page(title: str, markdown: str, folder: Path) -> str:
+    """Return a report as one HTML page; its pictures are looked for in `folder`."""
+    body = MarkdownIt("commonmark", {"html": True}).enable("table").render(markdown)
+    body = re.sub(r'<img src="([^"]+)"', lambda match: f'<img src="{_embedded(folder / match[1])}"', body)
+    for verdict in Verdict:
+        body = body.replace(f"<td>{verdict}</td>", f'<td class="{verdict.replace(" ", "-")}">{verdict}</td>')
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>\n<body>\n{body}</body></html>\n'
+    )
+
+
+def _embedded(picture: Path) -> str:
+    return f"data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}"
