@@ -21,6 +21,12 @@ from rig.studies.study import StudyOptions, StudyResult
 
 EXPLANATIONS = TOLERANCES.with_name("explanations.toml")
 TITLE = "Coldloop: the paper, figure by figure"
+QUICK = "**A quick run: ten minutes a run and one draw. Its verdicts say that it works, not more.**"
+READING = (
+    "Tolerances were set before the runs (`rig/report/tolerances.toml`); the paper's numbers are computed from the "
+    "points of its figures by the same formulas as ours. Ours are the mean over the draws and their range. Weights, "
+    "loads and operating point are this project's own, for the paper leaves them open: costs are compared as ratios."
+)
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -61,16 +67,15 @@ def report(options: StudyOptions, results: Mapping[str, StudyResult], judged: Se
     scale = " --quick" if options.quick else f" --seeds {options.seeds}"
     commands = {name: f"coldloop study {name}{scale}" for name in STUDIES}
     explanations = tomllib.loads(EXPLANATIONS.read_text(encoding="utf-8"))
-    quick = "\n\n**A quick run: ten minutes a run and one draw. Its verdicts say that it works, not more.**"
-    parts = [
-        f"# {TITLE}",
+    circumstances = (
         f"Coldloop {__version__}, Python {platform.python_version()}, {datetime.now(UTC):%Y-%m-%d}; "
         f"{len(options.draws)} draw(s) of each load; {effort}, what was kept from before included."
-        + (quick if options.quick else ""),
-        f"**{verdict_counts(judged)}.** Tolerances were set before the runs (`rig/report/tolerances.toml`); the paper's "
-        "numbers are computed from the points of its figures by the same formulas as ours. Ours are the mean over the "
-        "draws and their range. Weights, loads and operating point are this project's own, for the paper leaves them "
-        "open: costs are compared as ratios.",
+    )
+    parts = [
+        f"# {TITLE}",
+        circumstances,
+        QUICK if options.quick else "",
+        f"**{verdict_counts(judged)}.** {READING}",
         "## Scorecard",
         scorecard_table(judged, commands),
         "## What does not reproduce, and why",

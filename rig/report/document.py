@@ -88,10 +88,10 @@ def as_page(title: str, markdown: str, folder: Path) -> str:
     body = re.sub(r'<img src="([^"]+)"', lambda match: f'<img src="{_embedded(folder / match[1])}"', body)
     for verdict in Verdict:
         body = body.replace(f"<td>{verdict}</td>", f'<td class="{verdict.replace(" ", "-")}">{verdict}</td>')
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>\n<body>\n{body}</body></html>\n'
+    head = (
+        f'<meta charset="utf-8"><title>{html.escape(title)}</title><meta name="viewport" content="width=device-width">'
     )
+    return f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>\n<body>\n{body}</body></html>\n'
 
 
 def _embedded(picture: Path) -> str:

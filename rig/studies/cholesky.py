@@ -118,11 +118,11 @@ def _remark(curve: SpeedCurve, error: float) -> str:
     return (
         f"Fitted: {curve.c1 * 1e6:.3g} n + {curve.c2 * 1e6:.3g} n² + {curve.c3 * 1e6:.3g} n³ µs, within "
         f"{100 * error:.2f} % of the 25 measured times; {curve.flops_per_s(N) / 1e6:.3f} Mflop/s at n = {N}. An "
-        f"iteration of the ODE-based solver has {mean.flops:,.0f} operations with {ACTIVE_ROWS.mean:g} rows active, the "
-        f"mean of the closed loop, and takes {_counted_s(curve, mean):.3f} s; with none {_counted_s(curve, none):.3f} s, "
-        f"with the most ever seen {_counted_s(curve, worst):.3f} s. A working-set change of qpOASES, counted, takes "
-        f"{qpoases:.3f} s, much less than by the paper's route: 120 µs on the laptop are calls, copies and checks more "
-        "than arithmetic, which a lean implementation on the PLC would not have."
+        f"iteration of the ODE-based solver has {mean.flops:,.0f} operations with {ACTIVE_ROWS.mean:g} rows active, "
+        f"the mean of the closed loop, and takes {_counted_s(curve, mean):.3f} s; with none it takes "
+        f"{_counted_s(curve, none):.3f} s, with the most ever seen {_counted_s(curve, worst):.3f} s. A working-set "
+        f"change of qpOASES, counted, takes {qpoases:.3f} s, much less than by the paper's route: 120 µs on the laptop "
+        "are calls, copies and checks more than arithmetic, which a lean implementation on the PLC would not have."
     )
 
 

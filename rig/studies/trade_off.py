@@ -16,7 +16,7 @@ from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult
 from rig.studies.trajectories import seconds_since_step
 
 PERIODS_S: Final = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0)
-SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES", "fast_gradient": "fast gradient", "osqp": "OSQP"}
+SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES", "fast-gradient": "fast gradient", "osqp": "OSQP"}
 EVENT_S: Final = 60.0
 
 

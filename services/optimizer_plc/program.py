@@ -49,6 +49,7 @@ class Delivery:
     hot_start: float = 0.0
     last_but_one: float = 0.0
     delivered: float = 0.0
+    iterations: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,14 +197,15 @@ class OptimizerProgram:
         qp = self._problem.at(situation)
         self._solver.start(qp, self._problem.shifted(self._playing.z, period.ticks))
         hot_start = self._solver.cost
-        self._solver.iterate(period.iterations - 1)
+        done = self._solver.iterate(period.iterations - 1)
         last_but_one = self._solver.cost
-        self._solver.iterate(1)
+        done += self._solver.iterate(1)
         z = self._solver.solution
         sequence = self._sequence(period, z)
         self._sent = Delivery(
             z, situation, sequence.header.first_tick, sequence, qp,
             self._whole(hot_start, qp), self._whole(last_but_one, qp), self._whole(self._solver.cost, qp),
+            done,
         )  # fmt: skip
         return sequence
 
@@ -259,7 +261,7 @@ class OptimizerProgram:
         predicted = indicators(self._problem, sent.qp, sent.z, sent.situation)
         a = period.assessment
         return Optimization(
-            update=period.update.update, tick=period.update.tick, tau_u=period.ticks, iterations=period.iterations,
+            update=period.update.update, tick=period.update.tick, tau_u=period.ticks, iterations=sent.iterations,
             verdict=verdict, j_effective=float(period.effective), j_hot_start=float(sent.hot_start),
             j_delivered=float(sent.delivered), j_dev=predicted.j_dev, j_cst=predicted.j_cst,
             violation=predicted.violation, efficiency=float(a.efficiency), mismatch=float(a.mismatch),

@@ -33,8 +33,12 @@ class SolverName(StrEnum):
     ODE = "ode"
     QPOASES = "qpoases"
     OSQP = "osqp"
-    FAST_GRADIENT = "fast_gradient"
+    FAST_GRADIENT = "fast-gradient"
     DAQP = "daqp"
+
+
+SINGLE_PRECISION_SOLVERS = (SolverName.ODE, SolverName.FAST_GRADIENT)
+"""Those that are kernels of our own."""
 
 
 class RuleName(StrEnum):
@@ -114,6 +118,12 @@ class ProgramSettings(BaseModel):
         if value % TICK_S or 0 < value < 2 * TICK_S:
             raise ValueError("an updating period is a multiple of 0.25 s from 0.5 s on, or 0 for adaptive")
         return value
+
+    @model_validator(mode="after")
+    def _own_arithmetic(self) -> Self:
+        if self.arithmetic is Arithmetic.FLOAT32 and self.solver not in SINGLE_PRECISION_SOLVERS:
+            raise ValueError(f"{self.solver} computes in double precision; choose ode or fast-gradient")
+        return self
 
 
 class OptimizerServer(ServerSettings):

@@ -125,8 +125,8 @@ class Recorder:
     def reset(self) -> None:
         self._solver.reset()
 
-    def iterate(self, count: int) -> None:
-        self._solver.iterate(count)
+    def iterate(self, count: int) -> int:
+        return self._solver.iterate(count)
 
     @property
     def solution(self) -> Array:

@@ -19,7 +19,7 @@ _MAKERS: "dict[str, Callable[[ProgramSettings], Solver]]" = {
     "ode": lambda settings: OdeSolver(settings.ode),
     "qpoases": lambda settings: QpoasesSolver(settings.qpoases),
     "osqp": lambda settings: OsqpSolver(settings.osqp),
-    "fast_gradient": lambda settings: FastGradientSolver(settings.fast_gradient),
+    "fast-gradient": lambda settings: FastGradientSolver(settings.fast_gradient),
     "daqp": lambda settings: DaqpSolver(settings.daqp),
 }
 

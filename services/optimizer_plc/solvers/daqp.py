@@ -51,10 +51,10 @@ class DaqpSolver:
         self._multipliers = np.zeros_like(problem.gamma)
         self._done = not (np.isfinite(problem.phi).all() and np.isfinite(problem.gamma).all())
 
-    def iterate(self, count: int) -> None:
+    def iterate(self, count: int) -> int:
         """Solve the problem, once."""
         if count < 1 or self._done:
-            return
+            return 0
         self._done = True
         qp, n = self._problem, len(self._z)
         lower = np.full(n + len(qp.gamma), -UNBOUNDED)
@@ -67,6 +67,7 @@ class DaqpSolver:
         if flag == 1:
             self._z = np.clip(z, qp.low, qp.high)
             self._multipliers = np.maximum(info["lam"][n:], 0.0)
+        return 1
 
     @property
     def solution(self) -> Array:

@@ -37,8 +37,8 @@ class FastGradientSettings(BaseModel):
     alpha: PositiveFloat = PENALTY_WEIGHT
     adaptive_restart: bool = True
     """Whether the momentum is dropped when it points uphill."""
-    tau_1_s: PositiveFloat = 0.05
-    """Some 24,000 operations at 0.5 Mflop/s: a rough count, yet to be derived."""
+    tau_1_s: PositiveFloat = 0.03
+    """14,656 operations at 0.529 Mflop/s are 0.028 s (`docs/budget.md`)."""
 
 
 class Momentum(NamedTuple):
@@ -71,9 +71,10 @@ class FastGradientSolver:
         self._z = np.clip(guess, problem.low, problem.high)
         self._momentum = Momentum(self._z.copy(), np.ones_like(self._z[:1]))
 
-    def iterate(self, count: int) -> None:
+    def iterate(self, count: int) -> int:
         """Take `count` steps."""
         descend(self._problem, self._z, self._momentum, self._steps, self.alpha, self._adaptive_restart, count)
+        return count
 
     @property
     def solution(self) -> Array:

@@ -30,8 +30,8 @@ class Solver(Protocol):
     def start(self, problem: QuadraticProblem, guess: Array) -> None:
         """Begin with `guess` (n,), which is projected into the box."""
 
-    def iterate(self, count: int) -> None:
-        """Do this many iterations, or fewer when they would change nothing any more."""
+    def iterate(self, count: int) -> int:
+        """Do this many iterations, or fewer when they would change nothing any more; return how many were done."""
 
     @property
     def solution(self) -> Array:

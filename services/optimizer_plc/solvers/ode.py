@@ -95,14 +95,15 @@ class OdeSolver:
         self._z, self._cost, self._dt = begin(problem, guess, self._flow)
         self._stalled = 0
 
-    def iterate(self, count: int) -> None:
+    def iterate(self, count: int) -> int:
         """Take `count` steps, or fewer once the cost does not fall any more."""
-        for _ in range(count):
+        for done in range(count):
             if self._stalled == STALLED:
-                break
+                return done
             cost, dt = self._real(self._cost), self._real(self._dt)
             self._dt, self._cost = step(self._problem, self._z, self._stiff, cost, dt, self._flow)
             self._stalled = self._stalled + 1 if self._cost == cost else 0
+        return count
 
     @property
     def solution(self) -> Array:

@@ -39,7 +39,7 @@ class OsqpSettings(BaseModel):
     relaxation: Annotated[float, Field(gt=0.0, lt=2.0)] = 1.6
     """What OSQP calls alpha."""
     tau_1_s: PositiveFloat = 0.05
-    """Some 25,000 operations at 0.5 Mflop/s: a rough count, yet to be derived."""
+    """25,763 operations at 0.529 Mflop/s (`docs/budget.md`)."""
 
 
 class OsqpSolver:
@@ -82,15 +82,16 @@ class OsqpSolver:
         )  # fmt: skip
         return solver
 
-    def iterate(self, count: int) -> None:
+    def iterate(self, count: int) -> int:
         """Do `count` iterations."""
         if count < 1 or self._osqp is None or not self._finite:
-            return
+            return 0
         self._osqp.update_settings(max_iter=count)
         result = self._osqp.solve(raise_error=False)
         n = len(self._z)
         self._z = np.clip(result.x, self._problem.low, self._problem.high)
         self._multipliers = np.maximum(result.y[n:], 0.0)
+        return count
 
     @property
     def solution(self) -> Array:

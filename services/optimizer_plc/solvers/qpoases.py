@@ -81,21 +81,20 @@ class QpoasesSolver:
                 if self._chain.step() != ON_THE_WAY:
                     break
 
-    def iterate(self, count: int) -> None:
+    def iterate(self, count: int) -> int:
         """Go `count` steps along the homotopy, or up to its end."""
-        moved = False
-        for _ in range(count):
-            if self._chain is None or self._status != ON_THE_WAY:
-                break
+        done = 0
+        while done < count and self._chain is not None and self._status == ON_THE_WAY:
             self._status = self._chain.step()
-            moved = True
-        if not moved or self._chain is None:
-            return
+            done += 1
+        if self._chain is None or not done:
+            return done
         if self._status in (SOLVED, ON_THE_WAY):
             self._z = np.clip(self._chain.z, self._problem.low, self._problem.high)
             self._multipliers = np.maximum(self._chain.multipliers, 0.0)
         else:  # a chain that broke stays broken; the answer is the last one that was good
             self._chain = None
+        return done
 
     @property
     def solution(self) -> Array:

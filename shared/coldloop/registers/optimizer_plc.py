@@ -23,7 +23,7 @@ class Optimization(NamedTuple):
     update: Annotated[int, u32("Update")]
     tick: Annotated[int, u32("Tick of the updating instant t_i")]
     tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i", unit="0.25 s")]
-    iterations: Annotated[int, u16("Iterations q(t_i)")]
+    iterations: Annotated[int, u16("Iterations done: q(t_i), or fewer if more would have changed nothing")]
     verdict: Annotated[int, u16("Verdict of the control PLC on the sequence")]
     j_effective: Annotated[float, f32("J_i: the profile being played, at the state reached")]
     j_hot_start: Annotated[float, f32("J+_i: the shifted profile, at the predicted state")]
