@@ -177,7 +177,7 @@ def report_paths(name: str, problems: list[Recorded], harsh: NDArray[np.bool_], 
     share = 100.0 * rises.sum() / max(changes.sum(), 1)
     above = 100.0 * float((costs[:, -1] > costs[:, 0] * (1.0 + EQUAL)).mean())
     print(f"{name:14} {start:8.0f} {ten:9.0f} {ten_harsh / 10:9.1f} {share:8.1f} {above:10.1f} "
-          f"{smallest_l(costs, None):>8} {smallest_l(costs, 1):>8}")  # fmt: skip
+          f"{smallest_l(costs, None):>8} {smallest_l(costs, 1):>8} {smallest_l(costs[harsh], 1):>8}")  # fmt: skip
 
 
 def main() -> None:
@@ -200,7 +200,7 @@ def main() -> None:
     print(f"{'':14}", *(f"{count:21}" for count in COUNTS), f"{'primal':>8} {'dual':>8}")
     for name in names:
         report_cuts(name, problems, best, harsh)
-    print(f"\n{'':14} start us  ten us  harsh us/it. rises %  end above %  l any k  l from 0")
+    print(f"\n{'':14} start us  ten us  harsh us/it. rises %  end above %  l any k  l from 0  of harsh")
     for name in names:
         report_paths(name, problems, harsh, options.iterations)
 
