@@ -1,10 +1,14 @@
 """Compile the numerical kernels of one service, so that its image has them: `python precompile.py SERVICE`."""  # noqa: INP001 a program
 
 import sys
+from typing import TYPE_CHECKING
 
 from coldloop.model_file import read_header
 from coldloop.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.plant import Measurement
+
+if TYPE_CHECKING:
+    from optimizer_plc.settings import ProgramSettings
 
 
 def plant() -> None:
@@ -21,18 +25,24 @@ def control_plc() -> None:
 
 
 def optimizer_plc() -> None:
-    """Answer two updates of a plant that stands still."""
+    """Let each solver that has kernels of its own answer two updates of a plant that stands still."""
+    from optimizer_plc.settings import ProgramSettings, SolverName  # noqa: PLC0415
+
+    for solver in (SolverName.ODE, SolverName.FAST_GRADIENT):
+        _answer_two_updates(ProgramSettings(solver=solver))
+
+
+def _answer_two_updates(settings: "ProgramSettings") -> None:
     from coldloop.limits import InputLimits  # noqa: PLC0415
     from coldloop.lti_model import load  # noqa: PLC0415
     from control_plc.program import ControlProgram  # noqa: PLC0415
     from optimizer_plc.arithmetic import Arithmetic  # noqa: PLC0415
     from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
-    from optimizer_plc.settings import ProgramSettings  # noqa: PLC0415
 
     model = load(DEFAULT_MODEL_FILE)
     limits = InputLimits()
-    OptimizerProgram(model, ProgramSettings(arithmetic=Arithmetic.FLOAT32), limits)
-    optimizer = OptimizerProgram(model, ProgramSettings(), limits)
+    OptimizerProgram(model, settings.model_copy(update={"arithmetic": Arithmetic.FLOAT32}), limits)
+    optimizer = OptimizerProgram(model, settings, limits)
     control = ControlProgram(limits=limits, model_digest=optimizer.model_digest, initial_inputs=model.u0)
     control.restart(1)
     updates = 0

@@ -9,6 +9,9 @@ from optimizer_plc.problem import QuadraticProblem
 
 Array = NDArray[np.float64]
 
+CONTACT = 1e-7
+"""Distance within which a variable touches its bound: the precision of the exact solvers."""
+
 
 class Solution(NamedTuple):
     """A profile z, judged for min J_0(z) = z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high.
@@ -42,9 +45,9 @@ def judge(problem: QuadraticProblem, z: Array, alpha: float, multipliers: Array)
     outside = float(np.max(np.maximum(problem.low - z, z - problem.high), initial=0.0))
     base_cost = float(z @ problem.Phi @ z + problem.phi @ z)
     slope = 2.0 * problem.Phi @ z + problem.phi + problem.Gamma.T @ multipliers
-    held_up = np.where(
-        z <= problem.low, np.minimum(slope, 0.0), np.where(z >= problem.high, np.maximum(slope, 0.0), slope)
-    )
+    at_low, at_high = z <= problem.low + CONTACT, z >= problem.high - CONTACT
+    left = np.where(at_low, np.minimum(slope, 0.0), slope)
+    left = np.where(at_high, np.maximum(left, 0.0), left)
     return Solution(
         z=z,
         multipliers=multipliers,
@@ -52,7 +55,7 @@ def judge(problem: QuadraticProblem, z: Array, alpha: float, multipliers: Array)
         cost=base_cost + alpha * float(np.sum(np.maximum(excess, 0.0) ** 2)),
         violation=violation,
         primal_residual=max(violation, outside),
-        dual_residual=float(np.max(np.abs(held_up), initial=0.0)),
+        dual_residual=float(np.max(np.abs(left), initial=0.0)),
         gap=abs(float(multipliers @ excess)),
     )
 

@@ -23,6 +23,7 @@ from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.settings import ProgramSettings
+from optimizer_plc.solution import Solution
 from optimizer_plc.solvers import make_solver
 from optimizer_plc.solvers.interface import Solver
 from plant.cold_box import REFERENCE
@@ -135,6 +136,9 @@ class Recorder:
     @property
     def cost(self) -> float:
         return self._solver.cost
+
+    def judged(self) -> Solution:
+        return self._solver.judged()
 
 
 def recorded_jumps(model: LtiModel, hour: str, minutes: float) -> list[Jump]:

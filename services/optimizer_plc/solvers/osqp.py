@@ -34,8 +34,8 @@ class OsqpSettings(BaseModel):
 
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Weight that its answers are judged with; not OSQP's relaxation."""
-    rho: PositiveFloat = 30.0
-    """Step size of the multipliers; from 10 to 100 truncated answers are best."""
+    rho: PositiveFloat = 10.0
+    """Step size of the multipliers: with less, truncated answers are worse, with more, convergence is slower."""
     relaxation: Annotated[float, Field(gt=0.0, lt=2.0)] = 1.6
     """What OSQP calls alpha."""
     tau_1_s: PositiveFloat = 0.05

@@ -45,8 +45,9 @@ class QpoasesSettings(BaseModel):
 
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Weight that its answers are judged with; qpOASES itself knows no penalty."""
-    tau_1_s: PositiveFloat = 0.48
-    """120 us a recalculation, slowed down by 4000 (paper, section VI): 10 iterations in 5 s at P = 1."""
+    tau_1_s: PositiveFloat = 0.475
+    """120 us a recalculation, slowed down by 4000 (paper, section VI), are 0.48 s; with a slot of 0.25 s for the
+    preparation the paper's 10 iterations in 5 s at P = 1 need this."""
 
 
 class QpoasesSolver:

@@ -1,0 +1,219 @@
+"""All solvers side by side on one sequence of problems recorded from the closed loop.
+
+Each begins every problem at the recorded guess, and keeps from one problem to the next what it keeps in operation. J is
+the augmented cost with its constant and the program's floor of 1, J* its minimum over the box. Harsh problems are those
+whose guess costs more than 10 J*. l is the smallest count of iterations after which J is never above what it was that
+many iterations before (paper, Remark to Definition 1), or above what it was at the guess.
+"""
+
+import argparse
+import time
+from typing import NamedTuple
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.errors import ConfigurationError
+from coldloop.lti_model import load
+from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.settings import ProgramSettings, SolverName
+from optimizer_plc.solution import Solution
+from optimizer_plc.solvers import Solver, make_solver
+from plant.load import find_load
+from rig.one_process import OneProcessRig
+from rig.recording import Recorder
+from rig.scenario import Scenario
+from rig.settings import Settings
+
+Array = NDArray[np.float64]
+
+COUNTS = (2, 5, 10, 20)
+HARSH = 10.0
+UNBOUNDED = 1e30
+EQUAL = 1e-9
+"""Relative rise of J that is rounding."""
+
+
+class Recorded(NamedTuple):
+    """What a solver was started with."""
+
+    problem: QuadraticProblem
+    guess: Array
+
+
+class Listener:
+    """A solver that remembers what it was started with."""
+
+    def __init__(self, solver: Solver) -> None:
+        self._solver = solver
+        self.alpha, self.tau_1_s = solver.alpha, solver.tau_1_s
+        self.heard: list[Recorded] = []
+
+    def reset(self) -> None:
+        """Pass on."""
+        self._solver.reset()
+
+    def start(self, problem: QuadraticProblem, guess: Array) -> None:
+        """Remember, and pass on."""
+        self.heard.append(Recorded(problem, guess.copy()))
+        self._solver.start(problem, guess)
+
+    def iterate(self, count: int) -> None:
+        """Pass on."""
+        self._solver.iterate(count)
+
+    @property
+    def solution(self) -> Array:
+        """Of the solver listened to."""
+        return self._solver.solution
+
+    @property
+    def cost(self) -> float:
+        """Of the solver listened to."""
+        return self._solver.cost
+
+    def judged(self) -> Solution:
+        """Of the solver listened to."""
+        return self._solver.judged()
+
+
+def record(hours: str, minutes: float, period_s: float) -> list[Recorded]:
+    """Run the loop with the ODE-based solver; return its problems and guesses."""
+    settings = Settings()
+    heard: list[Recorded] = []
+    for hour in hours:
+        rig = OneProcessRig(settings)
+        listener = Listener(make_solver(settings.optimizer_plc.program))
+        rig.optimizer._solver = listener  # noqa: SLF001 only here does anybody want to listen
+        ticks = round(240 * minutes)
+        rig.run(Scenario(ticks, find_load(hour, load(settings.model.file).w0), period_s, seed=1), Recorder(ticks))
+        heard += listener.heard
+    matrices = {"Phi": heard[0].problem.Phi, "Gamma": heard[0].problem.Gamma}
+    floor = settings.optimizer_plc.program.adaptive.cost_floor
+    return [
+        Recorded(problem._replace(**matrices, constant=problem.constant + floor), guess) for problem, guess in heard
+    ]
+
+
+def lowest_cost(qp: QuadraticProblem, alpha: float) -> float:
+    """Return the minimum of J over the box: each penalty is a variable s >= 0 with Gamma z - s <= gamma."""
+    n, m = len(qp.phi), len(qp.gamma)
+    H = np.zeros((n + m, n + m))
+    H[:n, :n], H[n:, n:] = 2.0 * qp.Phi, 2.0 * alpha * np.eye(m)
+    low = np.concatenate([np.maximum(qp.low, -UNBOUNDED), np.zeros(m), np.full(m, -UNBOUNDED)])
+    high = np.minimum(np.concatenate([qp.high, np.full(m, UNBOUNDED), qp.gamma]), UNBOUNDED)
+    rows = np.hstack([qp.Gamma, -np.eye(m)])
+    _, lowest, flag, _ = daqp.solve(
+        H, np.concatenate([qp.phi, np.zeros(m)]), rows, high, low, np.zeros(len(high), np.int32), primal_tol=1e-9
+    )
+    if flag != 1:
+        raise RuntimeError(f"no optimum found: {flag}")
+    return float(lowest) + qp.constant
+
+
+def paths(solver: Solver, problems: list[Recorded], iterations: int) -> Array:
+    """Return J after 0, 1, ... iterations, a row for each problem."""
+    costs = np.empty((len(problems), iterations + 1))
+    for row, (problem, guess) in zip(costs, problems, strict=True):
+        solver.start(problem, guess)
+        row[0] = solver.cost + problem.constant
+        for q in range(iterations):
+            solver.iterate(1)
+            row[q + 1] = solver.cost + problem.constant
+    return costs
+
+
+def smallest_l(costs: Array, starts: int | None) -> str:
+    """Return the smallest l with J[k + l] <= J[k] for all problems and the first `starts` k, None for all."""
+    for step in range(1, costs.shape[1]):
+        before, after = costs[:, : costs.shape[1] - step][:, :starts], costs[:, step:][:, :starts]
+        if (after <= before * (1.0 + EQUAL)).all():
+            return str(step)
+    return f"> {costs.shape[1] - 1}"
+
+
+def times(solver: Solver, problems: list[Recorded], count: int) -> tuple[float, float]:
+    """Return the median times, in us, of a start and of `count` iterations."""
+    starts, iterations = [], []
+    for problem, guess in problems:
+        before = time.perf_counter()
+        solver.start(problem, guess)
+        between = time.perf_counter()
+        solver.iterate(count)
+        starts.append(between - before)
+        iterations.append(time.perf_counter() - between)
+    return float(np.median(starts)) * 1e6, float(np.median(iterations)) * 1e6
+
+
+def report_cuts(name: str, problems: list[Recorded], best: Array, harsh: NDArray[np.bool_]) -> None:
+    """Print the accuracy on harsh problems when every problem of the sequence is cut off at the same count."""
+    cells = []
+    for count in COUNTS:
+        solver = make_solver(ProgramSettings(solver=SolverName(name)))
+        ratios, judged = [], []
+        for (problem, guess), lowest in zip(problems, best, strict=True):
+            solver.start(problem, guess)
+            solver.iterate(count)
+            ratios.append((solver.cost + problem.constant) / lowest)
+            judged.append(solver.judged())
+        of_harsh = np.array(ratios)[harsh]
+        cells.append(f"{np.median(of_harsh):9.3g} / {of_harsh.max():9.3g}")
+    primal = np.median([solution.primal_residual for solution, hard in zip(judged, harsh, strict=True) if hard])
+    dual = np.median([solution.dual_residual for solution, hard in zip(judged, harsh, strict=True) if hard])
+    print(f"{name:14}", *cells, f"{primal:8.1e} {dual:8.1e}")
+
+
+def report_paths(name: str, problems: list[Recorded], harsh: NDArray[np.bool_], iterations: int) -> None:
+    """Print times and monotonicity."""
+    settings = ProgramSettings(solver=SolverName(name))
+    warm_up = make_solver(settings)
+    times(warm_up, problems[:2], 1)
+    start, ten = times(make_solver(settings), problems, 10)
+    _, ten_harsh = times(make_solver(settings), [p for p, hard in zip(problems, harsh, strict=True) if hard], 10)
+    costs = paths(make_solver(settings), problems, iterations)
+    rises = np.diff(costs, axis=1) > EQUAL * costs[:, :-1]
+    changes = np.abs(np.diff(costs, axis=1)) > EQUAL * costs[:, :-1]
+    share = 100.0 * rises.sum() / max(changes.sum(), 1)
+    above = 100.0 * float((costs[:, -1] > costs[:, 0] * (1.0 + EQUAL)).mean())
+    print(f"{name:14} {start:8.0f} {ten:9.0f} {ten_harsh / 10:9.1f} {share:8.1f} {above:10.1f} "
+          f"{smallest_l(costs, None):>8} {smallest_l(costs, 1):>8} {smallest_l(costs[harsh], 1):>8}")  # fmt: skip
+
+
+def main() -> None:
+    """Record, solve and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hours", default="ef", help="one-hour loads to record, a letter each")
+    parser.add_argument("--minutes", type=float, default=60, help="of each")
+    parser.add_argument("--period", type=float, default=5.0, help="updating period recorded, s")
+    parser.add_argument("--iterations", type=int, default=100, help="followed for the monotonicity")
+    options = parser.parse_args()
+    problems = record(options.hours, options.minutes, options.period)
+    alpha = ProgramSettings().ode.alpha
+    best = np.array([lowest_cost(problem, alpha) for problem, _ in problems])
+    names = [name.value for name in SolverName if is_there(name)]
+    guesses = paths(make_solver(ProgramSettings()), problems, 0)[:, 0] / best
+    harsh = guesses > HARSH
+    print(f"{len(problems)} problems, {harsh.sum()} of them harsh; J of their guesses / J*: median "
+          f"{np.median(guesses[harsh]):.3g}, largest {guesses.max():.3g}")  # fmt: skip
+    print(f"\nharsh problems, J / J* (median / largest), all cut off at     residuals at {COUNTS[-1]} (medians)")
+    print(f"{'':14}", *(f"{count:21}" for count in COUNTS), f"{'primal':>8} {'dual':>8}")
+    for name in names:
+        report_cuts(name, problems, best, harsh)
+    print(f"\n{'':14} start us  ten us  harsh us/it. rises %  end above %  l any k  l from 0  of harsh")
+    for name in names:
+        report_paths(name, problems, harsh, options.iterations)
+
+
+def is_there(name: SolverName) -> bool:
+    """Return whether a solver can be had here."""
+    try:
+        make_solver(ProgramSettings(solver=name))
+    except ConfigurationError as error:
+        print(error)
+        return False
+    return True
+
+
+if __name__ == "__main__":
+    main()
