@@ -41,7 +41,7 @@ class Workers:
             if self.scheduler is None:
                 address = stack.enter_context(
                     LocalCluster(  # type: ignore[no-untyped-call]
-                        n_workers=self.count, threads_per_worker=1, processes=True, dashboard_address=None,
+                        n_workers=self.count, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
                         memory_limit=0, silence_logs=50,
                     )
                 )  # fmt: skip

@@ -36,7 +36,7 @@ repeatable = settings(max_examples=15, deadline=None, derandomize=True)
 
 EVERY = [name.value for name in SolverName]
 EXACT = ["qpoases", "osqp", "daqp"]
-CONVERGED = {"qpoases": 500, "osqp": 20_000, "daqp": 1, "ode": 400, "fast_gradient": 15_000}
+CONVERGED = {"qpoases": 500, "osqp": 20_000, "daqp": 1, "ode": 400, "fast-gradient": 15_000}
 """Iterations after which nothing is truncated any more."""
 
 
@@ -72,7 +72,7 @@ def test_the_exact_ones_end_at_the_optimum(name: str, optimum: "Optimum", seed: 
     assert z == pytest.approx(optimum(qp), abs=1e-5)
 
 
-@pytest.mark.parametrize(("name", "accuracy"), [("ode", 5e-2), ("fast_gradient", 1e-4)])
+@pytest.mark.parametrize(("name", "accuracy"), [("ode", 5e-2), ("fast-gradient", 1e-4)])
 @repeatable
 @given(seed=seeds)
 def test_the_penalised_ones_end_at_the_penalised_optimum(
