@@ -15,7 +15,7 @@ from rig.studies.request import Outcome, RunRequest
 from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
 from rig.studies.trajectories import seconds_since_step
 
-PERIODS_S: Final = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0)
+PERIODS_S: Final = (1.0, 2.0, 3.0, 4.0, 5.0)
 SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES", "fast-gradient": "fast gradient", "osqp": "OSQP"}
 EVENT_S: Final = 60.0
 

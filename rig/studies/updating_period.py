@@ -57,7 +57,9 @@ class Variant:
 
 
 VARIANTS: Final = (
-    Variant("rate limit scaled by tau_u / 5 s", ("limits.rate_reference=elapsed",), NINE, (LITERAL, OWN_INTERRUPT)),
+    Variant(
+        "rate limit scaled by tau_u / 5 s", ("limits.rate_reference=elapsed",), NINE[::2], (LITERAL, OWN_INTERRUPT)
+    ),
     Variant("measurement noise", NOISE, FEW, POLICIES),
     Variant("fast gradient", (f"{PROGRAM}solver=fast-gradient", f"{PROGRAM}fast_gradient.tau_1_s=0.25"), FEW),
     Variant("ODE starting slowly", (f"{PROGRAM}ode.cost_scale=1e-8", f"{PROGRAM}ode.growth=2.0"), FEW),

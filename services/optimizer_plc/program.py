@@ -138,7 +138,7 @@ class OptimizerProgram:
         if last is None:
             return False
         elapsed = update.tick - last.update.tick
-        if elapsed != last.ticks:
+        if 0 < elapsed != last.ticks:
             self._estimator.predict(self._segments(last.update, elapsed))
         return elapsed < last.ticks
 

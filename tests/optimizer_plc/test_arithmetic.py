@@ -92,7 +92,7 @@ def test_no_kernel_computes_with_a_double_in_single_precision(model: LtiModel) -
             assert "float64" not in types, f"{name} is called with both types: {types}"
             assert not re.search(r"\bdouble\b", body(kernel, signature)), f"{name} computes with a double"
         checked |= unchecked
-    assert {name for name, _ in checked} == ON_LINE
+    assert {name for name, _ in checked} >= ON_LINE, "other tests may have compiled more"
 
 
 def test_the_check_finds_a_constant_in_double() -> None:

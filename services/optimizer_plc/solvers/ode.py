@@ -30,7 +30,9 @@ ERROR_CONSTANT = (-3.0 * G * G + 4.0 * G - 2.0) / (12.0 * (2.0 - G))
 
 
 STALLED = 20
-"""Steps in a row without a fall of J after which there is nothing left to win: they have become 1e-6 as long."""
+"""Steps in a row that hardly lower J after which there is nothing left to win."""
+HARDLY = 1e-6
+"""Of |J|."""
 
 
 class OdeSettings(BaseModel):
@@ -96,13 +98,13 @@ class OdeSolver:
         self._stalled = 0
 
     def iterate(self, count: int) -> int:
-        """Take `count` steps, or fewer once the cost does not fall any more."""
+        """Take `count` steps, or fewer once the cost hardly falls any more."""
         for done in range(count):
             if self._stalled == STALLED:
                 return done
             cost, dt = self._real(self._cost), self._real(self._dt)
             self._dt, self._cost = step(self._problem, self._z, self._stiff, cost, dt, self._flow)
-            self._stalled = self._stalled + 1 if self._cost == cost else 0
+            self._stalled = self._stalled + 1 if cost - self._cost <= HARDLY * abs(cost) else 0
         return count
 
     @property
