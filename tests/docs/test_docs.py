@@ -29,7 +29,8 @@ def test_every_coldloop_command_in_the_readme_is_understood() -> None:
     lines = [line for block in blocks for line in block.splitlines() if line.startswith("coldloop ")]
     assert len(lines) > 5
     for line in lines:
-        make_parser().parse_args(shlex.split(line, comments=True)[1:])
+        words = shlex.split(line, comments=True)[1:]
+        make_parser(words[0]).parse_args(words)
 
 
 def test_every_mbpoll_line_in_the_readme_reads_declared_floats() -> None:
