@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"coldloop: {error}\n")
         return error.exit_code
     except KeyboardInterrupt:
-        sys.stderr.write("coldloop: interrupted; no results were written\n")
+        sys.stderr.write("coldloop: interrupted; runs of a study that were done are kept, nothing else was written\n")
         return INTERRUPTED
     except BrokenPipeError:
         return 0

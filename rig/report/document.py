@@ -25,7 +25,10 @@ td.no-data-in-the-paper { background: #eef2f5; }
 
 def verdict_counts(judged: Sequence[Judged]) -> str:
     """Return how often each verdict was given, in words."""
-    return ", ".join(f"{number} {verdict}" for verdict, number in counts(judged).items())
+    return "; ".join(
+        f"{group}: " + ", ".join(f"{number} {verdict}" for verdict, number in numbers.items() if number)
+        for group, numbers in counts(judged).items()
+    )
 
 
 def scorecard_table(judged: Sequence[Judged], commands: Mapping[str, str]) -> str:
@@ -58,14 +61,15 @@ def _of_paper(judged: Judged) -> str:
 
 
 def _ours(values: Sequence[float]) -> str:
-    mean = sum(values) / len(values)
-    spread = f" ({_number(min(values))} to {_number(max(values))})" if len(values) > 1 else ""
-    return _number(mean) + spread
+    there = [value for value in values if math.isfinite(value)]
+    if not there:
+        return "none"
+    spread = f" ({_number(min(there))} to {_number(max(there))})" if len(there) > 1 else ""
+    missing = f", none in {len(values) - len(there)} draws" if len(there) < len(values) else ""
+    return _number(sum(there) / len(there)) + spread + missing
 
 
 def _number(value: float) -> str:
-    if math.isnan(value):
-        return "none"
     return f"{value:.3g}" if abs(value) < 1e5 else f"{value:.3e}"
 
 

@@ -40,6 +40,7 @@ class Verdict(StrEnum):
     PARTLY = "partly"
     NOT_REPRODUCED = "not reproduced"
     NO_DATA = "no data in the paper"
+    NOT_RUN = "not run"
 
 
 class Claim(BaseModel):
@@ -65,8 +66,7 @@ class Judged(NamedTuple):
     """One a draw; empty where the study gave none."""
     of_paper: float | None
     """From the points of the paper's figures."""
-    verdict: Verdict | None
-    """None where the study gave no value: it was cut short."""
+    verdict: Verdict
 
 
 @cache
@@ -76,8 +76,8 @@ def claims() -> tuple[Claim, ...]:
 
 
 def judge(values: Mapping[str, Sequence[float]]) -> list[Judged]:
-    """Return every claim of which the studies gave values, judged."""
-    return [_judged(claim, tuple(values[claim.value])) for claim in claims() if claim.value in values]
+    """Return every claim, judged by the values that the studies gave."""
+    return [_judged(claim, tuple(values.get(claim.value, ()))) for claim in claims()]
 
 
 def _judged(claim: Claim, values: tuple[float, ...]) -> Judged:
@@ -87,6 +87,8 @@ def _judged(claim: Claim, values: tuple[float, ...]) -> Judged:
 
 def verdict(claim: Claim, values: tuple[float, ...]) -> Verdict:
     """Return the verdict on a claim, given one value a draw."""
+    if not values:
+        return Verdict.NOT_RUN
     if claim.reproduced is None or claim.partly is None:
         return Verdict.NO_DATA
     if all(_within(claim.reproduced, value) for value in values):
@@ -98,7 +100,7 @@ def verdict(claim: Claim, values: tuple[float, ...]) -> Verdict:
 
 
 def _within(limits: tuple[float, float], value: float) -> bool:
-    return limits[0] <= value <= limits[1]
+    return math.isfinite(value) and limits[0] <= value <= limits[1]
 
 
 @cache
@@ -120,12 +122,15 @@ def _updating_period() -> dict[str, float]:
     fixed = np.array([hour["cost_fixed_pct"] for hour in hours])
     adaptive = np.array([hour["cost_adaptive_pct"][0] for hour in hours])
     best, argbest = fixed.min(axis=1), fixed.argmin(axis=1)
+    ends = np.maximum(fixed[:, 0], fixed[:, -1])
     literal = "Algorithm 1, hours"
     return {
         "interior optimum from 1 to 5 s, share of hours": float(
             ((argbest > 0) & (argbest < fixed.shape[1] - 1)).mean()
         ),
-        "worst end over best, smallest of hours": float((np.maximum(fixed[:, 0], fixed[:, -1]) / best).min()),
+        "worst end over best from 1 to 5 s, smallest of hours": float(
+            (np.maximum(fixed[:, 0], fixed[:, -1]) / best).min()
+        ),
         f"better than the mean fixed period, share: {literal}": float((adaptive < fixed.mean(axis=1)).mean()),
         f"best of all, share: {literal}": float((adaptive < best).mean()),
         f"within 2 % of the best fixed period, share: {literal}": float((adaptive <= 1.02 * best).mean()),
@@ -141,9 +146,18 @@ def _cholesky() -> dict[str, float]:
     return {SPEED: float(speed[size >= 50].mean()), SLOW_DOWN: float((plc_s / laptop_s)[size >= 40].mean())}
 
 
-def counts(judged: Sequence[Judged]) -> dict[str, int]:
-    """Return how often each verdict was given."""
-    return {one.value: sum(j.verdict is one for j in judged) for one in Verdict}
+OWN_AIM: Final = "not in the paper"
+
+
+def counts(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
+    """Return how often each verdict was given, to claims of the paper and to aims of this project."""
+    groups = {
+        "claims of the paper": [j for j in judged if j.claim.of_paper != OWN_AIM],
+        "aims of this project": [j for j in judged if j.claim.of_paper == OWN_AIM],
+    }
+    return {
+        name: {one.value: sum(j.verdict is one for j in group) for one in Verdict} for name, group in groups.items()
+    }
 
 
 def as_json(judged: Sequence[Judged]) -> list[dict[str, Any]]:
@@ -154,7 +168,7 @@ def as_json(judged: Sequence[Judged]) -> list[dict[str, Any]]:
             "reproduced": _plain(j.claim.reproduced),
             "partly": _plain(j.claim.partly),
             "paper": j.of_paper,
-            "values": list(j.values),
+            "values": [value if math.isfinite(value) else None for value in j.values],
             "verdict": j.verdict,
         }
         for j in judged

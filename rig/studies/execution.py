@@ -50,7 +50,7 @@ class Workers:
             try:
                 client = stack.enter_context(Client(address, timeout=CONNECT_PATIENCE_S))  # type: ignore[no-untyped-call]
             except (OSError, ValueError) as error:
-                reason = str(error).splitlines()[0]
+                reason = _first_line(error)
                 raise UsageError(f"--scheduler {self.scheduler}: {reason}; name one that is up") from None
             yield client
 
@@ -60,7 +60,6 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
 
     def path(self, request: RunRequest) -> Path:
         """Return where an outcome is kept."""
@@ -113,10 +112,14 @@ def _done(client: Client, requests: Sequence[RunRequest]) -> Iterator[tuple[RunR
         if isinstance(error, ColdloopError):
             raise error
         if error is not None:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            reason = _first_line(error)
             raise StudyError(f"a run under load {request.load} failed: {reason}; what was done before is kept")
         yield request, future.result()
         future.release()
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 @contextlib.contextmanager

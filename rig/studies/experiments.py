@@ -53,7 +53,8 @@ class ExperimentStudy:
                 result.values.setdefault(f"{self.name}: time outside the bands, {label}", []).append(outside)
                 if not period:
                     result.values.setdefault(f"{self.name}: rise after a load step", []).append(_rise(networked, load))
-            result.figures.setdefault("time courses", time_panels(labelled, BANDS))
+            if not result.figures:
+                result.figures["time courses"] = time_panels(labelled, BANDS)
         return result
 
 

@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
+from coldloop.errors import UsageError
 from coldloop.lti_model import load as load_model
 from coldloop.process import L1, T5, TICK_S
+from optimizer_plc.solvers import make_solver
 from plant.program import LoadProfile
 from rig.indicators import Indicators, evaluate, instantaneous_cost
 from rig.local_services import LocalServices
@@ -110,6 +112,21 @@ def programs_digest() -> str:
             for source in sorted(Path(folder).rglob("*.py")):
                 digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
+
+
+SHORTEST_TICKS = 60
+"""Three of the longest updating periods: with less, no update ever takes effect."""
+
+
+def check(request: RunRequest) -> None:
+    """Find out, before any run is done, what would make one fail.
+
+    Raises:
+        UsageError: A run is too short, or a solver is not there.
+    """
+    if request.ticks < SHORTEST_TICKS:
+        raise UsageError(f"{request.ticks * TICK_S:g} s are too short for a study: choose a --duration of 15 s or more")
+    make_solver(settings_of(request.assignments).optimizer_plc.program)
 
 
 def perform(request: RunRequest) -> str:

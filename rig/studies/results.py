@@ -8,6 +8,7 @@ from pathlib import Path
 from coldloop.errors import ResultsError
 from rig.results import prepare_folder, whole_file
 from rig.studies.execution import Store, Workers, perform_all
+from rig.studies.request import check
 from rig.studies.study import Cell, Study, StudyOptions, StudyResult
 
 RUNS = "runs"
@@ -20,8 +21,12 @@ def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path)
     Raises:
         ColdloopError: A run failed, or a file cannot be written.
     """
-    prepare_folder(folder / study.name)
-    outcomes = perform_all(study.requests(options), Store(folder / RUNS), workers, study.name)
+    for name in (study.name, RUNS):
+        prepare_folder(folder / name)
+    requests = study.requests(options)
+    for request in requests:
+        check(request)
+    outcomes = perform_all(requests, Store(folder / RUNS), workers, study.name)
     result = study.evaluate(options, outcomes)
     try:
         _write(study, result, folder / study.name)

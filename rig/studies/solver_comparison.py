@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from rig import paper as published
 from rig.studies.drawing import COLOURS, panels, paper, spread
@@ -76,13 +77,15 @@ def measures(powers: Series, table: Table) -> dict[str, float]:
     ode, qpoases = table["ode"], table["qpoases"]
     converged = qpoases["J_total"][-1]
     relative = qpoases["J_total"] / converged
+    distance = np.abs(relative - 1)
     at = {power: int(np.argmin(np.abs(powers - power))) for power in (0.2, 1.0)}
     one = at[1.0]
     return {
         "qpOASES over converged at P = 1": float(relative[one]),
         "qpOASES over converged at P = 0.2": float(relative[at[0.2]]),
-        "qpOASES from P = 10 on, largest distance from converged": float(np.abs(relative[powers >= 10] - 1).max()),
-        "qpOASES from P = 15 on, largest distance from converged": float(np.abs(relative[powers >= 15] - 1).max()),
+        "qpOASES from P = 10 on, largest distance from converged": _largest(
+            np.abs(relative[:-1] - 1), powers[:-1] >= 10
+        ),
         "qpOASES, largest rise of total cost with P": float((relative[1:] / relative[:-1] - 1).max()),
         "ODE over converged, largest from P = 0.6 on": float((ode["J_total"][powers >= 0.6] / converged).max()),
         "qpOASES over ODE in total cost at P = 1": float(qpoases["J_total"][one] / ode["J_total"][one]),
@@ -96,9 +99,15 @@ def measures(powers: Series, table: Table) -> dict[str, float]:
     }
 
 
+def _largest(values: Series, which: "NDArray[np.bool_]") -> float:
+    return float(values[which].max()) if which.any() else float("nan")
+
+
 def crossing(powers: Series, one: Series, other: Series) -> float:
-    """Return the power from which on `one` is not above `other` any more; NaN if it never is not."""
+    """Return the power from which on `one` is not above `other` any more; NaN if there is none."""
     above = np.log(one / other)
+    if not np.isfinite(above).all():
+        return float("nan")
     behind = np.flatnonzero(above > 0)
     if len(behind) == 0 or behind[-1] == len(powers) - 1:
         return float("nan") if len(behind) else float(powers[0])

@@ -9,7 +9,7 @@ from rig.studies.study import PROGRAM, Load
 
 PERIOD_S = 5.0
 UNLIMITED = 50.0
-"""Power at which qpOASES makes 520 recalculations in a period: more than any problem takes."""
+"""Power at which qpOASES makes 526 recalculations in a period: more than any problem takes."""
 
 
 def throttled(load: Load, solver: str, power: float, trace_ticks: int = 0) -> RunRequest:

@@ -74,18 +74,21 @@ class Load:
 def draw_of(name: str, draw: int, options: StudyOptions) -> Load:
     """Return a draw of a load; the draws of a file differ by their noise, which there is when there are several."""
     named = named_families(name) is not None
-    drawn = f"{name}@{draw}" if named and draw > 1 and "@" not in name else name
+    drawn = f"{name}@{draw}" if named and draw > 1 else name
     profile = find_load(drawn, load_model(DEFAULT_MODEL_FILE).w0)
     ticks = options.ticks or natural_ticks(drawn, profile)
     if options.quick:
         ticks = min(ticks, QUICK_TICKS)
-    noise = NOISE if not named and options.seeds > 1 else ()
-    return Load(drawn, draw, profile, ticks, noise)
+    noise = NOISE if not named and len(options.draws) > 1 else ()
+    return Load(drawn if named or draw == 1 else f"{name}#{draw}", draw, profile, ticks, noise)
 
 
 def loads(options: StudyOptions, *names: str) -> dict[str, list[Load]]:
-    """Return the draws of the loads asked for, or else of these, by name."""
-    return {name: [draw_of(name, draw, options) for draw in options.draws] for name in options.loads or names}
+    """Return the draws of the loads asked for, or else of these, by name; a name such as a@2 is one draw."""
+    return {
+        name: [draw_of(name, draw, options) for draw in (range(1, 2) if "@" in name else options.draws)]
+        for name in options.loads or names
+    }
 
 
 @dataclass

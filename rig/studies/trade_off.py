@@ -1,8 +1,9 @@
 """Efficiency E and degradation D against the updating period, measured (paper, section II, figure `compareSf`).
 
-With J+ the cost of the shifted profile and J that of the one played, E_k = J+_k - J_{k+1} is what the solver wins in a
-period and D_k = J+_k - J_k what shift and mismatch lose; the cost falls where E_k > D_k. Over a whole run the two
-telescope to the same mean, so they are averaged over the minute that follows load steps, where something is to be won.
+With J+ the cost of the shifted profile at the predicted state, J-hat that of the delivered one there and J that of the
+one being played, E_k = J+_k - J-hat_{k+1} is what the solver wins in a period and D_k = J+_k - J_k what waiting for it
+loses; the cost falls where E_k > D_k. Over a run, differences of J telescope to nothing, so only the first period after
+each load step counts: there a solver has everything to win.
 """
 
 from typing import Final
@@ -13,15 +14,14 @@ from matplotlib.figure import Figure
 from rig.studies.drawing import COLOURS, panels, spread
 from rig.studies.request import Outcome, RunRequest
 from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
-from rig.studies.trajectories import seconds_since_step
+from rig.studies.trajectories import follows_step
 
 PERIODS_S: Final = (1.0, 2.0, 3.0, 4.0, 5.0)
 SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES", "fast-gradient": "fast gradient", "osqp": "OSQP"}
-EVENT_S: Final = 60.0
 
 
 class TradeOff:
-    """E for each solver and D, against tau_u, in the minute after load steps."""
+    """E for each solver and D, against tau_u, in the first period after load steps."""
 
     name = "trade-off"
     title = "What a period wins and loses (figures compareSf and twocases)"
@@ -48,7 +48,8 @@ class TradeOff:
                     (load.name, label, period, won, lost, int(won > lost))
                     for period, (won, lost) in zip(periods, points, strict=True)
                 ]
-                share = float(np.mean([won > lost for won, lost in points]))
+                judged = [won > lost for won, lost in points if np.isfinite(won)]
+                share = float(np.mean(judged)) if judged else float("nan")
                 result.values.setdefault(f"share of the periods at which E > D: {label}", []).append(share)
         result.figures["efficiency and degradation"] = _figure(periods, curves)
         return result
@@ -67,11 +68,10 @@ def _request(load: Load, solver: str, period_s: float) -> RunRequest:
 
 
 def won_and_lost(run: Outcome, load: Load) -> tuple[float, float]:
-    """Return the mean of E_k and of D_k over the updates in the minute after load steps."""
-    played, hot_start = run.column("j_effective"), run.column("j_hot_start")
-    since = seconds_since_step(run, load)[:-1]
-    won, lost = hot_start[:-1] - played[1:], hot_start[:-1] - played[:-1]
-    event = since < EVENT_S
+    """Return the mean of E_k and of D_k over the first updates after load steps."""
+    played, hot_start, delivered = (run.column(name) for name in ("j_effective", "j_hot_start", "j_delivered"))
+    event = follows_step(run, load)
+    won, lost = hot_start - delivered, hot_start - played
     return (float(won[event].mean()), float(lost[event].mean())) if event.any() else (float("nan"), float("nan"))
 
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coldloop.process import TICK_S
 from optimizer_plc.design import ControlDesign
@@ -65,12 +66,15 @@ class TrajectoryStudy:
 
     def _judge(self, result: StudyResult, load: Load, runs: Sequence[Outcome]) -> None:
         reference = runs[-1]
-        values = {
-            "furthest outside": furthest_outside(reference),
-            "time outside": max(reference.indicators.L1_outside_band_pct, reference.indicators.T5_outside_band_pct),
-            "iterations": np.divide(*iterations_by_event(reference, load)),
-            "J_BF": runs[0].indicators.J_BF / reference.indicators.J_BF,
-        }
+        outside = reference.indicators.L1_outside_band_pct, reference.indicators.T5_outside_band_pct
+        after, quiet = iterations_by_event(reference, load)
+        values: dict[str, float] = {}
+        if len(runs) == 1:
+            values["furthest outside"] = furthest_outside(reference)
+            values["time outside"] = max(outside)
+            values["iterations"] = after / quiet if quiet else float("nan")
+        if len(runs) > 1:
+            values["J_BF"] = runs[0].indicators.J_BF / reference.indicators.J_BF
         if len(runs) > 2:
             values["J_BF of qpOASES over ODE"] = runs[1].indicators.J_BF / runs[0].indicators.J_BF
         for what, value in values.items():
@@ -91,14 +95,33 @@ def iterations_by_event(run: Outcome, load: Load) -> tuple[float, float]:
     since = seconds_since_step(run, load)
     iterations = run.column("iterations")
     after, quiet = iterations[since < AFTER_STEP_S], iterations[since >= QUIET_S]
-    return (float(after.mean()) if len(after) else 0.0, float(quiet.mean()) if len(quiet) else 0.0)
+    return (float(after.mean()) if len(after) else np.nan, float(quiet.mean()) if len(quiet) else np.nan)
+
+
+def load_steps(load: Load) -> Series:
+    """Return the ticks at which the load changes, after one before all time."""
+    changes = [
+        tick
+        for tick, before, watts in zip(load.profile.times[1:], load.profile.watts, load.profile.watts[1:], strict=False)
+        if watts != before
+    ]
+    return np.array([-np.inf, *changes])
+
+
+def follows_step(run: Outcome, load: Load) -> "NDArray[np.bool_]":
+    """Tell for each update whether it is the first one after a load step."""
+    seen = _steps_before(run.column("tick"), load)
+    return np.diff(seen, prepend=0) > 0
+
+
+def _steps_before(ticks: Series, load: Load) -> "NDArray[np.intp]":
+    return np.searchsorted(load_steps(load), ticks, side="right") - 1
 
 
 def seconds_since_step(run: Outcome, load: Load) -> Series:
     """Return for each update the plant time since the last load step, which begins at the first one."""
     ticks = run.column("tick")
-    steps = np.array([-np.inf, *load.profile.times[1:]])
-    last = steps[np.searchsorted(steps, ticks, side="right") - 1]
+    last = load_steps(load)[_steps_before(ticks, load)]
     since: Series = (ticks - last) * TICK_S
     return since
 

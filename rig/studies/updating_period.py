@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
+from coldloop.process import TICK_S
 from rig import paper as published
 from rig.plot import ACCENT, INK, THIRD
 from rig.studies.drawing import COLOURS, panels
@@ -41,9 +42,12 @@ POLICIES: Final = (
     OWN,
     Policy("contraction rule, interrupt", ADAPTIVE, (f"{RULE}contraction", INTERRUPT)),
     Policy("fixed 2.5 s, interrupt", 2.5, (INTERRUPT,)),
+    Policy("fixed 1.5 s, interrupt", 1.5, (INTERRUPT,)),
 )
 OWN_INTERRUPT = POLICIES[3]
 CONTROL = POLICIES[4]
+TUNING_DRAWS: Final = (11, 12)
+"""Draws that the constants of the contraction rule were chosen on."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +60,13 @@ class Variant:
     policies: tuple[Policy, ...] = (LITERAL,)
 
 
+SEVERAL: Final = (1.0, 1.5, 2.5, 3.5, 5.0)
 VARIANTS: Final = (
     Variant(
-        "rate limit scaled by tau_u / 5 s", ("limits.rate_reference=elapsed",), NINE[::2], (LITERAL, OWN_INTERRUPT)
+        "rate limit scaled by tau_u / 5 s",
+        ("limits.rate_reference=elapsed",),
+        (1.0, 1.5, 2.5, 3.5, 5.0),
+        (LITERAL, OWN_INTERRUPT, CONTROL),
     ),
     Variant("measurement noise", NOISE, FEW, POLICIES),
     Variant("fast gradient", (f"{PROGRAM}solver=fast-gradient", f"{PROGRAM}fast_gradient.tau_1_s=0.25"), FEW),
@@ -97,7 +105,7 @@ class UpdatingPeriodStudy:
                     row = (variant.label, load.name, label, one.tau_u_mean, one.J_open_mean, one.J_BF)
                     result.rows.append(row)
         first = {name: hour for name, hour in hours.items() if hour.load.draw == 1}
-        fresh = {name: hour for name, hour in hours.items() if hour.load.draw > 1}
+        fresh = {name: hour for name, hour in hours.items() if hour.load.draw not in (1, *TUNING_DRAWS)}
         result.figures["cost against period"] = _figure(first, fresh)
         result.figures["period after a load step"] = _response_figure(list(hours.values()))
         _judge(result, "hours", first)
@@ -163,25 +171,23 @@ class _Hour:
     def cost(self, label: str, indicator: str = "J_open_mean") -> float:
         return float(getattr(self.policies[label].indicators, indicator))
 
-    def has_interior_optimum(self) -> bool:
-        """Whether neither end of all periods tried is the best."""
-        costs = [run.indicators.J_open_mean for run in self.fixed.values()]
-        return 0 < int(np.argmin(costs)) < len(costs) - 1
-
-    def worst_end(self) -> float:
-        """Cost at the worse end of all periods tried over that of the best of them."""
-        costs = [run.indicators.J_open_mean for run in self.fixed.values()]
-        return max(costs[0], costs[-1]) / min(costs)
+    def every(self, indicator: str) -> Series:
+        """Costs of all fixed periods."""
+        return np.array([getattr(run.indicators, indicator) for run in self.fixed.values()])
 
 
 def _judge(result: StudyResult, which: str, hours: Mapping[str, _Hour]) -> None:
     """Compute what the claims are judged by, over these hours."""
     some = list(hours.values())
     values = result.values
-    values[f"interior optimum from 0.5 to 5 s, share of {which}"] = [_share(h.has_interior_optimum() for h in some)]
-    within_nine = (0 < int(np.argmin(h.nine("J_open_mean"))) < len(h.nine("J_open_mean")) - 1 for h in some)
-    values[f"interior optimum from 1 to 5 s, share of {which}"] = [_share(within_nine)]
-    values[f"worst end over best, smallest of {which}"] = [min(h.worst_end() for h in some)]
+    grids = {"1 to 5 s": [h.nine("J_open_mean") for h in some]}
+    if all(period in h.fixed for h in some for period in SHORTER):
+        grids["0.5 to 5 s"] = [h.every("J_open_mean") for h in some]
+    for grid, costs_by_hour in grids.items():
+        interior = (0 < int(np.argmin(costs)) < len(costs) - 1 for costs in costs_by_hour)
+        values[f"interior optimum from {grid}, share of {which}"] = [_share(interior)]
+        ends = [max(costs[0], costs[-1]) / costs.min() for costs in costs_by_hour]
+        values[f"worst end over best from {grid}, smallest of {which}"] = [float(min(ends))]
     for policy in POLICIES:
         costs = np.array([h.cost(policy.label) for h in some])
         best = np.array([h.nine("J_open_mean").min() for h in some])
@@ -194,6 +200,10 @@ def _judge(result: StudyResult, which: str, hours: Mapping[str, _Hour]) -> None:
         values[f"within 2 % of the best fixed period, share: {of}"] = [_share(costs <= 1.02 * best)]
         values[f"cost over that of the best fixed period, geometric mean: {of}"] = [_geometric_mean(costs / best)]
         values[f"J_BF over that of fixed 2.5 s, all together: {of}"] = [float(closed.sum() / usual.sum())]
+        closed_best = np.array([h.nine("J_BF").min() for h in some])
+        values[f"J_BF over that of the best fixed period, geometric mean: {of}"] = [
+            _geometric_mean(closed / closed_best)
+        ]
 
 
 def _share(which: Iterable[bool]) -> float:
@@ -211,9 +221,9 @@ def _response(hours: Sequence[_Hour], policy: Policy) -> tuple[float, float]:
     """Return the mean updating period that begins 0 to 5 s after a load step, and beyond 60 s, s."""
     runs = [(hour.policies[policy.label], hour.load) for hour in hours]
     since = np.concatenate([seconds_since_step(run, load) for run, load in runs])
-    tau = np.concatenate([run.column("tau_u") for run, _ in runs]) / 4
+    tau = np.concatenate([run.column("tau_u") for run, _ in runs]) * TICK_S
     soon, late = tau[since < 5.0], tau[since >= 60.0]
-    return (float(soon.mean()) if len(soon) else 0.0, float(late.mean()) if len(late) else 1.0)
+    return (float(soon.mean()) if len(soon) else np.nan, float(late.mean()) if len(late) else np.nan)
 
 
 def _response_figure(hours: Sequence[_Hour]) -> Figure:
@@ -221,7 +231,7 @@ def _response_figure(hours: Sequence[_Hour]) -> Figure:
         for policy, colour in zip((LITERAL, OWN, OWN_INTERRUPT), COLOURS, strict=False):
             runs = [(hour.policies[policy.label], hour.load) for hour in hours]
             since = np.concatenate([seconds_since_step(run, load) for run, load in runs])
-            tau = np.concatenate([run.column("tau_u") for run, _ in runs]) / 4
+            tau = np.concatenate([run.column("tau_u") for run, _ in runs]) * TICK_S
             bins = np.digitize(since, RESPONSE_EDGES_S)
             means = [tau[bins == i].mean() if (bins == i).any() else np.nan for i in range(1, len(RESPONSE_EDGES_S))]
             place.stairs(means, RESPONSE_EDGES_S, color=colour, baseline=None, linewidth=1.4, label=policy.label)
@@ -251,7 +261,7 @@ def _figure(first: Mapping[str, _Hour], fresh: Mapping[str, _Hour]) -> Figure:
                 place.plot(
                     theirs["tau_u_s"], theirs["cost_adaptive_pct"], ":", color=ACCENT, label="Algorithm 1, paper"
                 )
-            others = [other for other in fresh.values() if other.load.name.startswith(f"{name}@")]
+            others = [other for other in fresh.values() if other.load.name.startswith((f"{name}@", f"{name}#"))]
             for other in others:
                 scale = other.nine("J_open_mean").max() / 100.0
                 place.plot(list(other.fixed), [run.indicators.J_open_mean / scale for run in other.fixed.values()],
@@ -264,6 +274,8 @@ def _figure(first: Mapping[str, _Hour], fresh: Mapping[str, _Hour]) -> Figure:
         axes[0].legend(fontsize=7)
         for place in axes[-2:]:
             place.set_xlabel("updating period (s)")
+        for place in axes[len(first) :]:
+            place.set_visible(False)
     return figure
 
 

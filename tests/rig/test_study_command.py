@@ -42,7 +42,7 @@ def test_a_study_on_a_load_of_ones_own_leaves_table_figure_and_section(
     folder = tmp_path / "studies" / "limited"
     rows = list(csv.DictReader((folder / "results.csv").open()))
     assert len(rows) == 4, "two solvers, two draws of the noise"
-    assert {row["load"] for row in rows} == {str(own_load)}
+    assert {row["load"] for row in rows} == {str(own_load), f"{own_load}#2"}
     assert rows[0]["J_BF"] != rows[2]["J_BF"], "the draws differ by their noise"
     assert (folder / "time-courses.png").read_bytes().startswith(b"\x89PNG")
     assert "![time courses](time-courses.png)" in (folder / "section.md").read_text()
@@ -57,6 +57,7 @@ def test_a_study_on_a_load_of_ones_own_leaves_table_figure_and_section(
         (("limited", "--load", "missing.csv"), "missing.csv"),
         (("limited", "--seeds", "0"), "'0' is not a number from 1 on"),
         (("limited", "--duration", "soon"), "'soon' is not a duration"),
+        (("limited", "--duration", "5s"), "5 s are too short"),
         (("limited", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"), "give one of them"),
         (("limited", "--quick", "--scheduler", "nowhere"), "--scheduler nowhere"),
     ],

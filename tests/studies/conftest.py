@@ -28,6 +28,7 @@ def requests() -> Requests:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
+    (tmp_path / "runs").mkdir()
     return Store(tmp_path / "runs")
 
 
