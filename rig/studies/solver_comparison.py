@@ -83,9 +83,7 @@ def measures(powers: Series, table: Table) -> dict[str, float]:
     return {
         "qpOASES over converged at P = 1": float(relative[one]),
         "qpOASES over converged at P = 0.2": float(relative[at[0.2]]),
-        "qpOASES from P = 10 on, largest distance from converged": _largest(
-            np.abs(relative[:-1] - 1), powers[:-1] >= 10
-        ),
+        "qpOASES from P = 10 on, largest distance from converged": _largest(distance[:-1], powers[:-1] >= 10),
         "qpOASES, largest rise of total cost with P": float((relative[1:] / relative[:-1] - 1).max()),
         "ODE over converged, largest from P = 0.6 on": float((ode["J_total"][powers >= 0.6] / converged).max()),
         "qpOASES over ODE in total cost at P = 1": float(qpoases["J_total"][one] / ode["J_total"][one]),
