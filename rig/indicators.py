@@ -56,7 +56,7 @@ def evaluate(recording: Recording, model: LtiModel, design: ControlDesign) -> In
     violations = np.array([update.violation for update in updates], dtype=float)
     tau = np.array([update.tau_u for update in updates], dtype=float)
     delivered = np.array([update.tick + update.tau_u for update in updates], dtype=float)
-    since = np.diff(delivered, prepend=float(updates[0].tick)) if updates else delivered
+    since = np.diff(delivered, prepend=0.0)
     outside = _outside_pct(recording, design)
     return Indicators(
         J_dev=float(open_loop[:, 0].sum()),

@@ -91,7 +91,7 @@ class NetworkRig:
             await asyncio.sleep(min(max(pause_s, 0.001), 0.2))
         status = await self._control.read(Status)
         if status.mode != Mode.CLASSICAL:  # the loops ask for no updates
-            await updates.read_until(scenario.ticks)
+            await updates.read_until(scenario.ticks, 0 if scenario.realtime else status.update)
             status = await self._control.read(Status)
         recorder.link = LinkStatistics(
             status.deadline_misses, status.overruns, status.lateness_max, status.lateness_p99
@@ -155,11 +155,11 @@ class _UpdateReader:
         for update in range(done, done + new):
             self._recorder.update((await self._client.read_rows(Optimization, update % UPDATE_ROWS, 1))[0])
 
-    async def read_until(self, ticks: int) -> None:
-        """Read on until the update that reaches beyond the run is there."""
+    async def read_until(self, ticks: int, last: int) -> None:
+        """Read on until update `last` is there, and one that reaches beyond the run."""
         deadline = time.monotonic() + QUIET_S
         updates = self._recorder.updates
-        while not updates or updates[-1].tick + updates[-1].tau_u < ticks:
+        while not updates or updates[-1].update < last or updates[-1].tick + updates[-1].tau_u < ticks:
             if time.monotonic() > deadline:
                 raise LinkError(f"{self._client.peer} stopped after update {len(updates) - 1}: see its log")
             await self.read()

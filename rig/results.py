@@ -68,7 +68,7 @@ def manifest(
         "coldloop": __version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "dependencies": {name: _version(name) for name in DEPENDENCIES},
+        "dependencies": {name: installed_version(name) for name in DEPENDENCIES},
         "command": sys.argv[1:],
         "arguments": dict(arguments),
         "configuration": dict(configuration),
@@ -96,8 +96,9 @@ def _held(recording: Recording, ticks: int) -> list[tuple[str, str, Any]]:
     """Return the columns that change at updating instants only."""
     update = np.zeros(ticks, dtype=np.int32)
     tau_u, iterations, cost = np.zeros(ticks), np.zeros(ticks, dtype=np.int32), np.zeros(ticks)
-    for row in recording.updates:
-        here = slice(row.tick, row.tick + row.tau_u)
+    ends = [later.tick for later in recording.updates[1:]] + [ticks]
+    for row, end in zip(recording.updates, ends, strict=True):
+        here = slice(row.tick, max(row.tick + row.tau_u, end))  # what a load step cut off belongs to the one before
         update[here], tau_u[here], iterations[here] = row.update, row.tau_u * TICK_S, row.iterations
         cost[here] = row.j_effective
     return [("update", "1", update), ("tau_u", "s", tau_u), ("iterations", "1", iterations), ("J", "1", cost)]
@@ -110,7 +111,8 @@ def write_updates(path: Path, recording: Recording) -> None:
     whole_file(path, lambda draft: pq.write_table(table, draft, compression="zstd"))
 
 
-def _version(name: str) -> str:
+def installed_version(name: str) -> str:
+    """Return the version of a package, or that it is absent."""
     try:
         return version(name)
     except PackageNotFoundError:

@@ -61,7 +61,7 @@ def execute(options: argparse.Namespace) -> int:
     parts = [
         _speed_lines(curve, problem.size),
         _operation_lines(problem, prediction, curve),
-        _iteration_lines(program, problem, curve, powers, periods),
+        _iteration_lines(program, powers, periods),
         _memory_lines([footprint(one, estimator) for one in (problem, trivial)], [problem.size, trivial.size]),
     ]
     sys.stdout.write("\n\n".join("\n".join(lines) for lines in parts) + "\n")
@@ -128,19 +128,14 @@ def _paper_qpoases_s(size: int) -> float:
     return QPOASES_ON_LAPTOP_S * slow_down(cholesky_times(), size)
 
 
-def _iteration_lines(
-    program: ProgramSettings, problem: PredictiveProblem, curve: SpeedCurve, powers: Sequence[float],
-    periods: Sequence[float],
-) -> list[str]:  # fmt: skip
-    """Return the iterations with the tau_1 that runs use, and with the counted ones for solvers without."""
-    n, m = problem.size, len(problem.Gamma)
-    speed = curve.flops_per_s(n)
+def _iteration_lines(program: ProgramSettings, powers: Sequence[float], periods: Sequence[float]) -> list[str]:
+    """Return the iterations with the tau_1 that runs use."""
     tau_1_s = {
         "ODE": program.ode.tau_1_s,
-        "qpOASES": 2 * program.ode.tau_1_s,
-        "OSQP": operations.osqp(n, m).flops / speed,
-        "fast gradient": operations.fast_gradient(n, m, ACTIVE_ROWS.mean).flops / speed,
-        "DAQP": operations.daqp(n, m, WORKING_SET).flops / speed,
+        "qpOASES": program.qpoases.tau_1_s,
+        "OSQP": program.osqp.tau_1_s,
+        "fast gradient": program.fast_gradient.tau_1_s,
+        "DAQP": program.daqp.tau_1_s,
     }
     rows = [("iterations", "s", "P", *(f"tau_u {period:g} s" for period in periods))]
     for solver, seconds in tau_1_s.items():

@@ -24,12 +24,16 @@ from rig.local_services import LocalServices
 from rig.network import NetworkRig
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder, Recording
+from rig.results import installed_version
 from rig.scenario import Scenario
 from rig.settings import Settings
 
 Series = NDArray[np.float64]
 
 PROGRAM_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc")
+RIG_MODULES = ("rig.indicators", "rig.network", "rig.one_process", "rig.recording", "rig.studies.request")
+SUFFIXES = (".py", ".json", ".npz", ".csv")
+LIBRARIES = ("casadi", "daqp", "numba", "numpy", "osqp")
 UPDATE_COLUMNS = (
     "tick", "tau_u", "iterations", "j_effective", "j_hot_start", "j_delivered", "j_dev", "j_cst", "violation",
 )  # fmt: skip
@@ -104,13 +108,16 @@ class Outcome:
 
 @lru_cache(maxsize=1)
 def programs_digest() -> str:
-    """Return a digest of the sources that decide what a run gives."""
-    digest = hashlib.sha256()
-    for package in PROGRAM_PACKAGES:
-        spec = find_spec(package)
+    """Return a digest of all that decides what a run gives: sources, data files, versions of libraries."""
+    files = [Path(spec.origin) for spec in map(find_spec, RIG_MODULES) if spec and spec.origin]
+    for spec in map(find_spec, PROGRAM_PACKAGES):
         for folder in (spec.submodule_search_locations or ()) if spec else ():
-            for source in sorted(Path(folder).rglob("*.py")):
-                digest.update(source.read_bytes())
+            files += sorted(file for file in Path(folder).rglob("*") if file.suffix in SUFFIXES)
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.read_bytes())
+    for library in LIBRARIES:
+        digest.update(f"{library} {installed_version(library)}".encode())
     return digest.hexdigest()[:16]
 
 

@@ -16,7 +16,7 @@ from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.sequence import InputSequence, sealed
-from optimizer_plc.budget import PlcBudget
+from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.costs import augmented_cost, indicators
 from optimizer_plc.estimator import Estimate, Estimator, EstimatorKind, KalmanFilter, StateFeedback
 from optimizer_plc.prediction import PredictionModel
@@ -125,7 +125,8 @@ class OptimizerProgram:
         played = self._playing
         here = played.situation._replace(x=estimate.x, w=estimate.w)
         effective = self._cost(self._problem.at(here), played.z)
-        iterations, assessment = self._decide(effective, update, interrupted=interrupted)
+        wanted, assessment = self._decide(effective, update, interrupted=interrupted)
+        iterations = min(wanted, self._budget.iterations(MAX_PERIOD_TICKS))
         ticks = self._fixed_ticks or self._budget.period(iterations)
         self._last = _Period(update, estimate, iterations, ticks, effective, assessment)
         # a load that keeps moving must not keep the control PLC waiting for ever
@@ -140,7 +141,8 @@ class OptimizerProgram:
         elapsed = update.tick - last.update.tick
         if 0 < elapsed != last.ticks:
             self._estimator.predict(self._segments(last.update, elapsed))
-        return elapsed < last.ticks
+        stepped = abs(update.load - last.update.load) > self.settings.interrupting_load_step_w > 0
+        return stepped and 0 < elapsed < last.ticks
 
     def _follow(self, update: Update) -> None:
         """Find out which profile the control PLC plays from this instant on."""
@@ -162,7 +164,7 @@ class OptimizerProgram:
         if last is None:
             return self._rule.first, UNDECIDED
         if interrupted:
-            return self._rule.after_interruption, UNDECIDED
+            return self._rule.after_interruption(), UNDECIDED
         if played is not self._sent or played.first_tick != update.tick:
             return last.iterations, UNDECIDED
         observation = Observation(

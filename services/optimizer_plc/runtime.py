@@ -26,6 +26,8 @@ log = logging.getLogger("coldloop.optimizer_plc")
 
 ROWS_WITH_HEADER = 18
 """Rows that fit into one request with the header that commits them."""
+LOOK_OUT_S = TICK_S / 8
+"""Plant time between two looks for a load step in real time: the new computation begins so much later."""
 STRANGER = AwaitUpdate(session=0, update=0)
 """Asks for a fresh update, whatever the session."""
 
@@ -124,7 +126,7 @@ class OptimizerPlc:
     async def _computed(self, ready: float, update: Update, *, interruptible: bool) -> bool:
         """Wait until the PLC would have its answer; tell whether no load step has cut it off before."""
         while (remaining := ready - time.monotonic()) > 0.0:
-            await asyncio.sleep(min(remaining, TICK_S / self._pace.factor) if interruptible else remaining)
+            await asyncio.sleep(min(remaining, LOOK_OUT_S / self._pace.factor) if interruptible else remaining)
             if interruptible and await self._interrupted(update):
                 return False
         return True

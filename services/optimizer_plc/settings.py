@@ -63,6 +63,12 @@ class ContractionSettings(BaseModel):
     surprise: Annotated[float, Field(gt=1)] = 2.0
     """Cost reached over cost predicted from which on the next solve is a long one."""
 
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not self.q_busy <= self.q_quiet <= self.q_step:
+            raise ValueError("q_busy <= q_quiet <= q_step does not hold")
+        return self
+
 
 class AdaptiveSettings(BaseModel):
     """Which rule adapts the updating period, and its parameters; those by their names are Algorithm 1's."""

@@ -72,9 +72,8 @@ class UpdatingRule(Protocol):
     def first(self) -> int:
         """Iterations of the first period, q(t_0)."""
 
-    @property
     def after_interruption(self) -> int:
-        """Iterations of the period that begins with a load step."""
+        """Return the iterations of the period that begins with a load step."""
 
     def next(self, observation: Observation) -> tuple[int, Assessment]:
         """Return q(t_{k+1}) and the quantities it was, or could have been, decided by."""
@@ -91,9 +90,8 @@ class FixedPeriod:
         """The fixed number."""
         return self.iterations
 
-    @property
     def after_interruption(self) -> int:
-        """The fixed number."""
+        """Return the fixed number."""
         return self.iterations
 
     def next(self, observation: Observation) -> tuple[int, Assessment]:
@@ -115,9 +113,8 @@ class Algorithm1:
         """q(t_0)."""
         return self.q_first
 
-    @property
     def after_interruption(self) -> int:
-        """q(t_0): what was learnt of the problem before the step says nothing of the one after."""
+        """Return q(t_0): what was learnt of the problem before the step says nothing of the one after."""
         return self.q_first
 
     def next(self, observation: Observation) -> tuple[int, Assessment]:
@@ -153,9 +150,8 @@ class ContractionRule:
         """Iterations in quiet."""
         return self.q_quiet
 
-    @property
     def after_interruption(self) -> int:
-        """One long solve."""
+        """Return what one long solve takes."""
         self._delivered = 0.0  # another load is another problem: its cost says nothing of contraction
         return self.q_step
 

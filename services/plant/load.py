@@ -54,7 +54,7 @@ DRAW_SEEDS: Final = 1000
 
 
 def telegraph(family: Family, mean_w: float) -> LoadProfile:
-    """Return one hour of a family about `mean_w`, in whole ticks, starting and ending at the mean."""
+    """Return one hour of a family about `mean_w`, in whole ticks, starting at the mean."""
     draw = random.Random(family.seed).random  # noqa: S311 not for secrets; the one generator stable over versions
     times, watts = [0], [mean_w]
     tick = round(family.longest_s / TICK_S)
@@ -72,8 +72,10 @@ def concatenated(hours: list[LoadProfile]) -> LoadProfile:
     times: list[int] = []
     watts: list[float] = []
     for hour, profile in enumerate(hours):
-        times += [hour * HOUR_TICKS + time for time in profile.times]
-        watts += profile.watts
+        for time, load in zip(profile.times, profile.watts, strict=True):
+            if not watts or load != watts[-1]:
+                times.append(hour * HOUR_TICKS + time)
+                watts.append(load)
     return LoadProfile(tuple(times), tuple(watts))
 
 

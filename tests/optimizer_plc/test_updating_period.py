@@ -185,4 +185,4 @@ def test_a_surprise_is_answered_by_one_long_solve() -> None:
 def test_the_own_rule_stays_between_its_numbers(observed: list[Observation]) -> None:
     rule = own_rule()
     assert all(2 <= rule.next(one)[0] <= 13 for one in observed)
-    assert rule.after_interruption == 13
+    assert rule.after_interruption() == 13
