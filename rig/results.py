@@ -97,7 +97,7 @@ def _held(recording: Recording, ticks: int) -> list[tuple[str, str, Any]]:
     update = np.zeros(ticks, dtype=np.int32)
     tau_u, iterations, cost = np.zeros(ticks), np.zeros(ticks, dtype=np.int32), np.zeros(ticks)
     ends = [later.tick for later in recording.updates[1:]] + [ticks]
-    for row, end in zip(recording.updates, ends, strict=True):
+    for row, end in zip(recording.updates, ends, strict=False):
         here = slice(row.tick, max(row.tick + row.tau_u, end))  # what a load step cut off belongs to the one before
         update[here], tau_u[here], iterations[here] = row.update, row.tau_u * TICK_S, row.iterations
         cost[here] = row.j_effective

@@ -56,7 +56,7 @@ class TradeOff:
 
 
 def _loads(options: StudyOptions) -> list[Load]:
-    return [load for draws in loads(options, "c").values() for load in draws]
+    return [draws[0] for draws in loads(options, "c").values()]
 
 
 def _periods(options: StudyOptions) -> tuple[float, ...]:

@@ -34,18 +34,11 @@ class Policy:
     assignments: tuple[str, ...] = ()
 
 
-LITERAL = Policy("Algorithm 1", ADAPTIVE, (f"{RULE}algorithm-1",))
-OWN = Policy("contraction rule", ADAPTIVE, (f"{RULE}contraction",))
-POLICIES: Final = (
-    LITERAL,
-    Policy("Algorithm 1, interrupt", ADAPTIVE, (f"{RULE}algorithm-1", INTERRUPT)),
-    OWN,
-    Policy("contraction rule, interrupt", ADAPTIVE, (f"{RULE}contraction", INTERRUPT)),
-    Policy("fixed 2.5 s, interrupt", 2.5, (INTERRUPT,)),
-    Policy("fixed 1.5 s, interrupt", 1.5, (INTERRUPT,)),
-)
-OWN_INTERRUPT = POLICIES[3]
-CONTROL = POLICIES[4]
+LITERAL: Final = Policy("Algorithm 1", ADAPTIVE)
+OWN: Final = Policy("contraction rule", ADAPTIVE, (f"{RULE}contraction",))
+OWN_INTERRUPT: Final = Policy("contraction rule, interrupt", ADAPTIVE, (f"{RULE}contraction", INTERRUPT))
+CONTROL: Final = Policy("fixed 2.5 s, interrupt", 2.5, (INTERRUPT,))
+POLICIES: Final = (LITERAL, OWN, OWN_INTERRUPT, CONTROL, Policy("fixed 1.5 s, interrupt", 1.5, (INTERRUPT,)))
 TUNING_DRAWS: Final = (11, 12)
 """Draws that the constants of the contraction rule were chosen on."""
 
@@ -60,17 +53,16 @@ class Variant:
     policies: tuple[Policy, ...] = (LITERAL,)
 
 
-SEVERAL: Final = (1.0, 1.5, 2.5, 3.5, 5.0)
+SLOW: Final = (1.0, 2.5)
 VARIANTS: Final = (
     Variant(
         "rate limit scaled by tau_u / 5 s",
         ("limits.rate_reference=elapsed",),
-        (1.0, 1.5, 2.5, 3.5, 5.0),
-        (LITERAL, OWN_INTERRUPT, CONTROL),
+        policies=(LITERAL, OWN_INTERRUPT, CONTROL),
     ),
-    Variant("measurement noise", NOISE, FEW, POLICIES),
-    Variant("fast gradient", (f"{PROGRAM}solver=fast-gradient", f"{PROGRAM}fast_gradient.tau_1_s=0.25"), FEW),
-    Variant("ODE starting slowly", (f"{PROGRAM}ode.cost_scale=1e-8", f"{PROGRAM}ode.growth=2.0"), FEW),
+    Variant("measurement noise", NOISE, policies=(LITERAL, OWN_INTERRUPT, CONTROL)),
+    Variant("fast gradient", (f"{PROGRAM}solver=fast-gradient", f"{PROGRAM}fast_gradient.tau_1_s=0.25"), SLOW),
+    Variant("ODE starting slowly", (f"{PROGRAM}ode.cost_scale=1e-8", f"{PROGRAM}ode.growth=2.0"), SLOW),
 )
 
 
@@ -124,8 +116,10 @@ def _hours(options: StudyOptions) -> list[Load]:
     return [load for draws in loads(options, *names).values() for load in draws]
 
 
-def _periods(options: StudyOptions) -> tuple[float, ...]:
-    return FEW if options.quick else (*SHORTER, *NINE)
+def _periods(load: Load, options: StudyOptions) -> tuple[float, ...]:
+    if options.quick:
+        return FEW
+    return (*SHORTER, *NINE) if load.draw == 1 else NINE
 
 
 def _variants(options: StudyOptions) -> tuple[Variant, ...]:
@@ -133,7 +127,7 @@ def _variants(options: StudyOptions) -> tuple[Variant, ...]:
 
 
 def _main(load: Load, options: StudyOptions) -> list[RunRequest]:
-    fixed = [load.request(period) for period in _periods(options)]
+    fixed = [load.request(period) for period in _periods(load, options)]
     return fixed + [load.request(policy.period_s, *policy.assignments) for policy in POLICIES]
 
 
@@ -153,7 +147,7 @@ class _Hour:
     @classmethod
     def of(cls, load: Load, options: StudyOptions, outcomes: Outcomes) -> "_Hour":
         runs = [outcomes[request] for request in _main(load, options)]
-        periods = _periods(options)
+        periods = _periods(load, options)
         labels = [policy.label for policy in POLICIES]
         return cls(
             load,
