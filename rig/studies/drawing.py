@@ -63,6 +63,7 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
         ), strict=True):  # fmt: skip
             place.set_ylabel(label)
         axes[1].set_yscale("log")
+        axes[1].set_ylim(bottom=1e-4)
         for place, band in zip(axes[2:4], bands, strict=True):
             place.axhspan(*band, color=BAND, alpha=0.3, zorder=0)
         axes[0].legend(*axes[1].get_legend_handles_labels(), loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)

@@ -90,6 +90,7 @@ def measures(powers: Series, table: Table) -> dict[str, float]:
         "qpOASES over ODE in J_BF at P = 1": float(qpoases["J_BF"][one] / ode["J_BF"][one]),
         "crossing in total cost": crossing(powers, qpoases["J_total"], ode["J_total"]),
         "crossing in J_BF": crossing(powers, qpoases["J_BF"], ode["J_BF"]),
+        "crossing in J_BF within 2 %": crossing(powers, qpoases["J_BF"], 1.02 * ode["J_BF"]),
         "c1 of qpOASES at P = 1": float(qpoases["c1"][one]),
         "c2 of qpOASES at P = 1": float(qpoases["c2"][one]),
         "c1 of ODE at P = 1": float(ode["c1"][one]),
