@@ -92,7 +92,7 @@ def perform_all(
     known = {request: store.find(request) for request in dict.fromkeys(requests)}
     missing = [request for request, outcome in known.items() if outcome is None]
     if missing:
-        with _bar(title, len(known)) as bar, workers.connected() as client:
+        with workers.connected() as client, _bar(title, len(known)) as bar:
             bar.advance(bar.task_ids[0], len(known) - len(missing))
             for request, text in _done(client, missing):
                 outcome = known[request] = Outcome.from_json(text)

@@ -40,7 +40,7 @@ def test_a_study_on_a_load_of_ones_own_leaves_table_figure_and_section(
     outcome = coldloop(*asked, "--out", tmp_path / "studies")
     assert outcome.code == 0, outcome.complaints
     folder = tmp_path / "studies" / "limited"
-    rows = list(csv.DictReader((folder / "results.csv").open()))
+    rows = list(csv.DictReader((folder / "results.csv").read_text().splitlines()))
     assert len(rows) == 4, "two solvers, two draws of the noise"
     assert {row["load"] for row in rows} == {str(own_load), f"{own_load}#2"}
     assert rows[0]["J_BF"] != rows[2]["J_BF"], "the draws differ by their noise"

@@ -32,14 +32,14 @@ def store(tmp_path: Path) -> Store:
     return Store(tmp_path / "runs")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def client() -> Iterator[Client]:
     """Two workers."""
     with Workers(2).connected() as client:
         yield client
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def running(client: Client) -> Workers:
     """The same two workers, for whoever names their scheduler."""
     return Workers(1, scheduler=client.scheduler.address)
