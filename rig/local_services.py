@@ -13,7 +13,9 @@ from typing import Self, TypeVar
 from coldloop.config import PREFIX, to_environment
 from coldloop.endpoints import Endpoint
 from coldloop.errors import LinkError
-from rig.network import RigEndpoints
+from rig.network import NetworkRig, RigEndpoints
+from rig.recording import Recorder
+from rig.scenario import Scenario
 from rig.settings import Settings
 
 T = TypeVar("T")
@@ -94,6 +96,25 @@ class LocalServices:
     def _last_words(self, service: str) -> str:
         lines = self._log(service).read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return lines[-1] if lines else "without a word"
+
+
+async def run_on_localhost(settings: Settings, scenario: Scenario, recorder: Recorder, log_folder: Path) -> None:
+    """Run a scenario on three services started for it.
+
+    Raises:
+        LinkError: A service ended, or one could not be reached.
+    """
+    async with LocalServices(settings, log_folder) as services:
+        rig = NetworkRig(services.endpoints, settings)
+
+        async def work() -> None:
+            await rig.connect(services.endpoints.plant.patience_s)
+            await rig.run(scenario, recorder)
+
+        try:
+            await services.during(work())
+        finally:
+            rig.close()
 
 
 def _wired(settings: Settings, endpoints: RigEndpoints) -> Settings:

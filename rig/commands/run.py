@@ -16,7 +16,7 @@ from control_plc.settings import Driver
 from plant.load import NAMED, find_load
 from rig.commands.options import configuration, duration, endpoint, updating_period
 from rig.indicators import evaluate, instantaneous_cost
-from rig.local_services import LocalServices
+from rig.local_services import run_on_localhost
 from rig.network import NetworkRig, RigEndpoints
 from rig.one_process import OneProcessRig
 from rig.plot import plot_run
@@ -105,17 +105,7 @@ async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scena
 
 
 async def _spawned(settings: Settings, scenario: Scenario, recorder: Recorder, out: Path) -> int:
-    async with LocalServices(settings, out / "logs") as services:
-        rig = NetworkRig(services.endpoints, settings)
-
-        async def work() -> None:
-            await rig.connect(services.endpoints.plant.patience_s)
-            await rig.run(scenario, recorder)
-
-        try:
-            await services.during(work())
-        finally:
-            rig.close()
+    await run_on_localhost(settings, scenario, recorder, out / "logs")
     return 0
 
 

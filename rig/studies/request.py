@@ -20,8 +20,7 @@ from coldloop.process import L1, T5, TICK_S
 from optimizer_plc.solvers import make_solver
 from plant.program import LoadProfile
 from rig.indicators import Indicators, evaluate, instantaneous_cost
-from rig.local_services import LocalServices
-from rig.network import NetworkRig
+from rig.local_services import run_on_localhost
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder, Recording
 from rig.results import installed_version
@@ -144,7 +143,8 @@ def perform(request: RunRequest) -> str:
     )
     recorder = Recorder(request.ticks)
     if request.networked:
-        asyncio.run(_on_the_bus(settings, scenario, recorder))
+        with tempfile.TemporaryDirectory(prefix="coldloop-logs-") as logs:
+            asyncio.run(run_on_localhost(settings, scenario, recorder, Path(logs)))
     else:
         _rig(request.assignments).run(scenario, recorder)
     return _outcome(recorder.recording(), settings, request.trace_ticks).to_json()
@@ -159,21 +159,6 @@ def settings_of(assignments: tuple[str, ...]) -> Settings:
 @lru_cache(maxsize=1)
 def _rig(assignments: tuple[str, ...]) -> OneProcessRig:
     return OneProcessRig(settings_of(assignments))
-
-
-async def _on_the_bus(settings: Settings, scenario: Scenario, recorder: Recorder) -> None:
-    with tempfile.TemporaryDirectory(prefix="coldloop-logs-") as logs:
-        async with LocalServices(settings, Path(logs)) as services:
-            rig = NetworkRig(services.endpoints, settings)
-
-            async def work() -> None:
-                await rig.connect(services.endpoints.plant.patience_s)
-                await rig.run(scenario, recorder)
-
-            try:
-                await services.during(work())
-            finally:
-                rig.close()
 
 
 def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outcome:
