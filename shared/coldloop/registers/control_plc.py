@@ -6,16 +6,47 @@ from typing import Annotated, Final, NamedTuple
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
 from coldloop.registers.common import IDENTITY_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
+from coldloop.registers.safety import EVENT_ROWS, Alarm, AlarmCommand, AlarmKind, Event, Watchdog, WatchdogTime
 
 SEQUENCE_ROWS: Final = 240
 
 
 class Mode(IntEnum):
-    """Who decides the outputs: the rungs of the fail-safe ladder that exist so far, and the classical loops."""
+    """Who decides the outputs: the rungs of the fail-safe ladder (MPC, REST, HOLD, CLASSICAL), or an operator."""
 
     HOLD = 0
+    """The last value, for a set time."""
     MPC = 1
+    """A sequence, within the updating period that it was sent for."""
     CLASSICAL = 2
+    """Two PI loops; CV155 stands."""
+    REST = 3
+    """The rest of a sequence: the next one is late."""
+    MANUAL = 4
+    """Setpoints that an operator writes."""
+
+
+class Cause(IntEnum):
+    """Why the mode is what it is."""
+
+    NONE = 0
+    SESSION_STARTED = 1
+    SEQUENCE_BEGAN = 2
+    SEQUENCE_LATE = 3
+    SEQUENCE_EXHAUSTED = 4
+    HOLD_EXPIRED = 5
+    OPERATOR = 6
+    SENSOR_BAD = 7
+    RESTARTED = 8
+
+
+class OperatorMode(IntEnum):
+    """What an operator wants."""
+
+    AUTO = 0
+    """MPC, and the ladder when it is not there."""
+    CLASSICAL = 1
+    MANUAL = 2
 
 
 class Verdict(IntEnum):
@@ -32,6 +63,8 @@ class Verdict(IntEnum):
     OUT_OF_RANGE = 8
     RATE_EXCEEDED = 9
     REPEATED = 10
+    NOT_INVITED = 11
+    """No sequence is played now: an operator drives, or a sensor that MPC needs is bad."""
 
 
 class Process(NamedTuple):
@@ -46,7 +79,7 @@ class Process(NamedTuple):
 class Status(NamedTuple):
     """State of the sequence player and of the scan cycle."""
 
-    mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops")]
+    mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops, 3 rest of a sequence, 4 manual")]
     update: Annotated[int, u32("Last update latched")]
     next_update_tick: Annotated[
         int, u32("Tick of the next updating instant; the latest possible one until it is planned")
@@ -59,6 +92,23 @@ class Status(NamedTuple):
     overruns: Annotated[int, u32("Scans that began more than the tolerance late")]
     lateness_max: Annotated[float, f32("Largest lateness of a scan in real time", unit="ms")]
     lateness_p99: Annotated[float, f32("99th percentile of the lateness of a scan in real time", unit="ms")]
+
+
+class Ladder(NamedTuple):
+    """Where the fail-safe ladder stands, and what it knows of those it depends on."""
+
+    mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops, 3 rest of a sequence, 4 manual")]
+    cause: Annotated[
+        int,
+        u16(
+            "0 none, 1 session started, 2 sequence began, 3 sequence late, 4 sequence exhausted, 5 hold expired, "
+            "6 operator, 7 sensor bad, 8 restarted"
+        ),
+    ]
+    since: Annotated[int, u32("Tick at which this mode began")]
+    optimizer: Annotated[int, u16("1 while the optimiser shows signs of life", high=1)]
+    bad_sensors: Annotated[int, u32("Outputs whose measurement is substituted: bit i is output i")]
+    events: Annotated[int, u32("Number of the last event")]
 
 
 class Update(NamedTuple):
@@ -101,9 +151,25 @@ class Acknowledgement(NamedTuple):
         int,
         u16(
             "0 none, 1 accepted, 2 late, 3 wrong update, 4 wrong tick, 5 wrong length, 6 wrong model, 7 bad CRC, "
-            "8 out of range, 9 rate exceeded, 10 repeated"
+            "8 out of range, 9 rate exceeded, 10 repeated, 11 not invited"
         ),
     ]
+
+
+class Heartbeat(NamedTuple):
+    """Sign of life of the optimiser, besides its other requests."""
+
+    count: Annotated[int, u16("Any number; writing it is what counts")]
+    model_digest: Annotated[int, u32("First 32 bits of the digest of the optimiser's prediction model")]
+
+
+class Operator(NamedTuple):
+    """What an operator wants. Setpoints count in manual mode; they are clamped and rate-limited."""
+
+    mode: Annotated[int, u16("0 auto, 1 classical loops, 2 manual", high=2)]
+    cv155: Annotated[float, f32("Setpoint of the Joule-Thomson valve", unit="%", low=0, high=100)]
+    ncr22: Annotated[float, f32("Setpoint of the actuator part of the heater", unit="W", low=0, high=1000)]
+    cv156: Annotated[float, f32("Setpoint of the turbine valve", unit="%", low=0, high=100)]
 
 
 class SequenceHeader(NamedTuple):
@@ -145,18 +211,26 @@ class Grant(NamedTuple):
 
 CONTROL_MAP: Final = RegisterMap(
     service="control_plc",
-    version=1,
+    version=2,
     blocks=(
         IDENTITY_BLOCK,
         Block("status", 30, Status, "Sequence player and scan cycle"),
+        Block("ladder", 50, Ladder, "The fail-safe ladder"),
         Block("process", 100, Process, "The process at the last scan"),
         Block("update", 200, Update, "Latched at the last updating instant"),
         Block("await update", 400, AwaitUpdate, "Lets a read of the latch wait for a new update", Role.OPTIMIZER),
         Block("plan", 410, Plan, "Decided updating period", Role.OPTIMIZER),
         Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence"),
+        Block("heartbeat", 430, Heartbeat, "Sign of life of the optimiser", Role.OPTIMIZER),
+        Block("watchdog", 436, Watchdog, "Watches the optimiser"),
+        Block("watchdog time", 444, WatchdogTime, "Sets that watchdog", Role.OPERATOR),
         Block("session", 450, ControlSession, "Start of a session", Role.OPERATOR),
         Block("grant", 460, Grant, "How far to go in lock-step", Role.OPERATOR),
+        Block("operator", 470, Operator, "Who drives, and manual setpoints", Role.OPERATOR),
+        Block("alarm command", 480, AlarmCommand, "Acknowledges or shelves an alarm", Role.OPERATOR),
         Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
         Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
+        Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(AlarmKind)),
+        Block("events", 3000, Event, "The last events", rows=EVENT_ROWS),
     ),
 )

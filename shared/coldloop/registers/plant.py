@@ -1,10 +1,12 @@
 """Register map of the plant: a remote I/O rack, and the controls of a simulation."""
 
+from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
 from coldloop.registers.common import IDENTITY_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
+from coldloop.registers.safety import Watchdog, WatchdogTime
 
 HISTORY_ROWS: Final = 256
 LOAD_ROWS: Final = 2048
@@ -29,6 +31,22 @@ class Measurement(NamedTuple):
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
     x: Annotated[tuple[float, ...], f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS)]
     session: Annotated[int, u32("Session")]
+
+
+class SensorFaultKind(IntEnum):
+    """What is wrong with a sensor, on purpose."""
+
+    NONE = 0
+    NOT_A_NUMBER = 1
+    FROZEN = 2
+    VALUE = 3
+
+
+class SensorFault(NamedTuple):
+    """A fault put into one output of the simulation. Row i is output i; the history keeps the true value."""
+
+    kind: Annotated[int, u16("0 none, 1 not a number, 2 frozen at its present value, 3 the value below", high=3)]
+    value: Annotated[float, f32("Value that the sensor shows with fault 3")]
 
 
 class PlantSession(NamedTuple):
@@ -60,11 +78,14 @@ class PlantSample(NamedTuple):
 
 PLANT_MAP: Final = RegisterMap(
     service="plant",
-    version=1,
+    version=2,
     blocks=(
         IDENTITY_BLOCK,
         Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL),
         Block("measurement", 200, Measurement, "Inputs of the control PLC"),
+        Block("watchdog", 310, Watchdog, "Watches the control PLC; outputs go to their safe state when it expires"),
+        Block("watchdog time", 320, WatchdogTime, "Sets that watchdog", Role.CONTROL),
+        Block("sensor faults", 330, SensorFault, "Faults put into the outputs", Role.OPERATOR, len(OUTPUT_NAMES)),
         Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
         Block("load table", 1000, LoadStep, "Heat load over the session", Role.OPERATOR, LOAD_ROWS),
         Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
