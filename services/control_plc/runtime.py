@@ -63,13 +63,7 @@ class ControlPlc:
         self._settings = settings
         self._model_digest = header.short_digest
         self._program = make_program(header, section, settings.limits)
-        self._plant = RegisterClient(
-            PLANT_MAP,
-            host=section.plant.host,
-            port=section.plant.port,
-            timeout_s=section.plant.timeout_s,
-            order=section.plant.word_order,
-        )
+        self._plant = RegisterClient.at(PLANT_MAP, section.plant)
         self.bank = RegisterBank(CONTROL_MAP, section.word_order)
         self._pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
         self._pacer = self._new_pacer()
