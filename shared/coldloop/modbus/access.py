@@ -37,12 +37,10 @@ def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:
 
 def caller_with(certificate: bytes, name: str) -> Caller:
     """Return who calls with a certificate (DER) that has been verified."""
-    parsed = x509.load_der_x509_certificate(certificate)
-    subject = json.dumps(parsed.subject.rfc4514_string(), ensure_ascii=False)
-    text = _role_text(parsed)
-    known = {role.value: role for role in Role}
-    roles = frozenset({known[text]} if text in known else ())
-    return Caller(f"{name} certificate={subject} role={json.dumps(text, ensure_ascii=False)}", roles)
+    subject, role = _subject_and_role(certificate)
+    known = {each.value: each for each in Role}
+    described = " ".join(f"{key}={json.dumps(text)}" for key, text in (("certificate", subject), ("role", role)))
+    return Caller(f"{name} {described}", frozenset({known[role]} if role in known else ()))
 
 
 def _plain_address(host: str) -> IPv4Address | IPv6Address:
@@ -55,12 +53,16 @@ def _within(address: IPv4Address | IPv6Address, networks: Networks) -> bool:
     return any(address in network for network in networks)
 
 
-def _role_text(certificate: x509.Certificate) -> str:
+def _subject_and_role(der: bytes) -> tuple[str, str]:
+    """Return both as they stand in a certificate; empty where it is too odd to be read, though OpenSSL took it."""
+    subject = ""
     try:
+        certificate = x509.load_der_x509_certificate(der)
+        subject = certificate.subject.rfc4514_string()
         extension = certificate.extensions.get_extension_for_oid(ROLE_EXTENSION).value
     except (x509.ExtensionNotFound, x509.DuplicateExtension, ValueError):
-        return ""
-    return decoded_role(extension.public_bytes())
+        return subject, ""
+    return subject, decoded_role(extension.public_bytes())
 
 
 def encoded_role(text: str) -> bytes:

@@ -115,6 +115,8 @@ class Connection(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Answer all requests that are whole by now (event loop callback)."""
+        if self._transport.is_closing():  # with TLS, what was under way still comes
+            return
         self._buffer += data
         self._serve()
 
