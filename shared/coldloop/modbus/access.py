@@ -16,6 +16,8 @@ from coldloop.registers.declaration import Role
 ROLE_EXTENSION: Final = x509.ObjectIdentifier("1.3.6.1.4.1.50316.802.1")
 UTF8_STRING: Final = 0x0C
 """Tag of a UTF8String in DER."""
+MAX_LENGTH: Final = 127
+"""Longest role, in bytes: what DER says the length of in one byte."""
 
 
 class Caller(NamedTuple):
@@ -68,13 +70,13 @@ def _subject_and_role(der: bytes) -> tuple[str, str]:
 def encoded_role(text: str) -> bytes:
     """Return a role as the extension's DER."""
     raw = text.encode()
-    if len(raw) > 127:
-        raise ValueError("a role of more than 127 bytes")
+    if len(raw) > MAX_LENGTH:
+        raise ValueError(f"a role of more than {MAX_LENGTH} bytes")
     return bytes((UTF8_STRING, len(raw))) + raw
 
 
 def decoded_role(der: bytes) -> str:
     """Return the role in an extension's DER, empty when it is not one."""
-    if len(der) < 2 or der[0] != UTF8_STRING or der[1] != len(der) - 2:
+    if len(der) < 2 or der[0] != UTF8_STRING or der[1] > MAX_LENGTH or der[1] != len(der) - 2:
         return ""
     return der[2:].decode(errors="replace")
