@@ -6,7 +6,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Mapping
 from pathlib import Path
 from typing import Self, TypeVar
 
@@ -71,6 +71,11 @@ class LocalServices:
             except TimeoutError:
                 process.kill()
                 await process.wait()
+
+    @property
+    def processes(self) -> Mapping[str, asyncio.subprocess.Process]:
+        """The processes by service, while they live."""
+        return self._processes
 
     async def during(self, work: Awaitable[T]) -> T:
         """Return the result of `work`, unless a service ends before.
