@@ -6,13 +6,14 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Mapping
 from pathlib import Path
 from typing import Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
 from coldloop.endpoints import Endpoint
 from coldloop.errors import LinkError
+from coldloop.modbus.settings import TlsSettings
 from rig.network import NetworkRig, RigEndpoints
 from rig.recording import Recorder
 from rig.scenario import Scenario
@@ -35,7 +36,7 @@ class LocalServices:
     def __init__(self, settings: Settings, log_folder: Path) -> None:
         self.endpoints = RigEndpoints(
             *[
-                Endpoint(port=port, patience_s=START_PATIENCE_S, word_order=getattr(settings, service).word_order)
+                _endpoint(settings, service, port)
                 for service, port in zip(SERVICES, _free_ports(len(SERVICES)), strict=True)
             ]
         )
@@ -70,6 +71,11 @@ class LocalServices:
             except TimeoutError:
                 process.kill()
                 await process.wait()
+
+    @property
+    def processes(self) -> Mapping[str, asyncio.subprocess.Process]:
+        """The processes by service, while they live."""
+        return self._processes
 
     async def during(self, work: Awaitable[T]) -> T:
         """Return the result of `work`, unless a service ends before.
@@ -117,8 +123,21 @@ async def run_on_localhost(settings: Settings, scenario: Scenario, recorder: Rec
             rig.close()
 
 
+def _endpoint(settings: Settings, service: str, port: int) -> Endpoint:
+    section = getattr(settings, service)
+    return Endpoint(
+        port=port,
+        patience_s=START_PATIENCE_S,
+        word_order=section.word_order,
+        tls=settings.rig.tls if section.server.tls else None,
+    )
+
+
 def _wired(settings: Settings, endpoints: RigEndpoints) -> Settings:
     """Return the settings with the servers on these endpoints and the clients pointed at them."""
+
+    def client(endpoint: Endpoint, tls: TlsSettings | None) -> Endpoint:
+        return endpoint.model_copy(update={"tls": tls})
 
     def server(section: str, endpoint: Endpoint) -> object:
         return getattr(settings, section).server.model_copy(update={"host": endpoint.host, "port": endpoint.port})
@@ -128,12 +147,15 @@ def _wired(settings: Settings, endpoints: RigEndpoints) -> Settings:
             "session": settings.session.model_copy(update={"autostart": False}),
             "plant": settings.plant.model_copy(update={"server": server("plant", endpoints.plant)}),
             "control_plc": settings.control_plc.model_copy(
-                update={"server": server("control_plc", endpoints.control_plc), "plant": endpoints.plant}
+                update={
+                    "server": server("control_plc", endpoints.control_plc),
+                    "plant": client(endpoints.plant, settings.control_plc.plant.tls),
+                }
             ),
             "optimizer_plc": settings.optimizer_plc.model_copy(
                 update={
                     "server": server("optimizer_plc", endpoints.optimizer_plc),
-                    "control_plc": endpoints.control_plc,
+                    "control_plc": client(endpoints.control_plc, settings.optimizer_plc.control_plc.tls),
                 }
             ),
         }
