@@ -40,9 +40,9 @@ class NetworkRig:
 
     def __init__(self, endpoints: RigEndpoints, settings: Settings) -> None:
         self._settings = settings
-        self._plant = _client(PLANT_MAP, endpoints.plant)
-        self._control = _client(CONTROL_MAP, endpoints.control_plc)
-        self._optimizer = _client(OPTIMIZER_MAP, endpoints.optimizer_plc)
+        self._plant = client_of(PLANT_MAP, endpoints.plant)
+        self._control = client_of(CONTROL_MAP, endpoints.control_plc)
+        self._optimizer = client_of(OPTIMIZER_MAP, endpoints.optimizer_plc)
 
     async def connect(self, patience_s: float) -> None:
         """Connect to all three, and make sure that all run the model of our configuration.
@@ -72,7 +72,7 @@ class NetworkRig:
         Raises:
             LinkError: The rig stopped moving, or went faster than it could be recorded.
         """
-        session = await self._start(scenario)
+        session = await self.start(scenario)
         recorder.begin()
         updates = _UpdateReader(self._optimizer, recorder, session)
         quiet_since = time.monotonic()
@@ -97,7 +97,7 @@ class NetworkRig:
             status.deadline_misses, status.overruns, status.lateness_max, status.lateness_p99
         )
 
-    async def _start(self, scenario: Scenario) -> int:
+    async def start(self, scenario: Scenario) -> int:
         """Write the load and the settings of a new session to all three; return its number."""
         session = 1
         for client in (self._plant, self._control, self._optimizer):
@@ -166,7 +166,8 @@ class _UpdateReader:
             await asyncio.sleep(0.002)
 
 
-def _client(register_map: RegisterMap, endpoint: Endpoint) -> RegisterClient:
+def client_of(register_map: RegisterMap, endpoint: Endpoint) -> RegisterClient:
+    """Return a client of the server there."""
     return RegisterClient(
         register_map,
         host=endpoint.host,
