@@ -85,16 +85,17 @@ class LocalServices:
                 with contextlib.suppress(ProcessLookupError):
                     process.send_signal(number)
         for process in processes.values():
-            try:
-                async with asyncio.timeout(STOP_GRACE_S):
-                    await process.wait()
-            except TimeoutError:
-                process.kill()
-                await process.wait()
+            await _ended(process)
         await asyncio.gather(*self._watchers)
 
-    async def start(self, service: str, environment: Mapping[str, str] | None = None) -> None:
-        """Start one of them, where it was before; with further variables for this time."""
+    async def start(self, service: str, environment: Mapping[str, str] | None = None, *, may_end: bool = False) -> None:
+        """Start one of them, where it was before.
+
+        Args:
+            service: Which one.
+            environment: Further variables for this time.
+            may_end: Its end by itself does not end the run.
+        """
         # A session of their own: a Ctrl-C is the rig's to answer, in good order.
         with self.log(service).open("ab") as log:
             process = await asyncio.create_subprocess_exec(
@@ -103,20 +104,18 @@ class LocalServices:
                 stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
             )  # fmt: skip
         self._processes[service] = process
+        if may_end:
+            return
         watcher = asyncio.create_task(self._watch(service, process), name=f"watch {service}")
         self._watchers.add(watcher)
         watcher.add_done_callback(self._watchers.discard)
 
     async def stop(self, service: str, number: signal.Signals) -> None:
         """End one of them on purpose, by a signal, and wait until it has ended."""
-        process = self.release(service)
+        process = self._processes.pop(service)
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(number)
-        await process.wait()
-
-    def release(self, service: str) -> asyncio.subprocess.Process:
-        """Return the process of a service, which may end from now on."""
-        return self._processes.pop(service)
+        await _ended(process)
 
     def pid(self, service: str) -> int | None:
         """Return the process id of a service; None while it is not to run."""
@@ -125,11 +124,15 @@ class LocalServices:
 
     def pause(self, service: str) -> None:
         """Let a process stand still."""
-        self._processes[service].send_signal(signal.SIGSTOP)
+        self._signal(service, signal.SIGSTOP)
 
     def resume(self, service: str) -> None:
         """Let it go on."""
-        self._processes[service].send_signal(signal.SIGCONT)
+        self._signal(service, signal.SIGCONT)
+
+    def _signal(self, service: str, number: signal.Signals) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            self._processes[service].send_signal(number)
 
     async def during(self, work: Awaitable[T]) -> T:
         """Return the result of `work`, unless a service ends before by itself.
@@ -162,6 +165,16 @@ class LocalServices:
     def _last_words(self, service: str) -> str:
         lines = self.log(service).read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return lines[-1] if lines else "without a word"
+
+
+async def _ended(process: asyncio.subprocess.Process) -> None:
+    """Wait for the end of a process; one that does not end is made to."""
+    try:
+        async with asyncio.timeout(STOP_GRACE_S):
+            await process.wait()
+    except TimeoutError:
+        process.kill()
+        await process.wait()
 
 
 async def run_on_localhost(settings: Settings, scenario: Scenario, recorder: Recorder, log_folder: Path) -> None:

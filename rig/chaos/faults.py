@@ -57,6 +57,16 @@ class Fault(BaseModel):
         """What tables call it."""
         raise NotImplementedError
 
+    @property
+    def processes(self) -> frozenset[str]:
+        """Services whose processes it stops."""
+        return frozenset()
+
+    @property
+    def stops_time(self) -> bool:
+        """Whether plant time cannot go on under it in lock-step: the plant and the control PLC make it."""
+        return bool(self.processes & {"plant", "control_plc"})
+
 
 class LinkFault(Fault):
     """Something wrong with a link, as its proxy does it."""
@@ -155,6 +165,11 @@ class ProcessFault(Fault):
         """What tables call it."""
         return f"{self.kind} {self.process}"
 
+    @property
+    def processes(self) -> frozenset[str]:
+        """Services whose processes it stops."""
+        return frozenset({SERVICE_OF[self.process]})
+
 
 class Kill(ProcessFault):
     """SIGKILL, and a new start at the end."""
@@ -184,6 +199,11 @@ class Clock(Fault):
     def label(self) -> str:
         """What tables call it."""
         return f"clock +{self.duration_s:g} s"
+
+    @property
+    def processes(self) -> frozenset[str]:
+        """Services whose processes it stops."""
+        return frozenset(SERVICE_OF.values())
 
 
 class Sensor(Fault):
@@ -217,6 +237,11 @@ class WrongModel(Fault):
     def label(self) -> str:
         """What tables call it."""
         return "wrong model"
+
+    @property
+    def processes(self) -> frozenset[str]:
+        """Services whose processes it stops."""
+        return frozenset({"optimizer_plc"})
 
 
 AnyFault = Annotated[

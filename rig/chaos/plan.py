@@ -38,8 +38,9 @@ class Plan(BaseModel):
     factor: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
     updating_period_s: Annotated[float, Field(ge=0, le=5)] = 0.0
     """0 is adaptive."""
-    standstill_s: Annotated[float, Field(gt=0, le=600)] = 2.0
-    """In lock-step a fault under which plant time stands still ends after so much real time."""
+    standstill_s: Annotated[float, Field(gt=0, le=600)] = 8.0
+    """In lock-step a fault under which plant time stands still ends after so much real time. The control PLC gives an
+    optimiser up that stands still for `control_plc.ladder.optimizer_patience_s`, and goes on."""
     faults: tuple[AnyFault, ...] = ()
     every_s: Annotated[float, Field(ge=2 * SPREAD_S)] | None = None
     """Draw a fault so often, from `draw`."""
@@ -55,7 +56,13 @@ class Plan(BaseModel):
             raise ValueError("every_s and `draw` go together")
         if any(fault.tick >= self.ticks for fault in self.faults):
             raise ValueError(f"a fault begins after the end of the run, {self.duration_s:g} s")
+        _refuse_overlaps(self.schedule())
         return self
+
+    @property
+    def realtime(self) -> bool:
+        """Whether the clock makes time go on."""
+        return self.mode is TimeMode.REALTIME
 
     @property
     def ticks(self) -> int:
@@ -81,9 +88,19 @@ class Plan(BaseModel):
             load=_load(self.load, mean_w),
             updating_period_s=self.updating_period_s,
             seed=self.seed,
-            realtime=self.mode is TimeMode.REALTIME,
+            realtime=self.realtime,
             factor=self.factor,
         )
+
+
+def _refuse_overlaps(schedule: list[AnyFault]) -> None:
+    """Refuse a process that is to be stopped while it is stopped."""
+    for number, fault in enumerate(schedule):
+        for later in schedule[number + 1 :]:
+            if later.tick >= fault.end_tick:
+                break
+            if later.processes & fault.processes:
+                raise ValueError(f"'{later.label}' at {later.at_s:g} s begins before '{fault.label}' has ended")
 
 
 def _load(load: str | tuple[str, ...], mean_w: float) -> LoadProfile:
