@@ -5,7 +5,7 @@ where it is. Pure: measured outputs and applied inputs in, wanted inputs out. Th
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
@@ -140,15 +140,20 @@ class ClassicalLoops:
         self._level.restart()
         self._temperature.restart()
 
-    def wanted(self, tick: int, y: Sequence[float], applied: SequenceRow) -> SequenceRow:
+    def wanted(
+        self, tick: int, y: Sequence[float], applied: SequenceRow, *, without: Collection[int] = ()
+    ) -> SequenceRow:
         """Return the inputs wanted at `tick`, from the newest outputs y (22) and the inputs applied until now.
+
+        A loop whose output is among those to do `without` is left: its input stands.
 
         Between executions they are the applied ones. Executions are at multiples of the period, so that with 5 s and
         no sequence before each of them has a rate window of its own and may use it in full.
         """
         if tick % self._period:
             return applied
+        level, temperature = (math.nan if output in without else y[output] for output in (L1, T5))
         return applied._replace(
-            ncr22=self._level.execute(y[L1], applied.ncr22),
-            cv156=self._temperature.execute(y[T5], applied.cv156),
+            ncr22=self._level.execute(level, applied.ncr22),
+            cv156=self._temperature.execute(temperature, applied.cv156),
         )

@@ -42,13 +42,20 @@ class OutputGuard:
         self._limits = limits
         self._slack = [TOLERANCE * (high - low) for low, high in zip(limits.low, limits.high, strict=True)]
         self.applied = SequenceRow(*map(_inside, applied, limits.low, limits.high))
+        self._astray = False
         self._window = Window(self.applied, 0, 1.0, -TICKS_PER_SAMPLE)
+
+    def begin_at(self, tick: int, applied: SequenceRow) -> None:
+        """Go on from what is applied at `tick`, wherever that is; it counts as having moved just then."""
+        self.applied = applied
+        self._astray = self.out_of_range([applied])
+        self._window = Window(applied, tick, self._limits.rate_share(0), tick)
 
     def admit(self, tick: int, wanted: SequenceRow, *, update: bool) -> SequenceRow:
         """Return what may be applied at `tick`, and remember it as applied."""
         limits = self._limits
         window = self._window = self._window.at(tick, self.applied, limits, update=update)
-        if wanted == self.applied:  # it was admitted before, and a new window begins with it
+        if wanted == self.applied and not self._astray:  # it was admitted before, and a new window begins with it
             return wanted
         applied = SequenceRow(
             *[
@@ -59,6 +66,7 @@ class OutputGuard:
         if applied != self.applied:
             self._window = window._replace(moved=tick)
         self.applied = applied
+        self._astray = self._astray and self.out_of_range([applied])
         return applied
 
     def exceeds(self, rows: Sequence[SequenceRow], first_tick: int, before: SequenceRow) -> bool:
@@ -85,10 +93,13 @@ class OutputGuard:
 
 
 def _clamped(wanted: float, anchor: float, reach: float, low: float, high: float) -> float:
-    """Return the single-precision value nearest to `wanted` that lies in low..high and within `reach` of `anchor`."""
+    """Return the single-precision value nearest to `wanted` that lies in low..high and within `reach` of `anchor`.
+
+    From an anchor outside low..high it goes towards them, as far as `reach` lets it.
+    """
     if not math.isfinite(wanted):
         wanted = anchor
-    lowest, highest = max(low, anchor - reach), min(high, anchor + reach)
+    lowest, highest = min(max(low, anchor - reach), anchor + reach), max(min(high, anchor + reach), anchor - reach)
     value = _single(min(max(wanted, lowest), highest))
     while value != anchor and not (lowest <= value <= highest and abs(value - anchor) <= reach):
         value = _neighbour(value, anchor)  # rounding has crossed a limit

@@ -1,20 +1,26 @@
-"""The control PLC's program: scan cycle, sequence player, sequence contract and updating instants.
+"""The control PLC's program: scan cycle, fail-safe ladder, alarms.
 
 Pure: no sockets, no clock, no sleeping. A scan is `begin_scan` (decide the outputs), the exchange with the plant's
-rack, `end_scan` (take the measurement, latch an update at an updating instant).
-
-The fail-safe ladder begins here with its first two rungs: the sequence is played (MPC), and when it has run out its
-last value holds (HOLD). Further rungs are further modes of `_wanted`. Or the classical loops drive (CLASSICAL), from
-tick 0 to the end; then no update is latched.
+rack, `end_scan` (take the measurement, latch an update at an updating instant). Who decides the outputs is the
+ladder's choice (`ladder.py`); what the optimiser sends goes through the sequence player (`player.py`); the guard has
+the last word (`guard.py`).
 """
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from coldloop.errors import ConfigurationError
 from coldloop.limits import InputLimits
-from coldloop.process import TICKS_PER_SAMPLE
+from coldloop.process import L1, T5, TICK_S
+from coldloop.registers import safety
 from coldloop.registers.control_plc import (
-    SEQUENCE_ROWS,
     Acknowledgement,
+    Cause,
+    Heartbeat,
     Mode,
+    Operator,
+    OperatorMode,
     Plan,
     Process,
     SequenceRow,
@@ -22,200 +28,273 @@ from coldloop.registers.control_plc import (
     Verdict,
 )
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.sequence import InputSequence, checksum
+from coldloop.registers.safety import AlarmKind
+from coldloop.sequence import InputSequence
+from coldloop.watchdog import Watchdog
+from control_plc.alarms import AlarmPanel, Journal
 from control_plc.classical import ClassicalLoops
 from control_plc.guard import OutputGuard
+from control_plc.ladder import Ladder, Situation
+from control_plc.player import SequencePlayer
+from control_plc.sensors import SensorMonitor
+from control_plc.settings import ControlSection, Driver
+
+HANDSHAKE_PAUSE_S = 30.0
+"""After a handshake that came to nothing the classical loops are not held again for so long."""
+
+
+@dataclass(frozen=True, slots=True)
+class OperatingPoint:
+    """What the control PLC knows of the model: its inputs and outputs at rest, and its digest."""
+
+    inputs: tuple[float, ...]
+    outputs: tuple[float, ...]
+    model_digest: int
 
 
 class ControlProgram:
-    """One session of the control PLC, from tick 0 on.
+    """One session of the control PLC. `tick` is the tick of the next scan, or of the one in progress."""
 
-    `tick` is the tick of the next scan, or of the one in progress. `classical`, when given, drives instead of
-    sequences.
-    """
-
-    def __init__(
-        self,
-        *,
-        limits: InputLimits,
-        model_digest: int,
-        initial_inputs: tuple[float, ...],
-        classical: ClassicalLoops | None = None,
-    ) -> None:
+    def __init__(self, *, limits: InputLimits, point: OperatingPoint, section: ControlSection) -> None:
         self._limits = limits
-        self._classical = classical
-        self._model_digest = model_digest
-        self._initial = SequenceRow(*initial_inputs)
+        self._point = point
+        self._section = section
+        self._initial = SequenceRow(*point.inputs)
         if OutputGuard(limits, self._initial).out_of_range([self._initial]):
             raise ConfigurationError(
                 f"limits: the inputs {self._initial[:]} of the operating point are outside; widen low and high, or "
                 "give another model.file"
             )
+        self._loops = ClassicalLoops(section.classical, limits, point.outputs)
+        self.watchdog = Watchdog(section.ladder.optimizer_ticks)
+        self.journal = Journal()
+        self.alarms = AlarmPanel(self.journal)
         self.restart(session=0)
 
     def restart(self, session: int) -> None:
         """Begin a session at tick 0 with the initial inputs applied."""
-        self.session = session
-        self.tick = 0
-        self.mode = Mode.CLASSICAL if self._classical else Mode.HOLD
-        self.update: Update | None = None
-        self.process: Process | None = None
-        self.next_update_tick = 0
-        self.acknowledgement = Acknowledgement(0, Verdict.NONE)
-        self.accepted = self.rejected = self.deadline_misses = 0
-        self._guard = OutputGuard(self._limits, self._initial)
-        self._before = self._initial
-        self._playing: InputSequence | None = None
-        self._spare: InputSequence | None = None
-        self._load_step = 0.0
-        self._planned = False
-        self._abandoned = False
-        self._refused = False
-        self._in_scan = False
-        if self._classical is not None:
-            self._classical.restart()
+        classical = self._section.driver is Driver.CLASSICAL
+        self.operator = Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, *self._initial)
+        self._begin(session, 0, self._initial, updates=0)
+        mode = Mode.CLASSICAL if classical else Mode.HOLD
+        self._ladder = Ladder(self._section.ladder.hold_ticks, mode, Cause.SESSION_STARTED)
 
-    # -- what a lock-step runtime waits for ----------------------------------------------------------------------------
+    def resume(self, session: int, tick: int, applied: Sequence[float], *, updates: int, operator: Operator) -> None:
+        """Go on with a session after a restart: `applied` is what the rack applies at this tick."""
+        self.operator = operator
+        self._begin(session, tick, SequenceRow(*applied), updates=updates)
+        self._player.invite(tick)
+        self._ladder = Ladder(self._section.ladder.hold_ticks, Mode.HOLD, Cause.RESTARTED, tick)
+
+    def _begin(self, session: int, tick: int, applied: SequenceRow, *, updates: int) -> None:
+        self.session = session
+        self.tick = tick
+        self.process: Process | None = None
+        self.optimizer_present = True
+        self._guard = OutputGuard(self._limits, self._initial)
+        if tick:
+            self._guard.begin_at(tick, applied)
+        self._before = self._guard.applied
+        self._player = SequencePlayer(self._guard, self._point.model_digest, updates=updates)
+        self._sensors = SensorMonitor(self._section.sensors, self._point.outputs)
+        self._outside = {AlarmKind.LEVEL_BAND: 0, AlarmKind.T5_BAND: 0}
+        self._failed_handshake = -math.inf
+        self._in_scan = False
+        self.watchdog.set(self.watchdog.time, tick)
+        self._loops.restart()
+        self.alarms.now = tick
+
+    # -- what others see -----------------------------------------------------------------------------------------------
+
+    @property
+    def mode(self) -> Mode:
+        """Who decides the outputs."""
+        return self._ladder.mode
+
+    @property
+    def ladder(self) -> Ladder:
+        """Mode, cause and since when."""
+        return self._ladder
+
+    @property
+    def player(self) -> SequencePlayer:
+        """Updates, sequences, and what was thought of them."""
+        return self._player
+
+    @property
+    def bad_sensors(self) -> int:
+        """Bit i is set when output i is substituted."""
+        return self._sensors.mask
+
+    @property
+    def applied(self) -> SequenceRow:
+        """The inputs being applied."""
+        return self._guard.applied
+
+    @property
+    def remaining(self) -> int:
+        """Ticks of the sequence that are still to be played, the present one included."""
+        return self._player.remaining(self.tick)
 
     @property
     def awaiting_plan(self) -> bool:
-        """The last update has no updating period yet."""
-        return self.update is not None and not self._planned and not self._abandoned
+        """The last update has no updating period yet, and an optimiser is there to choose one."""
+        return self.optimizer_present and self._player.awaiting_plan
 
     @property
     def awaiting_sequence(self) -> bool:
-        """An updating instant has come and its sequence has not; one that a load step may cut off is due at once."""
-        due = self.tick == self.next_update_tick and self.tick > 0
-        wanted = due or (self._planned and self._load_step > 0)
-        return wanted and self._spare is None and not self._abandoned and not self._refused
+        """An updating instant has come, its sequence has not, and an optimiser is there to send it."""
+        return self.optimizer_present and self._player.awaiting_sequence(self.tick)
+
+    @property
+    def _earliest(self) -> int:
+        return self.tick + self._in_scan
 
     # -- scan ----------------------------------------------------------------------------------------------------------
 
     def begin_scan(self) -> Actuators:
         """Decide the outputs of this tick."""
+        tick = self.alarms.now = self.tick
         self._in_scan = True
         self._before = self._guard.applied
-        update = False
-        if self._spare is not None and self._spare.header.first_tick == self.tick:
-            self._playing, self._spare, update = self._spare, None, True
-        elif self.tick == self.next_update_tick and self.tick > 0:
-            self.deadline_misses += 1
-        applied = self._guard.admit(self.tick, self._wanted(self.tick), update=update)
-        if self._classical is None:
-            self.mode = Mode.MPC if self.remaining else Mode.HOLD
-        return Actuators(self.tick, *applied, self.session)
+        if self.watchdog.check(tick):
+            self.optimizer_lost()
+        began = self._player.begin(tick)
+        if not began and self._player.late:
+            self._failed_handshake = tick
+        row = self._player.row(tick)
+        self._climb(tick, row)
+        applied = self._guard.admit(tick, self._wanted(tick, row), update=began)
+        return Actuators(tick, *applied, self.session)
+
+    def _climb(self, tick: int, row: SequenceRow | None) -> None:
+        """Let the ladder choose the mode of this scan."""
+        before = self._ladder.mode
+        changed = self._ladder.step(
+            tick,
+            Situation(
+                operator=OperatorMode(self.operator.mode),
+                sensors_unusable=bool(self._sensors.unusable),
+                row=row is not None,
+                late=self._player.late,
+            ),
+        )
+        if not changed:
+            return
+        if self._ladder.mode is Mode.CLASSICAL:
+            self._loops.restart()
+            self._player.drop()
+        elif before is Mode.CLASSICAL:
+            self._failed_handshake = -math.inf
+        self.journal.note(tick, safety.EventKind.MODE, self._ladder.mode, self._ladder.cause)
+
+    def _wanted(self, tick: int, row: SequenceRow | None) -> SequenceRow:
+        """Return what is asked for by whom the ladder has chosen."""
+        mode = self._ladder.mode
+        if mode is Mode.MANUAL:
+            return SequenceRow(*self.operator[1:])
+        if mode is Mode.CLASSICAL and self.process is not None and not self._handing_over(tick):
+            return self._loops.wanted(tick, self.process.y, self._guard.applied, without=self._sensors.unusable)
+        return self._guard.applied if row is None else row
+
+    def _handing_over(self, tick: int) -> bool:
+        """Tell whether the loops stand still, so that the optimiser's first sequence begins where it was told."""
+        rested = tick - self._failed_handshake > HANDSHAKE_PAUSE_S / TICK_S
+        return rested and self.operator.mode == OperatorMode.AUTO and self._player.answering
 
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
         applied = tuple(self._guard.applied)
-        self.process = Process(self.tick, measurement.load, applied, measurement.y)
-        if self._interrupted_by(measurement.load):
-            self._spare = None
-            self.next_update_tick = self.tick
+        y = tuple(self._sensors.check(measurement.y))
+        self.process = Process(self.tick, measurement.load, applied, y)
+        self._let_play(usable=not self._sensors.unusable and all(map(math.isfinite, measurement.x)))
         latched = None
-        if self.tick == self.next_update_tick and self._classical is None:
-            latched = self.update = Update(
-                session=self.session,
-                update=self.update.update + 1 if self.update else 0,
-                tick=self.tick,
-                playing=self._playing.header.number if self._playing else 0,
-                load=measurement.load,
-                u_before=tuple(self._before),
-                u=applied,
-                y=measurement.y,
-                x=measurement.x,
-            )
-            self.next_update_tick = self.tick + TICKS_PER_SAMPLE  # until the optimiser has planned another
-            self._planned = self._abandoned = self._refused = False
+        if self._player.latches(self.tick, measurement.load):
+            latched = self._player.latch(
+                Update(
+                    session=self.session, update=0, tick=self.tick, playing=0, load=measurement.load,
+                    u_before=tuple(self._before), u=applied, y=y, x=measurement.x,
+                )
+            )  # fmt: skip
+        self._watch(y)
         self.tick += 1
         self._in_scan = False
         return latched
 
-    def _interrupted_by(self, load: float) -> bool:
-        """Tell whether the load has left the one that the update under way was latched with."""
-        if self.update is None or not self._planned or not self._load_step:
-            return False
-        return abs(load - self.update.load) > self._load_step
+    def _let_play(self, *, usable: bool) -> None:
+        """Invite the optimiser, or send it away: an operator drives, or MPC would work with what is not so."""
+        invited = usable and self.operator.mode == OperatorMode.AUTO
+        if invited and not self._player.invited:
+            self._player.invite(self.tick)
+        elif not invited and self._player.invited:
+            self._player.dismiss()
 
-    def _wanted(self, tick: int) -> SequenceRow:
-        """Return what is asked for: by the loops when they drive, else by the player, else what is applied."""
-        if self._classical is not None and self.process is not None:
-            return self._classical.wanted(tick, self.process.y, self._guard.applied)
-        playing = self._playing
-        if playing is None or tick - playing.header.first_tick >= len(playing.rows):
-            return self._guard.applied
-        return playing.rows[tick - playing.header.first_tick]
+    def rejoin(self, tick: int, applied: Sequence[float]) -> None:
+        """Go on at a later tick: the plant was away, or time has leapt; `applied` is what the rack applies."""
+        self.tick = max(tick, self.tick)
+        self._in_scan = False
+        self._guard.begin_at(self.tick, SequenceRow(*applied))
 
-    def _applied_before(self, tick: int) -> SequenceRow:
-        """Return what will have been applied just before a tick to come, if nothing else arrives."""
-        playing = self._playing
-        if playing is None or not self.remaining:
-            return self._guard.applied
-        return playing.rows[min(tick - 1 - playing.header.first_tick, len(playing.rows) - 1)]
+    # -- alarms --------------------------------------------------------------------------------------------------------
 
-    @property
-    def remaining(self) -> int:
-        """Ticks of the sequence that are still to be played, the present one included."""
-        if self._playing is None:
-            return 0
-        header = self._playing.header
-        return max(0, header.first_tick + header.length - self.tick)
+    def _watch(self, y: Sequence[float]) -> None:
+        """Raise and return the alarms that depend on the process and on the ladder."""
+        holds, bands = self.alarms.holds, self._section.alarms
+        self._watch_band(AlarmKind.LEVEL_BAND, y[L1], bands.level_band)
+        self._watch_band(AlarmKind.T5_BAND, y[T5], bands.t5_band)
+        mode, cause = self._ladder.mode, self._ladder.cause
+        fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR)
+        holds(AlarmKind.MODE, condition=fallen, cause=cause)
+        exhausted = mode is not Mode.MPC and cause in (Cause.SEQUENCE_EXHAUSTED, Cause.HOLD_EXPIRED)
+        holds(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
+        holds(AlarmKind.SEQUENCE_LATE, condition=self._player.late)
+        holds(AlarmKind.OPTIMIZER_LOST, condition=not self.optimizer_present)
+        bad = self._sensors.bad
+        holds(AlarmKind.SENSOR_BAD, condition=bool(bad), cause=min(bad, default=0))
 
-    @property
-    def playing(self) -> int:
-        """Number of the sequence being played; 0 is none."""
-        return self._playing.header.number if self._playing else 0
+    def _watch_band(self, kind: AlarmKind, value: float, band: tuple[float, float]) -> None:
+        self._outside[kind] = 0 if band[0] <= value <= band[1] else self._outside[kind] + 1
+        self.alarms.holds(kind, condition=self._outside[kind] > self._section.alarms.band_ticks)
 
     # -- the optimiser's side ------------------------------------------------------------------------------------------
 
+    def optimizer_seen(self) -> None:
+        """Note a sign of life of the optimiser."""
+        self.optimizer_present = True
+        self.watchdog.trigger(self.tick)
+
+    def optimizer_lost(self) -> None:
+        """Go on without the optimiser until it shows a sign of life; the alarm is raised by the next scan's end."""
+        self.optimizer_present = False
+
+    def heartbeat(self, beat: Heartbeat) -> None:
+        """Take a sign of life that tells the optimiser's model."""
+        self.optimizer_seen()
+        wrong = beat.model_digest != self._point.model_digest
+        self.alarms.holds(AlarmKind.MODEL_MISMATCH, condition=wrong)
+
     def accept_plan(self, plan: Plan) -> bool:
         """Take the updating period of the last update; tell whether it was acceptable."""
-        earliest = self.tick + self._in_scan
-        if self.update is None or self._planned or plan.update != self.update.update:
-            return False
-        if not earliest <= plan.next_update_tick <= self.update.tick + SEQUENCE_ROWS:
-            return False
-        self.next_update_tick = plan.next_update_tick
-        self._load_step = plan.load_step
-        self._planned = True
-        return True
+        self.optimizer_seen()
+        return self._player.accept_plan(plan, self._earliest)
 
     def abandon(self) -> None:
         """Give up the update under way: an optimiser that has lost the thread asks for a new one."""
-        if self.update is not None and self._spare is None:
-            self._abandoned = True
-            self.next_update_tick = self.tick + self._in_scan
+        self._player.abandon(self._earliest)
 
     def offer(self, sequence: InputSequence) -> Acknowledgement:
         """Check a committed sequence; accept it for its first tick, or reject it with a reason."""
-        verdict = self._judge(sequence)
-        if verdict is Verdict.ACCEPTED:
-            self._spare = sequence
-            self.accepted += 1
-        else:
-            self.rejected += 1
-            self._refused = self.update is not None and sequence.header.update == self.update.update
-        self.acknowledgement = Acknowledgement(sequence.header.number, verdict)
-        return self.acknowledgement
+        self.optimizer_seen()
+        answer = self._player.offer(sequence, self._earliest)
+        accepted = answer.verdict == Verdict.ACCEPTED
+        self.alarms.holds(AlarmKind.SEQUENCE_REJECTED, condition=not accepted, cause=answer.verdict)
+        if accepted or answer.verdict == Verdict.WRONG_MODEL:
+            self.alarms.holds(AlarmKind.MODEL_MISMATCH, condition=not accepted)
+        return answer
 
-    def _judge(self, sequence: InputSequence) -> Verdict:  # noqa: PLR0911 one return for each clause of the contract
-        header, rows = sequence
-        if not 1 <= header.length == len(rows):
-            return Verdict.WRONG_LENGTH
-        if checksum(header, rows) != header.crc:
-            return Verdict.BAD_CRC
-        if header.model_digest != self._model_digest:
-            return Verdict.WRONG_MODEL
-        if header.number <= max(self.playing, self._spare.header.number if self._spare else 0):
-            return Verdict.REPEATED
-        if header.first_tick < self.tick + self._in_scan:
-            return Verdict.LATE
-        if self.update is None or not self._planned or header.update != self.update.update:
-            return Verdict.WRONG_UPDATE
-        if header.first_tick != self.next_update_tick or header.first_tick - self.update.tick != header.tau_u:
-            return Verdict.WRONG_TICK
-        if self._guard.out_of_range(rows):
-            return Verdict.OUT_OF_RANGE
-        if self._guard.exceeds(rows, header.first_tick, self._applied_before(header.first_tick)):
-            return Verdict.RATE_EXCEEDED
-        return Verdict.ACCEPTED
+    # -- the operator's side -------------------------------------------------------------------------------------------
+
+    def operate(self, operator: Operator) -> None:
+        """Let an operator decide who drives, from the next scan on."""
+        self.operator = operator
+        self._let_play(usable=not self._sensors.unusable)

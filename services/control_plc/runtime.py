@@ -1,57 +1,66 @@
 """The control PLC on the bus: client of the plant's rack, server of the optimiser and of operators.
 
 A scan makes one exchange (FC23) with the rack. In lock-step the next scan waits for what it needs: the operator's
-grant, the optimiser's plan, and at an updating instant its sequence. In real time it waits for the clock only.
+grant, the optimiser's plan, and at an updating instant its sequence, as long as an optimiser is there. In real time it
+waits for the clock only. A plant that is lost is looked for; a session goes on where the rack has it.
 """
 
 import asyncio
+import contextlib
 import logging
 import time
-from collections.abc import Awaitable, Mapping
+from collections.abc import Awaitable
 
 from coldloop import __version__
 from coldloop.clock import Pacer, Schedule
+from coldloop.errors import LinkError
 from coldloop.limits import InputLimits
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import ModelHeader, read_header
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process import TICK_S
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.common import Identity, ServiceState
+from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import (
     CONTROL_MAP,
     AwaitUpdate,
     ControlSession,
     Grant,
-    Mode,
+    Heartbeat,
+    Operator,
     Plan,
-    Process,
     SequenceHeader,
     SequenceRow,
-    Status,
+    Verdict,
 )
 from coldloop.registers.declaration import Block
-from coldloop.registers.plant import PLANT_MAP, Measurement
+from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
+from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
+from coldloop.retained import RetainedFile, RetainedStateError
+from coldloop.seal import is_intact, sealed
 from coldloop.sequence import InputSequence
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
-from control_plc.classical import ClassicalLoops
-from control_plc.program import ControlProgram
-from control_plc.settings import ControlSection, ControlSettings, Driver
+from control_plc.program import ControlProgram, OperatingPoint
+from control_plc.publication import Publication
+from control_plc.retained_state import OWNER, RetainedState
+from control_plc.settings import ControlSection, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
 
 TICKS_PER_SECOND = round(1 / TICK_S)
 LONGEST_WAIT_S = 1.0
 """Longest time that a read of the latch waits for an update; the optimiser then asks again."""
+SEARCH_S = 0.5
+"""How long one attempt to reach a lost plant may take."""
+TROUBLE_TICKS = round(60 / TICK_S)
+"""An alarm for something that happens at an instant returns when it has not happened again for so long."""
 
 
 def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:
     """Return the program that the configuration asks for, at the operating point of its model file."""
-    classical = ClassicalLoops(section.classical, limits, header.y0) if section.driver is Driver.CLASSICAL else None
-    return ControlProgram(
-        limits=limits, model_digest=header.short_digest, initial_inputs=header.u0, classical=classical
-    )
+    point = OperatingPoint(header.u0, header.y0, header.short_digest)
+    return ControlProgram(limits=limits, point=point, section=section)
 
 
 class ControlPlc:
@@ -61,7 +70,6 @@ class ControlPlc:
         header = read_header(settings.model.file)
         section = settings.control_plc
         self._settings = settings
-        self._model_digest = header.short_digest
         self._program = make_program(header, section, settings.limits)
         self._plant = RegisterClient(
             PLANT_MAP,
@@ -71,23 +79,24 @@ class ControlPlc:
             order=section.plant.word_order,
         )
         self.bank = RegisterBank(CONTROL_MAP, section.word_order)
+        self.publication = Publication(self._program, self.bank, header.short_digest)
+        file = section.retain.file
+        self._retained = RetainedFile(file, OWNER, header.short_digest) if file else None
         self._pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
         self._pacer = self._new_pacer()
         self._running = False
         self._granted = 0
         self._overruns = 0
+        self._optimizer_waits = 0
+        self._trouble: dict[AlarmKind, int] = {}
         self._news = asyncio.Event()
         self._changed = asyncio.Event()
         self._asked: ControlSession | None = None
-        self._publish_status()
-        self._publish_identity()
+        self._publish_all()
 
     def close(self) -> None:
         """Let go of the plant."""
         self._plant.close()
-
-    def _new_pacer(self) -> Pacer:
-        return Pacer(Schedule(time.monotonic(), self._pace.factor))
 
     # -- scan cycle ----------------------------------------------------------------------------------------------------
 
@@ -95,33 +104,64 @@ class ControlPlc:
         """Scan until cancelled.
 
         Raises:
-            PeerUnreachableError: The plant is not there, or does not move as it should.
+            PeerUnreachableError: The plant has never been there.
         """
         await self._plant.connect(self._settings.control_plc.plant.patience_s)
-        if self._settings.session.autostart:
-            session = self._settings.session
-            self._start(ControlSession(1, session.mode is TimeMode.REALTIME, session.factor))
+        await self._begin()
         while True:
             await self._until_due()
             await self._scan()
 
     async def _until_due(self) -> None:
         """Wait until the next scan may begin."""
+        waiting_since = time.monotonic()
         while True:
             if self._asked is not None:
                 self._start(self._asked)
             if self._running and self._pace.realtime:
-                if self._program.tick == 0:
-                    self._pacer = self._new_pacer()
-                lateness = await self._pacer.until(self._program.tick)
-                self._overruns += lateness * 1000 > self._settings.control_plc.scan_tolerance_ms
+                await self._until_clock()
                 if self._asked is None:
                     return
             elif self._may_go_on():
                 return
             else:
-                self._changed.clear()
+                await self._until_changed(waiting_since)
+
+    async def _until_clock(self) -> None:
+        """Wait for the tick; when a whole one or more has been slept through, go on at the present one."""
+        program = self._program
+        if program.tick == 0:
+            self._pacer = self._new_pacer()
+        lateness = await self._pacer.until(program.tick)
+        if lateness * 1000 > self._settings.control_plc.scan_tolerance_ms:
+            self._overruns += 1
+            self._note_trouble(AlarmKind.DEADLINE_MISSED)
+        if lateness * self._pace.factor > TICK_S:
+            program.rejoin(self._clock_tick(), program.applied)
+
+    def _clock_tick(self) -> int:
+        """Return the tick that the clock shows; in lock-step, the program's."""
+        if not self._pace.realtime:
+            return self._program.tick
+        elapsed = (time.monotonic() - self._pacer.schedule.start) * self._pace.factor
+        return max(self._program.tick, int(elapsed / TICK_S))
+
+    async def _until_changed(self, waiting_since: float) -> None:
+        """Wait until somebody writes something; an optimiser that is waited for too long is lost."""
+        self._changed.clear()
+        program = self._program
+        awaited = (
+            self._running and program.tick < self._granted and (program.awaiting_plan or program.awaiting_sequence)
+        )
+        if not awaited:
+            await self._changed.wait()
+            return
+        patience = self._settings.control_plc.ladder.optimizer_patience_s
+        try:
+            async with asyncio.timeout(waiting_since + patience - time.monotonic()):
                 await self._changed.wait()
+        except TimeoutError:
+            program.optimizer_lost()
 
     def _may_go_on(self) -> bool:
         program = self._program
@@ -134,32 +174,81 @@ class ControlPlc:
 
     async def _scan(self) -> None:
         program = self._program
-        actuators = program.begin_scan()
-        measurement = await self._plant.exchange(actuators, Measurement)
-        if not self._fits(measurement):
-            self._end_session(measurement)
+        if self._optimizer_waits:
+            program.optimizer_seen()
+        try:
+            measurement = await self._plant.exchange(sealed(program.begin_scan()), Measurement)
+        except LinkError as error:
+            await self._find_plant(str(error))
             return
+        if not is_intact(measurement):
+            await self._find_plant("a measurement arrived damaged")
+        elif measurement.session != program.session:
+            await self._leave(measurement)
+        elif measurement.tick != program.tick and not self._pace.realtime:
+            await self._find_plant(f"the plant is at tick {measurement.tick}, not {program.tick}")
+        else:
+            self._take(measurement)
+
+    def _take(self, measurement: Measurement) -> None:
+        """End the scan with its measurement, and tell what is new."""
+        program = self._program
+        events = program.journal.count
         update = program.end_scan(measurement)
+        self._end_troubles()
         if program.process is not None:
             self.bank.put(program.process)
         if update is not None or program.tick % TICKS_PER_SECOND == 0:
             self._publish_status()
+        if program.journal.count != events or program.tick % TICKS_PER_SECOND == 0:
+            self.publication.safety()
         if update is not None:
             self.bank.put(update)
             self._news.set()
             self._news = asyncio.Event()
-        self._publish_identity()
+        self.publication.identity(running=self._running)
+        self._keep()
 
-    def _fits(self, measurement: Measurement) -> bool:
-        """Tell whether the plant is where the session has it; in real time it may be a tick off."""
-        same_tick = measurement.tick == self._program.tick or self._pace.realtime
-        return measurement.session == self._program.session and same_tick
+    # -- sessions ------------------------------------------------------------------------------------------------------
 
-    def _end_session(self, measurement: Measurement) -> None:
-        """Wait for a new session: the plant was restarted, or is driven by somebody else."""
-        self._running = False
-        self._publish_status()
-        self._publish_identity()
+    async def _begin(self) -> None:
+        """Go on with the session of before a restart, or with the plant's, or wait for one."""
+        state = self._state_of_before()
+        measurement = await self._plant.read(Measurement)
+        if state is not None and state.session == measurement.session != 0:
+            self._program.alarms.rows = list(state.alarms)
+            self._pace = state.pace
+            await self._join(measurement, state.updates, state.operator)
+        elif self._settings.session.autostart:
+            if measurement.tick:
+                await self._join(measurement, 0, self._program.operator)
+            else:
+                self._start(ControlSession(measurement.session or 1, self._pace.realtime, self._pace.factor))
+
+    async def _join(self, measurement: Measurement, updates: int, operator: Operator) -> None:
+        """Go on with the plant's session where the plant is."""
+        actuators = await self._plant.read(Actuators)
+        applied = actuators[1:4] if actuators.session == measurement.session else self._program.applied
+        tick = await self._in_step(measurement.tick) if self._pace.realtime else measurement.tick
+        self._program.resume(measurement.session, tick, applied, updates=updates, operator=operator)
+        self._running = True
+        self.bank.put(operator)
+        self._publish_all()
+        log.warning("session resumed", extra={"session": measurement.session, "tick": tick})
+
+    async def _in_step(self, tick: int) -> int:
+        """Set the pacer by the plant's clock, which ticks half-way between our scans; return the tick to come."""
+        tick_s = TICK_S / self._pace.factor
+        deadline = time.monotonic() + 2 * tick_s
+        present = tick
+        while present == tick and time.monotonic() < deadline:
+            present = (await self._plant.read(Identity)).tick
+        phase = 0.5 * tick_s if present != tick else 0.0
+        self._pacer = Pacer(Schedule(time.monotonic() + phase - present * tick_s, self._pace.factor))
+        return present
+
+    async def _leave(self, measurement: Measurement) -> None:
+        """The plant was restarted, or is driven by somebody else: wait for a session, or begin with its own."""
         log.error(
             "session ended: the plant has left it",
             extra={
@@ -169,6 +258,33 @@ class ControlPlc:
                 "plant_tick": measurement.tick,
             },
         )
+        self._running = False
+        if self._settings.session.autostart and measurement.session:
+            await self._join(measurement, self._program.player.updates, self._program.operator)
+        self._publish_all()
+
+    async def _find_plant(self, reason: str) -> None:
+        """Look for the plant until it is there, and go on where it is."""
+        program = self._program
+        log.warning("plant lost", extra={"reason": reason, "tick": program.tick})
+        program.alarms.raised(AlarmKind.PLANT_LOST)
+        while True:
+            self.publication.safety()
+            with contextlib.suppress(LinkError):
+                await self._plant.connect(SEARCH_S)
+                measurement, actuators = await self._plant.read(Measurement), await self._plant.read(Actuators)
+                break
+            await asyncio.sleep(SEARCH_S / 5)
+            program.alarms.now = self._clock_tick()
+        if measurement.session != program.session:
+            await self._leave(measurement)
+            return
+        applied = actuators[1:4] if actuators.session == program.session else program.applied
+        tick = self._clock_tick() if self._pace.realtime else measurement.tick
+        program.rejoin(tick, applied)
+        program.alarms.now = tick
+        program.alarms.returned(AlarmKind.PLANT_LOST)
+        self._publish_all()
 
     def _start(self, asked: ControlSession) -> None:
         self._asked = None
@@ -177,44 +293,86 @@ class ControlPlc:
         self._granted = self._overruns = 0
         self._running = True
         self._pacer = self._new_pacer()
-        self._publish_status()
-        self._publish_identity()
+        self.bank.put(self._program.operator)
+        self._publish_all()
         log.info("session started", extra={"session": asked.session, "realtime": bool(asked.realtime)})
+
+    def _new_pacer(self) -> Pacer:
+        return Pacer(Schedule(time.monotonic(), self._pace.factor))
+
+    # -- retained state ------------------------------------------------------------------------------------------------
+
+    def _state_of_before(self) -> RetainedState | None:
+        if self._retained is None:
+            return None
+        try:
+            content = self._retained.load()
+            return None if content is None else RetainedState.parsed(content)
+        except RetainedStateError as error:
+            log.warning("retained state refused", extra={"reason": str(error)})
+            return None
+
+    def _keep(self) -> None:
+        if self._retained is None:
+            return
+        try:
+            self._retained.save(RetainedState.of(self._program, self._pace).model_dump())
+        except RetainedStateError as error:
+            log.error("no state is retained any more", extra={"reason": str(error)})  # noqa: TRY400 one line
+            self._retained = None
 
     # -- what clients write --------------------------------------------------------------------------------------------
 
     def on_write(self, block: Block) -> Awaitable[None] | None:
         """Take what a client has written; an awaitable lets its answer wait."""
-        record = block.record
+        record, program = block.record, self._program
         if record is AwaitUpdate:
             return self._await_update(self.bank.get(AwaitUpdate))
         if record is Plan:
-            self._program.accept_plan(self.bank.get(Plan))
+            program.accept_plan(self.bank.get(Plan))
         elif record is SequenceHeader:
             self._offer(self.bank.get(SequenceHeader))
         elif record is Grant:
             self._granted = self.bank.get(Grant).until_tick
         elif record is ControlSession:
             self._asked = self.bank.get(ControlSession)
+        elif record is Heartbeat:
+            program.heartbeat(self.bank.get(Heartbeat))
+        else:
+            self._command(record)
         if record is not SequenceRow:
             self._changed.set()
         return None
+
+    def _command(self, record: type[object]) -> None:
+        """Do what an operator has written."""
+        program = self._program
+        if record is Operator:
+            program.operate(self.bank.get(Operator))
+        elif record is AlarmCommand:
+            program.alarms.command(self.bank.get(AlarmCommand))
+        elif record is WatchdogTime:
+            program.watchdog.set(self.bank.get(WatchdogTime).time, program.tick)
+        else:
+            return
+        self.publication.safety()
 
     def _offer(self, header: SequenceHeader) -> None:
         rows = [self.bank.get(SequenceRow, row) for row in range(header.length)]
         answer = self._program.offer(InputSequence(header, rows))
         self.bank.put(answer)
-        if answer.verdict != 1:
-            log.warning("sequence rejected", extra={"number": answer.number, "verdict": answer.verdict})
+        if answer.verdict != Verdict.ACCEPTED:
+            self.publication.safety()
         if self._pace.realtime:
             self._publish_status()
 
     def _await_update(self, asked: AwaitUpdate) -> Awaitable[None] | None:
         """Let the answer wait for the update asked for; one who asks out of session gets the next fresh one."""
         program = self._program
+        program.optimizer_seen()
         wanted = asked.update
         if asked.session != program.session or not self._running:
-            latched = program.update
+            latched = program.player.update
             if latched is not None and not (program.awaiting_plan and latched.tick == program.tick - 1):
                 program.abandon()
                 wanted = latched.update + 1
@@ -224,12 +382,13 @@ class ControlPlc:
         return None if self._latched(wanted) else self._wait_for(wanted)
 
     def _latched(self, wanted: int) -> bool:
-        latched = self._program.update
+        latched = self._program.player.update
         return latched is not None and latched.update >= wanted
 
     async def _wait_for(self, wanted: int) -> None:
         """Wait for an update; an update of a newer session, which counts from 0 again, will do."""
         session = self._program.session
+        self._optimizer_waits += 1
         try:
             async with asyncio.timeout(LONGEST_WAIT_S):
                 while not self._latched(wanted):
@@ -238,53 +397,39 @@ class ControlPlc:
                         return
         except TimeoutError:
             return
+        finally:
+            self._optimizer_waits -= 1
+
+    def on_optimizer_departure(self) -> None:
+        """The optimiser's connection is gone: do not wait for it."""
+        self._program.optimizer_lost()
+        self._changed.set()
+
+    def on_refusal(self, kind: str) -> None:
+        """A server has refused something to somebody."""
+        if kind == "access_refused":
+            self._note_trouble(AlarmKind.ACCESS_REFUSED)
+
+    def _note_trouble(self, kind: AlarmKind) -> None:
+        """Raise an alarm for something that happens at an instant."""
+        self._trouble[kind] = self._program.tick
+        self._program.alarms.raised(kind)
+
+    def _end_troubles(self) -> None:
+        for kind, tick in list(self._trouble.items()):
+            if self._program.tick - tick > TROUBLE_TICKS:
+                del self._trouble[kind]
+                self._program.alarms.returned(kind)
 
     # -- what others see -----------------------------------------------------------------------------------------------
 
     def _publish_status(self) -> None:
-        program, record = self._program, self._pacer.record
-        self.bank.put(
-            Status(
-                mode=program.mode,
-                update=program.update.update if program.update else 0,
-                next_update_tick=program.next_update_tick,
-                playing=program.playing,
-                remaining=program.remaining,
-                accepted=program.accepted,
-                rejected=program.rejected,
-                deadline_misses=program.deadline_misses,
-                overruns=self._overruns,
-                lateness_max=record.maximum_s * 1000 if self._pace.realtime else 0.0,
-                lateness_p99=record.percentile_s(0.99) * 1000 if self._pace.realtime else 0.0,
-            )
-        )
+        self.publication.status(self._overruns, self._pacer.record if self._pace.realtime else None)
 
-    def _publish_identity(self) -> None:
-        program = self._program
-        self.bank.put(
-            Identity(
-                map_digest=CONTROL_MAP.digest,
-                map_version=CONTROL_MAP.version,
-                state=ServiceState.RUNNING if self._running else ServiceState.READY,
-                model_digest=self._model_digest,
-                session=program.session,
-                tick=program.tick,
-                heartbeat=program.tick & 0xFFFF,
-            )
-        )
-
-    def snapshot(self) -> Mapping[str, object]:
-        """Return what telemetry publishes."""
-        status, process = self.bank.get(Status), self.bank.get(Process)
-        return {
-            "session": self._program.session,
-            "tick": process.tick,
-            **status._asdict(),
-            "mode": Mode(status.mode).name.lower(),
-            "load_w": process.load,
-            "inputs": dict(zip(INPUT_NAMES, process.u, strict=True)),
-            "outputs": dict(zip(OUTPUT_NAMES, process.y, strict=True)),
-        }
+    def _publish_all(self) -> None:
+        self._publish_status()
+        self.publication.safety()
+        self.publication.identity(running=self._running)
 
 
 async def serve(settings: ControlSettings) -> None:
@@ -297,7 +442,8 @@ async def serve(settings: ControlSettings) -> None:
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(plc.run(), name="scan cycle")
-            tasks.create_task(Telemetry(settings.telemetry, "control_plc", plc.snapshot).run(), name="telemetry")
+            telemetry = Telemetry(settings.telemetry, "control_plc", plc.publication.snapshot)
+            tasks.create_task(telemetry.run(), name="telemetry")
     finally:
         plc.close()
         await server.close()

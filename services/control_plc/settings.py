@@ -3,16 +3,19 @@
 from enum import StrEnum
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from coldloop.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
 from coldloop.limits import InputLimits
 from coldloop.modbus.settings import ServerSettings
 from coldloop.model_settings import ModelSettings
+from coldloop.process import TICK_S
 from coldloop.registers.codec import WordOrder
+from coldloop.retained import RetainSettings
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
 from control_plc.classical import ClassicalSettings
+from control_plc.sensors import SensorCheckSettings
 
 
 class ControlServer(ServerSettings):
@@ -36,6 +39,47 @@ class Driver(StrEnum):
     """The classical loops; no update is latched, and the optimiser idles."""
 
 
+class LadderSettings(BaseModel):
+    """How long each rung of the fail-safe ladder bears."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    hold_s: Annotated[float, Field(ge=0)] = 30.0
+    """How long the last value holds before the classical loops take over."""
+    optimizer_timeout_s: Annotated[float, Field(ge=0, le=16_000)] = 15.0
+    """An optimiser that gives no sign of life for so long is lost; 0 is never. Plant time, longer than any tau_u."""
+    optimizer_patience_s: Annotated[float, Field(gt=0)] = 5.0
+    """In lock-step plant time stands while the optimiser is waited for: it is lost after so long in real time."""
+
+    @property
+    def hold_ticks(self) -> int:
+        """The hold, in ticks."""
+        return round(self.hold_s / TICK_S)
+
+    @property
+    def optimizer_ticks(self) -> int:
+        """The time-out, in ticks."""
+        return round(self.optimizer_timeout_s / TICK_S)
+
+
+class AlarmSettings(BaseModel):
+    """When the alarms of the process are raised."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    level_band: tuple[FiniteFloat, FiniteFloat] = (59.0, 61.0)
+    """L1, %."""
+    t5_band: tuple[FiniteFloat, FiniteFloat] = (9.0, 16.0)
+    """T5, K."""
+    band_delay_s: Annotated[float, Field(ge=0)] = 5.0
+    """How long an output must be outside."""
+
+    @property
+    def band_ticks(self) -> int:
+        """That delay, in ticks."""
+        return round(self.band_delay_s / TICK_S)
+
+
 class ControlSection(BaseModel):
     """Section `control_plc` of the configuration."""
 
@@ -48,6 +92,10 @@ class ControlSection(BaseModel):
     """Lateness of a scan, in real time, that counts as an overrun."""
     driver: Driver = Driver.MPC
     classical: ClassicalSettings = ClassicalSettings()
+    ladder: LadderSettings = LadderSettings()
+    sensors: SensorCheckSettings = SensorCheckSettings()
+    alarms: AlarmSettings = AlarmSettings()
+    retain: RetainSettings = RetainSettings()
 
 
 class ControlSettings(BaseModel):

@@ -118,6 +118,8 @@ class OptimizerProgram:
 
     def plan(self, update: Update) -> Plan:
         """Take the update latched at t_i and decide the updating period that begins there."""
+        if not update.playing and self._playing.sequence is not None:
+            self._begin_again(update)
         interrupted = self._return_to(update)
         estimate = self._estimator.correct(update)
         self._follow(update)
@@ -132,6 +134,13 @@ class OptimizerProgram:
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
         return Plan(update.update, update.tick + ticks, load_step)
+
+    def _begin_again(self, update: Update) -> None:
+        """Forget what was sent: others have moved the inputs since, from which the next profile sets out."""
+        self._estimator.reset()
+        u = np.asarray(update.u, self._real) - self._prediction.u0
+        self._playing = Delivery(self._problem.hold(u), self._playing.situation._replace(u_before=u), update.tick, None)
+        self._sent = self._last = None
 
     def _return_to(self, update: Update) -> bool:
         """Predict to this instant if another one was planned; tell whether a load step has cut the period off."""

@@ -6,14 +6,14 @@ import time
 from collections.abc import Mapping
 
 from coldloop import __version__
-from coldloop.errors import ModelFileError
+from coldloop.errors import ModelFileError, PeerUnreachableError
 from coldloop.lti_model import load
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process import TICK_S
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
-from coldloop.registers.control_plc import CONTROL_MAP, Acknowledgement, AwaitUpdate, Status, Update, Verdict
+from coldloop.registers.control_plc import CONTROL_MAP, Acknowledgement, AwaitUpdate, Heartbeat, Status, Update, Verdict
 from coldloop.registers.declaration import Block
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, OPTIMIZER_MAP, Optimization, OptimizerSession
 from coldloop.sequence import InputSequence
@@ -28,6 +28,10 @@ ROWS_WITH_HEADER = 18
 """Rows that fit into one request with the header that commits them."""
 LOOK_OUT_S = TICK_S / 8
 """Plant time between two looks for a load step in real time: the new computation begins so much later."""
+HEARTBEAT_S = 1.0
+"""Plant time between two signs of life while an answer is computed."""
+SEARCH_S = 0.2
+"""Between two attempts to reach a lost control PLC."""
 STRANGER = AwaitUpdate(session=0, update=0)
 """Asks for a fresh update, whatever the session."""
 
@@ -49,6 +53,7 @@ class OptimizerPlc:
         self.bank = RegisterBank(OPTIMIZER_MAP, section.word_order)
         self._pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
         self._session = 0
+        self._beats = 0
         self._last: Optimization | None = None
         self._publish_identity(0)
 
@@ -57,14 +62,32 @@ class OptimizerPlc:
         self._control.close()
 
     async def run(self) -> None:
-        """Serve one update after the other until cancelled.
+        """Serve one update after the other until cancelled; a control PLC that is lost is looked for.
 
         Raises:
-            PeerUnreachableError: The control PLC is not there.
+            PeerUnreachableError: The control PLC has never been there.
             ModelFileError: The control PLC runs another model.
         """
-        await self._control.connect(self._settings.optimizer_plc.control_plc.patience_s)
-        await self._same_model()
+        patience_s = self._settings.optimizer_plc.control_plc.patience_s
+        await self._control.connect(patience_s)
+        while True:
+            try:
+                await self._introduce()
+                await self._serve_updates()
+            except PeerUnreachableError as error:
+                log.warning("control PLC lost", extra={"reason": str(error)})
+                await self._find_control_plc()
+
+    async def _find_control_plc(self) -> None:
+        while True:
+            try:
+                await self._control.connect(SEARCH_S)
+            except PeerUnreachableError:
+                await asyncio.sleep(SEARCH_S)
+            else:
+                return
+
+    async def _serve_updates(self) -> None:
         wanted = STRANGER
         while True:
             update = await self._control.exchange(wanted, Update)
@@ -77,13 +100,20 @@ class OptimizerPlc:
             elif update.session != wanted.session:
                 wanted = STRANGER
 
-    async def _same_model(self) -> None:
+    async def _introduce(self) -> None:
+        """Tell the control PLC our model, and make sure that it is its own."""
+        await self._beat()
         theirs = (await self._control.read(Identity)).model_digest
         if theirs != self._program.model_digest:
             raise ModelFileError(
                 f"{self._control.peer} runs model {theirs:08x}, this optimiser {self._program.model_digest:08x} "
                 f"({self._settings.model.file}): give both PLCs the same model.file"
             )
+
+    async def _beat(self) -> Status:
+        """Give a sign of life; return how the control PLC is."""
+        self._beats = (self._beats + 1) & 0xFFFF
+        return await self._control.exchange(Heartbeat(self._beats, self._program.model_digest), Status)
 
     def _is_news(self, update: Update, wanted: AwaitUpdate) -> bool:
         """Tell an awaited update from the old one that the control PLC answers with when nothing happens."""
@@ -125,15 +155,16 @@ class OptimizerPlc:
 
     async def _computed(self, ready: float, update: Update, *, interruptible: bool) -> bool:
         """Wait until the PLC would have its answer; tell whether no load step has cut it off before."""
+        look_s = (LOOK_OUT_S if interruptible else HEARTBEAT_S) / self._pace.factor
         while (remaining := ready - time.monotonic()) > 0.0:
-            await asyncio.sleep(min(remaining, LOOK_OUT_S / self._pace.factor) if interruptible else remaining)
-            if interruptible and await self._interrupted(update):
+            await asyncio.sleep(min(remaining, look_s))
+            if await self._interrupted(update) and interruptible:
                 return False
         return True
 
     async def _interrupted(self, update: Update) -> bool:
         """Tell whether the control PLC has latched another update since."""
-        return (await self._control.read(Status)).update > update.update
+        return (await self._beat()).update > update.update
 
     async def _deliver(self, sequence: InputSequence) -> Verdict:
         """Send a sequence, the header that commits it last; return what the control PLC thinks of it."""

@@ -1,9 +1,10 @@
 """The plant as a program: inputs in, one tick forward, measurements out. No sockets, no clock."""
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
+from typing import Any
 
 import numpy as np
 
@@ -88,6 +89,7 @@ class PlantProgram:
         helium = load_helium()
         self.tick = 0
         self._tick_s = tick_s
+        self._parameters = box
         self._box, self._helium = plain_tuples(box), plain_tuples(helium)
         self._x = _vector(x0, STATE_NAMES, "states")
         self._u = _vector(u0, INPUT_NAMES, "inputs")
@@ -96,6 +98,23 @@ class PlantProgram:
         self._generator = np.random.Generator(np.random.PCG64(noise.seed if noise else 0))
         self._measured = self._sample(outputs(self._x, self._u, self.load, box, helium))
         self._step()  # no session waits for the compiler
+
+    def resume(self, tick: int, x: Sequence[float], u: Sequence[float], noise_state: Mapping[str, Any]) -> None:
+        """Go on from what `retained` told.
+
+        Raises:
+            ValueError: it is not of this plant.
+        """
+        self.tick = tick
+        self._x = _vector(x, STATE_NAMES, "states")
+        self._u = _vector(u, INPUT_NAMES, "inputs")
+        self._generator.bit_generator.state = noise_state
+        self._measured = self._sample(outputs(self._x, self._u, self.load, self._parameters, load_helium()))
+
+    def retained(self) -> dict[str, Any]:
+        """Return what `resume` needs, as plain data."""
+        noise_state = self._generator.bit_generator.state
+        return {"tick": self.tick, "x": self._x.tolist(), "u": self._u.tolist(), "noise_state": noise_state}
 
     @property
     def state(self) -> tuple[float, ...]:

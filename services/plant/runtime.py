@@ -6,6 +6,7 @@ real time the plant moves by the clock, half a tick away from the scans, whateve
 
 import asyncio
 import logging
+import math
 import time
 from collections.abc import Mapping
 from functools import cache
@@ -28,17 +29,26 @@ from coldloop.registers.plant import (
     Measurement,
     PlantSample,
     PlantSession,
+    SensorFault,
+    SensorFaultKind,
 )
+from coldloop.registers.safety import WatchdogTime
+from coldloop.retained import RetainedFile, RetainedStateError
+from coldloop.seal import is_intact, sealed
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
+from coldloop.watchdog import Watchdog
 from plant.cold_box import REFERENCE
 from plant.helium.properties import load_helium
 from plant.load import find_load
 from plant.model import parameters_digest
 from plant.program import LoadProfile, MeasurementNoise, PlantProgram
-from plant.settings import PlantSettings, SensorSettings
+from plant.settings import PlantSettings, SafeAction, SensorSettings
 
 log = logging.getLogger("coldloop.plant")
+
+OWNER = "plant/1"
+"""Who retained states belong to, and the version of what they hold."""
 
 
 def own_header(file: Path) -> ModelHeader:
@@ -73,8 +83,13 @@ class PlantRack:
         self._settings = settings
         self._header = own_header(settings.model.file)
         self.bank = RegisterBank(PLANT_MAP, settings.plant.word_order)
+        self._watchdog = Watchdog(settings.plant.watchdog.ticks)
+        self._faults: dict[int, float] = {}
+        file = settings.plant.retain.file
+        self._retained = RetainedFile(file, OWNER, self._header.short_digest) if file else None
         load = find_load(settings.plant.load, self._header.w0)
         self._begin(1 if settings.session.autostart else 0, self._configured_pace(), load, settings.plant.seed)
+        self._resume()
 
     def _configured_pace(self) -> Pace:
         session = self._settings.session
@@ -82,12 +97,52 @@ class PlantRack:
 
     def _begin(self, session: int, pace: Pace, load: LoadProfile, seed: int) -> None:
         self._program = make_program(self._header, self._settings.plant.sensors, load, seed)
-        self._session, self._pace = session, pace
-        self._applied = tuple(self._header.u0)
+        self._session, self._pace, self._load, self._seed = session, pace, load, seed
+        self._applied = self._header.u0
         self._moving = False
         self._clock: asyncio.Task[None] | None = None
+        self._watchdog.set(self._watchdog.time, 0)
+        self._faults.clear()
         self.bank.put(self._measurement())
         self._publish()
+
+    # -- retained state ------------------------------------------------------------------------------------------------
+
+    def _resume(self) -> None:
+        """Go on where a session was when the rack was ended, if that was kept."""
+        if self._retained is None:
+            return
+        try:
+            content = self._retained.load()
+            if content is None:
+                return
+            load = LoadProfile(tuple(content["times"]), tuple(content["watts"]))
+            self._begin(content["session"], Pace(*content["pace"]), load, content["seed"])
+            self._program.resume(**content["program"])
+        except (RetainedStateError, KeyError, TypeError, ValueError) as error:
+            log.warning("retained state refused", extra={"reason": str(error)})
+            return
+        tick = self._program.tick
+        cv155, ncr22, cv156 = content["program"]["u"]
+        self._applied = cv155, ncr22, cv156
+        self._watchdog.set(self._watchdog.time, tick)
+        self.bank.put(sealed(Actuators(tick, *self._applied, self._session)))
+        self.bank.put(self._measurement())
+        self._publish()
+        log.warning("session resumed", extra={"session": self._session, "tick": tick})
+
+    def _keep(self) -> None:
+        if self._retained is None or not self._session:
+            return
+        state = {
+            "session": self._session, "pace": self._pace, "times": self._load.times, "watts": self._load.watts,
+            "seed": self._seed, "program": self._program.retained(),
+        }  # fmt: skip
+        try:
+            self._retained.save(state)
+        except RetainedStateError as error:
+            log.error("no state is retained any more", extra={"reason": str(error)})  # noqa: TRY400 one line
+            self._retained = None
 
     def on_write(self, block: Block) -> None:
         """Take what a client has written."""
@@ -95,6 +150,21 @@ class PlantRack:
             self._exchange(self.bank.get(Actuators))
         elif block.record is PlantSession:
             self._start_session(self.bank.get(PlantSession))
+        elif block.record is WatchdogTime:
+            self._watchdog.set(self.bank.get(WatchdogTime).time, self._program.tick)
+        elif block.record is SensorFault:
+            self._set_faults()
+
+    def _set_faults(self) -> None:
+        """Take the sensors' faults; a frozen one keeps showing what it shows now."""
+        shown = self._measurement().y
+        rows = [self.bank.get(SensorFault, row) for row in range(len(OUTPUT_NAMES))]
+        values = {
+            SensorFaultKind.NOT_A_NUMBER: lambda row: math.nan,  # noqa: ARG005 - one signature for all kinds
+            SensorFaultKind.FROZEN: lambda row: shown[row],
+            SensorFaultKind.VALUE: lambda row: rows[row].value,
+        }
+        self._faults = {row: values[SensorFaultKind(fault.kind)](row) for row, fault in enumerate(rows) if fault.kind}
 
     # -- sessions ------------------------------------------------------------------------------------------------------
 
@@ -109,13 +179,14 @@ class PlantRack:
     # -- exchange ------------------------------------------------------------------------------------------------------
 
     def _exchange(self, asked: Actuators) -> None:
-        if asked.session != self._session:
+        if asked.session != self._session or not is_intact(asked):
             return
         if self._moving:  # the next request came in before the plant had moved on
             self._advance()
         self._applied = (asked.cv155, asked.ncr22, asked.cv156)
         self._program.apply(self._applied)
-        self.bank.put(self._measurement())
+        self._watchdog.trigger(self._program.tick)
+        self.bank.put(sealed(self._measurement()))
         loop = asyncio.get_running_loop()
         if self._pace.realtime:
             if self._clock is None:
@@ -135,7 +206,20 @@ class PlantRack:
             program.tick % HISTORY_ROWS,
         )
         program.advance()
+        self._watch()
         self._publish()
+        self._keep()
+
+    def _watch(self) -> None:
+        """Bring the outputs into their safe state when the control PLC has been silent for too long."""
+        tick, watchdog = self._program.tick, self._settings.plant.watchdog
+        if not self._watchdog.check(tick):
+            return
+        log.warning("watchdog expired", extra={"tick": tick, "action": watchdog.action})
+        if watchdog.action is SafeAction.SAFE:
+            self._applied = watchdog.safe_state
+            self._program.apply(self._applied)
+            self.bank.put(sealed(Actuators(tick, *self._applied, self._session)))  # the control PLC reads them back
 
     async def _run_by_the_clock(self) -> None:
         pacer = Pacer(Schedule(time.monotonic(), self._pace.factor))
@@ -149,10 +233,14 @@ class PlantRack:
 
     def _measurement(self) -> Measurement:
         program = self._program
-        return Measurement(program.tick, program.load, program.measure(), program.state, self._session)
+        y = program.measure()
+        if self._faults:
+            y = tuple(self._faults.get(output, value) for output, value in enumerate(y))
+        return Measurement(program.tick, program.load, y, program.state, self._session)
 
     def _publish(self) -> None:
         program = self._program
+        self.bank.put(self._watchdog.registers(program.tick))
         self.bank.put(
             Identity(
                 map_digest=PLANT_MAP.digest,

@@ -1,5 +1,6 @@
 """Configuration of the plant service, checked when it is made and immutable after."""
 
+from enum import StrEnum
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -7,11 +8,15 @@ from pydantic import BaseModel, ConfigDict, Field
 from coldloop.endpoints import PLANT_PORT
 from coldloop.modbus.settings import ServerSettings
 from coldloop.model_settings import ModelSettings
+from coldloop.process import TICK_S
 from coldloop.registers.codec import WordOrder
+from coldloop.retained import RetainSettings
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
 
 Deviation = Annotated[float, Field(ge=0)]
+Percent = Annotated[float, Field(ge=0, le=100)]
+Power = Annotated[float, Field(ge=0, le=1000)]
 
 
 class SensorSettings(BaseModel):
@@ -34,6 +39,32 @@ class SensorSettings(BaseModel):
         return (self.level, self.speed, *[self.temperature] * 10, *[self.pressure] * 10)
 
 
+class SafeAction(StrEnum):
+    """What the rack does with its outputs when the control PLC is silent."""
+
+    HOLD = "hold"
+    """It leaves them as they are."""
+    SAFE = "safe"
+    """It applies `safe_state`."""
+
+
+class WatchdogSettings(BaseModel):
+    """The rack's watchdog over the control PLC."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    timeout_s: Annotated[float, Field(ge=0, le=16_000)] = 10.0
+    """Plant time without new outputs after which it expires; 0 is never. In lock-step plant time then stands."""
+    action: SafeAction = SafeAction.HOLD
+    safe_state: tuple[Percent, Power, Percent] = (43.0, 75.0, 36.0)
+    """CV155 %, NCR22_A W, CV156 %."""
+
+    @property
+    def ticks(self) -> int:
+        """The time-out, in ticks."""
+        return round(self.timeout_s / TICK_S)
+
+
 class PlantServer(ServerSettings):
     """The rack's server."""
 
@@ -52,6 +83,8 @@ class PlantSection(BaseModel):
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     """Seed of the sensors' noise."""
     sensors: SensorSettings = SensorSettings()
+    watchdog: WatchdogSettings = WatchdogSettings()
+    retain: RetainSettings = RetainSettings()
 
 
 class PlantSettings(BaseModel):

@@ -5,21 +5,26 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from coldloop.limits import InputLimits
+from coldloop.model_file import read_header
+from coldloop.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.plant import Actuators, Measurement
 from coldloop.sequence import InputSequence, sealed
-from control_plc.program import ControlProgram
+from control_plc.program import ControlProgram, OperatingPoint
+from control_plc.settings import ControlSection
 
 MODEL = 0xC01D1005
+HEADER = read_header(DEFAULT_MODEL_FILE)
 INITIAL = SequenceRow(43.0, 75.0, 36.0)
 
 
 class Bench:
     """A control program in its first session, driven scan by scan."""
 
-    def __init__(self, limits: InputLimits) -> None:
-        self.program = ControlProgram(limits=limits, model_digest=MODEL, initial_inputs=INITIAL)
+    def __init__(self, limits: InputLimits, section: ControlSection | None = None) -> None:
+        point = OperatingPoint(tuple(INITIAL), HEADER.y0, MODEL)
+        self.program = ControlProgram(limits=limits, point=point, section=section or ControlSection())
         self.program.restart(session=1)
         self.number = 0
         self.load = 384.0
@@ -38,15 +43,15 @@ class Bench:
 
     def plan(self, ticks: int, load_step: float = 0.0) -> bool:
         """Plan the next updating instant so many ticks after the last one, or at a load step."""
-        update = self.program.update
+        update = self.program.player.update
         assert update is not None
         return self.program.accept_plan(Plan(update.update, update.tick + ticks, load_step))
 
     def sequence(self, rows: Sequence[SequenceRow], **changed: int) -> InputSequence:
         """Return a sealed answer to the last update, with header fields changed before it is sealed."""
-        update = self.program.update
+        update = self.program.player.update
         assert update is not None
-        first = self.program.next_update_tick or 0
+        first = self.program.player.next_update_tick or 0
         self.number += 1
         header = SequenceHeader(
             number=self.number,
@@ -64,8 +69,8 @@ class Bench:
         assert self.plan(ticks)
         offered = self.offer(self.sequence(rows))
         assert offered.verdict == Verdict.ACCEPTED, Verdict(offered.verdict).name
-        assert self.program.next_update_tick is not None
-        return self.scans(self.program.next_update_tick - self.program.tick)
+        assert self.program.player.next_update_tick is not None
+        return self.scans(self.program.player.next_update_tick - self.program.tick)
 
     def offer(self, sequence: InputSequence) -> Acknowledgement:
         return self.program.offer(sequence)

@@ -200,7 +200,7 @@ def test_the_loops_drive_from_the_first_measurement_on_and_no_update_is_latched(
     assert applied[:PERIOD] == [REST] * PERIOD
     assert applied[PERIOD].ncr22 == pytest.approx(REST.ncr22 + 100.0 * 5.0 / 300.0)
     assert len(set(applied)) == 3, "one move each 5 s"
-    assert program.deadline_misses == 0
+    assert program.player.deadline_misses == 0
 
 
 def test_a_new_session_begins_as_the_first_did() -> None:

@@ -20,7 +20,7 @@ def test_a_load_step_latches_an_update_and_what_is_played_goes_on(bench: "Bench"
     assert bench.plan(10, load_step=10.0)
     assert bench.offer(bench.sequence([at(0.2)] * 20)).verdict == Verdict.ACCEPTED
     bench.scans(3)
-    before = bench.program.update
+    before = bench.program.player.update
     bench.load += 10.5
     applied, update = bench.scan()
     assert applied == as_transmitted(at(0.1))
@@ -72,4 +72,4 @@ def test_lock_step_does_not_wait_for_ever_for_an_optimiser_whose_answer_was_refu
     assert bench.offer(bench.sequence([at(30.0)] * 20)).verdict == Verdict.OUT_OF_RANGE
     assert not bench.program.awaiting_sequence
     assert bench.scan()[1] is not None
-    assert bench.program.deadline_misses == 1
+    assert bench.program.player.deadline_misses == 1

@@ -99,7 +99,7 @@ FAULTS = {
 
 
 def test_the_faults_reach_every_verdict_of_a_rejection() -> None:
-    assert set(FAULTS.values()) == set(Verdict) - {Verdict.NONE, Verdict.ACCEPTED}
+    assert set(FAULTS.values()) == set(Verdict) - {Verdict.NONE, Verdict.ACCEPTED, Verdict.NOT_INVITED}
 
 
 @pytest.mark.parametrize(("fault", "verdict"), FAULTS.items(), ids=FAULTS)
@@ -109,11 +109,14 @@ def test_a_faulty_sequence_is_rejected_with_its_reason_and_never_reaches_the_act
     sequence = wrong(playing, at, fault)
     assert playing.offer(sequence) == Acknowledgement(sequence.header.number, verdict)
     program = playing.program
-    assert program.acknowledgement == Acknowledgement(sequence.header.number, verdict)
-    assert (program.accepted, program.rejected, program.playing) == (1, 1, 1)
+    assert program.player.acknowledgement == Acknowledgement(sequence.header.number, verdict)
+    assert (program.player.accepted, program.player.rejected, program.player.playing) == (1, 1, 1)
     expected = as_transmitted(at(0.3))
     assert set(playing.scans(38)) == {expected}
-    assert (program.playing, program.deadline_misses) == (1, 2)  # its own instant, and the silence after it
+    assert (program.player.playing, program.player.deadline_misses) == (
+        1,
+        2,
+    )  # its own instant, and the silence after it
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -130,7 +133,7 @@ def test_a_fault_after_a_right_sequence_does_not_displace_it(playing: "Bench", a
     assert playing.offer(playing.sequence([at(0.4)] * 20)).verdict == Verdict.ACCEPTED
     playing.offer(wrong(playing, at, fault))
     assert playing.scans(10)[7:] == [as_transmitted(at(0.4))] * 3
-    assert playing.program.playing == 2
+    assert playing.program.player.playing == 2
 
 
 def test_a_sequence_before_its_plan_answers_no_update(bench: "Bench", at: At) -> None:
@@ -157,7 +160,7 @@ def test_an_answer_is_late_from_the_moment_its_scan_begins(bench: "Bench", at: A
     assert bench.offer(sequence).verdict == Verdict.LATE
     bench.program.end_scan(bench.measurement(actuators))
     assert bench.offer(sequence).verdict == Verdict.LATE
-    assert bench.program.deadline_misses == 1
+    assert bench.program.player.deadline_misses == 1
 
 
 def test_an_answer_that_comes_just_before_its_scan_is_in_time(bench: "Bench", at: At) -> None:
@@ -209,7 +212,7 @@ def test_with_elapsed_rates_a_missed_deadline_does_not_widen_what_is_accepted(
     bench.scan()
     assert bench.plan(10)
     bench.scans(10)
-    assert bench.program.deadline_misses == 1
+    assert bench.program.player.deadline_misses == 1
     assert bench.plan(15)
     offered = bench.offer(bench.sequence([at(0.4)] * 20))
     assert offered.verdict == Verdict.RATE_EXCEEDED or bench.scans(15)[-1] == as_transmitted(at(0.4))
@@ -246,7 +249,7 @@ def test_what_is_accepted_is_what_is_applied(
             return
         for value, asked, low, high in zip(now, sequence.rows[0], limits.low, limits.high, strict=True):
             assert abs(value - asked) <= 1.1e-5 * (high - low)
-    played = bench.program.playing
+    played = bench.program.player.playing
     if played:
         for asked_row, applied in zip(sequence.rows[1:], bench.scans(len(sequence.rows) - 1), strict=True):
             for value, asked, low, high in zip(applied, asked_row, limits.low, limits.high, strict=True):

@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 import optimizer_plc.program
 from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel, load
+from coldloop.model_file import read_header
 from coldloop.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.plant import Measurement
 from coldloop.sequence import InputSequence
-from control_plc.program import ControlProgram
+from control_plc.runtime import make_program
+from control_plc.settings import ControlSection
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
@@ -147,9 +149,7 @@ def recorded_jumps(model: LtiModel, hour: str, minutes: float) -> list[Jump]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(optimizer_plc.program, "make_solver", lambda _settings: recorder)
         optimizer = OptimizerProgram(model, ProgramSettings(updating_period_s=5.0), InputLimits())
-    control = ControlProgram(
-        limits=InputLimits(), model_digest=model.short_digest, initial_inputs=tuple(model.u0.tolist())
-    )
+    control = make_program(read_header(DEFAULT_MODEL_FILE), ControlSection(), InputLimits())
     control.restart(session=1)
     plant = PlantProgram(
         box=REFERENCE, x0=model.x0.tolist(), u0=model.u0.tolist(), load=find_load(hour, model.w0), noise=None

@@ -159,7 +159,7 @@ class Acknowledgement(NamedTuple):
 class Heartbeat(NamedTuple):
     """Sign of life of the optimiser, besides its other requests."""
 
-    count: Annotated[int, u16("Any number; writing it is what counts")]
+    beat: Annotated[int, u16("Any number; writing it is what counts")]
     model_digest: Annotated[int, u32("First 32 bits of the digest of the optimiser's prediction model")]
 
 

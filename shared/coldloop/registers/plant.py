@@ -21,6 +21,9 @@ class Actuators(NamedTuple):
     ncr22: Annotated[float, f32("Actuator part of the bath heater's power", unit="W", low=0, high=1000)]
     cv156: Annotated[float, f32("Opening of the turbine valve", unit="%", low=0, high=100)]
     session: Annotated[int, u32("Session that these outputs belong to")]
+    crc: Annotated[
+        int, u32("CRC-32 of the registers before; 0 is none, a wrong one leaves the outputs as they are")
+    ] = 0
 
 
 class Measurement(NamedTuple):
@@ -31,6 +34,7 @@ class Measurement(NamedTuple):
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
     x: Annotated[tuple[float, ...], f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS)]
     session: Annotated[int, u32("Session")]
+    crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
 class SensorFaultKind(IntEnum):

@@ -75,7 +75,7 @@ class Alarm(NamedTuple):
     cause: Annotated[
         int, u16("Cause: of a mode its ladder cause, of a sensor its output, of a sequence its verdict")
     ] = 0
-    count: Annotated[int, u16("Times that it was raised")] = 0
+    times: Annotated[int, u16("Times that it was raised")] = 0
     raised: Annotated[int, u32("Tick at which it was last raised")] = 0
     returned: Annotated[int, u32("Tick at which the condition last ended")] = 0
 

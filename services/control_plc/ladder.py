@@ -1,0 +1,60 @@
+"""The fail-safe ladder: who decides the outputs of a scan.
+
+    MPC        a sequence, within the updating period it was sent for
+    REST       the rest of a sequence: the next one is late
+    HOLD       the sequence is exhausted: its last value, for a set time
+    CLASSICAL  the PI loops, until a sequence is accepted again
+
+An operator may take the ladder away (CLASSICAL, MANUAL). A bad sensor that MPC needs leads to CLASSICAL at once.
+"""
+
+from dataclasses import dataclass
+
+from coldloop.registers.control_plc import Cause, Mode, OperatorMode
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What the choice depends on."""
+
+    operator: OperatorMode
+    sensors_unusable: bool
+    row: bool
+    """There is a row to be played."""
+    late: bool
+    """It is the rest of a sequence whose successor is late."""
+
+
+class Ladder:
+    """Where the ladder stands; `since` is the tick at which the mode began."""
+
+    def __init__(self, hold_ticks: int, mode: Mode, cause: Cause, tick: int = 0) -> None:
+        self._hold_ticks = hold_ticks
+        self.mode, self.cause, self.since = mode, cause, tick
+
+    def step(self, tick: int, situation: Situation) -> bool:
+        """Choose the mode of this scan; tell whether it has changed."""
+        mode, cause = self._chosen(tick, situation)
+        if mode is self.mode:
+            return False
+        self.mode, self.cause, self.since = mode, cause, tick
+        return True
+
+    def _chosen(self, tick: int, situation: Situation) -> tuple[Mode, Cause]:
+        if situation.operator is OperatorMode.MANUAL:
+            return Mode.MANUAL, Cause.OPERATOR
+        if situation.operator is OperatorMode.CLASSICAL:
+            return Mode.CLASSICAL, Cause.OPERATOR
+        if situation.sensors_unusable:
+            return Mode.CLASSICAL, Cause.SENSOR_BAD
+        if situation.row:
+            return (Mode.REST, Cause.SEQUENCE_LATE) if situation.late else (Mode.MPC, Cause.SEQUENCE_BEGAN)
+        return self._without_sequence(tick)
+
+    def _without_sequence(self, tick: int) -> tuple[Mode, Cause]:
+        if self.mode is Mode.CLASSICAL:
+            return self.mode, self.cause
+        if self.mode is Mode.HOLD:
+            expired = tick - self.since >= self._hold_ticks
+            return (Mode.CLASSICAL, Cause.HOLD_EXPIRED) if expired else (self.mode, self.cause)
+        return Mode.HOLD, Cause.OPERATOR if self.mode is Mode.MANUAL else Cause.SEQUENCE_EXHAUSTED

@@ -1,0 +1,183 @@
+"""The sequence player: updating instants, plans, the sequence contract, and the rows that are played.
+
+Pure. `tick` is the tick of the scan in progress; `earliest` the first tick that can still be changed: the next scan's.
+"""
+
+from coldloop.process import TICKS_PER_SAMPLE
+from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, SequenceRow, Update, Verdict
+from coldloop.sequence import InputSequence, checksum
+from control_plc.guard import OutputGuard
+
+
+class SequencePlayer:
+    """Plays what the optimiser sends, and refuses what breaks the contract."""
+
+    def __init__(self, guard: OutputGuard, model_digest: int, *, updates: int = 0) -> None:
+        self._guard = guard
+        self._model_digest = model_digest
+        self._updates = updates
+        self._playing: InputSequence | None = None
+        self._spare: InputSequence | None = None
+        self._load_step = 0.0
+        self._planned = self._abandoned = self._refused = False
+        self.update: Update | None = None
+        self.next_update_tick = 0
+        self.invited = True
+        self.late = False
+        """The updating instant of what is being played has passed without a new sequence."""
+        self.acknowledgement = Acknowledgement(0, Verdict.NONE)
+        self.accepted = self.rejected = self.deadline_misses = 0
+
+    # -- what a lock-step runtime waits for ----------------------------------------------------------------------------
+
+    @property
+    def awaiting_plan(self) -> bool:
+        """The last update has no updating period yet."""
+        return self.invited and self.update is not None and not self._planned and not self._abandoned
+
+    def awaiting_sequence(self, tick: int) -> bool:
+        """An updating instant has come and its sequence has not; one that a load step may cut off is due at once."""
+        due = tick == self.next_update_tick and tick > 0
+        wanted = due or (self._planned and self._load_step > 0)
+        return self.invited and wanted and self._spare is None and not self._abandoned and not self._refused
+
+    @property
+    def answering(self) -> bool:
+        """The optimiser has planned the update under way, so its sequence is to be expected."""
+        return self._planned and not self._refused
+
+    # -- scan ----------------------------------------------------------------------------------------------------------
+
+    def begin(self, tick: int) -> bool:
+        """Tell whether a sequence begins at this tick; an updating instant without one is a miss."""
+        if self._spare is not None and self._spare.header.first_tick <= tick:
+            self._playing, self._spare, self.late = self._spare, None, False
+            return True
+        if self.invited and tick >= self.next_update_tick and tick > 0:
+            self.deadline_misses += self.update is not None
+            self.late = self.update is not None
+        return False
+
+    def row(self, tick: int) -> SequenceRow | None:
+        """Return the row that is to be played at this tick, if there is one."""
+        playing = self._playing
+        if playing is None or not 0 <= tick - playing.header.first_tick < len(playing.rows):
+            return None
+        return playing.rows[tick - playing.header.first_tick]
+
+    def latches(self, tick: int, load: float) -> bool:
+        """Tell whether an update is to be latched at the end of this scan: its instant, or a load step that cuts it."""
+        if not self.invited:
+            return False
+        if self._interrupted_by(load):
+            self._spare = None
+            self.next_update_tick = tick
+        return tick >= self.next_update_tick
+
+    def latch(self, update: Update) -> Update:
+        """Begin an update; return it with its number."""
+        self.update = update._replace(update=self._updates, playing=self.playing)
+        self._updates += 1
+        self.next_update_tick = update.tick + TICKS_PER_SAMPLE  # until the optimiser has planned another
+        self._planned = self._abandoned = self._refused = False
+        return self.update
+
+    def _interrupted_by(self, load: float) -> bool:
+        """Tell whether the load has left the one that the update under way was latched with."""
+        if self.update is None or not self._planned or not self._load_step:
+            return False
+        return abs(load - self.update.load) > self._load_step
+
+    def remaining(self, tick: int) -> int:
+        """Ticks of the sequence that are still to be played, the present one included."""
+        if self._playing is None:
+            return 0
+        header = self._playing.header
+        return max(0, header.first_tick + header.length - tick)
+
+    @property
+    def playing(self) -> int:
+        """Number of the sequence being played; 0 is none."""
+        return self._playing.header.number if self._playing else 0
+
+    @property
+    def updates(self) -> int:
+        """Number of the next update."""
+        return self._updates
+
+    # -- who else drives -----------------------------------------------------------------------------------------------
+
+    def dismiss(self) -> None:
+        """Let nothing be played, and nothing be offered, until `invite`."""
+        self.invited = self.late = self._planned = False
+        self._playing = self._spare = self.update = None
+
+    def invite(self, tick: int) -> None:
+        """Latch an update at the next scan, so that the optimiser may begin again."""
+        self.invited = True
+        self._abandoned = True
+        self.next_update_tick = tick
+
+    def drop(self) -> None:
+        """Forget the sequence that has been played to its end: somebody else moves the inputs now."""
+        self._playing = None
+
+    # -- the optimiser's side ------------------------------------------------------------------------------------------
+
+    def accept_plan(self, plan: Plan, earliest: int) -> bool:
+        """Take the updating period of the last update; tell whether it was acceptable."""
+        if not self.invited or self.update is None or self._planned or plan.update != self.update.update:
+            return False
+        if not earliest <= plan.next_update_tick <= self.update.tick + SEQUENCE_ROWS:
+            return False
+        self.next_update_tick = plan.next_update_tick
+        self._load_step = plan.load_step
+        self._planned = True
+        return True
+
+    def abandon(self, earliest: int) -> None:
+        """Give up the update under way: an optimiser that has lost the thread asks for a new one."""
+        if self.update is not None and self._spare is None:
+            self._abandoned = True
+            self.next_update_tick = earliest
+
+    def offer(self, sequence: InputSequence, earliest: int) -> Acknowledgement:
+        """Check a committed sequence; accept it for its first tick, or reject it with a reason."""
+        verdict = self._judge(sequence, earliest) if self.invited else Verdict.NOT_INVITED
+        if verdict is Verdict.ACCEPTED:
+            self._spare = sequence
+            self.accepted += 1
+        else:
+            self.rejected += 1
+            self._refused = self.update is not None and sequence.header.update == self.update.update
+        self.acknowledgement = Acknowledgement(sequence.header.number, verdict)
+        return self.acknowledgement
+
+    def _judge(self, sequence: InputSequence, earliest: int) -> Verdict:  # noqa: PLR0911 a return for each clause
+        header, rows = sequence
+        if not 1 <= header.length == len(rows):
+            return Verdict.WRONG_LENGTH
+        if checksum(header, rows) != header.crc:
+            return Verdict.BAD_CRC
+        if header.model_digest != self._model_digest:
+            return Verdict.WRONG_MODEL
+        if header.number <= max(self.playing, self._spare.header.number if self._spare else 0):
+            return Verdict.REPEATED
+        if header.first_tick < earliest:
+            return Verdict.LATE
+        if self.update is None or not self._planned or header.update != self.update.update:
+            return Verdict.WRONG_UPDATE
+        if header.first_tick != self.next_update_tick or header.first_tick - self.update.tick != header.tau_u:
+            return Verdict.WRONG_TICK
+        if self._guard.out_of_range(rows):
+            return Verdict.OUT_OF_RANGE
+        if self._guard.exceeds(rows, header.first_tick, self._applied_before(header.first_tick, earliest)):
+            return Verdict.RATE_EXCEEDED
+        return Verdict.ACCEPTED
+
+    def _applied_before(self, tick: int, earliest: int) -> SequenceRow:
+        """Return what will have been applied just before a tick to come, if nothing else arrives."""
+        playing = self._playing
+        if playing is None or not self.remaining(earliest):
+            return self._guard.applied
+        return playing.rows[min(tick - 1 - playing.header.first_tick, len(playing.rows) - 1)]

@@ -1,0 +1,132 @@
+"""What the control PLC shows: registers, log and telemetry, made from the program's state."""
+
+import logging
+import time
+from collections.abc import Mapping
+
+from coldloop.clock import LatenessRecord
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
+from coldloop.registers.bank import RegisterBank
+from coldloop.registers.common import Identity, ServiceState
+from coldloop.registers.control_plc import CONTROL_MAP, Cause, Ladder, Mode, Process, Status
+from coldloop.registers.safety import EVENT_ROWS, AlarmKind, AlarmState, Event, EventKind
+from control_plc.program import ControlProgram
+
+log = logging.getLogger("coldloop.control_plc")
+
+LINES_AT_ONCE = 20
+LINES_INTERVAL_S = 10.0
+
+
+class Publication:
+    """Puts the program's state into the registers."""
+
+    def __init__(self, program: ControlProgram, bank: RegisterBank, model_digest: int) -> None:
+        self._program = program
+        self._bank = bank
+        self._model_digest = model_digest
+        self._told_events = 0
+        self._told_alarms = -1
+        self._lines = 0
+        self._lines_since = 0.0
+
+    def identity(self, *, running: bool) -> None:
+        """Show who we are, and the tick."""
+        program = self._program
+        self._bank.put(
+            Identity(
+                map_digest=CONTROL_MAP.digest,
+                map_version=CONTROL_MAP.version,
+                state=ServiceState.RUNNING if running else ServiceState.READY,
+                model_digest=self._model_digest,
+                session=program.session,
+                tick=program.tick,
+                heartbeat=program.tick & 0xFFFF,
+            )
+        )
+
+    def status(self, overruns: int, lateness: LatenessRecord | None) -> None:
+        """Show the sequence player and the scan cycle; there is no lateness in lock-step."""
+        program = self._program
+        player = program.player
+        self._bank.put(
+            Status(
+                mode=program.mode,
+                update=player.update.update if player.update else 0,
+                next_update_tick=player.next_update_tick,
+                playing=player.playing,
+                remaining=program.remaining,
+                accepted=player.accepted,
+                rejected=player.rejected,
+                deadline_misses=player.deadline_misses,
+                overruns=overruns,
+                lateness_max=lateness.maximum_s * 1000 if lateness else 0.0,
+                lateness_p99=lateness.percentile_s(0.99) * 1000 if lateness else 0.0,
+            )
+        )
+
+    def safety(self) -> None:
+        """Show ladder, watchdog, alarms and events, as far as they have changed, and log the events."""
+        program = self._program
+        events = program.journal.since(self._told_events)
+        for event in events:
+            self._bank.put(event, event.number % EVENT_ROWS)
+            self._log(event)
+        self._told_events = program.journal.count
+        if program.alarms.changes != self._told_alarms:
+            self._told_alarms = program.alarms.changes
+            for row, alarm in enumerate(program.alarms.rows):
+                self._bank.put(alarm, row)
+        self._bank.put(
+            Ladder(
+                mode=program.mode,
+                cause=program.ladder.cause,
+                since=program.ladder.since,
+                optimizer=int(program.optimizer_present),
+                bad_sensors=program.bad_sensors,
+                events=program.journal.count,
+            )
+        )
+        self._bank.put(program.watchdog.registers(program.tick))
+
+    def _log(self, event: Event) -> None:
+        """Log an event, unless so many came at once that they would flood the log: registers have them all."""
+        now = time.monotonic()
+        if now - self._lines_since > LINES_INTERVAL_S:
+            self._lines, self._lines_since = 0, now
+        self._lines += 1
+        if self._lines > LINES_AT_ONCE:
+            return
+        if self._lines == LINES_AT_ONCE:
+            log.warning("many events: the next %d s are in the registers only", LINES_INTERVAL_S)
+            return
+        kind = EventKind(event.kind)
+        if kind is EventKind.MODE:
+            log.warning(
+                "mode %s", Mode(event.subject).name.lower(),
+                extra={"tick": event.tick, "cause": Cause(event.cause).name.lower()},
+            )  # fmt: skip
+            return
+        what = kind.name.lower().replace("_", " ")
+        extra = {"alarm": AlarmKind(event.subject).name.lower(), "tick": event.tick, "cause": event.cause}
+        log.log(logging.WARNING if kind is EventKind.ALARM_RAISED else logging.INFO, what, extra=extra)
+
+    def snapshot(self) -> Mapping[str, object]:
+        """Return what telemetry publishes."""
+        status, process = self._bank.get(Status), self._bank.get(Process)
+        alarms = {
+            kind.name.lower(): AlarmState(alarm.state).name.lower()
+            for kind, alarm in zip(AlarmKind, self._program.alarms.rows, strict=True)
+            if alarm.state != AlarmState.NORMAL
+        }
+        return {
+            "session": self._program.session,
+            "tick": process.tick,
+            **status._asdict(),
+            "mode": self._program.mode.name.lower(),
+            "cause": self._program.ladder.cause.name.lower(),
+            "alarms": alarms,
+            "load_w": process.load,
+            "inputs": dict(zip(INPUT_NAMES, process.u, strict=True)),
+            "outputs": dict(zip(OUTPUT_NAMES, process.y, strict=True)),
+        }

@@ -1,0 +1,108 @@
+"""Measurements that cannot be right: found, replaced by the last good value, and told.
+
+A measurement is bad when it is no number, outside its sensor's range, or, for the outputs that are controlled, frozen:
+it stands to the last bit for a while in which most of the others move.
+"""
+
+from collections.abc import Sequence
+from operator import le
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+
+from coldloop.process import L1, OUTPUT_NAMES, T5, TICK_S
+
+Range = tuple[FiniteFloat, FiniteFloat]
+CONTROLLED = (L1, T5)
+RECOVERY_TICKS = 8
+"""A sensor is good again after so many good measurements."""
+
+
+class SensorCheckSettings(BaseModel):
+    """What a sensor can tell, and how long a bad one is bridged."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    level: Range = (-5.0, 105.0)
+    """%."""
+    speed: Range = (-10.0, 20_000.0)
+    """Hz."""
+    temperature: Range = (1.0, 400.0)
+    """K."""
+    pressure: Range = (-1.0, 100.0)
+    """bar."""
+    frozen_s: Annotated[float, Field(gt=0)] = 20.0
+    """A controlled output that stands for so long, while others move, is frozen."""
+    bridged_s: Annotated[float, Field(ge=0)] = 10.0
+    """How long the last good value of a controlled output is worked with; then what needs it is left."""
+
+    @property
+    def ranges(self) -> tuple[Range, ...]:
+        """Range of each output."""
+        return (self.level, self.speed, *[self.temperature] * 10, *[self.pressure] * 10)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if any(low >= high for low, high in self.ranges):
+            raise ValueError("each range begins below its end")
+        return self
+
+
+class SensorMonitor:
+    """Looks at every measurement; `bad` are the outputs that are substituted now."""
+
+    def __init__(self, settings: SensorCheckSettings, initial: Sequence[float]) -> None:
+        self._low, self._high = zip(*settings.ranges, strict=True)
+        self._frozen_ticks = round(settings.frozen_s / TICK_S)
+        self._bridged_ticks = round(settings.bridged_s / TICK_S)
+        self._good = list(initial)
+        self._before = tuple(initial)
+        self._stands = dict.fromkeys(CONTROLLED, 0)
+        self._recovering: dict[int, int] = {}
+        self.bad: dict[int, int] = {}
+        """Output, and the ticks for which it has been bad."""
+
+    def check(self, y: Sequence[float]) -> Sequence[float]:
+        """Return the outputs with bad ones replaced by their last good value."""
+        self._watch_standing(y)
+        if not self.bad and all(map(le, self._low, y)) and all(map(le, y, self._high)) and not self._frozen():
+            self._good[:] = y
+            return y
+        frozen = self._frozen()
+        for output, value in enumerate(y):
+            self._judge(output, ok=self._low[output] <= value <= self._high[output] and output not in frozen)
+            if output not in self.bad:
+                self._good[output] = value
+        return tuple(self._good)
+
+    def _watch_standing(self, y: Sequence[float]) -> None:
+        """Count for how long each controlled output has stood while most of the others moved."""
+        moved = sum(now != before for now, before in zip(y, self._before, strict=True))
+        for output in CONTROLLED:
+            if y[output] != self._before[output]:
+                self._stands[output] = 0
+            elif 2 * moved > len(OUTPUT_NAMES):
+                self._stands[output] += 1
+        self._before = tuple(y)
+
+    def _frozen(self) -> list[int]:
+        return [output for output, ticks in self._stands.items() if ticks >= self._frozen_ticks]
+
+    def _judge(self, output: int, *, ok: bool) -> None:
+        if not ok:
+            self.bad[output] = self.bad.get(output, 0) + 1
+            self._recovering.pop(output, None)
+        elif output in self.bad:
+            self._recovering[output] = self._recovering.get(output, 0) + 1
+            if self._recovering[output] >= RECOVERY_TICKS:
+                del self.bad[output], self._recovering[output]
+
+    @property
+    def unusable(self) -> list[int]:
+        """Controlled outputs that have been bad for longer than they are bridged."""
+        return [output for output in CONTROLLED if self.bad.get(output, 0) > self._bridged_ticks]
+
+    @property
+    def mask(self) -> int:
+        """Bit i is set when output i is substituted."""
+        return sum(1 << output for output in self.bad)
