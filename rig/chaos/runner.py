@@ -10,7 +10,6 @@ from typing import Final
 from coldloop.config import PREFIX
 from coldloop.errors import LinkError
 from coldloop.process import TICK_S
-from control_plc.settings import ControlSection
 from rig.chaos.faults import AnyFault, Link, ProcessFault, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
@@ -79,8 +78,6 @@ async def conduct(
 
 def _retained(folder: Path) -> dict[str, str]:
     """Return the variables that let the control PLC and the plant come back where they were killed."""
-    if "retain" not in ControlSection.model_fields:
-        return {}
     files = {service: folder / f"retained_{service}.json" for service in ("control_plc", "plant")}
     for file in files.values():
         file.unlink(missing_ok=True)
