@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from coldloop.process import L1, T5, TICK_S
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind, Event, EventKind
-from rig.chaos.trace import ChaosTrace, Mark
+from rig.chaos.trace import ChaosTrace
 from rig.recording import Recording
 
 Triple = tuple[float, float, float]
@@ -38,7 +38,7 @@ class Row(NamedTuple):
     lasted_s: float | None
     """Plant time, until what was stopped answered again; None when it did not end within the run."""
     modes: tuple[str, ...]
-    """The mode before, and those passed in the window."""
+    """The mode before, and those passed until the next fault."""
     alarms: tuple[RaisedAlarm, ...]
     """Raised in the window."""
     largest_steps: Triple
@@ -77,64 +77,54 @@ def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: Triple, bands: Ban
     """
     bands = bands or Bands()
     recording = trace.recording()
-    steps = _steps(recording, rate)
     outside, outside_undisturbed = _outside(recording, bands), _outside(undisturbed, bands)
-    ends = [*(mark.begin for mark in trace.marks[1:]), trace.ticks]
-    rows = [
-        _row(mark, end, trace.events, steps, outside, outside_undisturbed)
-        for mark, end in zip(trace.marks, ends, strict=False)
-    ]
+    steps = _steps(recording, rate)
+    rows = [_row(trace, number, steps, (outside, outside_undisturbed)) for number in range(len(trace.marks))]
     return Evaluation(
         rows, _largest(steps), _seconds(outside), _seconds(outside_undisturbed), missing_ticks=trace.missing
     )
 
 
 def _row(
-    mark: Mark,
-    end: int,
-    events: Sequence[Event],
-    steps: NDArray[np.float64],
-    outside: NDArray[np.bool_],
-    outside_undisturbed: NDArray[np.bool_],
+    trace: ChaosTrace, number: int, steps: NDArray[np.float64], outside: tuple[NDArray[np.bool_], NDArray[np.bool_]]
 ) -> Row:
-    window = slice(mark.begin, end)
-    here = [event for event in events if mark.begin <= event.tick < end]
-    changes = [event for event in here if event.kind == EventKind.MODE]
-    before = _mode_before(events, mark.begin)
+    mark, following = trace.marks[number], trace.marks[number + 1 : number + 2]
+    end, last_event = trace.ticks, len(trace.events)
+    for later in following:
+        end, last_event = later.begin, later.first_event
+    before = [Mode(event.subject) for event in trace.modes(0, mark.first_event)[-1:]]
+    changes = trace.modes(mark.first_event, last_event)
     return Row(
         fault=mark.fault.label,
         at_s=mark.begin * TICK_S,
         lasted_s=None if mark.end is None else (mark.end - mark.begin) * TICK_S,
-        modes=(*before, *(Mode(event.subject).name for event in changes)),
+        modes=tuple(mode.name for mode in _different([*before, *(Mode(event.subject) for event in changes)])),
         alarms=tuple(
-            RaisedAlarm(AlarmKind(event.subject).name, (event.tick - mark.begin) * TICK_S)
-            for event in here
+            RaisedAlarm(AlarmKind(event.subject).name, max(0, event.tick - mark.begin) * TICK_S)
+            for event in trace.events[mark.first_event : last_event]
             if event.kind == EventKind.ALARM_RAISED
         ),
-        largest_steps=_largest(steps[window]),
-        outside_s=_seconds(outside[window]),
-        undisturbed_s=_seconds(outside_undisturbed[window]),
-        back_s=_back_s(mark, end, before, changes),
+        largest_steps=_largest(steps[mark.begin : end]),
+        outside_s=_seconds(outside[0][mark.begin : end]),
+        undisturbed_s=_seconds(outside[1][mark.begin : end]),
+        back_s=_back_s(mark.end, before, changes),
     )
 
 
-def _mode_before(events: Sequence[Event], tick: int) -> list[str]:
-    """Return the mode that holds until `tick`, if any event tells."""
-    changes = [event for event in events if event.kind == EventKind.MODE and event.tick < tick]
-    return [Mode(changes[-1].subject).name] if changes else []
+def _different(modes: Sequence[Mode]) -> list[Mode]:
+    """Return modes without repetitions."""
+    return [mode for mode, previous in zip(modes, [None, *modes], strict=False) if mode is not previous]
 
 
-def _back_s(mark: Mark, end: int, before: list[str], changes: list[Event]) -> float | None:
-    if mark.end is None or mark.end > end:
+def _back_s(end: int | None, before: Sequence[Mode], changes: Sequence[Event]) -> float | None:
+    """Return the time from the end of a fault until MPC drives; None when it does not."""
+    if end is None:
         return None
-    mode = before[-1] if before else None
-    for event in changes:
-        if event.tick > mark.end and mode == Mode.MPC.name:
-            return 0.0
-        mode = Mode(event.subject).name
-        if event.tick >= mark.end and mode == Mode.MPC.name:
-            return (event.tick - mark.end) * TICK_S
-    return 0.0 if mode == Mode.MPC.name else None
+    at_end = [*before, *(Mode(event.subject) for event in changes if event.tick <= end)]
+    if at_end and at_end[-1] is Mode.MPC:
+        return 0.0
+    back = [event.tick for event in changes if event.tick > end and event.subject == Mode.MPC]
+    return (back[0] - end) * TICK_S if back else None
 
 
 def _steps(recording: Recording, rate: Triple) -> NDArray[np.float64]:

@@ -11,7 +11,6 @@ from matplotlib.patches import Patch
 
 from coldloop.process import INPUT_NAMES, L1, T5, TICK_S
 from coldloop.registers.control_plc import Mode
-from coldloop.registers.safety import EventKind
 from rig.chaos.evaluation import Bands
 from rig.chaos.trace import ChaosTrace
 from rig.plot import ACCENT, BAND, INK, THIRD, Series
@@ -59,7 +58,7 @@ def _inputs(valves: Axes, heater: Axes, minutes: Series, recording: Recording) -
 
 
 def _modes(axes: Axes, trace: ChaosTrace) -> None:
-    changes = [(event.tick, Mode(event.subject)) for event in trace.events if event.kind == EventKind.MODE]
+    changes = [(event.tick, Mode(event.subject)) for event in trace.modes()]
     ends = [tick for tick, _ in changes[1:]] + [trace.ticks]
     for (tick, mode), end in zip(changes, ends, strict=False):
         axes.axvspan(tick * TICK_S / 60, end * TICK_S / 60, color=COLOURS[mode], linewidth=0)

@@ -192,7 +192,7 @@ class Driver:
         fault = moment.fault
         if isinstance(fault, ProcessFault) and fault.offset_ms:
             await self._go_on(fault.end_tick)  # the signal is to come while the rig moves on
-        mark = Mark(fault, begin=self.tick, began_s=self._seconds)
+        mark = Mark(fault, begin=self.tick, first_event=len(self._trace.events))
         self._marks[id(fault)] = mark
         self._trace.marks.append(mark)
         await self._injector.begin(fault)
@@ -206,8 +206,10 @@ class Driver:
         started = await self._injector.end(moment.fault)
         if started is not None:
             await self._until_up(started, moment.fault)
-        await self._look()
-        mark.end, mark.ended_s = self.tick, self._seconds
+        sight = await self._look()
+        if started == "control_plc" and sight.ladder is not None:
+            self._trace.sight_mode(self.tick, sight.ladder)
+        mark.end = self.tick
 
     async def _until_up(self, service: str, fault: AnyFault) -> None:
         """Wait until a service that was started again answers, and in lock-step an optimiser is known again."""

@@ -8,7 +8,7 @@ import numpy as np
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.control_plc import Ladder
 from coldloop.registers.plant import PlantSample
-from coldloop.registers.safety import Alarm, Event
+from coldloop.registers.safety import Alarm, Event, EventKind
 from rig.chaos.faults import AnyFault
 from rig.recording import LinkStatistics, Recording
 
@@ -22,9 +22,9 @@ class Mark:
     """Tick at which it began."""
     end: int | None = None
     """Tick at which it ended, and what it had stopped answered again."""
-    began_s: float = 0.0
-    """The same in real time, from the start of the session."""
-    ended_s: float | None = None
+    first_event: int = 0
+    """Index in `ChaosTrace.events` of the first one after its beginning. Ticks alone do not tell: a control PLC that
+    was restarted goes on one tick back."""
 
 
 class Resources(NamedTuple):
@@ -43,6 +43,7 @@ class ChaosTrace:
 
     ticks: int
     events: list[Event] = field(default_factory=list)
+    """As they came; one with the number 0 was not told, but seen."""
     alarms: list[Alarm] = field(default_factory=list)
     ladder: Ladder | None = None
     marks: list[Mark] = field(default_factory=list)
@@ -61,6 +62,14 @@ class ChaosTrace:
         """Take a tick; a tick that is done again replaces what was there."""
         for rows, values in zip(self._rows, ((sample.load,), sample.u, sample.y, sample.x), strict=True):
             rows[sample.tick] = np.array(values)
+
+    def sight_mode(self, tick: int, ladder: Ladder) -> None:
+        """Take the mode of a control PLC that was started again: it makes no event of it."""
+        self.events.append(Event(tick=tick, kind=EventKind.MODE, subject=ladder.mode, cause=ladder.cause))
+
+    def modes(self, first: int = 0, last: int | None = None) -> list[Event]:
+        """Return the changes of mode among the events from one index to before another."""
+        return [event for event in self.events[first:last] if event.kind == EventKind.MODE]
 
     @property
     def missing(self) -> int:
