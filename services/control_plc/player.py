@@ -25,6 +25,8 @@ class SequencePlayer:
         self.invited = True
         self.late = False
         """The updating instant of what is being played has passed without a new sequence."""
+        self.broken_promise = False
+        """The sequence of an update that was planned is missing at its instant, which is now."""
         self.acknowledgement = Acknowledgement(0, Verdict.NONE)
         self.accepted = self.rejected = self.deadline_misses = 0
 
@@ -50,12 +52,14 @@ class SequencePlayer:
 
     def begin(self, tick: int) -> bool:
         """Tell whether a sequence begins at this tick; an updating instant without one is a miss."""
+        self.broken_promise = False
         if self._spare is not None and self._spare.header.first_tick <= tick:
             self._playing, self._spare, self.late = self._spare, None, False
             return True
         if self.invited and tick >= self.next_update_tick and tick > 0:
             self.deadline_misses += self.update is not None
             self.late = self.update is not None
+            self.broken_promise = self._planned
         return False
 
     def row(self, tick: int) -> SequenceRow | None:

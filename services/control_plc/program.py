@@ -160,7 +160,7 @@ class ControlProgram:
         if self.watchdog.check(tick):
             self.optimizer_lost()
         began = self._player.begin(tick)
-        if not began and self._player.late:
+        if self._player.broken_promise:
             self._failed_handshake = tick
         row = self._player.row(tick)
         self._climb(tick, row)

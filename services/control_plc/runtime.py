@@ -33,7 +33,7 @@ from coldloop.registers.control_plc import (
     SequenceRow,
     Verdict,
 )
-from coldloop.registers.declaration import Block
+from coldloop.registers.declaration import Block, Role
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
 from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
 from coldloop.retained import RetainedFile, RetainedStateError
@@ -400,10 +400,11 @@ class ControlPlc:
         finally:
             self._optimizer_waits -= 1
 
-    def on_optimizer_departure(self) -> None:
-        """The optimiser's connection is gone: do not wait for it."""
-        self._program.optimizer_lost()
-        self._changed.set()
+    def on_departure(self, role: Role) -> None:
+        """Nobody of this role is connected any more: an optimiser is not waited for."""
+        if role is Role.OPTIMIZER:
+            self._program.optimizer_lost()
+            self._changed.set()
 
     def on_refusal(self, kind: str) -> None:
         """A server has refused something to somebody."""
@@ -436,7 +437,10 @@ async def serve(settings: ControlSettings) -> None:
     """Serve and scan until cancelled."""
     plc = ControlPlc(settings)
     identity = DeviceIdentity(product="Coldloop control PLC", revision=__version__)
-    server = ModbusServer(plc.bank, settings=settings.control_plc.server, on_write=plc.on_write, identity=identity)
+    server = ModbusServer(
+        plc.bank, settings=settings.control_plc.server, on_write=plc.on_write, identity=identity,
+        on_departure=plc.on_departure, on_refusal=plc.on_refusal,
+    )  # fmt: skip
     await server.start()
     log.info("serving", extra={"host": settings.control_plc.server.host, "port": server.port})
     try:

@@ -7,6 +7,7 @@ import pytest
 from coldloop.limits import InputLimits
 from coldloop.model_file import read_header
 from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process import L1, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.plant import Actuators, Measurement
@@ -28,6 +29,13 @@ class Bench:
         self.program.restart(session=1)
         self.number = 0
         self.load = 384.0
+        self.steady = False
+        """The process stands at its setpoints, moved by `level` and `temperature`; else the outputs count the ticks."""
+        self.level = self.temperature = 0.0
+        self.moving = False
+        """Everything trembles about that."""
+        self.readings: dict[int, float] = {}
+        """What single sensors show instead."""
 
     def scan(self) -> tuple[SequenceRow, Update | None]:
         """Do one scan; return what was applied and the update if one was latched."""
@@ -35,8 +43,19 @@ class Bench:
         return SequenceRow(*actuators[1:4]), self.program.end_scan(self.measurement(actuators))
 
     def measurement(self, actuators: Actuators) -> Measurement:
-        y = tuple(float(actuators.tick + i) for i in range(22))
-        return Measurement(actuators.tick, self.load, y, tuple(float(i) for i in range(28)), actuators.session)
+        x = tuple(float(i) for i in range(28))
+        return Measurement(actuators.tick, self.load, self.outputs(), x, actuators.session)
+
+    def outputs(self) -> tuple[float, ...]:
+        tick = self.program.tick
+        if not self.steady:
+            return tuple(float(tick + i) for i in range(22))
+        y = [value + (0.001 * (tick % 7) if self.moving else 0.0) for value in HEADER.y0]
+        y[L1] += self.level
+        y[T5] += self.temperature
+        for output, reading in self.readings.items():
+            y[output] = reading
+        return tuple(y)
 
     def scans(self, number: int) -> list[SequenceRow]:
         return [self.scan()[0] for _ in range(number)]

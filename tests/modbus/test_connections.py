@@ -25,7 +25,7 @@ def framed(pdu: bytes, transaction: int = 1) -> bytes:
 
 
 async def test_when_full_the_connection_that_has_been_idle_longest_makes_room(serve: "Serve") -> None:
-    async with serve(connection_limit=3) as running:
+    async with serve(connection_limit=3, replaceable_after_s=0) as running:
         wires = [await running.connect() for _ in range(3)]
         for wire in (wires[1], wires[0], wires[2]):
             await wire.ask(READ_MAGIC)
@@ -52,7 +52,7 @@ async def test_a_connection_with_a_request_in_flight_is_not_the_one_that_makes_r
         waiting.set()
         await release.wait()
 
-    async with serve(connection_limit=2, on_write=wait) as running:
+    async with serve(connection_limit=2, replaceable_after_s=0, on_write=wait) as running:
         oldest, idle = await running.connect(), await running.connect()
         await idle.ask(READ_MAGIC)
         oldest.send(framed(bytes.fromhex("06 0192 0001")))

@@ -1,21 +1,25 @@
-"""One connection of a server: frames in, answers out, and the wait that a write may ask for.
+"""One connection of a server: who it is, frames in, answers out, and the wait that a write may ask for.
 
 Everything runs in the callbacks of the event loop. A request costs no task and no await unless `on_write` asks for a
 wait; then requests that arrive behind it stay in the buffer until its answer is written.
 """
 
 import asyncio
+import ssl
 from collections.abc import Awaitable, Callable, Iterator
 from functools import partial
 from time import monotonic
 from typing import Final, cast
 
+from coldloop.modbus.access import Caller, caller_at, caller_with
 from coldloop.modbus.framing import Frame, MalformedFrameError, framed, next_frame
+from coldloop.modbus.handshake import HandshakeError, secured
+from coldloop.modbus.rate_limit import RateLimit
 from coldloop.modbus.refusals import RefusalLog
 from coldloop.modbus.requests import NO_SUCH_UNIT, SERVER_FAILURE, RequestHandler, Written, exception_answer
 from coldloop.modbus.settings import ServerSettings
-from coldloop.registers.bank import RefusedAccessError
-from coldloop.registers.declaration import Block
+from coldloop.registers.bank import ForbiddenWriteError, RefusedAccessError
+from coldloop.registers.declaration import Block, Role
 
 INPUT_LIMIT: Final = 64 * 1024
 """Bytes of unserved requests beyond which a connection is not read from."""
@@ -29,20 +33,28 @@ _KINDS: Final = {1: "illegal_function", 2: "illegal_address", 3: "illegal_value"
 
 
 class Connection(asyncio.Protocol):
-    """Serves one client. `opened` and `lost` tell the server that the connection exists and that it is gone."""
+    """Serves one client.
+
+    `opened` tells the server that the connection exists, and returns whether it may stay; `lost` tells that it is gone.
+    With `tls`, nothing is served before the client has shown its certificate.
+    """
+
+    _handle: Callable[[bytes], bytes | Written]
 
     def __init__(
         self,
         *,
-        handler: RequestHandler,
+        handler_for: Callable[[frozenset[Role]], RequestHandler],
         settings: ServerSettings,
+        tls: ssl.SSLContext | None,
         on_write: OnWrite,
         refusals: RefusalLog,
-        opened: Callable[["Connection"], None],
+        opened: Callable[["Connection"], bool],
         lost: Callable[["Connection"], None],
     ) -> None:
-        self._handler = handler
+        self._handler_for = handler_for
         self._settings = settings
+        self._tls = tls
         self._on_write = on_write
         self._refusals = refusals
         self._opened = opened
@@ -52,40 +64,83 @@ class Connection(asyncio.Protocol):
         self._wait: asyncio.Future[None] | None = None
         self._output_blocked = False
         self._reading_paused = False
+        self._rate = RateLimit(settings.request_rate, settings.request_burst) if settings.request_rate else None
+        self._held: asyncio.TimerHandle | None = None
+        self._known = self._dismissed = self._gone = False
+        self.requests = 0
+        self.written_as: set[Role | None] = set()
         self.last_request = monotonic()  # not the loop's time, which uvloop rounds to milliseconds
         self.peer = "?"
 
     @property
     def idle(self) -> bool:
         """Whether no request is waiting for its answer."""
-        return self._wait is None
+        return self._wait is None and self._held is None
 
     def close(self) -> None:
         """Close when what was answered has been sent."""
+        self._dismissed = True
         self._transport.close()
 
     def abort(self) -> None:
         """Close now."""
+        self._dismissed = True
         self._transport.abort()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begin to serve (event loop callback)."""
+        """Find out who it is, and begin to serve (event loop callback)."""
         self._transport = cast("asyncio.Transport", transport)
-        self.peer = "{}:{}".format(*transport.get_extra_info("peername"))
         self._idle_timer = self._loop.call_later(self._settings.idle_timeout_s, self._check_idle)
-        self._opened(self)
+        address = transport.get_extra_info("peername")
+        if not address:  # gone again
+            self.abort()
+            return
+        self.peer = f"{address[0]}:{address[1]}"
+        if not self._opened(self):
+            return
+        if self._tls is None:
+            self._welcome(caller_at(address[0], self.peer, self._settings.access))
+        else:
+            self._transport.pause_reading()
+            self._handshake = self._loop.create_task(self._secure(self._tls), name="TLS handshake")
+
+    async def _secure(self, tls: ssl.SSLContext) -> None:
+        try:
+            self._transport, certificate = await secured(self._transport, self, tls)
+        except HandshakeError as error:
+            if not self._dismissed:
+                self._refusals.note("tls_refused", self.peer, str(error))
+            self.connection_lost(None)  # the loop does not always tell of one that never was secure
+        else:
+            self._welcome(caller_with(certificate, self.peer))
+
+    def _welcome(self, caller: Caller | None) -> None:
+        if caller is None:
+            self._refusals.note("access_refused", self.peer, "this address has no role and may not read")
+            self.close()
+            return
+        self.peer = caller.name
+        self._handle = self._handler_for(caller.roles).handle
+        self._known = True
+        self._serve()
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - why it was lost changes nothing
         """Cancel what the client no longer waits for (event loop callback)."""
+        if self._gone:
+            return
+        self._gone = True
         self._idle_timer.cancel()
         if self._wait is not None:
             self._wait.cancel()
+        if self._held is not None:
+            self._held.cancel()
         self._lost(self)
 
     def data_received(self, data: bytes) -> None:
         """Answer all requests that are whole by now (event loop callback)."""
         self._buffer += data
-        self._serve()
+        if self._known:
+            self._serve()
 
     def pause_writing(self) -> None:
         """Stop serving a client that does not read its answers (event loop callback)."""
@@ -98,7 +153,7 @@ class Connection(asyncio.Protocol):
         self._serve()
 
     def _serve(self) -> None:
-        while self._wait is None and not self._output_blocked:
+        while self._wait is None and self._held is None and not self._output_blocked:
             answers = self._answers()
             if not answers:
                 break
@@ -107,7 +162,7 @@ class Connection(asyncio.Protocol):
         self._regulate_reading()
 
     def _regulate_reading(self) -> None:
-        pause = self._output_blocked or len(self._buffer) > INPUT_LIMIT
+        pause = self._output_blocked or self._held is not None or len(self._buffer) > INPUT_LIMIT
         if pause is self._reading_paused or self._transport.is_closing():
             return
         self._reading_paused = pause
@@ -123,7 +178,7 @@ class Connection(asyncio.Protocol):
         try:
             while len(answers) < OUTPUT_CHUNK and self._wait is None:
                 frame = next_frame(self._buffer, position)
-                if frame is None:
+                if frame is None or (self._rate is not None and self._too_fast(self._rate)):
                     break
                 position = frame.end
                 answers += self._answer(frame)
@@ -135,21 +190,37 @@ class Connection(asyncio.Protocol):
         del self._buffer[:position]
         return answers
 
+    def _too_fast(self, limit: RateLimit) -> bool:
+        """Tell whether the next request comes too early; then it is served, and the client read from, later."""
+        wait_s = limit.take()
+        if wait_s:
+            rate = self._settings.request_rate
+            self._refusals.note("rate_limited", self.peer, f"more than {rate:g} requests/s: read from later")
+            self._held = self._loop.call_later(wait_s, self._release)
+        return wait_s > 0.0
+
+    def _release(self) -> None:
+        self._held = None
+        self._serve()
+
     def _answer(self, frame: Frame) -> bytes:
         """Carry a request out; return its answer, or nothing when it waits or is to be ignored."""
+        self.requests += 1
         if frame.unit not in self._settings.unit_ids:
             self._refusals.note("unknown_unit", self.peer, f"unit id {frame.unit} is not served")
             if self._settings.unknown_unit == "silence":
                 return b""
             return framed(frame, exception_answer(frame.pdu[0], NO_SUCH_UNIT))
         try:
-            outcome = self._handler.handle(frame.pdu)
+            outcome = self._handle(frame.pdu)
         except RefusedAccessError as refusal:
-            self._refusals.note(_KINDS[refusal.exception_code], self.peer, f"function {frame.pdu[0]}: {refusal}")
+            kind = _KINDS[refusal.exception_code] if not isinstance(refusal, ForbiddenWriteError) else "access_refused"
+            self._refusals.note(kind, self.peer, f"function {frame.pdu[0]}: {refusal}")
             return framed(frame, exception_answer(frame.pdu[0], refusal.exception_code))
         except Exception as error:  # noqa: BLE001 - whatever goes wrong in here, the client gets an answer
             return self._failure(frame, error)
         if isinstance(outcome, Written):
+            self.written_as.update([block.writer for block in outcome.blocks])
             return self._answer_written(frame, outcome, iter(outcome.blocks))
         return framed(frame, outcome)
 
@@ -183,7 +254,7 @@ class Connection(asyncio.Protocol):
 
     def _check_idle(self) -> None:
         now = monotonic()
-        if self._wait is not None:
+        if not self.idle:
             self.last_request = now
         remaining = self.last_request + self._settings.idle_timeout_s - now
         if remaining > 0:

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Final
 
@@ -23,20 +24,31 @@ class ErrorCounters:
     idle_timeout: int = 0
     connection_evicted: int = 0
     connection_refused: int = 0
+    access_refused: int = 0
+    tls_refused: int = 0
+    rate_limited: int = 0
 
 
 class RefusalLog:
-    """Counts each refusal and logs at most one line of a kind in `LOG_INTERVAL_S`, so that no client floods the log."""
+    """Counts each refusal and logs at most one line of a kind in `LOG_INTERVAL_S`, so that no client floods the log.
 
-    def __init__(self, service: str) -> None:
+    Args:
+        service: Whose refusals these are.
+        on_refusal: Called with the kind of every one.
+    """
+
+    def __init__(self, service: str, on_refusal: Callable[[str], None] | None = None) -> None:
         self.counters = ErrorCounters()
         self._service = service
+        self._on_refusal = on_refusal
         self._next_line = dict.fromkeys((field.name for field in fields(ErrorCounters)), 0.0)
         self._unlogged = dict.fromkeys(self._next_line, 0)
 
     def note(self, kind: str, peer: str, reason: str) -> None:
         """Count a refusal of `kind`, a field of `ErrorCounters`."""
         setattr(self.counters, kind, getattr(self.counters, kind) + 1)
+        if self._on_refusal is not None:
+            self._on_refusal(kind)
         now = time.monotonic()
         if now < self._next_line[kind]:
             self._unlogged[kind] += 1

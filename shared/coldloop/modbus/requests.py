@@ -11,8 +11,14 @@ from functools import partial
 from typing import Final, NamedTuple
 
 from coldloop.modbus.identification import ENCAPSULATED_INTERFACE, DeviceIdentity, identification_answer
-from coldloop.registers.bank import IllegalAddressError, IllegalValueError, RefusedAccessError, RegisterBank
-from coldloop.registers.declaration import Block
+from coldloop.registers.bank import (
+    ALL_ROLES,
+    IllegalAddressError,
+    IllegalValueError,
+    RefusedAccessError,
+    RegisterBank,
+)
+from coldloop.registers.declaration import Block, Role
 
 READ_COILS: Final = 1
 READ_DISCRETE_INPUTS: Final = 2
@@ -55,10 +61,14 @@ def exception_answer(function: int, exception_code: int) -> bytes:
 
 
 class RequestHandler:
-    """Carries requests out on one bank. Nothing is stored unless the whole request is right."""
+    """Carries requests of clients with the same roles out on one bank.
 
-    def __init__(self, bank: RegisterBank, identity: DeviceIdentity) -> None:
+    Nothing is stored unless the whole request is right.
+    """
+
+    def __init__(self, bank: RegisterBank, identity: DeviceIdentity, roles: frozenset[Role] = ALL_ROLES) -> None:
         self._bank = bank
+        self._roles = roles
         self._functions: Final[dict[int, Callable[[bytes], bytes | Written]]] = {
             READ_COILS: _read_bits,
             READ_DISCRETE_INPUTS: _read_bits,
@@ -92,22 +102,25 @@ class RequestHandler:
     def _registers(self, function: int, address: int, count: int) -> bytes:
         return bytes((function, 2 * count)) + self._bank.read(address, count)
 
+    def _write(self, address: int, data: bytes) -> list[Block]:
+        return self._bank.write(address, data, self._roles)
+
     def _write_single(self, pdu: bytes) -> Written:
         address, _ = _unpacked(_PAIR, pdu)
-        return Written(self._bank.write(address, pdu[3:]), lambda: pdu)
+        return Written(self._write(address, pdu[3:]), lambda: pdu)
 
     def _write_multiple(self, pdu: bytes) -> Written:
         address, count, byte_count = _unpacked(_WRITE, pdu, has_data=True)
         data = pdu[_WRITE.size :]
         _check_quantity(count, MAX_WRITE_WORDS)
         _check_byte_count(byte_count, 2 * count, data)
-        return Written(self._bank.write(address, data), lambda: pdu[: _PAIR.size])
+        return Written(self._write(address, data), lambda: pdu[: _PAIR.size])
 
     def _mask_write(self, pdu: bytes) -> Written:
         address, and_mask, or_mask = _unpacked(_MASK, pdu)
         (present,) = _WORD.unpack(self._bank.read(address, 1))
         word = (present & and_mask) | (or_mask & ~and_mask)
-        return Written(self._bank.write(address, _WORD.pack(word)), lambda: pdu)
+        return Written(self._write(address, _WORD.pack(word)), lambda: pdu)
 
     def _read_write(self, pdu: bytes) -> Written:
         read_address, read_count, address, count, byte_count = _unpacked(_READ_WRITE, pdu, has_data=True)
@@ -116,7 +129,7 @@ class RequestHandler:
         _check_quantity(count, MAX_READ_WRITE_WORDS)
         _check_byte_count(byte_count, 2 * count, data)
         self._bank.read(read_address, read_count)  # refuses before anything is stored
-        blocks = self._bank.write(address, data)
+        blocks = self._write(address, data)
         return Written(blocks, partial(self._registers, READ_WRITE_REGISTERS, read_address, read_count))
 
 

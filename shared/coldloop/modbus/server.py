@@ -3,6 +3,11 @@
 import asyncio
 import contextlib
 import errno
+import ssl
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import cache
+from time import monotonic
 from typing import Final
 
 from coldloop.errors import PortInUseError
@@ -11,7 +16,10 @@ from coldloop.modbus.identification import DeviceIdentity
 from coldloop.modbus.refusals import ErrorCounters, RefusalLog
 from coldloop.modbus.requests import RequestHandler
 from coldloop.modbus.settings import ServerSettings
+from coldloop.modbus.tls import server_context
 from coldloop.registers.bank import RegisterBank
+from coldloop.registers.common import ServerStatistics
+from coldloop.registers.declaration import Role
 
 __all__ = ["DeviceIdentity", "ErrorCounters", "ModbusServer", "OnWrite", "ServerSettings"]
 
@@ -36,20 +44,38 @@ class ModbusServer:
             done; other connections are served meanwhile. It is cancelled when its client goes away, so it must not be
             shared. When `on_write` or its awaitable raises, the client gets exception 04.
         identity: Answer to the device identification, function 43 / 14.
+        on_departure: Called with a role when the last open connection that has written a block of that role closes,
+            unless the server itself is being closed.
+        on_refusal: Called with the kind, a field of `ErrorCounters`, of everything that is refused.
+
+    The block of `ServerStatistics`, where the map has one, is kept up to date.
     """
 
     def __init__(
-        self, bank: RegisterBank, *, settings: ServerSettings, on_write: OnWrite, identity: DeviceIdentity
+        self,
+        bank: RegisterBank,
+        *,
+        settings: ServerSettings,
+        on_write: OnWrite,
+        identity: DeviceIdentity,
+        on_departure: Callable[[Role], None] | None = None,
+        on_refusal: Callable[[str], None] | None = None,
     ) -> None:
         self._settings = settings
         self._on_write = on_write
         self._service = bank.map.service
-        self._handler = RequestHandler(bank, identity)
-        self._refusals = RefusalLog(bank.map.service)
+        self._on_departure = on_departure
+        self._handler_for = cache(lambda roles: RequestHandler(bank, identity, roles))
+        self._refusals = RefusalLog(bank.map.service, on_refusal)
+        self._tls: ssl.SSLContext | None = None
+        self._closing = False
+        self._accepted = self._past_requests = 0
         self._connections: dict[Connection, None] = {}  # in the order of their arrival
         self._none_connected = asyncio.Event()
         self._none_connected.set()
         self._listener: asyncio.Server | None = None
+        if any(block.record is ServerStatistics for block in bank.map.blocks):
+            bank.keep_fresh(ServerStatistics, self.statistics)
 
     @property
     def counters(self) -> ErrorCounters:
@@ -60,6 +86,17 @@ class ModbusServer:
     def connections(self) -> int:
         """Number of connections being served."""
         return len(self._connections)
+
+    def statistics(self) -> ServerStatistics:
+        """Return what the server has done so far; counts wrap as their registers do."""
+        requests = self._past_requests + sum(connection.requests for connection in self._connections)
+        errors = {kind: count & 0xFFFFFFFF for kind, count in asdict(self.counters).items()}
+        return ServerStatistics(
+            connections=min(self.connections, 0xFFFF),
+            accepted=self._accepted & 0xFFFFFFFF,
+            requests=requests & 0xFFFFFFFF,
+            **errors,
+        )
 
     @property
     def port(self) -> int:
@@ -73,7 +110,10 @@ class ModbusServer:
 
         Raises:
             PortInUseError: The address cannot be listened on.
+            ConfigurationError: The files for TLS cannot be used.
         """
+        if self._settings.tls is not None:
+            self._tls = server_context(self._settings.tls, f"{self._service}.server.tls")
         host, port = self._settings.host, self._settings.port
         try:
             self._listener = await asyncio.get_running_loop().create_server(self._new_connection, host, port)
@@ -83,6 +123,7 @@ class ModbusServer:
 
     async def close(self) -> None:
         """Stop listening and close all connections; waits of `on_write` are cancelled."""
+        self._closing = True
         if self._listener is not None:
             self._listener.close()
         for connection in tuple(self._connections):
@@ -96,31 +137,50 @@ class ModbusServer:
 
     def _new_connection(self) -> Connection:
         return Connection(
-            handler=self._handler,
+            handler_for=self._handler_for,
             settings=self._settings,
+            tls=self._tls,
             on_write=self._on_write,
             refusals=self._refusals,
             opened=self._admit,
             lost=self._forget,
         )
 
-    def _admit(self, newcomer: Connection) -> None:
+    def _admit(self, newcomer: Connection) -> bool:
+        """Take a connection in, where need be in the place of an idle one; return whether it may stay."""
+        if len(self._connections) >= self._settings.connection_limit and not self._make_room(newcomer):
+            self._refusals.note("connection_refused", newcomer.peer, "as many connections as may be, and none is idle")
+            newcomer.close()
+            return False
+        self._accepted += 1
         self._connections[newcomer] = None
         self._none_connected.clear()
-        if len(self._connections) <= self._settings.connection_limit:
-            return
-        idle = [connection for connection in self._connections if connection.idle and connection is not newcomer]
-        if idle:
-            oldest = min(idle, key=lambda connection: connection.last_request)
-            self._refusals.note("connection_evicted", oldest.peer, f"idle longest, replaced by {newcomer.peer}")
-            surplus = oldest
-        else:
-            self._refusals.note("connection_refused", newcomer.peer, "all connections have a request in flight")
-            surplus = newcomer
-        del self._connections[surplus]
-        surplus.abort()
+        return True
+
+    def _make_room(self, newcomer: Connection) -> bool:
+        """Close the connection that has been idle longest, first those that never made a request."""
+        before = monotonic() - self._settings.replaceable_after_s
+        idle = [
+            connection
+            for connection in self._connections
+            if connection.idle and (not connection.requests or connection.last_request <= before)
+        ]
+        if not idle:
+            return False
+        oldest = min(idle, key=lambda connection: (connection.requests > 0, connection.last_request))
+        self._refusals.note("connection_evicted", oldest.peer, f"idle longest, replaced by {newcomer.peer}")
+        del self._connections[oldest]
+        oldest.abort()
+        return True
 
     def _forget(self, connection: Connection) -> None:
         self._connections.pop(connection, None)
+        self._past_requests += connection.requests
         if not self._connections:
             self._none_connected.set()
+        if self._on_departure is None or self._closing:
+            return
+        present = {role for other in self._connections for role in other.written_as}
+        for role in connection.written_as - present:
+            if role is not None:
+                self._on_departure(role)

@@ -1,8 +1,52 @@
-"""How a server is set up."""
+"""How a server is set up, and who may do what with it."""
 
-from typing import Annotated, Literal
+from ipaddress import IPv4Network, IPv6Network
+from pathlib import Path
+from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, IPvAnyNetwork
+
+Networks = tuple[IPvAnyNetwork, ...]
+"""Addresses and networks, such as `192.168.7.11` and `10.1.0.0/16`."""
+
+LOOPBACK: Final[Networks] = (IPv4Network("127.0.0.0/8"), IPv6Network("::1/128"))
+EVERYBODY: Final[Networks] = (IPv4Network("0.0.0.0/0"), IPv6Network("::/0"))
+
+
+class AccessSettings(BaseModel):
+    """Where the clients of each role are, and who may read. A client may have several roles; who has one may read.
+
+    None of this counts with TLS: there the client's certificate says its role, and who has a certificate may read.
+
+    Args:
+        control: Where the control PLC is.
+        optimizer: Where the optimiser PLC is.
+        operator: Where operators are.
+        readers: Who may read, without a role.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    control: Networks = LOOPBACK
+    optimizer: Networks = LOOPBACK
+    operator: Networks = LOOPBACK
+    readers: Networks = EVERYBODY
+
+
+class TlsSettings(BaseModel):
+    """Files for Modbus/TCP Security, all PEM; `coldloop certificates` makes a set.
+
+    Args:
+        certificate: Our certificate, and the intermediate ones that lead to the peer's CA.
+        key: Its key, without a passphrase.
+        ca: Certificates of the authorities whose peers we accept.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    certificate: Path
+    key: Path
+    ca: Path
 
 
 class ServerSettings(BaseModel):
@@ -13,8 +57,13 @@ class ServerSettings(BaseModel):
         port: TCP port; 0 takes any free one.
         unit_ids: Unit ids that are answered. Clients that talk to the server itself use 255, 0 or 1.
         unknown_unit: Other unit ids are refused with exception 0x0B, or left without an answer.
-        connection_limit: Connections served at a time; a further one replaces the one that has been idle longest.
+        access: Who may write and read.
+        tls: Modbus/TCP Security instead of plain Modbus/TCP.
+        connection_limit: Connections served at a time. A further one replaces one that is idle, or is refused.
+        replaceable_after_s: A connection is idle, and may be replaced, when its last request is this long ago.
         idle_timeout_s: A connection without a whole request for this long is closed.
+        request_rate: Requests a second that a connection may keep up; beyond, it is read from later. 0 is no limit.
+        request_burst: Requests that it may make at once.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -23,5 +72,10 @@ class ServerSettings(BaseModel):
     port: int = Field(ge=0, le=0xFFFF)
     unit_ids: frozenset[Annotated[int, Field(ge=0, le=255)]] = frozenset({0, 1, 255})
     unknown_unit: Literal["refuse", "silence"] = "refuse"
+    access: AccessSettings = AccessSettings()
+    tls: TlsSettings | None = None
     connection_limit: int = Field(default=32, ge=1)
+    replaceable_after_s: float = Field(default=10.0, ge=0)
     idle_timeout_s: float = Field(default=300.0, gt=0)
+    request_rate: float = Field(default=0.0, ge=0)
+    request_burst: int = Field(default=100, ge=1)

@@ -3,15 +3,17 @@
 import math
 import struct
 from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar, cast
 
 from coldloop.registers.codec import RecordCodec, ValueCodec, WordOrder, codec_of
-from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, fields_of
+from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, Role, fields_of
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
 FIRST_HALF, SECOND_HALF = 1, 2
+ALL_ROLES = frozenset(Role)
 MAX_SPANS = 512
 """Ranges that clients write to are remembered up to this number."""
 
@@ -29,6 +31,10 @@ class IllegalAddressError(RefusedAccessError):
 
     def __init__(self, reason: str) -> None:
         super().__init__(2, reason)
+
+
+class ForbiddenWriteError(IllegalAddressError):
+    """Exception 02: a register that somebody else writes."""
 
 
 class IllegalValueError(RefusedAccessError):
@@ -55,6 +61,7 @@ class RegisterBank:
         self._places: dict[type[tuple[Any, ...]], tuple[Block, RecordCodec]] = {}
         self._checks: list[tuple[int, Kind, Field, str]] = []
         self._spans: dict[tuple[int, int], _Span] = {}
+        self._live: tuple[int, int, Callable[[], tuple[Any, ...]]] = (0x10000, 0, tuple)
         for block in register_map.blocks:
             self._declare(block)
         self._check_addresses = [address for address, *_ in self._checks]
@@ -86,6 +93,11 @@ class RegisterBank:
         start = 2 * block.address + row * codec.size
         self._memory[start : start + codec.size] = codec.encode(record)
 
+    def keep_fresh(self, record: type[tuple[Any, ...]], present: Callable[[], tuple[Any, ...]]) -> None:
+        """Store `present()` whenever a client reads from the block that holds `record`; one block may have this."""
+        block, _ = self._places[record]
+        self._live = block.address, block.end, present
+
     def read(self, address: int, count: int) -> bytes:
         """Return `count` words from `address` on.
 
@@ -95,41 +107,52 @@ class RegisterBank:
         end = address + count
         if end > 0x10000 or self._declared.find(0, address, end) >= 0:
             raise IllegalAddressError(f"no register at some of {address}..{end - 1}")
+        start, behind, present = self._live
+        if address < behind and start < end:
+            self.put(present())
         return bytes(self._memory[2 * address : 2 * end])
 
-    def check_write(self, address: int, data: bytes) -> None:
-        """Raise what `write` would raise, store nothing.
+    def write(self, address: int, data: bytes, roles: frozenset[Role] = ALL_ROLES) -> list[Block]:
+        """Check and store words from `address` on; return the blocks that they fall in.
+
+        Args:
+            address: Of the first word.
+            data: The words, high byte first.
+            roles: Of whom it is that writes.
 
         Raises:
             IllegalAddressError: A register does not exist or is read-only.
+            ForbiddenWriteError: A register is not for these roles to write.
             IllegalValueError: A value is out of range, or half of a 32-bit value.
         """
-        self._checked(address, data)
-
-    def write(self, address: int, data: bytes) -> list[Block]:
-        """Check and store words from `address` on; return the blocks that they fall in."""
-        span = self._checked(address, data)
+        span = self._checked(address, data, roles)
         self._memory[2 * address : 2 * address + len(data)] = data
         return span.blocks
 
-    def _checked(self, address: int, data: bytes) -> "_Span":
+    def _checked(self, address: int, data: bytes, roles: frozenset[Role]) -> "_Span":
         words = len(data) // 2
         span = self._spans.get((address, words))
         if span is None:
-            span = self._make_span(address, words)
+            span = self._make_span(address, words, roles)
             if len(self._spans) >= MAX_SPANS:
                 self._spans.clear()
             self._spans[address, words] = span
+        elif not span.writers <= roles:
+            raise _forbidden(span.blocks, roles)
         values = span.codec.unpack(data)
         if not span.plain or not math.isfinite(sum(values)):
             for value, (field, name) in zip(values, span.fields, strict=True):
                 _check_value(value, field, name)
         return span
 
-    def _make_span(self, address: int, words: int) -> "_Span":
+    def _make_span(self, address: int, words: int, roles: frozenset[Role]) -> "_Span":
         end = address + words
         if end > 0x10000 or self._writable.find(0, address, end) >= 0:
             raise IllegalAddressError(f"no writable register at some of {address}..{end - 1}")
+        blocks = [block for block in self.map.blocks if block.address < end and address < block.end]
+        writers = frozenset(block.writer for block in blocks if block.writer is not None)
+        if not writers <= roles:  # before anything else: who may not write learns nothing by trying
+            raise _forbidden(blocks, roles)
         if self._halves[address] == SECOND_HALF or self._halves[end - 1] == FIRST_HALF:
             raise IllegalValueError(
                 f"a 32-bit register is written whole or not at all, {address}..{end - 1} halves one"
@@ -139,7 +162,8 @@ class RegisterBank:
             codec=ValueCodec("".join(kind.letter for _, kind, _, _ in checks), self.order),
             fields=[(field, name) for *_, field, name in checks],
             plain=all(field.low is None and field.high is None for *_, field, _ in checks),
-            blocks=[block for block in self.map.blocks if block.address < end and address < block.end],
+            blocks=blocks,
+            writers=writers,
         )
 
 
@@ -151,6 +175,13 @@ class _Span(NamedTuple):
     plain: bool
     """No value has a range of its own: it is enough that all are finite."""
     blocks: list[Block]
+    writers: frozenset[Role]
+
+
+def _forbidden(blocks: list[Block], roles: frozenset[Role]) -> ForbiddenWriteError:
+    block = next(block for block in blocks if block.writer not in roles)
+    own = ", ".join(sorted(roles)) or "none"
+    return ForbiddenWriteError(f"block '{block.name}' is written by the {block.writer}; roles of this client: {own}")
 
 
 def _check_value(value: float, field: Field, name: str) -> None:

@@ -1,4 +1,4 @@
-"""The corner at address 0 that is the same in every map."""
+"""The corner below address 100 that is the same in every map."""
 
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
@@ -28,4 +28,25 @@ class Identity(NamedTuple):
     heartbeat: Annotated[int, u16("Rises with every tick or update, and wraps")] = 0
 
 
+class ServerStatistics(NamedTuple):
+    """What the server has done since it started; all counts wrap."""
+
+    connections: Annotated[int, u16("Connections open now")] = 0
+    accepted: Annotated[int, u32("Connections accepted")] = 0
+    requests: Annotated[int, u32("Requests, the refused ones too")] = 0
+    illegal_function: Annotated[int, u32("Requests refused: function not served")] = 0
+    illegal_address: Annotated[int, u32("Requests refused: no such register, or read-only")] = 0
+    illegal_value: Annotated[int, u32("Requests refused: quantity, length or value")] = 0
+    server_failure: Annotated[int, u32("Requests that failed in the server")] = 0
+    unknown_unit: Annotated[int, u32("Requests for an unknown unit id")] = 0
+    malformed_frame: Annotated[int, u32("Connections closed: not Modbus/TCP")] = 0
+    idle_timeout: Annotated[int, u32("Connections closed: no request for too long")] = 0
+    connection_evicted: Annotated[int, u32("Connections closed: idle, and replaced by a new one")] = 0
+    connection_refused: Annotated[int, u32("Connections refused: too many, and all busy")] = 0
+    access_refused: Annotated[int, u32("Writes and connections refused: not for this client")] = 0
+    tls_refused: Annotated[int, u32("Connections refused: no TLS 1.3, or no certificate that holds")] = 0
+    rate_limited: Annotated[int, u32("Times that a connection was made to wait for its rate")] = 0
+
+
 IDENTITY_BLOCK: Final = Block("identity", 0, Identity, "Who answers, and whether it is alive")
+STATISTICS_BLOCK: Final = Block("statistics", 60, ServerStatistics, "What the server has done, and what it refused")

@@ -4,7 +4,7 @@ from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
-from coldloop.registers.common import IDENTITY_BLOCK
+from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
 from coldloop.registers.safety import EVENT_ROWS, Alarm, AlarmCommand, AlarmKind, Event, Watchdog, WatchdogTime
 
@@ -216,6 +216,7 @@ CONTROL_MAP: Final = RegisterMap(
         IDENTITY_BLOCK,
         Block("status", 30, Status, "Sequence player and scan cycle"),
         Block("ladder", 50, Ladder, "The fail-safe ladder"),
+        STATISTICS_BLOCK,
         Block("process", 100, Process, "The process at the last scan"),
         Block("update", 200, Update, "Latched at the last updating instant"),
         Block("await update", 400, AwaitUpdate, "Lets a read of the latch wait for a new update", Role.OPTIMIZER),

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.registers.common import IDENTITY_BLOCK
+from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, u16, u32
 
 HISTORY_ROWS: Final = 256
@@ -40,10 +40,11 @@ class Optimization(NamedTuple):
 
 OPTIMIZER_MAP: Final = RegisterMap(
     service="optimizer_plc",
-    version=1,
+    version=2,
     blocks=(
         IDENTITY_BLOCK,
         Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
+        STATISTICS_BLOCK,
         Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
     ),
 )

@@ -4,7 +4,7 @@ from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
-from coldloop.registers.common import IDENTITY_BLOCK
+from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
 from coldloop.registers.safety import Watchdog, WatchdogTime
 
@@ -85,6 +85,7 @@ PLANT_MAP: Final = RegisterMap(
     version=2,
     blocks=(
         IDENTITY_BLOCK,
+        STATISTICS_BLOCK,
         Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL),
         Block("measurement", 200, Measurement, "Inputs of the control PLC"),
         Block("watchdog", 310, Watchdog, "Watches the control PLC; outputs go to their safe state when it expires"),

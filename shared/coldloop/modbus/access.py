@@ -1,0 +1,78 @@
+"""Who asks, and what that client may do: by its address, or with TLS by the role in its certificate.
+
+A certificate says its role in the X.509v3 extension of the Modbus/TCP Security Protocol Specification (v21, section
+8.2, "Role extension"): a UTF8String. One without a role, or with a role that we do not know, may only read.
+"""
+
+import json
+from ipaddress import IPv4Address, IPv6Address, ip_address
+from typing import Final, NamedTuple
+
+from cryptography import x509
+
+from coldloop.modbus.settings import AccessSettings, Networks
+from coldloop.registers.declaration import Role
+
+ROLE_EXTENSION: Final = x509.ObjectIdentifier("1.3.6.1.4.1.50316.802.1")
+UTF8_STRING: Final = 0x0C
+"""Tag of a UTF8String in DER."""
+
+
+class Caller(NamedTuple):
+    """A client as the server knows it: its name in messages, and its roles."""
+
+    name: str
+    roles: frozenset[Role]
+
+
+def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:
+    """Return who calls from an address, or None when nobody may from there."""
+    address = _plain_address(host)
+    places = {Role.CONTROL: access.control, Role.OPTIMIZER: access.optimizer, Role.OPERATOR: access.operator}
+    roles = frozenset(role for role, networks in places.items() if _within(address, networks))
+    if not roles and not _within(address, access.readers):
+        return None
+    return Caller(name, roles)
+
+
+def caller_with(certificate: bytes, name: str) -> Caller:
+    """Return who calls with a certificate (DER) that has been verified."""
+    parsed = x509.load_der_x509_certificate(certificate)
+    subject = json.dumps(parsed.subject.rfc4514_string(), ensure_ascii=False)
+    text = _role_text(parsed)
+    known = {role.value: role for role in Role}
+    roles = frozenset({known[text]} if text in known else ())
+    return Caller(f"{name} certificate={subject} role={json.dumps(text, ensure_ascii=False)}", roles)
+
+
+def _plain_address(host: str) -> IPv4Address | IPv6Address:
+    """Return an address; an IPv4 client of a socket for both versions counts as what it is."""
+    address = ip_address(host)
+    return getattr(address, "ipv4_mapped", None) or address
+
+
+def _within(address: IPv4Address | IPv6Address, networks: Networks) -> bool:
+    return any(address in network for network in networks)
+
+
+def _role_text(certificate: x509.Certificate) -> str:
+    try:
+        extension = certificate.extensions.get_extension_for_oid(ROLE_EXTENSION).value
+    except (x509.ExtensionNotFound, x509.DuplicateExtension, ValueError):
+        return ""
+    return decoded_role(extension.public_bytes())
+
+
+def encoded_role(text: str) -> bytes:
+    """Return a role as the extension's DER."""
+    raw = text.encode()
+    if len(raw) > 127:
+        raise ValueError("a role of more than 127 bytes")
+    return bytes((UTF8_STRING, len(raw))) + raw
+
+
+def decoded_role(der: bytes) -> str:
+    """Return the role in an extension's DER, empty when it is not one."""
+    if len(der) < 2 or der[0] != UTF8_STRING or der[1] != len(der) - 2:
+        return ""
+    return der[2:].decode(errors="replace")

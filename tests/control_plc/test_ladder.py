@@ -1,0 +1,275 @@
+"""The fail-safe ladder: MPC, the rest of a sequence, hold, the classical loops, and back; operators; bad sensors."""
+
+import math
+from collections.abc import Callable, Iterable
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import pytest
+
+from coldloop.limits import InputLimits
+from coldloop.process import L1, OUTPUT_NAMES, T5
+from coldloop.registers.codec import as_transmitted
+from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, SequenceRow, Update, Verdict
+from coldloop.registers.plant import Measurement
+from coldloop.registers.safety import AlarmKind, AlarmState, EventKind
+from control_plc.program import ControlProgram
+from control_plc.settings import ControlSection
+
+if TYPE_CHECKING:
+    from tests.control_plc.conftest import Bench
+
+At = Callable[..., SequenceRow]
+NewBench = Callable[..., "Bench"]
+
+HOLD_TICKS = 12
+AT_REST = (43.0, 75.0, 36.0)
+
+
+def section(**changed: object) -> ControlSection:
+    return ControlSection.model_validate({"ladder": {"hold_s": HOLD_TICKS / 4}, **changed})
+
+
+@pytest.fixture
+def rig(new_bench: NewBench) -> "Bench":
+    """A control PLC with a short hold, whose first update has been latched; the process stands at its setpoints."""
+    bench = new_bench(InputLimits(), section())
+    bench.steady = True
+    bench.scan()
+    return bench
+
+
+def modes(program: ControlProgram) -> list[tuple[Mode, Cause]]:
+    return [
+        (Mode(event.subject), Cause(event.cause)) for event in program.journal.since(0) if event.kind == EventKind.MODE
+    ]
+
+
+def alarm(bench: "Bench", kind: AlarmKind) -> AlarmState:
+    return AlarmState(bench.program.alarms.rows[kind].state)
+
+
+def steps(rows: Iterable[SequenceRow]) -> list[float]:
+    """Largest step of each input between consecutive ticks."""
+    pairs = list(pairwise(rows))
+    return [max(abs(later[i] - earlier[i]) for earlier, later in pairs) for i in range(3)]
+
+
+def test_a_silent_optimiser_leads_down_the_ladder_rung_by_rung(rig: "Bench", at: At) -> None:
+    rig.play([at(0.2)] * 30, ticks=2)
+    rig.scans(30 + HOLD_TICKS + 5)
+    assert modes(rig.program) == [
+        (Mode.MPC, Cause.SEQUENCE_BEGAN),
+        (Mode.REST, Cause.SEQUENCE_LATE),
+        (Mode.HOLD, Cause.SEQUENCE_EXHAUSTED),
+        (Mode.CLASSICAL, Cause.HOLD_EXPIRED),
+    ]
+    assert [event.tick for event in rig.program.journal.since(0) if event.kind == EventKind.MODE] == [
+        2, 22, 32, 32 + HOLD_TICKS,
+    ]  # fmt: skip
+    for kind in (AlarmKind.MODE, AlarmKind.SEQUENCE_LATE, AlarmKind.SEQUENCE_EXHAUSTED):
+        assert alarm(rig, kind) is AlarmState.UNACKNOWLEDGED
+
+
+def test_the_optimiser_comes_back_through_a_handshake_from_the_input_being_applied(rig: "Bench", at: At) -> None:
+    rig.play([at(0.2)] * 5, ticks=2)
+    rig.level = 1.0  # the loops have something to do
+    rig.scans(5 + 20 + HOLD_TICKS + 60)
+    program = rig.program
+    assert program.mode is Mode.CLASSICAL
+    program.abandon()
+    _, update = rig.scan()
+    assert update is not None
+    assert update.playing == 0
+    assert rig.plan(18)
+    start = SequenceRow(*update.u)
+    assert start != at(0.2), "the loops have moved the inputs"
+    first = start._replace(cv155=start.cv155 + 0.3)
+    assert rig.offer(rig.sequence([first] * 20)).verdict == Verdict.ACCEPTED
+    applied = rig.scans(18)
+    assert set(applied[:-1]) == {start}, "the loops stand still for the handshake"
+    assert applied[-1] == as_transmitted(first)
+    assert program.mode is Mode.MPC
+    assert alarm(rig, AlarmKind.MODE) is AlarmState.RETURNED
+
+
+def test_a_handshake_that_comes_to_nothing_does_not_keep_the_loops_from_working(rig: "Bench", at: At) -> None:
+    rig.play([at()] * 2, ticks=2)
+    rig.level = 1.0
+    rig.scans(2 + 20 + HOLD_TICKS + 30)
+    assert rig.program.mode is Mode.CLASSICAL
+    moved = []
+    for _ in range(6):
+        rig.program.abandon()
+        rig.scan()
+        assert rig.plan(20)
+        applied = rig.scans(20)  # planned, and nothing sent
+        moved.append(len(set(applied)) > 1)
+    assert moved.count(True) >= 4
+
+
+@pytest.mark.parametrize("mode", [OperatorMode.CLASSICAL, OperatorMode.MANUAL])
+def test_an_operator_takes_over_without_a_bump_and_gives_back_without_one(
+    rig: "Bench", at: At, mode: OperatorMode
+) -> None:
+    rig.play([at(0.2, 3.0)] * 40, ticks=2)
+    applied = rig.scans(3)
+    program = rig.program
+    stale = rig.sequence([at(0.2)] * 20)
+    program.operate(Operator(mode, *applied[-1]))
+    applied += rig.scans(40)
+    assert program.mode is (Mode.CLASSICAL if mode is OperatorMode.CLASSICAL else Mode.MANUAL)
+    assert program.ladder.cause is Cause.OPERATOR
+    assert not program.awaiting_plan
+    assert rig.offer(stale).verdict == Verdict.NOT_INVITED
+    program.operate(Operator(OperatorMode.AUTO, *applied[-1]))
+    taken, update = rig.scan()
+    applied.append(taken)
+    assert update is not None, "the optimiser is invited at once"
+    assert rig.plan(4)
+    assert rig.offer(rig.sequence([taken._replace(cv155=taken.cv155 + 0.1)] * 20)).verdict == Verdict.ACCEPTED
+    applied += rig.scans(5)
+    assert program.mode is Mode.MPC
+    assert steps(applied)[0] <= 0.1001
+    assert steps(applied[1:40])[1] < 0.01
+
+
+def test_manual_setpoints_are_clamped_and_approached_within_the_rate(rig: "Bench") -> None:
+    rig.program.operate(Operator(OperatorMode.MANUAL, 100.0, 1000.0, 0.0))
+    applied = [SequenceRow(*AT_REST), *rig.scans(20 * 60)]
+    assert applied[19].cv155 == pytest.approx(43.5)
+    assert applied[-1].cv155 == 60.0
+    assert applied[-1].ncr22 == 150.0
+    limits = InputLimits()
+    for tick in range(39, len(applied), 20):
+        for i, rate in enumerate(limits.rate):
+            assert abs(applied[tick][i] - applied[tick - 20][i]) <= rate
+    assert all(step <= rate for step, rate in zip(steps(applied), limits.rate, strict=True))
+
+
+def test_the_optimiser_is_lost_when_its_watchdog_expires_and_the_alarm_comes_in_that_scan(rig: "Bench") -> None:
+    program = rig.program
+    rig.scans(58)
+    assert program.optimizer_present
+    rig.scans(2)
+    assert not program.optimizer_present
+    assert program.alarms.rows[AlarmKind.OPTIMIZER_LOST].raised == 60
+    assert not program.awaiting_plan, "lock-step does not wait for nobody"
+    program.heartbeat(Heartbeat(1, 0xC01D1005))
+    assert program.optimizer_present
+    rig.scan()
+    assert alarm(rig, AlarmKind.OPTIMIZER_LOST) is AlarmState.RETURNED
+    assert program.watchdog.trips == 1
+
+
+def test_an_optimiser_with_another_model_is_told(rig: "Bench") -> None:
+    rig.program.heartbeat(Heartbeat(1, 0xBAD))
+    assert alarm(rig, AlarmKind.MODEL_MISMATCH) is AlarmState.UNACKNOWLEDGED
+    rig.program.heartbeat(Heartbeat(2, 0xC01D1005))
+    assert alarm(rig, AlarmKind.MODEL_MISMATCH) is AlarmState.RETURNED
+
+
+# -- sensors -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reading", [math.nan, math.inf, -50.0, 1e6], ids=["nan", "inf", "low", "high"])
+@pytest.mark.parametrize("output", [L1, T5, OUTPUT_NAMES.index("P4")], ids=lambda i: OUTPUT_NAMES[i])
+def test_a_bad_measurement_is_replaced_by_the_last_good_one_and_told(rig: "Bench", output: int, reading: float) -> None:
+    good = rig.program.process
+    assert good is not None
+    rig.readings[output] = reading
+    rig.scans(3)
+    process = rig.program.process
+    assert process is not None
+    assert process.y == good.y
+    assert rig.program.bad_sensors == 1 << output
+    row = rig.program.alarms.rows[AlarmKind.SENSOR_BAD]
+    assert (row.state, row.cause, row.raised) == (AlarmState.UNACKNOWLEDGED, output, 1)
+    del rig.readings[output]
+    rig.scans(9)
+    assert rig.program.bad_sensors == 0
+    assert alarm(rig, AlarmKind.SENSOR_BAD) is AlarmState.RETURNED
+
+
+@pytest.mark.parametrize(("output", "stands", "moves"), [(L1, 1, 2), (T5, 2, 1)], ids=["L1", "T5"])
+def test_a_controlled_output_that_stays_bad_ends_mpc_and_only_the_loop_that_needs_it(
+    rig: "Bench", at: At, output: int, stands: int, moves: int
+) -> None:
+    rig.play([at()] * 200, ticks=2)
+    stale = rig.sequence([at()] * 20)
+    rig.level, rig.temperature = 1.0, 1.0
+    rig.scan()
+    rig.readings[output] = math.nan
+    rig.scans(41)
+    assert rig.program.mode is not Mode.CLASSICAL, "it is bridged for 10 s"
+    applied = rig.scans(60)
+    assert rig.program.mode is Mode.CLASSICAL
+    assert rig.program.ladder.cause is Cause.SENSOR_BAD
+    assert len({row[stands] for row in applied}) == 1
+    assert len({row[moves] for row in applied}) > 1
+    assert rig.offer(stale).verdict == Verdict.NOT_INVITED
+    del rig.readings[output]
+    latched = [rig.scan()[1] for _ in range(10)]
+    assert any(latched), "MPC is invited again"
+
+
+def test_a_frozen_level_is_found_while_others_move_and_a_process_at_rest_is_not_taken_for_it(
+    rig: "Bench", new_bench: NewBench
+) -> None:
+    rig.scans(200)
+    assert rig.program.bad_sensors == 0, "all stand: the process is at rest"
+    lively = new_bench(InputLimits(), section())
+    lively.steady = lively.moving = True
+    lively.scans(100)
+    assert lively.program.bad_sensors == 0
+    lively.readings[L1] = 60.0
+    lively.scans(79)
+    assert lively.program.bad_sensors == 0
+    lively.scans(3)
+    assert lively.program.bad_sensors == 1 << L1
+
+
+def test_a_state_that_is_no_number_is_not_worked_with(rig: "Bench") -> None:
+    program = rig.program
+    program.begin_scan()
+    bad = Measurement(program.tick, rig.load, rig.outputs(), (math.nan,) * 28, 1)
+    assert program.end_scan(bad) is None
+    assert not program.awaiting_plan
+    _, update = rig.scan()
+    assert isinstance(update, Update)
+
+
+# -- restarts and leaps ------------------------------------------------------------------------------------------------
+
+
+def test_after_a_restart_the_session_goes_on_from_what_is_applied(rig: "Bench", at: At) -> None:
+    program = rig.program
+    applied = as_transmitted(at(0.4, -8.0))
+    program.resume(7, 500, applied, updates=31, operator=Operator(OperatorMode.AUTO, *applied))
+    row, update = rig.scan()
+    assert row == applied
+    assert update is not None
+    assert (update.session, update.update, update.tick, update.playing) == (7, 31, 500, 0)
+    assert (program.mode, program.ladder.cause) == (Mode.HOLD, Cause.RESTARTED)
+    assert rig.plan(3)
+    assert rig.offer(rig.sequence([applied] * 5)).verdict == Verdict.ACCEPTED
+
+
+def test_outputs_that_a_safe_state_left_outside_the_bounds_are_brought_back_within_the_rate(rig: "Bench") -> None:
+    rig.program.rejoin(100, (10.0, 75.0, 36.0))
+    applied = [SequenceRow(10.0, 75.0, 36.0), *rig.scans(20 * 25)]
+    assert applied[-1].cv155 >= 20.0
+    assert steps(applied)[0] <= 0.5
+
+
+def test_after_a_leap_of_time_the_sequence_goes_on_where_it_would_be(rig: "Bench", at: At) -> None:
+    rig.play([at(0.01 * row) for row in range(40)], ticks=2)
+    rig.scans(3)
+    rig.program.rejoin(15, rig.program.applied)
+    row, _ = rig.scan()
+    assert row == as_transmitted(at(0.13))
+    rig.program.rejoin(100, rig.program.applied)
+    row, update = rig.scan()
+    assert rig.program.mode is Mode.HOLD
+    assert update is not None
+    assert update.tick == 100
