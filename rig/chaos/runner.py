@@ -31,7 +31,7 @@ STANDSTILL_PATIENCE_S: Final = 60.0
 """A rig that does not move for so long without a fault is given up."""
 RESTART_PATIENCE_S: Final = 90.0
 PRESENCE_S: Final = 10.0
-"""How long a new optimiser may take, in lock-step, until the control PLC knows of it."""
+"""How long an optimiser may take after a fault, in lock-step, until the control PLC knows of it."""
 RESOURCE_TICKS: Final = 1200
 LOOK_S: Final = 0.005
 SLOWEST: Final = 20.0
@@ -206,13 +206,15 @@ class Driver:
         started = await self._injector.end(moment.fault)
         if started is not None:
             await self._until_up(started, moment.fault)
+        if not self._plan.realtime and not self._timeline.on:
+            await self._until_optimizer_is_known()
         sight = await self._look()
         if started == "control_plc" and sight.ladder is not None:
             self._trace.sight_mode(self.tick, sight.ladder)
         mark.end = self.tick
 
     async def _until_up(self, service: str, fault: AnyFault) -> None:
-        """Wait until a service that was started again answers, and in lock-step an optimiser is known again."""
+        """Wait until a service that was started again answers."""
         if service == "control_plc":
             self._observer.expect_new_events()
         since = time.monotonic()
@@ -222,8 +224,15 @@ class Driver:
             if self._plan.realtime:
                 await self._look()
             await asyncio.sleep(LOOK_S)
-        while service == "optimizer_plc" and not self._plan.realtime:
+
+    async def _until_optimizer_is_known(self) -> None:
+        """Hold plant time in lock-step until the control PLC knows of its optimiser again.
+
+        Without one it runs as fast as it can, and what the optimiser takes to come back says nothing in plant time.
+        """
+        since = time.monotonic()
+        while time.monotonic() - since < PRESENCE_S:
             sight = await self._look()
-            if (sight.ladder is not None and sight.ladder.optimizer) or time.monotonic() - since > PRESENCE_S:
+            if sight.ladder is not None and sight.ladder.optimizer:
                 return
             await asyncio.sleep(LOOK_S)
