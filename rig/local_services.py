@@ -122,6 +122,10 @@ class LocalServices:
         process = self._processes.get(service)
         return process.pid if process is not None else None
 
+    def ended(self, service: str) -> bool:
+        """Tell whether a service has ended by itself."""
+        return self._processes[service].returncode is not None
+
     def pause(self, service: str) -> None:
         """Let a process stand still."""
         self._signal(service, signal.SIGSTOP)

@@ -41,6 +41,7 @@ class Fault(BaseModel):
     at_s: Annotated[float, Field(ge=0)] | None = None
     """Left out where the instant is drawn."""
     duration_s: Duration
+    kind: str
 
     @property
     def tick(self) -> int:
@@ -55,7 +56,7 @@ class Fault(BaseModel):
     @property
     def label(self) -> str:
         """What tables call it."""
-        raise NotImplementedError
+        return self.kind.replace("_", " ")
 
     @property
     def processes(self) -> frozenset[str]:
@@ -72,7 +73,6 @@ class LinkFault(Fault):
     """Something wrong with a link, as its proxy does it."""
 
     link: Link
-    kind: str
 
     @property
     def label(self) -> str:
@@ -156,7 +156,6 @@ class ProcessFault(Fault):
     """Something done to a process."""
 
     process: Literal["optimizer", "control", "plant"]
-    kind: str
     offset_ms: Milliseconds = 0.0
     """Real time by which the signal is sent later than the tick, while the rig moves on."""
 
@@ -232,11 +231,6 @@ class WrongModel(Fault):
     """The optimiser is restarted with the model of another operating point, and with the right one at the end."""
 
     kind: Literal["wrong_model"]
-
-    @property
-    def label(self) -> str:
-        """What tables call it."""
-        return "wrong model"
 
     @property
     def processes(self) -> frozenset[str]:

@@ -46,7 +46,7 @@ async def conduct(
     Raises:
         LinkError: A service ended by itself, the rig stood still, or it all took too long.
     """
-    if any(isinstance(fault, WrongModel) for fault in plan.schedule()):
+    if any(isinstance(fault, WrongModel) for fault in plan.schedule()):  # not while the clock is running
         await asyncio.to_thread(save_wrong_model, settings.model.file, folder / WRONG_MODEL)
     detours = Detours(*free_ports(len(Detours._fields)))
     services = LocalServices(settings, folder / "logs", detours=detours, environment=_retained(folder))
@@ -196,6 +196,8 @@ class Driver:
         self._marks[id(fault)] = mark
         self._trace.marks.append(mark)
         await self._injector.begin(fault)
+        if isinstance(fault, WrongModel) and not self._plan.realtime:
+            await self._until_refused()
         if isinstance(fault, ProcessFault) and fault.offset_ms:
             await self._look()
             mark.begin = self.tick
@@ -223,6 +225,13 @@ class Driver:
                 raise LinkError(f"after '{fault.label}' the {service} service does not answer: see its log")
             if self._plan.realtime:
                 await self._look()
+            await asyncio.sleep(LOOK_S)
+
+    async def _until_refused(self) -> None:
+        """Hold plant time until an optimiser with a wrong model has ended, if it does."""
+        since = time.monotonic()
+        while not self._services.ended("optimizer_plc") and time.monotonic() - since < PRESENCE_S:
+            await self._look()
             await asyncio.sleep(LOOK_S)
 
     async def _until_optimizer_is_known(self) -> None:
