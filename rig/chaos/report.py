@@ -1,6 +1,7 @@
 """The files of a run under chaos, and its table."""
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -8,7 +9,7 @@ from typing import Any, Final
 from coldloop.process import INPUT_NAMES
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind, AlarmState
-from rig.chaos.evaluation import Evaluation, Row
+from rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
 from rig.chaos.plan import Plan
 from rig.chaos.trace import ChaosTrace
 from rig.results import whole_file, write_json
@@ -17,6 +18,9 @@ HEADINGS: Final = (
     "fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit", "L1 out s (was)", "T5 out s (was)",
     "back to MPC s",
 )  # fmt: skip
+
+MANY_MODES: Final = 8
+"""More modes than this are not all named in a table."""
 
 
 def table(rows: Sequence[Row]) -> list[list[str]]:
@@ -122,10 +126,24 @@ def _cells(row: Row) -> list[str]:
         row.fault,
         f"{row.at_s:g}",
         "-" if row.lasted_s is None else f"{row.lasted_s:g}",
-        " > ".join(row.modes) or "-",
-        ", ".join(f"{alarm.name} {alarm.after_s:g}" for alarm in row.alarms) or "none",
+        _modes(row.modes),
+        _alarms(row.alarms),
         f"{row.largest_step:.3f}",
         f"{row.outside_s[0]:g} ({row.undisturbed_s[0]:g})",
         f"{row.outside_s[1]:g} ({row.undisturbed_s[1]:g})",
         "not" if row.back_s is None else f"{row.back_s:g}",
     ]
+
+
+def _modes(modes: Sequence[str]) -> str:
+    if len(modes) > MANY_MODES:
+        modes = [*modes[: MANY_MODES - 2], f"({len(modes) - MANY_MODES} more)", *modes[-2:]]
+    return " > ".join(modes) or "-"
+
+
+def _alarms(alarms: Sequence[RaisedAlarm]) -> str:
+    """Return each alarm once: when it was first raised, and how often if more than once."""
+    times = Counter(alarm.name for alarm in alarms)
+    first = {alarm.name: alarm.after_s for alarm in reversed(alarms)}
+    cells = [f"{name} {first[name]:g}" + (f" (x{count})" if count > 1 else "") for name, count in times.items()]
+    return ", ".join(cells) or "none"

@@ -37,6 +37,11 @@ class Timeline:
         """The tick of the next moment; None when there is none."""
         return min((moment.tick for moment in [*self._begins[:1], *self.on[:1]]), default=None)
 
+    def left_s(self, seconds: float) -> float | None:
+        """Return the real time until an end is due by the clock; None when there is none."""
+        due = [end.due_s for end in self.on if end.due_s is not None]
+        return max(0.001, min(due) - seconds) if due else None
+
     def due(self, tick: int, seconds: float) -> Moment | None:
         """Take out and return a moment that is due; ends come before beginnings."""
         for end in self.on:

@@ -130,3 +130,14 @@ def test_the_tables_have_a_line_a_fault(killed: ChaosTrace) -> None:
     assert "MPC > HOLD > CLASSICAL > MPC" in as_text(cells)
     assert "OPTIMIZER_LOST 0.25" in as_markdown(cells)
     assert as_markdown(cells).count("\n") == 4
+
+
+def test_a_restless_run_still_has_a_table_that_can_be_read() -> None:
+    trace = quiet()
+    for tick in range(100, 300, 10):
+        trace.events += [mode(tick, Mode.REST), alarm(tick, AlarmKind.SEQUENCE_LATE), mode(tick + 5, Mode.MPC)]
+    trace.marks = [Mark(KILL, 90, 95)]
+    (row,) = evaluated(trace).rows
+    assert len(row.modes) == 40
+    assert "REST > MPC > (32 more) > REST > MPC" in as_text(table([row]))
+    assert "SEQUENCE_LATE 2.5 (x20)" in as_text(table([row]))

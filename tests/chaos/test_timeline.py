@@ -31,7 +31,9 @@ def test_in_real_time_a_fault_ends_by_the_clock_though_plant_time_stands() -> No
     timeline = Timeline([KILL], factor=10.0)
     moment = timeline.due(40, 4.0)
     assert moment is not None
+    assert timeline.left_s(4.0) is None
     timeline.begun(moment, 4.0)
+    assert timeline.left_s(5.0) == 1.0
     assert timeline.due(41, 5.9) is None
     end = timeline.due(41, 6.0)
     assert end is not None
