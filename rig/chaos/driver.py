@@ -124,15 +124,14 @@ class Driver:
         fault = moment.fault
         if isinstance(fault, ProcessFault) and fault.offset_ms:
             await self._go_on(fault.end_tick)  # the signal is to come while the rig moves on
+            await asyncio.sleep(fault.offset_ms / 1000)
+            await self._look()
         mark = Mark(fault, begin=self.tick, first_event=len(self._trace.events))
         self._marks[id(fault)] = mark
         self._trace.marks.append(mark)
         await self._injector.begin(fault)
         if isinstance(fault, WrongModel) and not self._plan.realtime:
             await self._until_refused()
-        if isinstance(fault, ProcessFault) and fault.offset_ms:
-            await self._look()
-            mark.begin = self.tick
         self._timeline.begun(moment, self._seconds)
 
     async def _end(self, moment: Moment) -> None:

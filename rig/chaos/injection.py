@@ -18,7 +18,6 @@ from rig.chaos.faults import (
     Link,
     LinkFault,
     Pause,
-    ProcessFault,
     Restart,
     Sensor,
     WrongModel,
@@ -49,8 +48,6 @@ class Injector:
 
     async def begin(self, fault: AnyFault) -> None:
         """Bring a fault about."""
-        if isinstance(fault, ProcessFault) and fault.offset_ms:
-            await asyncio.sleep(fault.offset_ms / 1000)
         if isinstance(fault, LinkFault):
             self._proxies[fault.link].begin(fault)
         elif isinstance(fault, Kill):
