@@ -13,6 +13,7 @@ from coldloop.errors import ColdloopError
 
 COMMANDS: Final = {
     "run": "run the loop and record it",
+    "chaos": "a run with faults on purpose, and what became of it",
     "study": "do the runs of a study and draw its figure",
     "reproduce": "all studies of the paper, one report and a scorecard",
     "budget": "what the reference PLC can compute, and in which time",

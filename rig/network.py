@@ -71,7 +71,7 @@ class NetworkRig:
         Raises:
             LinkError: The rig stopped moving, or went faster than it could be recorded.
         """
-        session = await self._start(scenario)
+        session = await self.start(scenario)
         recorder.begin()
         updates = _UpdateReader(self._optimizer, recorder, session)
         quiet_since = time.monotonic()
@@ -96,7 +96,7 @@ class NetworkRig:
             status.deadline_misses, status.overruns, status.lateness_max, status.lateness_p99
         )
 
-    async def _start(self, scenario: Scenario) -> int:
+    async def start(self, scenario: Scenario) -> int:
         """Write the load and the settings of a new session to all three; return its number."""
         session = 1
         for client in (self._plant, self._control, self._optimizer):

@@ -1,0 +1,91 @@
+"""What becomes of a service that is killed, or stands still, at instants drawn by a seed."""
+
+import argparse
+import random
+import tempfile
+from pathlib import Path
+
+from coldloop.process import TICK_S
+from coldloop.session import TimeMode
+from rig.chaos.evaluation import Evaluation
+from rig.chaos.experiment import perform
+from rig.chaos.faults import Kill, Pause
+from rig.chaos.plan import Plan
+from rig.chaos.progress import ChaosProgress
+from rig.chaos.report import summary_lines, write_report
+from rig.results import prepare_folder
+from rig.settings import Settings
+
+GAP_S = 120.0
+"""Plant time from one instant to the next, about: enough to come back to MPC in between."""
+IN_FLIGHT_MS = 20.0
+"""In real time the signal comes up to so much after a tick, with the rig moving on: anywhere in a scan or a solve."""
+HOURS = 8
+
+
+def make_plan(options: argparse.Namespace) -> Plan:
+    """Return a plan with all the instants in one run."""
+    draw = random.Random(options.seed)  # noqa: S311 not for secrets
+    faults = []
+    for number in range(1, options.count + 1):
+        values = {
+            "process": options.service,
+            "at_s": number * GAP_S + TICK_S * draw.randrange(round(0.5 * GAP_S / TICK_S)),
+            "duration_s": options.outage,
+            "offset_ms": draw.uniform(0, IN_FLIGHT_MS),
+        }
+        faults.append(Kill(kind="kill", **values) if options.signal == "kill" else Pause(kind="pause", **values))
+    duration_s = (options.count + 2) * GAP_S
+    draws = int(duration_s // (HOURS * 3600)) + 1
+    return Plan(
+        name=f"{options.signal}-{options.service}",
+        description=f"{options.count} times {options.signal} {options.service}",
+        load=tuple(f"{HOURS}h@{number}" for number in range(1, draws + 1)),
+        duration_s=duration_s,
+        seed=options.seed,
+        mode=TimeMode(options.mode),
+        factor=options.factor,
+        faults=tuple(faults),
+    )
+
+
+def tell(evaluation: Evaluation) -> None:
+    """Print what became of it."""
+    rows = evaluation.rows
+    first_alarms = [row.alarms[0].after_s for row in rows if row.alarms]
+    back = [row.back_s for row in rows if row.back_s is not None]
+    print(f"{len(rows)} instants")
+    print(f"largest step/limit: {max((row.largest_step for row in rows), default=0.0):.6f}")
+    print(f"first alarm after at most {max(first_alarms, default=0.0):g} s; none in {len(rows) - len(first_alarms)}")
+    print(f"back to MPC after at most {max(back, default=0.0):g} s; not before the next one in {len(rows) - len(back)}")
+
+
+def main() -> int:
+    """Do all of it in one run, and print; return 1 when the run failed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--service", choices=("optimizer", "control", "plant"), default="optimizer")
+    parser.add_argument("--signal", choices=("kill", "stop"), default="kill")
+    parser.add_argument("--count", type=int, default=200)
+    parser.add_argument("--mode", choices=[mode.value for mode in TimeMode], default="lockstep")
+    parser.add_argument("--factor", type=float, default=20.0, help="in real time")
+    parser.add_argument("--outage", type=float, default=20.0, help="plant time until it is started again, s")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="folder for chaos.json, chaos.md and logs (default: none are kept)")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = options.out or Path(scratch)
+        prepare_folder(folder)
+        plan = make_plan(options)
+        with ChaosProgress(plan.ticks) as progress:
+            experiment = perform(plan, Settings(), folder, progress)
+        write_report(folder, plan, experiment.trace, experiment.evaluation, {}, experiment.failure)
+    tell(experiment.evaluation)
+    print(*summary_lines(experiment.trace, experiment.evaluation), sep="\n")
+    if experiment.failure is not None:
+        print(f"failed: {experiment.failure}")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,1 @@
+"""Faults on purpose: chaos plans, the proxies and processes they act on, and what came of them."""

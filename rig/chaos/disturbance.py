@@ -1,0 +1,93 @@
+"""What happens to the frames of a disturbed link: decisions only, no sockets."""
+
+import random
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from coldloop.modbus.framing import MalformedFrameError, next_frame
+from rig.chaos.faults import Delay, Direction, Drop, Duplicate, Flip, FrameFault, Reorder, Truncate
+
+
+class Outcome(NamedTuple):
+    """What becomes of one frame."""
+
+    data: bytes
+    """What goes on, with what was held back before."""
+    delay_s: float = 0.0
+    """How much later."""
+    close: bool = False
+    """Whether the connection is closed behind it."""
+
+
+class Mangler:
+    """Decides about the frames of one direction of one connection.
+
+    Args:
+        direction: Requests or answers.
+        seed: The same seed, frames and faults lead to the same decisions.
+    """
+
+    def __init__(self, direction: Direction, seed: str) -> None:
+        self._direction = direction
+        self._draw = random.Random(seed)  # noqa: S311 not for secrets
+        self._held = b""
+        self.hold_s: float | None = None
+        """While a frame is held back: how long, unless another one comes."""
+
+    def decide(self, frame: bytes, faults: Iterable[FrameFault]) -> Outcome:
+        """Return what becomes of a frame under the faults that are on."""
+        pieces, delay_s, overtaken = [frame], 0.0, self.release()
+        for fault in faults:
+            if fault.direction not in {Direction.BOTH, self._direction}:
+                continue
+            if isinstance(fault, Delay):
+                delay_s += max(0.0, fault.delay_ms + fault.jitter_ms * self._draw.uniform(-1, 1)) / 1000
+            elif isinstance(fault, Truncate):
+                if pieces and self._hit(fault.share):
+                    return Outcome(b"".join(pieces[:-1]) + pieces[-1][: len(pieces[-1]) // 2], delay_s, close=True)
+            elif isinstance(fault, Reorder):
+                if pieces and not overtaken and self._hit(fault.share):
+                    self._held, self.hold_s = pieces.pop(), fault.hold_ms / 1000
+            elif isinstance(fault, Drop | Duplicate | Flip):
+                pieces = self._changed(pieces, fault)
+        return Outcome(b"".join([*pieces, overtaken]), delay_s)
+
+    def release(self) -> bytes:
+        """Return what is held back; it is let go."""
+        held, self._held, self.hold_s = self._held, b"", None
+        return held
+
+    def _changed(self, pieces: list[bytes], fault: Drop | Duplicate | Flip) -> list[bytes]:
+        changed: list[bytes] = []
+        for piece in pieces:
+            hit = self._hit(fault.share)
+            if isinstance(fault, Flip):
+                changed.append(self._flipped(piece, fault.bits) if hit else piece)
+            elif isinstance(fault, Drop):
+                changed += [] if hit else [piece]
+            else:
+                changed += [piece, piece] if hit else [piece]
+        return changed
+
+    def _flipped(self, piece: bytes, bits: int) -> bytes:
+        damaged = bytearray(piece)
+        for bit in self._draw.sample(range(8 * len(piece)), min(bits, 8 * len(piece))):
+            damaged[bit // 8] ^= 1 << bit % 8
+        return bytes(damaged)
+
+    def _hit(self, share: float) -> bool:
+        return self._draw.random() < share
+
+
+def take_frames(buffer: bytearray) -> list[bytes]:
+    """Take all whole frames out of a buffer; what is no Modbus/TCP comes as one piece, as it stands."""
+    frames, position = [], 0
+    try:
+        while (frame := next_frame(buffer, position)) is not None:
+            frames.append(bytes(buffer[position : frame.end]))
+            position = frame.end
+    except MalformedFrameError:
+        frames.append(bytes(buffer[position:]))
+        position = len(buffer)
+    del buffer[:position]
+    return frames

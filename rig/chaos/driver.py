@@ -1,0 +1,178 @@
+"""Takes a session from fault to fault: grants ticks, looks at what happens, brings faults about and takes them back."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from typing import Final
+
+from coldloop.errors import LinkError
+from coldloop.process import TICK_S
+from rig.chaos.faults import AnyFault, ProcessFault, WrongModel
+from rig.chaos.injection import Injector
+from rig.chaos.observer import Observer, Sight
+from rig.chaos.plan import Plan
+from rig.chaos.resources import log_lines, resident_mb
+from rig.chaos.timeline import Moment, Timeline
+from rig.chaos.trace import ChaosTrace, Mark, Resources
+from rig.local_services import LocalServices
+
+Progress = Callable[[int, Sight, list[str]], None]
+"""Told of the plant's tick, what was seen, and the faults that are on."""
+
+STANDSTILL_PATIENCE_S: Final = 60.0
+"""A rig that does not move for so long without a fault is given up."""
+RESTART_PATIENCE_S: Final = 90.0
+PRESENCE_S: Final = 10.0
+"""How long an optimiser may take after a fault, in lock-step, until the control PLC knows of it."""
+RESOURCE_TICKS: Final = 1200
+LOOK_S: Final = 0.005
+
+
+class Driver:
+    """Takes a session from fault to fault."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        services: LocalServices,
+        observer: Observer,
+        injector: Injector,
+        trace: ChaosTrace,
+        progress: Progress,
+    ) -> None:
+        self._plan = plan
+        self._services = services
+        self._observer = observer
+        self._injector = injector
+        self._trace = trace
+        self._progress = progress
+        self._timeline = Timeline(plan.schedule(), factor=plan.factor if plan.realtime else None)
+        self._marks: dict[int, Mark] = {}
+        self._began = time.monotonic()
+        self.tick = 0
+
+    async def run(self) -> None:
+        """Drive the session to its end."""
+        while (moment := await self._next_moment()) is not None:
+            if moment.is_begin:
+                await self._begin(moment)
+            else:
+                await self._end(moment)
+            self._observer.moved()
+        await self._observer.read_alarms()
+
+    def finish(self) -> None:
+        """Record what is known at the end, whatever the end was."""
+        self._trace.seconds = self._seconds
+        self._trace.log_lines = log_lines(self._services)
+
+    @property
+    def _seconds(self) -> float:
+        return time.monotonic() - self._began
+
+    async def _next_moment(self) -> Moment | None:
+        """Let the rig go on until a fault begins or ends; return None at the end of the run."""
+        while True:
+            with contextlib.suppress(TimeoutError):  # what stands still must not keep a fault from ending in time
+                async with asyncio.timeout(self._timeline.left_s(self._seconds)):
+                    await self._look()
+            moment = self._timeline.due(self.tick, self._seconds) or self._cut_short()
+            if moment is not None:
+                return moment
+            if self.tick >= self._plan.ticks:
+                return None
+            await self._go_on(self._timeline.next_tick or self._plan.ticks)
+            await asyncio.sleep(LOOK_S)
+
+    async def _go_on(self, until: int) -> None:
+        if not self._plan.realtime:
+            await self._observer.grant(min(until, self._plan.ticks))
+
+    async def _look(self) -> Sight:
+        sight = await self._observer.look()
+        if sight.tick is not None:
+            self.tick = sight.tick
+        resources = self._trace.resources
+        if not resources or self.tick - resources[-1].tick >= RESOURCE_TICKS:
+            resources.append(Resources(self.tick, self._seconds, resident_mb(self._services)))
+        self._progress(self.tick, sight, [moment.fault.label for moment in self._timeline.on])
+        return sight
+
+    def _cut_short(self) -> Moment | None:
+        """Return the end of a fault under which plant time stands still.
+
+        Raises:
+            LinkError: It stands still without a fault.
+        """
+        standing = self._observer.standing_s
+        for end in self._timeline.on:
+            fault = end.fault
+            bearable = self._plan.standstill_s
+            if fault.stops_time:
+                bearable = min(bearable, fault.duration_s)
+            if not self._plan.realtime and standing > bearable:
+                return self._timeline.take(end)
+        if not self._timeline.on and standing > max(STANDSTILL_PATIENCE_S, 4 * TICK_S / self._plan.factor):
+            raise LinkError(
+                f"plan {self._plan.name}: the plant stands at {self.tick * TICK_S:g} s for {standing:.0f} s without a "
+                f"fault: see {self._services.log('control_plc')}"
+            )
+        return None
+
+    async def _begin(self, moment: Moment) -> None:
+        fault = moment.fault
+        if isinstance(fault, ProcessFault) and fault.offset_ms:
+            await self._go_on(fault.end_tick)  # the signal is to come while the rig moves on
+            await asyncio.sleep(fault.offset_ms / 1000)
+            await self._look()
+        mark = Mark(fault, begin=self.tick, first_event=len(self._trace.events))
+        self._marks[id(fault)] = mark
+        self._trace.marks.append(mark)
+        await self._injector.begin(fault)
+        if isinstance(fault, WrongModel) and not self._plan.realtime:
+            await self._until_refused()
+        self._timeline.begun(moment, self._seconds)
+
+    async def _end(self, moment: Moment) -> None:
+        mark = self._marks.pop(id(moment.fault))
+        started = await self._injector.end(moment.fault)
+        if started is not None:
+            await self._until_up(started, moment.fault)
+        if not self._plan.realtime and not self._timeline.on:
+            await self._until_optimizer_is_known()
+        sight = await self._look()
+        if started == "control_plc" and sight.ladder is not None:
+            self._trace.sight_mode(self.tick, sight.ladder)
+        mark.end = self.tick
+
+    async def _until_up(self, service: str, fault: AnyFault) -> None:
+        """Wait until a service that was started again answers."""
+        if service == "control_plc":
+            self._observer.expect_new_events()
+        since = time.monotonic()
+        while not await self._observer.answers(service):
+            if time.monotonic() - since > RESTART_PATIENCE_S:
+                raise LinkError(f"after '{fault.label}' the {service} service does not answer: see its log")
+            if self._plan.realtime:
+                await self._look()
+            await asyncio.sleep(LOOK_S)
+
+    async def _until_refused(self) -> None:
+        """Hold plant time until an optimiser with a wrong model has ended, if it does."""
+        since = time.monotonic()
+        while not self._services.ended("optimizer_plc") and time.monotonic() - since < PRESENCE_S:
+            await self._look()
+            await asyncio.sleep(LOOK_S)
+
+    async def _until_optimizer_is_known(self) -> None:
+        """Hold plant time in lock-step until the control PLC knows of its optimiser again.
+
+        Without one it runs as fast as it can, and what the optimiser takes to come back says nothing in plant time.
+        """
+        since = time.monotonic()
+        while time.monotonic() - since < PRESENCE_S:
+            sight = await self._look()
+            if sight.ladder is not None and sight.ladder.optimizer:
+                return
+            await asyncio.sleep(LOOK_S)

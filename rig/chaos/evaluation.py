@@ -1,0 +1,151 @@
+"""What the faults of a run did, fault by fault: from the trace, the events, and the same run without faults."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.process import L1, T5, TICK_S
+from coldloop.registers.control_plc import Mode
+from coldloop.registers.safety import AlarmKind, Event, EventKind
+from rig.chaos.trace import ChaosTrace
+from rig.recording import Recording
+
+Triple = tuple[float, float, float]
+Pair = tuple[float, float]
+
+
+class Bands(NamedTuple):
+    """Where the constrained outputs are to stay, (L1 %, T5 K)."""
+
+    low: Pair = (59.0, 9.0)
+    high: Pair = (61.0, 16.0)
+
+
+class RaisedAlarm(NamedTuple):
+    """An alarm, and how long after the beginning of the fault it was raised."""
+
+    name: str
+    after_s: float
+
+
+class Row(NamedTuple):
+    """One fault. Its window lasts from its beginning to that of the next one, or to the end of the run."""
+
+    fault: str
+    at_s: float
+    lasted_s: float | None
+    """Plant time, until what was stopped answered again; None when it did not end within the run."""
+    modes: tuple[str, ...]
+    """The mode before, and those passed until the next fault."""
+    alarms: tuple[RaisedAlarm, ...]
+    """Raised in the window."""
+    largest_steps: Triple
+    """Largest change of each input from a tick to the next, as a share of its limit."""
+    outside_s: Pair
+    """Time in the window that L1 and T5 were outside their bands."""
+    undisturbed_s: Pair
+    """The same without faults."""
+    back_s: float | None
+    """From the end of the fault to MPC: 0 when MPC drove then, None when it did not come back in the window."""
+
+    @property
+    def largest_step(self) -> float:
+        """The largest share among the inputs."""
+        return max(self.largest_steps)
+
+
+class Evaluation(NamedTuple):
+    """A run."""
+
+    rows: list[Row]
+    largest_steps: Triple
+    outside_s: Pair
+    undisturbed_s: Pair
+    missing_ticks: int
+
+
+def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: Triple, bands: Bands | None = None) -> Evaluation:
+    """Compute the rows of all faults, and the same for the whole run.
+
+    Args:
+        trace: The run.
+        undisturbed: The same run without faults.
+        rate: Largest change of each input, as the limits have it.
+        bands: Those of the paper by default.
+    """
+    bands = bands or Bands()
+    recording = trace.recording()
+    outside, outside_undisturbed = _outside(recording, bands), _outside(undisturbed, bands)
+    steps = _steps(recording, rate)
+    rows = [_row(trace, number, steps, (outside, outside_undisturbed)) for number in range(len(trace.marks))]
+    return Evaluation(
+        rows, _largest(steps), _seconds(outside), _seconds(outside_undisturbed), missing_ticks=trace.missing
+    )
+
+
+def _row(
+    trace: ChaosTrace, number: int, steps: NDArray[np.float64], outside: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+) -> Row:
+    mark, following = trace.marks[number], trace.marks[number + 1 : number + 2]
+    end, last_event = trace.ticks, len(trace.events)
+    for later in following:
+        end, last_event = later.begin, later.first_event
+    before = [Mode(event.subject) for event in trace.modes(0, mark.first_event)[-1:]]
+    changes = trace.modes(mark.first_event, last_event)
+    return Row(
+        fault=mark.fault.label,
+        at_s=mark.begin * TICK_S,
+        lasted_s=None if mark.end is None else (mark.end - mark.begin) * TICK_S,
+        modes=tuple(mode.name for mode in _different([*before, *(Mode(event.subject) for event in changes)])),
+        alarms=tuple(
+            RaisedAlarm(AlarmKind(event.subject).name, max(0, event.tick - mark.begin) * TICK_S)
+            for event in trace.events[mark.first_event : last_event]
+            if event.kind == EventKind.ALARM_RAISED
+        ),
+        largest_steps=_largest(steps[mark.begin : end]),
+        outside_s=_seconds(outside[0][mark.begin : end]),
+        undisturbed_s=_seconds(outside[1][mark.begin : end]),
+        back_s=_back_s(mark.end, before, changes),
+    )
+
+
+def _different(modes: Sequence[Mode]) -> list[Mode]:
+    """Return modes without repetitions."""
+    return [mode for mode, previous in zip(modes, [None, *modes], strict=False) if mode is not previous]
+
+
+def _back_s(end: int | None, before: Sequence[Mode], changes: Sequence[Event]) -> float | None:
+    """Return the time from the end of a fault until MPC drives; None when it does not."""
+    if end is None:
+        return None
+    at_end = [*before, *(Mode(event.subject) for event in changes if event.tick <= end)]
+    if at_end and at_end[-1] is Mode.MPC:
+        return 0.0
+    back = [event.tick for event in changes if event.tick > end and event.subject == Mode.MPC]
+    return (back[0] - end) * TICK_S if back else None
+
+
+def _steps(recording: Recording, rate: Triple) -> NDArray[np.float64]:
+    """Return the change of each input at each tick as a share of its limit, (N, 3); NaN where it is not known."""
+    u = recording.u.astype(float)
+    steps: NDArray[np.float64] = np.abs(np.diff(u, axis=0, prepend=u[:1])) / np.array(rate)
+    return steps
+
+
+def _largest(steps: NDArray[np.float64]) -> Triple:
+    first, second, third = (float(value) for value in np.max(np.nan_to_num(steps), axis=0, initial=0.0))
+    return first, second, third
+
+
+def _outside(recording: Recording, bands: Bands) -> NDArray[np.bool_]:
+    """Tell for each tick whether L1 and T5 are outside, (N, 2); a tick that is not known is not."""
+    y = recording.y[:, [L1, T5]]
+    outside: NDArray[np.bool_] = (y < np.array(bands.low)) | (y > np.array(bands.high))
+    return outside
+
+
+def _seconds(outside: NDArray[np.bool_]) -> Pair:
+    level, temperature = outside.sum(axis=0) * TICK_S
+    return float(level), float(temperature)

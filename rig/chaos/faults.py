@@ -1,0 +1,245 @@
+"""The faults that a chaos plan may hold; each knows what belongs to it."""
+
+from enum import StrEnum
+from typing import Annotated, Final, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from coldloop.process import OUTPUT_NAMES, TICK_S
+
+Share = Annotated[float, Field(gt=0, le=1)]
+Duration = Annotated[float, Field(gt=0, le=86_400)]
+Milliseconds = Annotated[float, Field(ge=0, le=60_000)]
+
+SERVICE_OF: Final = {"optimizer": "optimizer_plc", "control": "control_plc", "plant": "plant"}
+"""What plans call a process, and the service that it is."""
+
+
+class Link(StrEnum):
+    """A connection between two of the services."""
+
+    OPTIMIZER = "optimizer"
+    """From the optimiser to the control PLC."""
+    PLANT = "plant"
+    """From the control PLC to the plant."""
+
+
+class Direction(StrEnum):
+    """Which frames of a link."""
+
+    BOTH = "both"
+    REQUESTS = "requests"
+    """From the client to the server."""
+    ANSWERS = "answers"
+
+
+class Fault(BaseModel):
+    """A fault, from `at_s` on for `duration_s`, both in seconds of plant time."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    at_s: Annotated[float, Field(ge=0)] | None = None
+    """Left out where the instant is drawn."""
+    duration_s: Duration
+    kind: str
+
+    @property
+    def tick(self) -> int:
+        """The tick before which it begins."""
+        return round((self.at_s or 0.0) / TICK_S)
+
+    @property
+    def end_tick(self) -> int:
+        """The tick before which it is to end."""
+        return self.tick + round(self.duration_s / TICK_S)
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        return self.kind.replace("_", " ")
+
+    @property
+    def processes(self) -> frozenset[str]:
+        """Services whose processes it stops."""
+        return frozenset()
+
+    @property
+    def stops_time(self) -> bool:
+        """Whether plant time cannot go on under it in lock-step: the plant and the control PLC make it."""
+        return bool(self.processes & {"plant", "control_plc"})
+
+
+class LinkFault(Fault):
+    """Something wrong with a link, as its proxy does it."""
+
+    link: Link
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        return f"{self.kind} link {self.link}"
+
+
+class FrameFault(LinkFault):
+    """Something that happens to single frames."""
+
+    direction: Direction = Direction.BOTH
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        which = "" if self.direction is Direction.BOTH else f" ({self.direction})"
+        return f"{super().label}{which}"
+
+
+class Delay(FrameFault):
+    """Frames arrive late, in order."""
+
+    kind: Literal["delay"]
+    delay_ms: Milliseconds
+    """Real time."""
+    jitter_ms: Milliseconds = 0.0
+    """Largest deviation from it, either way."""
+
+
+class Drop(FrameFault):
+    """Whole frames are lost."""
+
+    kind: Literal["drop"]
+    share: Share
+
+
+class Duplicate(FrameFault):
+    """Frames arrive twice."""
+
+    kind: Literal["duplicate"]
+    share: Share
+
+
+class Reorder(FrameFault):
+    """A frame is overtaken by the next one, if that comes soon enough."""
+
+    kind: Literal["reorder"]
+    share: Share
+    hold_ms: Milliseconds = 20.0
+    """How long it waits for one to overtake it, real time."""
+
+
+class Reset(LinkFault):
+    """All connections are reset (RST), and new ones as long as it lasts."""
+
+    kind: Literal["reset"]
+
+
+class Freeze(LinkFault):
+    """Nothing passes; the connections stay open."""
+
+    kind: Literal["freeze"]
+
+
+class Truncate(FrameFault):
+    """Half a frame passes, then the connection is closed."""
+
+    kind: Literal["truncate"]
+    share: Share = 1.0
+
+
+class Flip(FrameFault):
+    """Bits of frames are flipped."""
+
+    kind: Literal["flip"]
+    share: Share
+    bits: Annotated[int, Field(ge=1, le=64)] = 1
+
+
+class ProcessFault(Fault):
+    """Something done to a process."""
+
+    process: Literal["optimizer", "control", "plant"]
+    offset_ms: Milliseconds = 0.0
+    """Real time by which the signal is sent later than the tick, while the rig moves on."""
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        return f"{self.kind} {self.process}"
+
+    @property
+    def processes(self) -> frozenset[str]:
+        """Services whose processes it stops."""
+        return frozenset({SERVICE_OF[self.process]})
+
+
+class Kill(ProcessFault):
+    """SIGKILL, and a new start at the end."""
+
+    kind: Literal["kill"]
+
+
+class Pause(ProcessFault):
+    """SIGSTOP, and SIGCONT at the end."""
+
+    kind: Literal["pause"]
+
+
+class Restart(ProcessFault):
+    """SIGTERM, and a new start at the end."""
+
+    kind: Literal["restart"]
+    duration_s: Duration = TICK_S
+
+
+class Clock(Fault):
+    """A jump of the clock as all three processes see it: all are paused, and go on."""
+
+    kind: Literal["clock"]
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        return f"clock +{self.duration_s:g} s"
+
+    @property
+    def processes(self) -> frozenset[str]:
+        """Services whose processes it stops."""
+        return frozenset(SERVICE_OF.values())
+
+
+class Sensor(Fault):
+    """A sensor of the plant shows something else."""
+
+    kind: Literal["sensor"]
+    output: str
+    shows: Literal["nan", "frozen", "value"]
+    value: Annotated[float, Field(allow_inf_nan=False)] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.output not in OUTPUT_NAMES:
+            raise ValueError(f"there is no output '{self.output}'; take one of {', '.join(OUTPUT_NAMES)}")
+        if (self.shows == "value") != (self.value is not None):
+            raise ValueError('a value goes with shows = "value", and only with that')
+        return self
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        return f"sensor {self.output} {self.shows if self.value is None else f'= {self.value:g}'}"
+
+
+class WrongModel(Fault):
+    """The optimiser is restarted with the model of another operating point, and with the right one at the end."""
+
+    kind: Literal["wrong_model"]
+
+    @property
+    def processes(self) -> frozenset[str]:
+        """Services whose processes it stops."""
+        return frozenset({"optimizer_plc"})
+
+
+AnyFault = Annotated[
+    Delay | Drop | Duplicate | Reorder | Reset | Freeze | Truncate | Flip
+    | Kill | Pause | Restart | Clock | Sensor | WrongModel,
+    Field(discriminator="kind"),
+]  # fmt: skip

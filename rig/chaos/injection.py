@@ -1,0 +1,94 @@
+"""Brings faults about, and takes them back."""
+
+import asyncio
+import signal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from coldloop.config import PREFIX
+from coldloop.errors import LinkError
+from coldloop.process import OUTPUT_NAMES
+from coldloop.registers.plant import SensorFault, SensorFaultKind
+from rig.chaos.faults import (
+    SERVICE_OF,
+    AnyFault,
+    Clock,
+    Kill,
+    Link,
+    LinkFault,
+    Pause,
+    Restart,
+    Sensor,
+    WrongModel,
+)
+from rig.chaos.models import WRONG_MODEL
+from rig.chaos.observer import Observer
+from rig.chaos.proxy import LinkProxy
+from rig.local_services import SERVICES, LocalServices
+
+ATTEMPTS: Final = 20
+_SHOWN: Final = {"nan": SensorFaultKind.NOT_A_NUMBER, "frozen": SensorFaultKind.FROZEN, "value": SensorFaultKind.VALUE}
+
+
+class Injector:
+    """Acts on the processes, the proxies and the plant's sensors of one run."""
+
+    def __init__(
+        self,
+        services: LocalServices,
+        proxies: Mapping[Link, LinkProxy],
+        observer: Observer,
+        folder: Path,
+    ) -> None:
+        self._services = services
+        self._proxies = proxies
+        self._observer = observer
+        self._wrong_model = folder / WRONG_MODEL
+
+    async def begin(self, fault: AnyFault) -> None:
+        """Bring a fault about."""
+        if isinstance(fault, LinkFault):
+            self._proxies[fault.link].begin(fault)
+        elif isinstance(fault, Kill):
+            await self._services.stop(SERVICE_OF[fault.process], signal.SIGKILL)
+        elif isinstance(fault, Restart):
+            await self._services.stop(SERVICE_OF[fault.process], signal.SIGTERM)
+        elif isinstance(fault, Pause):
+            self._services.pause(SERVICE_OF[fault.process])
+        elif isinstance(fault, Clock):
+            for service in SERVICES:
+                self._services.pause(service)
+        elif isinstance(fault, Sensor):
+            await self._set_sensor(fault.output, SensorFault(_SHOWN[fault.shows], fault.value or 0.0))
+        elif isinstance(fault, WrongModel):
+            await self._services.stop("optimizer_plc", signal.SIGTERM)
+            await self._services.start("optimizer_plc", {f"{PREFIX}MODEL__FILE": str(self._wrong_model)}, may_end=True)
+
+    async def end(self, fault: AnyFault) -> str | None:
+        """Take a fault back; return the service that has been started again, if one has."""
+        if isinstance(fault, LinkFault):
+            self._proxies[fault.link].end(fault)
+        elif isinstance(fault, Kill | Restart):
+            service = SERVICE_OF[fault.process]
+            await self._services.start(service)
+            return service
+        elif isinstance(fault, Pause):
+            self._services.resume(SERVICE_OF[fault.process])
+        elif isinstance(fault, Clock):
+            for service in SERVICES:
+                self._services.resume(service)
+        elif isinstance(fault, Sensor):
+            await self._set_sensor(fault.output, SensorFault(SensorFaultKind.NONE, 0.0))
+        elif isinstance(fault, WrongModel):
+            await self._services.stop("optimizer_plc", signal.SIGTERM)
+            await self._services.start("optimizer_plc")
+            return "optimizer_plc"
+        return None
+
+    async def _set_sensor(self, output: str, fault: SensorFault) -> None:
+        for _ in range(ATTEMPTS):
+            if await self._observer.set_sensor_fault(OUTPUT_NAMES.index(output), fault):
+                return
+            await asyncio.sleep(0.5)
+        raise LinkError(f"the plant took no sensor fault for {output}: see its log")

@@ -1,0 +1,172 @@
+"""Chaos plans: TOML files that say what is run, and what goes wrong in it and when."""
+
+import random
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Final, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from coldloop.errors import LoadFileError, UsageError
+from coldloop.process import TICK_S
+from coldloop.session import TimeMode
+from plant.load import concatenated, find_load, named_families, telegraph
+from plant.program import LoadProfile
+from rig.chaos.faults import AnyFault
+from rig.scenario import Scenario
+
+SHIPPED: Final = files("rig.chaos") / "plans"
+
+SPREAD_S: Final = 20.0
+"""Drawn faults begin up to so much after their multiple of `every_s`: anywhere in an updating period."""
+
+
+class Plan(BaseModel):
+    """A run and its faults."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    description: str
+    load: str | tuple[str, ...] = "a"
+    """Named load or CSV file; or named loads, one after the other."""
+    duration_s: Annotated[float, Field(gt=0, le=7 * 86_400, multiple_of=TICK_S)]
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
+    """Of all that is drawn: instants, the fate of frames, the sensors' noise."""
+    mode: TimeMode = TimeMode.LOCKSTEP
+    factor: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
+    updating_period_s: Annotated[float, Field(ge=0, le=5)] = 0.0
+    """0 is adaptive."""
+    standstill_s: Annotated[float, Field(gt=0, le=600)] = 8.0
+    """In lock-step a fault under which plant time stands still ends after so much real time. The control PLC gives an
+    optimiser up that stands still for `control_plc.ladder.optimizer_patience_s`, and goes on."""
+    faults: tuple[AnyFault, ...] = ()
+    every_s: Annotated[float, Field(ge=2 * SPREAD_S)] | None = None
+    """Draw a fault so often, from `draw`."""
+    draw: tuple[AnyFault, ...] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if any(fault.at_s is None for fault in self.faults):
+            raise ValueError("each of `faults` needs at_s")
+        if any(fault.at_s is not None for fault in self.draw):
+            raise ValueError("those in `draw` have no at_s: their instants are drawn")
+        if (self.every_s is None) != (not self.draw):
+            raise ValueError("every_s and `draw` go together")
+        if any(fault.tick >= self.ticks for fault in self.faults):
+            raise ValueError(f"a fault begins after the end of the run, {self.duration_s:g} s")
+        _refuse_overlaps(self.schedule())
+        return self
+
+    @property
+    def realtime(self) -> bool:
+        """Whether the clock makes time go on."""
+        return self.mode is TimeMode.REALTIME
+
+    @property
+    def ticks(self) -> int:
+        """Length of the run."""
+        return round(self.duration_s / TICK_S)
+
+    def schedule(self) -> list[AnyFault]:
+        """Return all faults, those drawn too, in the order in which they begin."""
+        drawn = []
+        if self.every_s is not None:
+            draw = random.Random(self.seed)  # noqa: S311 not for secrets
+            for number in range(1, int(self.duration_s / self.every_s) + 1):
+                at = number * self.every_s + TICK_S * draw.randrange(round(SPREAD_S / TICK_S))
+                fault = self.draw[draw.randrange(len(self.draw))]
+                if at + fault.duration_s < self.duration_s:
+                    drawn.append(fault.model_copy(update={"at_s": at}))
+        return sorted([*self.faults, *drawn], key=lambda fault: fault.tick)
+
+    def scenario(self, mean_w: float) -> Scenario:
+        """Return the run without its faults; `mean_w` is the load of the operating point."""
+        return Scenario(
+            ticks=self.ticks,
+            load=_load(self.load, mean_w),
+            updating_period_s=self.updating_period_s,
+            seed=self.seed,
+            realtime=self.realtime,
+            factor=self.factor,
+        )
+
+
+def _refuse_overlaps(schedule: list[AnyFault]) -> None:
+    """Refuse a process that is to be stopped while it is stopped."""
+    for number, fault in enumerate(schedule):
+        for later in schedule[number + 1 :]:
+            if later.tick >= fault.end_tick:
+                break
+            if later.processes & fault.processes:
+                raise ValueError(f"'{later.label}' at {later.at_s:g} s begins before '{fault.label}' has ended")
+
+
+def _load(load: str | tuple[str, ...], mean_w: float) -> LoadProfile:
+    if isinstance(load, str):
+        return find_load(load, mean_w)
+    families = []
+    for name in load:
+        here = named_families(name)
+        if here is None:
+            raise LoadFileError(f"load {name}: only named loads can follow each other; give a CSV file alone")
+        families += here
+    return concatenated([telegraph(family, mean_w) for family in families])
+
+
+def shipped_plans() -> list[Plan]:
+    """Return the plans that come with Coldloop, by name."""
+    entries = [entry for entry in SHIPPED.iterdir() if entry.name.endswith(".toml")]
+    plans = [parse_plan(entry.read_text(encoding="utf-8"), entry.name, {}) for entry in entries]
+    return sorted(plans, key=lambda plan: plan.name)
+
+
+def find_plan(name: str, changes: dict[str, Any]) -> Plan:
+    """Return a shipped plan, or that of a file, with some of its values changed.
+
+    Raises:
+        UsageError: There is no such plan, or something in it is wrong; one line that says what.
+    """
+    shipped = SHIPPED / f"{name}.toml"
+    if "/" not in name and shipped.is_file():
+        return parse_plan(shipped.read_text(encoding="utf-8"), name, changes)
+    path = Path(name)
+    if not path.exists():
+        raise UsageError(f"plan {name}: neither a file nor a shipped plan; `coldloop chaos --list` names them")
+    try:
+        return parse_plan(path.read_text(encoding="utf-8"), name, changes)
+    except UnicodeDecodeError:
+        raise UsageError(f"{name}: not UTF-8 text; save it as UTF-8") from None
+    except OSError as error:
+        raise UsageError(f"{name}: {error.strerror}; name a readable TOML file") from None
+
+
+def parse_plan(text: str, source: str, changes: dict[str, Any]) -> Plan:
+    """Return the plan that a TOML text holds, with some of its values changed."""
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"{source}: not TOML: {error}") from None
+    if "duration_s" in changes:  # a shorter run has fewer faults
+        content["faults"] = [
+            fault for fault in content.get("faults", []) if _begins_before(fault, changes["duration_s"])
+        ]
+    try:
+        return Plan.model_validate({**content, **changes})
+    except ValidationError as error:
+        raise UsageError(f"{source}: {_explained(error)}") from None
+
+
+def _begins_before(fault: object, end_s: float) -> bool:
+    at = fault.get("at_s") if isinstance(fault, dict) else None
+    return not isinstance(at, int | float) or at < end_s
+
+
+def _explained(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    message = " ".join(first["msg"].removeprefix("Value error, ").split())
+    if first["type"] == "extra_forbidden":
+        message = "no such key; docs/chaos.md lists them"
+    return f"{where}: {message}" if where else message

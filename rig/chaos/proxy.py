@@ -1,0 +1,145 @@
+"""A TCP proxy between the client and the server of one link, which does to the link what a plan says."""
+
+import asyncio
+import contextlib
+import socket
+import struct
+from typing import Final
+
+from rig.chaos.disturbance import Mangler, take_frames
+from rig.chaos.faults import Direction, FrameFault, Freeze, LinkFault, Reset
+
+HOST: Final = "127.0.0.1"
+CHUNK: Final = 4096
+_LINGER_NOT: Final = struct.pack("ii", 1, 0)
+
+
+class LinkProxy:
+    """Passes Modbus/TCP frames on, one by one, under the faults that are on.
+
+    Args:
+        port: Where to listen; 0 takes any free port.
+        target: Port of the server.
+        seed: Decides what happens to which frame, with the number of the connection.
+
+    A frame is not read before the one in front of it has gone on, so nothing piles up here: what waits, waits in the
+    buffers of TCP.
+    """
+
+    def __init__(self, port: int, target: int, seed: str) -> None:
+        self.port = port
+        self._target = target
+        self._seed = seed
+        self._faults: list[LinkFault] = []
+        self._flowing = asyncio.Event()
+        self._flowing.set()
+        self._number = 0
+        self._open: set[asyncio.StreamWriter] = set()
+        self._serving: set[asyncio.Task[None]] = set()
+        self._listener: asyncio.Server | None = None
+
+    async def start(self) -> None:
+        """Listen."""
+        self._listener = await asyncio.start_server(self._serve, HOST, self.port)
+        self.port = self._listener.sockets[0].getsockname()[1]
+
+    async def close(self) -> None:
+        """Stop listening and drop all connections."""
+        if self._listener is not None:
+            self._listener.close()
+        for task in self._serving:
+            task.cancel()
+        await asyncio.gather(*self._serving, return_exceptions=True)
+
+    def begin(self, fault: LinkFault) -> None:
+        """Disturb the link."""
+        self._faults.append(fault)
+        if isinstance(fault, Freeze):
+            self._flowing.clear()
+        elif isinstance(fault, Reset):
+            for writer in tuple(self._open):
+                _reset(writer)
+
+    def end(self, fault: LinkFault) -> None:
+        """Stop disturbing it."""
+        self._faults.remove(fault)
+        if not any(isinstance(other, Freeze) for other in self._faults):
+            self._flowing.set()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        if task is not None:
+            self._serving.add(task)
+            task.add_done_callback(self._serving.discard)
+        ends = [writer]
+        try:
+            if any(isinstance(fault, Reset) for fault in self._faults):
+                _reset(writer)
+                return
+            far_reader, far_writer = await asyncio.open_connection(HOST, self._target)
+            ends.append(far_writer)
+            self._open.update(ends)
+            await self._pass_both_ways((reader, writer), (far_reader, far_writer))
+        except OSError:
+            _reset(writer)  # nobody listens behind the proxy: as if nobody listened here
+        except asyncio.CancelledError:
+            pass  # the proxy is being closed
+        finally:
+            for end in ends:
+                self._open.discard(end)
+                end.close()
+
+    async def _pass_both_ways(
+        self,
+        near: tuple[asyncio.StreamReader, asyncio.StreamWriter],
+        far: tuple[asyncio.StreamReader, asyncio.StreamWriter],
+    ) -> None:
+        """Pass frames on until either end is closed."""
+        self._number += 1
+        seed = f"{self._seed}/{self._number}"
+        pumps = [
+            asyncio.create_task(self._pump(near[0], far[1], Mangler(Direction.REQUESTS, f"{seed}/requests"))),
+            asyncio.create_task(self._pump(far[0], near[1], Mangler(Direction.ANSWERS, f"{seed}/answers"))),
+        ]
+        try:
+            await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for pump in pumps:
+                pump.cancel()
+            await asyncio.gather(*pumps, return_exceptions=True)
+
+    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, mangler: Mangler) -> None:
+        buffer = bytearray()
+        with contextlib.suppress(ConnectionError):
+            while True:
+                try:
+                    async with asyncio.timeout(mangler.hold_s):
+                        data = await reader.read(CHUNK)
+                except TimeoutError:
+                    writer.write(mangler.release())
+                    continue
+                await self._flowing.wait()
+                if not data:
+                    return
+                buffer += data
+                for frame in take_frames(buffer):
+                    if not await self._pass(frame, writer, mangler):
+                        return
+
+    async def _pass(self, frame: bytes, writer: asyncio.StreamWriter, mangler: Mangler) -> bool:
+        """Do with a frame what is decided; tell whether the connection is to go on."""
+        outcome = mangler.decide(frame, [fault for fault in self._faults if isinstance(fault, FrameFault)])
+        if outcome.delay_s > 0:
+            await asyncio.sleep(outcome.delay_s)
+        await self._flowing.wait()
+        writer.write(outcome.data)
+        await writer.drain()
+        return not outcome.close
+
+
+def _reset(writer: asyncio.StreamWriter) -> None:
+    """Close with RST: nothing is sent any more, and the peer is told at once."""
+    connection = writer.get_extra_info("socket")
+    if connection is not None and not writer.is_closing():
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_NOT)
+    writer.transport.abort()

@@ -1,0 +1,149 @@
+"""The files of a run under chaos, and its table."""
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from coldloop.process import INPUT_NAMES
+from coldloop.registers.control_plc import Mode
+from coldloop.registers.safety import AlarmKind, AlarmState
+from rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
+from rig.chaos.plan import Plan
+from rig.chaos.trace import ChaosTrace
+from rig.results import whole_file, write_json
+
+HEADINGS: Final = (
+    "fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit", "L1 out s (was)", "T5 out s (was)",
+    "back to MPC s",
+)  # fmt: skip
+
+MANY_MODES: Final = 8
+"""More modes than this are not all named in a table."""
+
+
+def table(rows: Sequence[Row]) -> list[list[str]]:
+    """Return the cells of all rows, the headings first."""
+    return [list(HEADINGS), *(_cells(row) for row in rows)]
+
+
+def as_text(cells: Sequence[Sequence[str]]) -> str:
+    """Return a table for a terminal."""
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+    return "".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() + "\n" for row in cells
+    )
+
+
+def as_markdown(cells: Sequence[Sequence[str]]) -> str:
+    """Return a table for a page."""
+    rule = ["---"] * len(cells[0])
+    return "".join(f"| {' | '.join(row)} |\n" for row in [cells[0], rule, *cells[1:]])
+
+
+def write_report(
+    folder: Path, plan: Plan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
+) -> None:
+    """Write chaos.json and chaos.md."""
+    write_json(folder / "chaos.json", document(plan, trace, evaluation, hashes, failure))
+    text = _page(plan, trace, evaluation, failure)
+    whole_file(folder / "chaos.md", lambda draft: draft.write_text(text, encoding="utf-8"))
+
+
+def document(
+    plan: Plan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
+) -> dict[str, Any]:
+    """Return what chaos.json holds."""
+    return {
+        "plan": json.loads(plan.model_dump_json()),
+        "failure": failure,
+        "faults": [
+            {**row._asdict(), "alarms": [alarm._asdict() for alarm in row.alarms], "back_s": row.back_s}
+            for row in evaluation.rows
+        ],
+        "largest_steps": dict(zip(INPUT_NAMES, evaluation.largest_steps, strict=True)),
+        "outside_s": evaluation.outside_s,
+        "undisturbed_outside_s": evaluation.undisturbed_s,
+        "missing_ticks": evaluation.missing_ticks,
+        "lost_contacts": trace.lost_contacts,
+        "ladder": trace.ladder._asdict() if trace.ladder else None,
+        "alarms": {AlarmKind(i).name: alarm._asdict() for i, alarm in enumerate(trace.alarms)},
+        "events": [event._asdict() for event in trace.events],
+        "resources": [sample._asdict() for sample in trace.resources],
+        "log_lines": trace.log_lines,
+        "wall_seconds": round(trace.seconds, 3),
+        **hashes,
+    }
+
+
+def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
+    """Return what is said below the table."""
+    steps = ", ".join(f"{name} {step:.3f}" for name, step in zip(INPUT_NAMES, evaluation.largest_steps, strict=True))
+    outside, was = evaluation.outside_s, evaluation.undisturbed_s
+    lines = [
+        f"largest step/limit: {steps}",
+        f"outside the bands: L1 {outside[0]:g} s (undisturbed {was[0]:g} s), T5 {outside[1]:g} s ({was[1]:g} s)",
+        f"ticks not seen: {evaluation.missing_ticks} of {trace.ticks}",
+    ]
+    if trace.ladder is not None:
+        lines.append(f"mode at the end: {Mode(trace.ladder.mode).name}, {trace.ladder.events} events")
+    standing = [AlarmKind(i).name for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
+    if standing:
+        lines.append(f"alarms that stand or wait for an operator: {', '.join(standing)}")
+    return [*lines, *_resource_lines(trace)]
+
+
+def _resource_lines(trace: ChaosTrace) -> list[str]:
+    if not trace.resources:
+        return []
+    lines = []
+    for service, count in trace.log_lines.items():
+        sizes = [sample.rss_mb[service] for sample in trace.resources if service in sample.rss_mb]
+        if sizes:
+            lines.append(
+                f"{service}: {sizes[0]:.0f} MB at first, {max(sizes):.0f} MB at most, {sizes[-1]:.0f} MB at last; "
+                f"{count} log lines"
+            )
+    return lines
+
+
+def _page(plan: Plan, trace: ChaosTrace, evaluation: Evaluation, failure: str | None) -> str:
+    lines = [
+        f"# Chaos plan {plan.name}\n",
+        f"{plan.description}\n",
+        f"Load {plan.load}, {plan.duration_s:g} s, seed {plan.seed}, {plan.mode}.\n",
+        *([f"**The run failed:** {failure}\n"] if failure else []),
+        as_markdown(table(evaluation.rows)),
+        *(f"- {line}" for line in summary_lines(trace, evaluation)),
+        "\n![Outputs, inputs, modes, faults](chaos.png)\n",
+    ]
+    return "\n".join(lines)
+
+
+def _cells(row: Row) -> list[str]:
+    return [
+        row.fault,
+        f"{row.at_s:g}",
+        "-" if row.lasted_s is None else f"{row.lasted_s:g}",
+        _modes(row.modes),
+        _alarms(row.alarms),
+        f"{row.largest_step:.3f}",
+        f"{row.outside_s[0]:g} ({row.undisturbed_s[0]:g})",
+        f"{row.outside_s[1]:g} ({row.undisturbed_s[1]:g})",
+        "not" if row.back_s is None else f"{row.back_s:g}",
+    ]
+
+
+def _modes(modes: Sequence[str]) -> str:
+    if len(modes) > MANY_MODES:
+        modes = [*modes[: MANY_MODES - 2], f"({len(modes) - MANY_MODES} more)", *modes[-2:]]
+    return " > ".join(modes) or "-"
+
+
+def _alarms(alarms: Sequence[RaisedAlarm]) -> str:
+    """Return each alarm once: when it was first raised, and how often if more than once."""
+    times = Counter(alarm.name for alarm in alarms)
+    first = {alarm.name: alarm.after_s for alarm in reversed(alarms)}
+    cells = [f"{name} {first[name]:g}" + (f" (x{count})" if count > 1 else "") for name, count in times.items()]
+    return ", ".join(cells) or "none"

@@ -1,0 +1,82 @@
+"""What a run under chaos leaves behind: the physical trace with its gaps, events, alarms, and its faults."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.registers.control_plc import Ladder
+from coldloop.registers.plant import PlantSample
+from coldloop.registers.safety import Alarm, Event, EventKind
+from rig.chaos.faults import AnyFault
+from rig.recording import LinkStatistics, Recording
+
+
+@dataclass
+class Mark:
+    """A fault as it really was."""
+
+    fault: AnyFault
+    begin: int
+    """Tick at which it began."""
+    end: int | None = None
+    """Tick at which it ended, and what it had stopped answered again."""
+    first_event: int = 0
+    """Index in `ChaosTrace.events` of the first one after its beginning. Ticks alone do not tell: a control PLC that
+    was restarted goes on one tick back."""
+
+
+class Resources(NamedTuple):
+    """What the processes use at one tick."""
+
+    tick: int
+    seconds: float
+    """Real time from the start of the session."""
+    rss_mb: dict[str, float]
+    """Resident memory of those that run, by service."""
+
+
+@dataclass
+class ChaosTrace:
+    """Collects while a run goes on; ticks that nobody saw stay NaN."""
+
+    ticks: int
+    events: list[Event] = field(default_factory=list)
+    """As they came; one with the number 0 was not told, but seen."""
+    alarms: list[Alarm] = field(default_factory=list)
+    ladder: Ladder | None = None
+    marks: list[Mark] = field(default_factory=list)
+    resources: list[Resources] = field(default_factory=list)
+    log_lines: dict[str, int] = field(default_factory=dict)
+    lost_contacts: int = 0
+    """Requests of the rig's own that were not answered."""
+    seconds: float = 0.0
+    """Real time of the run."""
+
+    def __post_init__(self) -> None:
+        sizes = (1, len(INPUT_NAMES), len(OUTPUT_NAMES), len(STATE_NAMES))
+        self._rows = [np.full((self.ticks, size), np.nan, dtype=np.float32) for size in sizes]
+
+    def sample(self, sample: PlantSample) -> None:
+        """Take a tick; a tick that is done again replaces what was there."""
+        for rows, values in zip(self._rows, ((sample.load,), sample.u, sample.y, sample.x), strict=True):
+            rows[sample.tick] = np.array(values)
+
+    def sight_mode(self, tick: int, ladder: Ladder) -> None:
+        """Take the mode of a control PLC that was started again: it makes no event of it."""
+        self.events.append(Event(tick=tick, kind=EventKind.MODE, subject=ladder.mode, cause=ladder.cause))
+
+    def modes(self, first: int = 0, last: int | None = None) -> list[Event]:
+        """Return the changes of mode among the events from one index to before another."""
+        return [event for event in self.events[first:last] if event.kind == EventKind.MODE]
+
+    @property
+    def missing(self) -> int:
+        """Ticks of which there is no sample."""
+        return int(np.isnan(self._rows[0]).sum())
+
+    def recording(self) -> Recording:
+        """Return the physical trace in the form of an ordinary run's."""
+        load, u, y, x = self._rows
+        return Recording(load[:, 0], u, y, x, [], LinkStatistics())

@@ -1,0 +1,87 @@
+"""`coldloop chaos`: a run with faults on purpose, and what the fail-safe side made of them."""
+
+import argparse
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from coldloop.errors import LinkError, ResultsError, UsageError
+from coldloop.process import TICK_S
+from coldloop.service import add_configuration_options
+from coldloop.session import TimeMode
+from rig.chaos.experiment import Experiment, perform
+from rig.chaos.figure import plot_chaos
+from rig.chaos.plan import Plan, find_plan, shipped_plans
+from rig.chaos.progress import ChaosProgress
+from rig.chaos.report import as_text, summary_lines, table, write_report
+from rig.commands.options import configuration, duration
+from rig.results import prepare_folder
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_configuration_options(parser)
+    parser.add_argument("plan", nargs="?", metavar="PLAN", help="a shipped plan (see --list) or a TOML file")
+    parser.add_argument("--list", action="store_true", help="name the plans that are shipped")
+    parser.add_argument("--out", type=Path, help="folder for the results (default: chaos/<plan>-<time>)")
+    parser.add_argument("--seed", type=_seed, dest="plan_seed", help="instead of the plan's")
+    parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s, instead of the plan's")
+    parser.add_argument("--load", dest="plan_load", help="a named load or a CSV file, instead of the plan's")
+    parser.add_argument("--mode", choices=[mode.value for mode in TimeMode], dest="plan_mode",
+                        help="instead of the plan's")  # fmt: skip
+    parser.add_argument("--factor", type=float, dest="plan_factor", help="instead of the plan's")
+    parser.set_defaults(execute=execute)
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 0 on")
+    return int(text)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """List the plans, or run one."""
+    if options.list:
+        for plan in shipped_plans():
+            sys.stdout.write(f"{plan.name:20} {plan.description}\n")
+        return 0
+    if options.plan is None:
+        raise UsageError("which plan? `coldloop chaos --list` names those that are shipped")
+    plan = find_plan(options.plan, _changes(options))
+    settings = configuration(options).settings
+    out = options.out or Path("chaos") / f"{plan.name}-{datetime.now():%Y%m%d-%H%M%S}"  # noqa: DTZ005
+    prepare_folder(out)
+    with ChaosProgress(plan.ticks) as progress:
+        experiment = perform(plan, settings, out, progress)
+    try:
+        _write(out, plan, experiment)
+    except OSError as error:
+        raise ResultsError(f"{out}: {error.strerror}; no report was written, choose another --out") from None
+    sys.stdout.write(as_text(table(experiment.evaluation.rows)))
+    for line in [*summary_lines(experiment.trace, experiment.evaluation), f"results in {out}"]:
+        sys.stdout.write(f"{line}\n")
+    if experiment.failure is not None:
+        raise LinkError(experiment.failure)
+    return 0
+
+
+def _changes(options: argparse.Namespace) -> dict[str, Any]:
+    given = {
+        "seed": options.plan_seed,
+        "duration_s": None if options.duration is None else options.duration * TICK_S,
+        "load": options.plan_load,
+        "mode": options.plan_mode,
+        "factor": options.plan_factor,
+    }
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def _write(out: Path, plan: Plan, experiment: Experiment) -> None:
+    trace, undisturbed = experiment.trace, experiment.undisturbed
+    hashes = {
+        "trace_sha256": trace.recording().trace_sha256,
+        "undisturbed_trace_sha256": undisturbed.trace_sha256,
+    }
+    write_report(out, plan, trace, experiment.evaluation, hashes, experiment.failure)
+    plot_chaos(out / "chaos.png", trace, undisturbed, f"{plan.name}: {plan.description}")

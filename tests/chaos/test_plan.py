@@ -1,0 +1,81 @@
+"""Plans: what they may hold, and what is said about those that are wrong."""
+
+import pytest
+
+from coldloop.errors import LoadFileError, UsageError
+from rig.chaos.faults import Drop, Kill, Reset
+from rig.chaos.plan import SPREAD_S, Plan, find_plan, parse_plan, shipped_plans
+
+KINDS = {
+    "delay", "drop", "duplicate", "reorder", "reset", "freeze", "truncate", "flip",
+    "kill", "pause", "restart", "clock", "sensor", "wrong_model",
+}  # fmt: skip
+
+HEAD = 'name = "mine"\ndescription = "one of mine"\nduration_s = 600\n'
+
+
+def with_fault(*lines: str) -> str:
+    return "\n".join([HEAD, "[[faults]]", *lines])
+
+
+def test_the_shipped_plans_are_sound_and_have_all_kinds() -> None:
+    plans = shipped_plans()
+    assert {fault.kind for plan in plans for fault in plan.faults} == KINDS
+    assert all(find_plan(plan.name, {}) == plan for plan in plans)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("name = ", "mine.toml: not TOML"),
+        ('name = "mine"', "mine.toml: description: Field required"),
+        (HEAD.replace("600", "0.3"), "mine.toml: duration_s: Input should be a multiple of 0.25"),
+        (HEAD + "sped = 3", "mine.toml: sped: no such key"),
+        (with_fault('kind = "explode"', "at_s = 3"), "mine.toml: faults.0: Input tag 'explode'"),
+        (with_fault('kind = "drop"', 'link = "plant"', "at_s = 3", "duration_s = 1"), "faults.0.drop.share"),
+        (with_fault('kind = "drop"', 'link = "plant"', "at_s = 3", "duration_s = 1", "share = 1.5"), "less than or"),
+        (with_fault('kind = "clock"', "duration_s = 3"), "each of `faults` needs at_s"),
+        (with_fault('kind = "clock"', "at_s = 600", "duration_s = 3"), "begins after the end of the run"),
+        (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T5"', 'shows = "value"'), "a value"),
+        (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T99"', 'shows = "nan"'), "no output"),
+        (with_fault('kind = "kill"', "at_s = 1", "duration_s = 9", 'process = "plant"')
+         + '\n[[faults]]\nkind = "clock"\nat_s = 5\nduration_s = 1', "begins before 'kill plant' has ended"),
+        (HEAD + "every_s = 60", "every_s and `draw` go together"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_in_one_line(text: str, complaint: str) -> None:
+    with pytest.raises(UsageError) as error:
+        parse_plan(text, "mine.toml", {})
+    assert complaint in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_shorter_run_leaves_out_the_faults_behind_its_end() -> None:
+    plan = find_plan("kill", {"duration_s": 500.0})
+    assert [fault.label for fault in plan.faults] == ["kill optimizer"]
+
+
+def drawing(seed: int) -> Plan:
+    return Plan(
+        name="x", description="x", duration_s=3600, every_s=600, seed=seed,
+        draw=(
+            Kill(kind="kill", process="optimizer", duration_s=60),
+            Reset(kind="reset", link="plant", duration_s=1),
+            Drop(kind="drop", link="plant", share=0.1, duration_s=1),
+        ),
+    )  # fmt: skip
+
+
+def test_drawn_faults_come_every_so_often_and_follow_the_seed() -> None:
+    schedule = drawing(1).schedule()
+    assert schedule == drawing(1).schedule()
+    assert schedule != drawing(2).schedule()
+    assert len(schedule) == 5
+    assert all(0 <= (fault.at_s or 0) - 600 * n < SPREAD_S for n, fault in enumerate(schedule, 1))
+
+
+def test_named_loads_follow_each_other_and_files_do_not() -> None:
+    plan = Plan(name="x", description="x", duration_s=7200, load=("a", "b"))
+    assert plan.scenario(385.0).load == plan.model_copy(update={"load": "2h"}).scenario(385.0).load
+    with pytest.raises(LoadFileError, match="only named loads"):
+        plan.model_copy(update={"load": ("a", "mine.csv")}).scenario(385.0)
