@@ -12,7 +12,7 @@ from typing import Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
 from coldloop.endpoints import Endpoint
-from coldloop.errors import ConfigurationError, LinkError
+from coldloop.errors import LinkError
 from coldloop.modbus.settings import TlsSettings
 from rig.network import NetworkRig, RigEndpoints
 from rig.recording import Recorder
@@ -125,7 +125,6 @@ async def run_on_localhost(settings: Settings, scenario: Scenario, recorder: Rec
 
 def _endpoint(settings: Settings, service: str, port: int) -> Endpoint:
     section = getattr(settings, service)
-    _check_tls(settings, service, "rig", settings.rig.tls)
     return Endpoint(
         port=port,
         patience_s=START_PATIENCE_S,
@@ -134,18 +133,8 @@ def _endpoint(settings: Settings, service: str, port: int) -> Endpoint:
     )
 
 
-def _check_tls(settings: Settings, service: str, client: str, tls: TlsSettings | None) -> None:
-    if getattr(settings, service).server.tls and not tls:
-        raise ConfigurationError(
-            f"{client}.tls is not set, and {service}.server.tls is: name a certificate for the client"
-        )
-
-
 def _wired(settings: Settings, endpoints: RigEndpoints) -> Settings:
     """Return the settings with the servers on these endpoints and the clients pointed at them."""
-    control_tls, optimizer_tls = settings.control_plc.plant.tls, settings.optimizer_plc.control_plc.tls
-    _check_tls(settings, "plant", "control_plc.plant", control_tls)
-    _check_tls(settings, "control_plc", "optimizer_plc.control_plc", optimizer_tls)
 
     def client(endpoint: Endpoint, tls: TlsSettings | None) -> Endpoint:
         return endpoint.model_copy(update={"tls": tls})
@@ -160,13 +149,13 @@ def _wired(settings: Settings, endpoints: RigEndpoints) -> Settings:
             "control_plc": settings.control_plc.model_copy(
                 update={
                     "server": server("control_plc", endpoints.control_plc),
-                    "plant": client(endpoints.plant, control_tls),
+                    "plant": client(endpoints.plant, settings.control_plc.plant.tls),
                 }
             ),
             "optimizer_plc": settings.optimizer_plc.model_copy(
                 update={
                     "server": server("optimizer_plc", endpoints.optimizer_plc),
-                    "control_plc": client(endpoints.control_plc, optimizer_tls),
+                    "control_plc": client(endpoints.control_plc, settings.optimizer_plc.control_plc.tls),
                 }
             ),
         }
