@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 
 from coldloop import __version__
-from coldloop.errors import ModelFileError, PeerUnreachableError
+from coldloop.errors import LinkError, ModelFileError
 from coldloop.lti_model import load
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
@@ -62,13 +62,12 @@ class OptimizerPlc:
             PeerUnreachableError: The control PLC has never been there.
             ModelFileError: The control PLC runs another model.
         """
-        patience_s = self._settings.optimizer_plc.control_plc.patience_s
-        await self._control.connect(patience_s)
+        await self._control.connect(self._settings.optimizer_plc.control_plc.patience_s)
+        await self._introduce()
         while True:
             try:
-                await self._introduce()
                 await self._serve_updates()
-            except PeerUnreachableError as error:
+            except LinkError as error:
                 log.warning("control PLC lost", extra={"reason": str(error)})
                 await self._find_control_plc()
 
@@ -76,7 +75,8 @@ class OptimizerPlc:
         while True:
             try:
                 await self._control.connect(SEARCH_S)
-            except PeerUnreachableError:
+                await self._introduce()
+            except LinkError:
                 await asyncio.sleep(SEARCH_S)
             else:
                 return

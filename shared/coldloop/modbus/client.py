@@ -31,6 +31,8 @@ from coldloop.registers.declaration import Block, RegisterMap
 R = TypeVar("R", bound=tuple[Any, ...])
 
 CONNECT_PAUSE_S: Final = 0.1
+BUFFER_BYTES: Final = 4096
+"""pymodbus throws away what is received when more than two frames' length of it has come, stale answers included."""
 
 _READ: Final = struct.Struct(">HH")
 _WRITE: Final = struct.Struct(">HHB")
@@ -248,6 +250,7 @@ class RegisterClient:
             trace_connect=self._connection_changed,
         )
         client.ctx.framer.decoder = RawDecoder(is_server=False)
+        client.ctx.max_buffer_size = BUFFER_BYTES
         if self._tls is not None:
             # pymodbus' own TLS client takes each TLS record for a whole answer, and does not say why it failed.
             client.ctx.call_create = partial(self._create_secured, client, self._tls)
