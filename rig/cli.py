@@ -18,6 +18,7 @@ COMMANDS: Final = {
     "reproduce": "all studies of the paper, one report and a scorecard",
     "budget": "what the reference PLC can compute, and in which time",
     "registers": "the register maps",
+    "certificates": "certificates for Modbus/TCP Security on a test site",
     "model": "the prediction model",
     "config": "the effective configuration and where each value comes from",
 }

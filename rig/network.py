@@ -10,7 +10,6 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.process import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, Mode, Status
-from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, Optimization, OptimizerSession
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, LoadStep, PlantSample, PlantSession
@@ -40,9 +39,9 @@ class NetworkRig:
 
     def __init__(self, endpoints: RigEndpoints, settings: Settings) -> None:
         self._settings = settings
-        self._plant = client_of(PLANT_MAP, endpoints.plant)
-        self._control = client_of(CONTROL_MAP, endpoints.control_plc)
-        self._optimizer = client_of(OPTIMIZER_MAP, endpoints.optimizer_plc)
+        self._plant = RegisterClient.at(PLANT_MAP, endpoints.plant)
+        self._control = RegisterClient.at(CONTROL_MAP, endpoints.control_plc)
+        self._optimizer = RegisterClient.at(OPTIMIZER_MAP, endpoints.optimizer_plc)
 
     async def connect(self, patience_s: float) -> None:
         """Connect to all three, and make sure that all run the model of our configuration.
@@ -164,14 +163,3 @@ class _UpdateReader:
                 raise LinkError(f"{self._client.peer} stopped after update {len(updates) - 1}: see its log")
             await self.read()
             await asyncio.sleep(0.002)
-
-
-def client_of(register_map: RegisterMap, endpoint: Endpoint) -> RegisterClient:
-    """Return a client of the server there."""
-    return RegisterClient(
-        register_map,
-        host=endpoint.host,
-        port=endpoint.port,
-        timeout_s=endpoint.timeout_s,
-        order=endpoint.word_order,
-    )

@@ -3,12 +3,22 @@
 from pydantic import BaseModel, ConfigDict
 
 from coldloop.limits import InputLimits
+from coldloop.modbus.settings import TlsSettings
 from coldloop.model_settings import ModelSettings
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
 from control_plc.settings import ControlSection
 from optimizer_plc.settings import OptimizerSection
 from plant.settings import PlantSection
+
+
+class RigSection(BaseModel):
+    """Section `rig` of the configuration."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tls: TlsSettings | None = None
+    """The operator's certificate, for servers with TLS."""
 
 
 class Settings(BaseModel):
@@ -23,3 +33,4 @@ class Settings(BaseModel):
     control_plc: ControlSection = ControlSection()
     optimizer_plc: OptimizerSection = OptimizerSection()
     telemetry: TelemetrySettings = TelemetrySettings()
+    rig: RigSection = RigSection()

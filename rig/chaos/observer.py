@@ -6,13 +6,14 @@ from typing import Final, NamedTuple, TypeVar
 
 from coldloop.endpoints import Endpoint
 from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, Grant, Ladder
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, PlantSample, SensorFault
 from coldloop.registers.safety import EVENT_ROWS, Alarm, AlarmKind, Event
 from rig.chaos.trace import ChaosTrace
-from rig.network import AHEAD, RigEndpoints, client_of
+from rig.network import AHEAD, RigEndpoints
 
 T = TypeVar("T")
 
@@ -34,7 +35,7 @@ class Observer:
 
     def __init__(self, endpoints: RigEndpoints, trace: ChaosTrace, session: int) -> None:
         self._plant, self._control, self._optimizer = (
-            client_of(register_map, _impatient(endpoint))
+            RegisterClient.at(register_map, _impatient(endpoint))
             for register_map, endpoint in zip((PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP), endpoints, strict=True)
         )
         self._clients = {"plant": self._plant, "control_plc": self._control, "optimizer_plc": self._optimizer}

@@ -16,10 +16,11 @@ from rig.chaos.observer import Observer
 from rig.chaos.plan import Plan
 from rig.chaos.proxy import LinkProxy
 from rig.chaos.trace import ChaosTrace
-from rig.local_services import Detours, LocalServices, free_ports
+from rig.local_services import LocalServices
 from rig.network import NetworkRig
 from rig.scenario import Scenario
 from rig.settings import Settings
+from rig.wiring import Detours, free_ports
 
 SLOWEST: Final = 20.0
 """Seconds of plant time in a second that lock-step should reach with proxies and all."""

@@ -17,8 +17,13 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Print one line a value, as TOML with its source behind it."""
     rows = configuration(options).effective()
-    texts = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value, _ in rows]
+    texts = [_shown(key, value) for key, value, _ in rows]
     width = min(60, max(len(text) for text in texts))
     for text, (_, _, source) in zip(texts, rows, strict=True):
         sys.stdout.write(f"{text.ljust(width)}  # {source}\n")
     return 0
+
+
+def _shown(key: str, value: object) -> str:
+    """Return a line of TOML, which has no word for what is not set."""
+    return f"# {key} = not set" if value is None else f"{key} = {json.dumps(value, ensure_ascii=False)}"

@@ -89,7 +89,9 @@ def _perform(
     if options.in_process:
         OneProcessRig(settings).run(scenario, recorder)
     elif options.attach:
-        run_event_loop(lambda: _attached(RigEndpoints(*options.attach), settings, scenario, recorder))
+        tls = {"tls": settings.rig.tls}
+        endpoints = RigEndpoints(*[endpoint.model_copy(update=tls) for endpoint in options.attach])
+        run_event_loop(lambda: _attached(endpoints, settings, scenario, recorder))
     else:
         run_event_loop(lambda: _spawned(settings, scenario, recorder, out))
 

@@ -71,13 +71,7 @@ class ControlPlc:
         section = settings.control_plc
         self._settings = settings
         self._program = make_program(header, section, settings.limits)
-        self._plant = RegisterClient(
-            PLANT_MAP,
-            host=section.plant.host,
-            port=section.plant.port,
-            timeout_s=section.plant.timeout_s,
-            order=section.plant.word_order,
-        )
+        self._plant = RegisterClient.at(PLANT_MAP, section.plant)
         self.bank = RegisterBank(CONTROL_MAP, section.word_order)
         self.publication = Publication(self._program, self.bank, header.short_digest)
         file = section.retain.file

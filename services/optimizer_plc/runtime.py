@@ -43,13 +43,7 @@ class OptimizerPlc:
         section = settings.optimizer_plc
         self._settings = settings
         self._program = OptimizerProgram(load(settings.model.file), section.program, settings.limits)
-        self._control = RegisterClient(
-            CONTROL_MAP,
-            host=section.control_plc.host,
-            port=section.control_plc.port,
-            timeout_s=section.control_plc.timeout_s,
-            order=section.control_plc.word_order,
-        )
+        self._control = RegisterClient.at(CONTROL_MAP, section.control_plc)
         self.bank = RegisterBank(OPTIMIZER_MAP, section.word_order)
         self._pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
         self._session = 0

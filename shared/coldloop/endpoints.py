@@ -4,6 +4,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
+from coldloop.modbus.settings import TlsSettings
 from coldloop.registers.codec import WordOrder
 
 PLANT_PORT = 5020
@@ -23,3 +24,5 @@ class Endpoint(BaseModel):
     """How long an answer may take."""
     patience_s: PositiveFloat = 20.0
     """How long to wait at the start until somebody answers."""
+    tls: TlsSettings | None = None
+    """Modbus/TCP Security instead of plain Modbus/TCP."""

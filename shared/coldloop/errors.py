@@ -10,6 +10,7 @@
     └── LinkError                   the bus: a port, a peer, an answer
         ├── PortInUseError
         ├── PeerUnreachableError
+        │   └── UntrustedPeerError  its certificate does not hold
         └── RequestRefusedError     the peer answered with a Modbus exception
 
 A message is one line that says what, where, and what to do.
@@ -58,6 +59,10 @@ class PortInUseError(LinkError):
 
 class PeerUnreachableError(LinkError):
     """A peer does not answer, or does not speak as its register map says."""
+
+
+class UntrustedPeerError(PeerUnreachableError):
+    """A peer cannot show that it is who it should be; trying again does not help."""
 
 
 class RequestRefusedError(LinkError):

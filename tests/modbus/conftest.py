@@ -3,20 +3,26 @@
 import asyncio
 import contextlib
 import inspect
+import ssl
 import struct
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, OnWrite, ServerSettings
+from coldloop.modbus.settings import TlsSettings
+from coldloop.modbus.tls import client_context
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
-from coldloop.registers.declaration import Block, RegisterMap
+from coldloop.registers.declaration import Block, RegisterMap, Role
 from coldloop.registers.plant import PLANT_MAP
+from rig.certificates import Authority, Pair
 
 PATIENCE_S = 20.0
 
@@ -51,7 +57,7 @@ class Wire:
     async def closed(self) -> bytes:
         """Wait until the server closes the connection; return what came before."""
         received = b""
-        with contextlib.suppress(ConnectionResetError):
+        with contextlib.suppress(ConnectionResetError, ssl.SSLError):
             while data := await self.reader.read(65536):
                 received += data
         return received
@@ -66,8 +72,12 @@ class Running:
     written: list[str] = field(default_factory=list)
     writers: list[asyncio.StreamWriter] = field(default_factory=list)
 
-    async def connect(self) -> Wire:
-        reader, writer = await asyncio.open_connection("127.0.0.1", self.server.port)
+    tls: ssl.SSLContext | None = None
+
+    async def connect(self, source: str = "127.0.0.1", tls: ssl.SSLContext | None = None) -> Wire:
+        reader, writer = await asyncio.open_connection(
+            "127.0.0.1", self.server.port, local_addr=(source, 0), ssl=tls or self.tls
+        )
         self.writers.append(writer)
         return Wire(reader, writer)
 
@@ -82,6 +92,9 @@ async def served(
     order: WordOrder = WordOrder.HIGH_FIRST,
     on_write: OnWrite | None = None,
     identity: DeviceIdentity | None = None,
+    client: ssl.SSLContext | None = None,
+    on_departure: Callable[[Role], None] | None = None,
+    on_refusal: Callable[[str], None] | None = None,
     **settings: Any,  # noqa: ANN401 - any field of ServerSettings
 ) -> AsyncIterator[Running]:
     bank = RegisterBank(register_map, order)
@@ -96,8 +109,10 @@ async def served(
         settings=ServerSettings(**{"port": 0, **settings}),
         on_write=on_write or note,
         identity=identity or DeviceIdentity(product=register_map.service, revision="0.1"),
+        on_departure=on_departure,
+        on_refusal=on_refusal,
     )
-    running = Running(server, bank, written)
+    running = Running(server, bank, written, tls=client)
     await server.start()
     try:
         yield running
@@ -110,6 +125,45 @@ async def served(
 @pytest.fixture
 def serve() -> Serve:
     return served
+
+
+class Site:
+    """Certificates of a site, as files."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.authority = Authority.new("site", 1)
+        self.keep("ca", self.authority.pair)
+        self.server = self.keep("server", self.authority.issue_server("server", ["127.0.0.1", "localhost"]))
+
+    def keep(self, name: str, pair: Pair) -> TlsSettings:
+        certificate, key = self.folder / f"{name}.crt", self.folder / f"{name}.key"
+        certificate.write_bytes(pair.certificate_pem)
+        key.write_bytes(pair.key_pem)
+        return TlsSettings(certificate=certificate, key=key, ca=self.folder / "ca.crt")
+
+    def client(self, role: str | None) -> ssl.SSLContext:
+        name = f"client-{role}"[:20]
+        return client_context(self.keep(name, self.authority.issue_client(name, role)), name)
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
+    return Site(tmp_path_factory.mktemp("site"))
+
+
+def written_by_the_operator(register_map: RegisterMap) -> RegisterMap:
+    """Return a map of which one certificate may write everything."""
+    blocks = [replace(block, writer=Role.OPERATOR) if block.writer else block for block in register_map.blocks]
+    return replace(register_map, blocks=tuple(blocks))
+
+
+@pytest.fixture(params=["tcp", "tls"])
+def serve_either(request: pytest.FixtureRequest, site: Site) -> Serve:
+    """Serve over plain TCP, and over TLS to a client who may write everything."""
+    if request.param == "tcp":
+        return served
+    return partial(served, written_by_the_operator(PLANT_MAP), tls=site.server, client=site.client("operator"))
 
 
 @pytest.hookimpl(tryfirst=True)

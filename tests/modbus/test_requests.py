@@ -14,6 +14,11 @@ ACTUATORS = Actuators(tick=7, cv155=50.0, ncr22=100.0, cv156=60.0, session=1)
 SESSION = PlantSession(session=1, realtime=0, factor=1.0, seed=2, load_steps=3)
 
 
+@pytest.fixture
+def serve(serve_either: "Serve") -> "Serve":
+    return serve_either
+
+
 def floats(*values: float) -> str:
     return struct.pack(f">{len(values)}f", *values).hex()
 

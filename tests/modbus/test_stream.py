@@ -14,6 +14,11 @@ READ_MAGIC = bytes.fromhex("0000 0006 01 03 0000 0002")
 MAGIC_PDU = bytes.fromhex("03 04 42f6e979")
 
 
+@pytest.fixture
+def serve(serve_either: "Serve") -> "Serve":
+    return serve_either
+
+
 def numbered(transaction: int) -> bytes:
     return struct.pack(">H", transaction) + READ_MAGIC
 

@@ -16,6 +16,8 @@ from coldloop.registers.declaration import Role
 ROLE_EXTENSION: Final = x509.ObjectIdentifier("1.3.6.1.4.1.50316.802.1")
 UTF8_STRING: Final = 0x0C
 """Tag of a UTF8String in DER."""
+MAX_LENGTH: Final = 127
+"""Longest role, in bytes: what DER says the length of in one byte."""
 
 
 class Caller(NamedTuple):
@@ -37,12 +39,10 @@ def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:
 
 def caller_with(certificate: bytes, name: str) -> Caller:
     """Return who calls with a certificate (DER) that has been verified."""
-    parsed = x509.load_der_x509_certificate(certificate)
-    subject = json.dumps(parsed.subject.rfc4514_string(), ensure_ascii=False)
-    text = _role_text(parsed)
-    known = {role.value: role for role in Role}
-    roles = frozenset({known[text]} if text in known else ())
-    return Caller(f"{name} certificate={subject} role={json.dumps(text, ensure_ascii=False)}", roles)
+    subject, role = _subject_and_role(certificate)
+    known = {each.value: each for each in Role}
+    described = " ".join(f"{key}={json.dumps(text)}" for key, text in (("certificate", subject), ("role", role)))
+    return Caller(f"{name} {described}", frozenset({known[role]} if role in known else ()))
 
 
 def _plain_address(host: str) -> IPv4Address | IPv6Address:
@@ -55,24 +55,28 @@ def _within(address: IPv4Address | IPv6Address, networks: Networks) -> bool:
     return any(address in network for network in networks)
 
 
-def _role_text(certificate: x509.Certificate) -> str:
+def _subject_and_role(der: bytes) -> tuple[str, str]:
+    """Return both as they stand in a certificate; empty where it is too odd to be read, though OpenSSL took it."""
+    subject = ""
     try:
+        certificate = x509.load_der_x509_certificate(der)
+        subject = certificate.subject.rfc4514_string()
         extension = certificate.extensions.get_extension_for_oid(ROLE_EXTENSION).value
     except (x509.ExtensionNotFound, x509.DuplicateExtension, ValueError):
-        return ""
-    return decoded_role(extension.public_bytes())
+        return subject, ""
+    return subject, decoded_role(extension.public_bytes())
 
 
 def encoded_role(text: str) -> bytes:
     """Return a role as the extension's DER."""
     raw = text.encode()
-    if len(raw) > 127:
-        raise ValueError("a role of more than 127 bytes")
+    if len(raw) > MAX_LENGTH:
+        raise ValueError(f"a role of more than {MAX_LENGTH} bytes")
     return bytes((UTF8_STRING, len(raw))) + raw
 
 
 def decoded_role(der: bytes) -> str:
     """Return the role in an extension's DER, empty when it is not one."""
-    if len(der) < 2 or der[0] != UTF8_STRING or der[1] != len(der) - 2:
+    if len(der) < 2 or der[0] != UTF8_STRING or der[1] > MAX_LENGTH or der[1] != len(der) - 2:
         return ""
     return der[2:].decode(errors="replace")

@@ -2,15 +2,17 @@
 
 import asyncio
 import logging
+import ssl
 import struct
 from collections.abc import Sequence
-from functools import cached_property
-from typing import Any, Final, TypeVar, cast
+from functools import cached_property, partial
+from typing import Any, Final, Self, TypeVar, cast
 
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusException
 
-from coldloop.errors import PeerUnreachableError, RequestRefusedError
+from coldloop.endpoints import Endpoint
+from coldloop.errors import PeerUnreachableError, RequestRefusedError, UntrustedPeerError
 from coldloop.modbus.peer_check import check_peer
 from coldloop.modbus.raw_pdu import RawDecoder, RawPdu
 from coldloop.modbus.requests import (
@@ -20,6 +22,8 @@ from coldloop.modbus.requests import (
     READ_WRITE_REGISTERS,
     WRITE_MULTIPLE_REGISTERS,
 )
+from coldloop.modbus.settings import TlsSettings
+from coldloop.modbus.tls import client_context
 from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
@@ -33,7 +37,7 @@ _WRITE: Final = struct.Struct(">HHB")
 _READ_WRITE: Final = struct.Struct(">HHHHB")
 _EXCEPTIONS: Final = {
     1: "illegal function",
-    2: "no such register, or not writable",
+    2: "no such register, or not for this client to write",
     3: "illegal value",
     4: "failure in the server",
     11: "no such unit id",
@@ -52,6 +56,7 @@ class RegisterClient:
         port: Its TCP port.
         timeout_s: How long connecting, and each answer, may take.
         order: Word order of 32-bit values.
+        tls: Files for Modbus/TCP Security; plain Modbus/TCP without.
 
     Requests of several tasks are sent one after the other. After a lost connection the next request connects again.
 
@@ -67,16 +72,34 @@ class RegisterClient:
         port: int,
         timeout_s: float,
         order: WordOrder = WordOrder.HIGH_FIRST,
+        tls: TlsSettings | None = None,
     ) -> None:
         self._map = register_map
         self._order = order
         self._host = host
         self._port = port
         self._timeout_s = timeout_s
+        self._tls = client_context(tls, f"tls of the client of {self.peer}") if tls else None
         self._turn = asyncio.Lock()
         self._places: dict[type[tuple[Any, ...]], tuple[Block, RecordCodec]] = {
             block.record: (block, codec_of(block, order)) for block in register_map.blocks
         }
+
+    @classmethod
+    def at(cls, register_map: RegisterMap, endpoint: Endpoint) -> Self:
+        """Return a client of the server at an endpoint.
+
+        Raises:
+            ConfigurationError: The files for TLS cannot be used.
+        """
+        return cls(
+            register_map,
+            host=endpoint.host,
+            port=endpoint.port,
+            timeout_s=endpoint.timeout_s,
+            order=endpoint.word_order,
+            tls=endpoint.tls,
+        )
 
     @property
     def peer(self) -> str:
@@ -98,6 +121,8 @@ class RegisterClient:
             try:
                 block, codec = self._places[Identity]
                 raw = await self._read_words(block, block.address, codec.size // 2)
+            except UntrustedPeerError:
+                raise
             except PeerUnreachableError:
                 if loop.time() >= deadline:
                     raise
@@ -223,7 +248,22 @@ class RegisterClient:
             trace_connect=self._connection_changed,
         )
         client.ctx.framer.decoder = RawDecoder(is_server=False)
+        if self._tls is not None:
+            # pymodbus' own TLS client takes each TLS record for a whole answer, and does not say why it failed.
+            client.ctx.call_create = partial(self._create_secured, client, self._tls)
         return client
+
+    async def _create_secured(self, client: AsyncModbusTcpClient, tls: ssl.SSLContext) -> Any:  # noqa: ANN401 - pymodbus' signature
+        try:
+            return await asyncio.get_running_loop().create_connection(
+                client.ctx.handle_new_connection, self._host, self._port, ssl=tls
+            )
+        except ssl.SSLCertVerificationError as error:
+            raise UntrustedPeerError(
+                f"{self.peer} cannot be trusted: {error.verify_message}: check the host name, and tls.ca here"
+            ) from None
+        except (ssl.SSLError, ConnectionResetError, ConnectionAbortedError):
+            raise PeerUnreachableError(f"{self.peer} does not speak TLS 1.3: check server.tls there") from None
 
     def _connection_changed(self, connected: bool) -> None:  # noqa: FBT001 - pymodbus' signature
         answer = self._client.ctx.response_future
@@ -234,6 +274,7 @@ class RegisterClient:
         what = "closed the connection" if isinstance(error, ConnectionException) else "did not answer in time"
         return PeerUnreachableError(
             f"{self.peer} {what} at a request for block '{block.name}': check that it runs and is what listens there"
+            f"{', and that it accepts our certificate' if self._tls else ''}"
         )
 
     def _refused(self, function: int, block: Block, payload: bytes) -> RequestRefusedError:

@@ -5,7 +5,6 @@ wait; then requests that arrive behind it stay in the buffer until its answer is
 """
 
 import asyncio
-import ssl
 from collections.abc import Awaitable, Callable, Iterator
 from functools import partial
 from time import monotonic
@@ -13,7 +12,6 @@ from typing import Final, cast
 
 from coldloop.modbus.access import Caller, caller_at, caller_with
 from coldloop.modbus.framing import Frame, MalformedFrameError, framed, next_frame
-from coldloop.modbus.handshake import HandshakeError, secured
 from coldloop.modbus.rate_limit import RateLimit
 from coldloop.modbus.refusals import RefusalLog
 from coldloop.modbus.requests import NO_SUCH_UNIT, SERVER_FAILURE, RequestHandler, Written, exception_answer
@@ -36,7 +34,6 @@ class Connection(asyncio.Protocol):
     """Serves one client.
 
     `opened` tells the server that the connection exists, and returns whether it may stay; `lost` tells that it is gone.
-    With `tls`, nothing is served before the client has shown its certificate.
     """
 
     _handle: Callable[[bytes], bytes | Written]
@@ -46,7 +43,6 @@ class Connection(asyncio.Protocol):
         *,
         handler_for: Callable[[frozenset[Role]], RequestHandler],
         settings: ServerSettings,
-        tls: ssl.SSLContext | None,
         on_write: OnWrite,
         refusals: RefusalLog,
         opened: Callable[["Connection"], bool],
@@ -54,7 +50,6 @@ class Connection(asyncio.Protocol):
     ) -> None:
         self._handler_for = handler_for
         self._settings = settings
-        self._tls = tls
         self._on_write = on_write
         self._refusals = refusals
         self._opened = opened
@@ -66,7 +61,6 @@ class Connection(asyncio.Protocol):
         self._reading_paused = False
         self._rate = RateLimit(settings.request_rate, settings.request_burst) if settings.request_rate else None
         self._held: asyncio.TimerHandle | None = None
-        self._known = self._dismissed = self._gone = False
         self.requests = 0
         self.written_as: set[Role | None] = set()
         self.last_request = monotonic()  # not the loop's time, which uvloop rounds to milliseconds
@@ -79,12 +73,10 @@ class Connection(asyncio.Protocol):
 
     def close(self) -> None:
         """Close when what was answered has been sent."""
-        self._dismissed = True
         self._transport.close()
 
     def abort(self) -> None:
         """Close now."""
-        self._dismissed = True
         self._transport.abort()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -98,21 +90,11 @@ class Connection(asyncio.Protocol):
         self.peer = f"{address[0]}:{address[1]}"
         if not self._opened(self):
             return
-        if self._tls is None:
+        secure = transport.get_extra_info("ssl_object")
+        if secure is None:
             self._welcome(caller_at(address[0], self.peer, self._settings.access))
         else:
-            self._transport.pause_reading()
-            self._handshake = self._loop.create_task(self._secure(self._tls), name="TLS handshake")
-
-    async def _secure(self, tls: ssl.SSLContext) -> None:
-        try:
-            self._transport, certificate = await secured(self._transport, self, tls)
-        except HandshakeError as error:
-            if not self._dismissed:
-                self._refusals.note("tls_refused", self.peer, str(error))
-            self.connection_lost(None)  # the loop does not always tell of one that never was secure
-        else:
-            self._welcome(caller_with(certificate, self.peer))
+            self._welcome(caller_with(secure.getpeercert(binary_form=True), self.peer))
 
     def _welcome(self, caller: Caller | None) -> None:
         if caller is None:
@@ -121,14 +103,9 @@ class Connection(asyncio.Protocol):
             return
         self.peer = caller.name
         self._handle = self._handler_for(caller.roles).handle
-        self._known = True
-        self._serve()
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - why it was lost changes nothing
         """Cancel what the client no longer waits for (event loop callback)."""
-        if self._gone:
-            return
-        self._gone = True
         self._idle_timer.cancel()
         if self._wait is not None:
             self._wait.cancel()
@@ -138,9 +115,10 @@ class Connection(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Answer all requests that are whole by now (event loop callback)."""
+        if self._transport.is_closing():  # with TLS, what was under way still comes
+            return
         self._buffer += data
-        if self._known:
-            self._serve()
+        self._serve()
 
     def pause_writing(self) -> None:
         """Stop serving a client that does not read its answers (event loop callback)."""

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import errno
-import ssl
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import cache
@@ -17,6 +16,7 @@ from coldloop.modbus.refusals import ErrorCounters, RefusalLog
 from coldloop.modbus.requests import RequestHandler
 from coldloop.modbus.settings import ServerSettings
 from coldloop.modbus.tls import server_context
+from coldloop.modbus.tls_listener import TlsListener
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import ServerStatistics
 from coldloop.registers.declaration import Role
@@ -67,13 +67,12 @@ class ModbusServer:
         self._on_departure = on_departure
         self._handler_for = cache(lambda roles: RequestHandler(bank, identity, roles))
         self._refusals = RefusalLog(bank.map.service, on_refusal)
-        self._tls: ssl.SSLContext | None = None
         self._closing = False
         self._accepted = self._past_requests = 0
         self._connections: dict[Connection, None] = {}  # in the order of their arrival
         self._none_connected = asyncio.Event()
         self._none_connected.set()
-        self._listener: asyncio.Server | None = None
+        self._listener: asyncio.Server | TlsListener | None = None
         if any(block.record is ServerStatistics for block in bank.map.blocks):
             bank.keep_fresh(ServerStatistics, self.statistics)
 
@@ -112,14 +111,25 @@ class ModbusServer:
             PortInUseError: The address cannot be listened on.
             ConfigurationError: The files for TLS cannot be used.
         """
-        if self._settings.tls is not None:
-            self._tls = server_context(self._settings.tls, f"{self._service}.server.tls")
         host, port = self._settings.host, self._settings.port
         try:
-            self._listener = await asyncio.get_running_loop().create_server(self._new_connection, host, port)
+            self._listener = await self._listen(host, port)
         except OSError as error:
             reason = _REMEDIES.get(error.errno or 0, f"{error.strerror}; choose another host or port")
             raise PortInUseError(f"{self._service} cannot listen on {host}:{port}: {reason}") from error
+
+    async def _listen(self, host: str, port: int) -> asyncio.Server | TlsListener:
+        tls = self._settings.tls
+        if tls is None:
+            return await asyncio.get_running_loop().create_server(self._new_connection, host, port)
+        return await TlsListener.at(
+            host,
+            port,
+            server_context(tls, f"{self._service}.server.tls"),
+            make_protocol=self._new_connection,
+            limit=self._settings.connection_limit,
+            refusals=self._refusals,
+        )
 
     async def close(self) -> None:
         """Stop listening and close all connections; waits of `on_write` are cancelled."""
@@ -139,7 +149,6 @@ class ModbusServer:
         return Connection(
             handler_for=self._handler_for,
             settings=self._settings,
-            tls=self._tls,
             on_write=self._on_write,
             refusals=self._refusals,
             opened=self._admit,
