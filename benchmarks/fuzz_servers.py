@@ -192,7 +192,7 @@ def text_of(log: Path) -> str:
 async def fuzz(service: str, services: LocalServices, log: Path, options: argparse.Namespace) -> tuple[str, bool]:
     """Fuzz one service; return its line of the table, and whether it stood."""
     port = getattr(services.endpoints, service).port
-    process = services.processes[service]
+    pid = services.pid(service) or 0
     requests = Requests(MAPS[service], random.Random(f"{options.seed} {service}"))  # noqa: S311 - must be repeatable
     await up(port)
     tally = Tally()
@@ -200,7 +200,7 @@ async def fuzz(service: str, services: LocalServices, log: Path, options: argpar
     try:
         for count, data in requests.batches(options.frames):
             if not before and tally.frames >= min(WARM_UP_FRAMES, options.frames // 2):
-                before = resident_mb(process.pid)
+                before = resident_mb(pid)
             await provoke(port, data, tally)
             tally.frames += count
         for data in requests.garbage(options.bytes):
@@ -212,11 +212,12 @@ async def fuzz(service: str, services: LocalServices, log: Path, options: argpar
     except ConnectionRefusedError:
         tally.failures.append("listens no more")
     seconds = time.monotonic() - began
-    if process.returncode is not None:
-        tally.failures.append(f"ended with {process.returncode}")
+    ended = services.ended(service)
+    if ended:
+        tally.failures.append("ended")
     if "Traceback" in text_of(log):
         tally.failures.append("traceback in its log")
-    after = resident_mb(process.pid) if process.returncode is None else 0.0
+    after = resident_mb(pid) if not ended else 0.0
     outcome = ", ".join(dict.fromkeys(tally.failures)) or "stood"
     line = _row(
         service, tally.frames, tally.served, tally.sent, tally.received, tally.connections,

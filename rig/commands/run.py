@@ -107,8 +107,22 @@ async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scena
 
 
 async def _spawned(settings: Settings, scenario: Scenario, recorder: Recorder, out: Path) -> int:
+    _check_certificates(settings)
     await run_on_localhost(settings, scenario, recorder, out / "logs")
     return 0
+
+
+def _check_certificates(settings: Settings) -> None:
+    """Refuse a rig in which a client could not show its server a certificate."""
+    clients = [
+        ("rig", settings.rig.tls, ("plant", "control_plc", "optimizer_plc")),
+        ("control_plc.plant", settings.control_plc.plant.tls, ("plant",)),
+        ("optimizer_plc.control_plc", settings.optimizer_plc.control_plc.tls, ("control_plc",)),
+    ]
+    for client, tls, servers in clients:
+        for server in servers:
+            if tls is None and getattr(settings, server).server.tls is not None:
+                raise UsageError(f"{client}.tls is not set, and {server}.server.tls is: name a client certificate")
 
 
 def _write(

@@ -1,7 +1,6 @@
 """What the control PLC shows: registers, log and telemetry, made from the program's state."""
 
 import logging
-import time
 from collections.abc import Mapping
 
 from coldloop.clock import LatenessRecord
@@ -14,9 +13,6 @@ from control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")
 
-LINES_AT_ONCE = 20
-LINES_INTERVAL_S = 10.0
-
 
 class Publication:
     """Puts the program's state into the registers."""
@@ -27,8 +23,6 @@ class Publication:
         self._model_digest = model_digest
         self._told_events = 0
         self._told_alarms = -1
-        self._lines = 0
-        self._lines_since = 0.0
 
     def identity(self, *, running: bool) -> None:
         """Show who we are, and the tick."""
@@ -89,22 +83,16 @@ class Publication:
         )
         self._bank.put(program.watchdog.registers(program.tick))
 
-    def _log(self, event: Event) -> None:
-        """Log an event, unless so many came at once that they would flood the log: registers have them all."""
-        now = time.monotonic()
-        if now - self._lines_since > LINES_INTERVAL_S:
-            self._lines, self._lines_since = 0, now
-        self._lines += 1
-        if self._lines > LINES_AT_ONCE:
-            return
-        if self._lines == LINES_AT_ONCE:
-            log.warning("many events: the next %d s are in the registers only", LINES_INTERVAL_S)
-            return
+    @staticmethod
+    def _log(event: Event) -> None:
         kind = EventKind(event.kind)
         if kind is EventKind.MODE:
             log.warning(
-                "mode %s", Mode(event.subject).name.lower(),
-                extra={"tick": event.tick, "cause": Cause(event.cause).name.lower()},
+                "mode changed",
+                extra={
+                    "mode": Mode(event.subject).name.lower(), "tick": event.tick,
+                    "cause": Cause(event.cause).name.lower(),
+                },
             )  # fmt: skip
             return
         what = kind.name.lower().replace("_", " ")

@@ -152,7 +152,8 @@ class OptimizerPlc:
         look_s = (LOOK_OUT_S if interruptible else HEARTBEAT_S) / self._pace.factor
         while (remaining := ready - time.monotonic()) > 0.0:
             await asyncio.sleep(min(remaining, look_s))
-            if await self._interrupted(update) and interruptible:
+            look = interruptible or remaining > look_s  # an answer that is ready does not wait for a sign of life
+            if look and await self._interrupted(update) and interruptible:
                 return False
         return True
 

@@ -89,7 +89,6 @@ class PlantProgram:
         helium = load_helium()
         self.tick = 0
         self._tick_s = tick_s
-        self._parameters = box
         self._box, self._helium = plain_tuples(box), plain_tuples(helium)
         self._x = _vector(x0, STATE_NAMES, "states")
         self._u = _vector(u0, INPUT_NAMES, "inputs")
@@ -99,7 +98,9 @@ class PlantProgram:
         self._measured = self._sample(outputs(self._x, self._u, self.load, box, helium))
         self._step()  # no session waits for the compiler
 
-    def resume(self, tick: int, x: Sequence[float], u: Sequence[float], noise_state: Mapping[str, Any]) -> None:
+    def resume(
+        self, tick: int, x: Sequence[float], u: Sequence[float], y: Sequence[float], noise_state: Mapping[str, Any]
+    ) -> None:
         """Go on from what `retained` told.
 
         Raises:
@@ -109,12 +110,15 @@ class PlantProgram:
         self._x = _vector(x, STATE_NAMES, "states")
         self._u = _vector(u, INPUT_NAMES, "inputs")
         self._generator.bit_generator.state = noise_state
-        self._measured = self._sample(outputs(self._x, self._u, self.load, self._parameters, load_helium()))
+        self._measured = tuple(_vector(y, OUTPUT_NAMES, "outputs").tolist())
 
     def retained(self) -> dict[str, Any]:
         """Return what `resume` needs, as plain data."""
         noise_state = self._generator.bit_generator.state
-        return {"tick": self.tick, "x": self._x.tolist(), "u": self._u.tolist(), "noise_state": noise_state}
+        return {
+            "tick": self.tick, "x": self._x.tolist(), "u": self._u.tolist(), "y": self._measured,
+            "noise_state": noise_state,
+        }  # fmt: skip
 
     @property
     def state(self) -> tuple[float, ...]:

@@ -3,6 +3,8 @@
 import json
 import logging
 import sys
+import time
+from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any, TextIO
 
@@ -31,9 +33,32 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(line, default=str, ensure_ascii=False)
 
 
+class FloodFilter(logging.Filter):
+    """Lets at most `lines` of one event through in an interval; the next one says how many were left out."""
+
+    def __init__(self, lines: int = 20, interval_s: float = 10.0, now: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._lines = lines
+        self._interval_s = interval_s
+        self._now = now
+        self._seen: dict[tuple[str, str], tuple[float, int]] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Tell whether a record is to be written."""
+        event, now = (record.name, str(record.msg)), self._now()
+        since, count = self._seen.get(event, (now, 0))
+        if now - since >= self._interval_s:
+            if count > self._lines:
+                record.left_out = count - self._lines
+            since, count = now, 0
+        self._seen[event] = since, count + 1
+        return count < self._lines
+
+
 def set_up_logs(service: str, level: str, stream: TextIO = sys.stderr) -> None:
     """Send the logs of this process, from `level` up, to `stream`."""
     handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonFormatter(service))
+    handler.addFilter(FloodFilter())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # what it would say is raised by our client

@@ -1,4 +1,4 @@
-"""Any bytes at all, to the handler and to a connection: each request is answered, and nothing stored that may not be."""
+"""Any bytes at all, to the handler and to a connection: each request is answered, nothing stored that may not be."""
 
 import asyncio
 import struct

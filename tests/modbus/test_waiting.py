@@ -24,7 +24,7 @@ ADJOINING_MAP = RegisterMap(
     (
         IDENTITY_BLOCK,
         Block("actuators", 100, Actuators, "", Role.CONTROL),
-        Block("session", 110, PlantSession, "", Role.OPERATOR),
+        Block("session", 112, PlantSession, "", Role.OPERATOR),
     ),
 )
 
@@ -148,8 +148,8 @@ async def test_blocks_are_told_in_the_order_of_their_addresses_each_after_the_wa
 
     async with serve(ADJOINING_MAP, on_write=take_in) as running:
         wire = await running.connect()
-        both = struct.pack(">IfffIIHfIH", 1, 2.0, 3.0, 4.0, 1, 5, 1, 6.0, 7, 9)
-        assert await wire.ask(bytes.fromhex("10 0064 0012 24") + both) == bytes.fromhex("10 0064 0012")
+        both = struct.pack(">IfffIIIHfIH", 1, 2.0, 3.0, 4.0, 1, 0, 5, 1, 6.0, 7, 9)
+        assert await wire.ask(bytes.fromhex("10 0064 0014 28") + both) == bytes.fromhex("10 0064 0014")
         assert running.bank.get(PlantSession) == PlantSession(5, 1, 6.0, 7, 9)
         assert story == ["actuators begins", "actuators ends", "session begins", "session ends"]
 

@@ -93,3 +93,20 @@ def test_what_is_asked_for_wrongly_is_told_in_one_line(
     (complaint,) = outcome.complaints
     assert message.format(tmp_path) in complaint
     assert not (tmp_path / "site").exists()
+
+
+@pytest.mark.parametrize(
+    ("client", "server"),
+    [("rig", "plant"), ("control_plc.plant", "plant"), ("optimizer_plc.control_plc", "control_plc")],
+)
+def test_a_run_whose_client_has_no_certificate_for_its_server_is_refused_at_once(
+    coldloop: "Coldloop", tmp_path: Path, client: str, server: str
+) -> None:
+    coldloop("certificates", "--out", tmp_path / "site")
+    sections = (tmp_path / "site" / "tls.toml").read_text().split("\n\n")
+    file = tmp_path / "partial.toml"
+    file.write_text("\n\n".join(section for section in sections if not section.startswith(f"[{client}.tls]")))
+    outcome = coldloop("run", "--config", file, "--duration", "2s", "--out", tmp_path / "run")
+    assert outcome.code == USAGE
+    (complaint,) = outcome.complaints
+    assert f"{client}.tls is not set, and {server}.server.tls is" in complaint

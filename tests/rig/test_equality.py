@@ -118,3 +118,17 @@ def test_the_command_starts_three_services_and_gets_the_trace_of_one_process(
     assert {log.name for log in (tmp_path / "three" / "logs").iterdir()} == {
         "plant.log", "control_plc.log", "optimizer_plc.log"
     }  # fmt: skip
+
+
+def test_tls_on_every_connection_changes_nothing_about_the_trace(coldloop: "Coldloop", tmp_path: Path) -> None:
+    assert coldloop("certificates", "--out", tmp_path / "site").code == 0
+    traces = []
+    for arguments in (("--in-process",), ("--config", tmp_path / "site" / "tls.toml")):
+        out = tmp_path / f"run-{len(traces)}"
+        outcome = coldloop("run", "--load", "c", "--duration", "20s", *arguments, "--out", out)
+        assert outcome.code == 0, outcome.complaints
+        traces += [line for line in outcome.out.splitlines() if line.startswith("trace")]
+    assert traces[0] == traces[1]
+    logs = [log.read_text(encoding="utf-8") for log in (out / "logs").iterdir()]
+    assert len(logs) == 3
+    assert not [log for log in logs if "refused" in log]

@@ -214,7 +214,7 @@ class RegisterClient:
             client.ctx.comm_params.timeout_connect = patience_s or self._timeout_s
             try:
                 response = await client.execute(False, request)  # noqa: FBT003 - pymodbus takes it by position only
-            except ModbusException as error:
+            except (ModbusException, RuntimeError) as error:  # uvloop's, when the transport has just been closed
                 client.close()  # a late answer must not meet a later request
                 raise self._silent(block, error) from error
             except asyncio.CancelledError:
@@ -270,8 +270,9 @@ class RegisterClient:
         if not connected and not answer.done():
             answer.set_exception(ConnectionException("closed by the peer"))
 
-    def _silent(self, block: Block, error: ModbusException) -> PeerUnreachableError:
-        what = "closed the connection" if isinstance(error, ConnectionException) else "did not answer in time"
+    def _silent(self, block: Block, error: Exception) -> PeerUnreachableError:
+        lost = isinstance(error, ConnectionException | RuntimeError)
+        what = "closed the connection" if lost else "did not answer in time"
         return PeerUnreachableError(
             f"{self.peer} {what} at a request for block '{block.name}': check that it runs and is what listens there"
             f"{', and that it accepts our certificate' if self._tls else ''}"
