@@ -22,9 +22,10 @@ from pathlib import Path
 
 from coldloop.registers.common import STATISTICS_BLOCK
 from coldloop.registers.declaration import RegisterMap
-from rig.local_services import SERVICES, LocalServices
+from rig.local_services import LocalServices
 from rig.register_listing import MAPS
 from rig.settings import Settings
+from rig.wiring import SERVICES
 
 BATCH = 64
 WARM_UP_FRAMES = 2000
@@ -192,7 +193,7 @@ def text_of(log: Path) -> str:
 async def fuzz(service: str, services: LocalServices, log: Path, options: argparse.Namespace) -> tuple[str, bool]:
     """Fuzz one service; return its line of the table, and whether it stood."""
     port = getattr(services.endpoints, service).port
-    pid = services.pid(service) or 0
+    pid = services.processes[service].pid
     requests = Requests(MAPS[service], random.Random(f"{options.seed} {service}"))  # noqa: S311 - must be repeatable
     await up(port)
     tally = Tally()

@@ -4,35 +4,22 @@ import asyncio
 import contextlib
 import os
 import signal
-import socket
 import sys
 from collections.abc import Awaitable, Mapping
 from pathlib import Path
-from typing import NamedTuple, Self, TypeVar
+from typing import Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
-from coldloop.endpoints import Endpoint
 from coldloop.errors import LinkError
-from rig.network import NetworkRig, RigEndpoints
+from rig.network import NetworkRig
 from rig.recording import Recorder
 from rig.scenario import Scenario
 from rig.settings import Settings
+from rig.wiring import SERVICES, Detours, endpoints_on, free_ports, wired
 
 T = TypeVar("T")
 
-SERVICES = ("plant", "control_plc", "optimizer_plc")
-START_PATIENCE_S = 90.0
-"""The first start on a machine compiles the kernels."""
 STOP_GRACE_S = 5.0
-
-
-class Detours(NamedTuple):
-    """Ports that clients are pointed at instead of those of their servers."""
-
-    plant: int
-    """For the control PLC."""
-    control_plc: int
-    """For the optimiser."""
 
 
 class LocalServices:
@@ -53,15 +40,10 @@ class LocalServices:
         detours: Detours | None = None,
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        self.endpoints = RigEndpoints(
-            *[
-                _endpoint(settings, service, port)
-                for service, port in zip(SERVICES, free_ports(len(SERVICES)), strict=True)
-            ]
-        )
+        self.endpoints = endpoints_on(free_ports(len(SERVICES)), settings)
         self._environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
-            **to_environment(_wired(settings, self.endpoints, detours)),
+            **to_environment(wired(settings, self.endpoints, detours)),
             **(environment or {}),
         }
         self._logs = log_folder
@@ -117,11 +99,6 @@ class LocalServices:
             process.send_signal(number)
         await _ended(process)
 
-    def pid(self, service: str) -> int | None:
-        """Return the process id of a service; None while it is not to run."""
-        process = self._processes.get(service)
-        return process.pid if process is not None else None
-
     def ended(self, service: str) -> bool:
         """Tell whether a service has ended by itself."""
         return self._processes[service].returncode is not None
@@ -137,6 +114,11 @@ class LocalServices:
     def _signal(self, service: str, number: signal.Signals) -> None:
         with contextlib.suppress(ProcessLookupError):
             self._processes[service].send_signal(number)
+
+    @property
+    def processes(self) -> Mapping[str, asyncio.subprocess.Process]:
+        """The processes by service, of those that are to run."""
+        return self._processes
 
     async def during(self, work: Awaitable[T]) -> T:
         """Return the result of `work`, unless a service ends before by itself.
@@ -198,53 +180,3 @@ async def run_on_localhost(settings: Settings, scenario: Scenario, recorder: Rec
             await services.during(work())
         finally:
             rig.close()
-
-
-def _endpoint(settings: Settings, service: str, port: int) -> Endpoint:
-    section = getattr(settings, service)
-    return Endpoint(
-        port=port,
-        patience_s=START_PATIENCE_S,
-        word_order=section.word_order,
-        tls=settings.rig.tls if section.server.tls else None,
-    )
-
-
-def _wired(settings: Settings, endpoints: RigEndpoints, detours: Detours | None) -> Settings:
-    """Return the settings with the servers on these endpoints and the clients pointed at them, or at the detours."""
-
-    def server(section: str, endpoint: Endpoint) -> object:
-        return getattr(settings, section).server.model_copy(update={"host": endpoint.host, "port": endpoint.port})
-
-    def client(endpoint: Endpoint, configured: Endpoint, detour: int | None) -> Endpoint:
-        port = endpoint.port if detour is None else detour
-        return endpoint.model_copy(update={"port": port, "timeout_s": configured.timeout_s, "tls": configured.tls})
-
-    plant, control_plc = detours or (None, None)
-    return settings.model_copy(
-        update={
-            "session": settings.session.model_copy(update={"autostart": False}),
-            "plant": settings.plant.model_copy(update={"server": server("plant", endpoints.plant)}),
-            "control_plc": settings.control_plc.model_copy(
-                update={
-                    "server": server("control_plc", endpoints.control_plc),
-                    "plant": client(endpoints.plant, settings.control_plc.plant, plant),
-                }
-            ),
-            "optimizer_plc": settings.optimizer_plc.model_copy(
-                update={
-                    "server": server("optimizer_plc", endpoints.optimizer_plc),
-                    "control_plc": client(endpoints.control_plc, settings.optimizer_plc.control_plc, control_plc),
-                }
-            ),
-        }
-    )
-
-
-def free_ports(count: int) -> list[int]:
-    """Return ports that nobody listens on."""
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [int(one.getsockname()[1]) for one in sockets]

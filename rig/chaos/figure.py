@@ -39,7 +39,7 @@ def plot_chaos(path: Path, trace: ChaosTrace, undisturbed: Recording, title: str
             place.legend(loc="upper right", frameon=False)
         _inputs(axes[2], axes[3], minutes, recording)
         _modes(axes[4], trace)
-        for place in axes:
+        for place in axes[:4]:
             _mark_faults(place, trace)
         _name_faults(axes[0], trace)
         axes[4].set_xlabel("time (min)")

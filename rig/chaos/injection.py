@@ -25,7 +25,8 @@ from rig.chaos.faults import (
 from rig.chaos.models import WRONG_MODEL
 from rig.chaos.observer import Observer
 from rig.chaos.proxy import LinkProxy
-from rig.local_services import SERVICES, LocalServices
+from rig.local_services import LocalServices
+from rig.wiring import SERVICES
 
 ATTEMPTS: Final = 20
 _SHOWN: Final = {"nan": SensorFaultKind.NOT_A_NUMBER, "frozen": SensorFaultKind.FROZEN, "value": SensorFaultKind.VALUE}

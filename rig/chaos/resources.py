@@ -4,16 +4,16 @@ import contextlib
 import re
 from pathlib import Path
 
-from rig.local_services import SERVICES, LocalServices
+from rig.local_services import LocalServices
+from rig.wiring import SERVICES
 
 
 def resident_mb(services: LocalServices) -> dict[str, float]:
     """Return the resident memory of the services that run, where the system tells it (Linux)."""
     sizes = {}
-    for service in SERVICES:
-        pid = services.pid(service)
+    for service, process in services.processes.items():
         with contextlib.suppress(OSError):
-            found = re.search(r"VmRSS:\s*(\d+) kB", Path(f"/proc/{pid}/status").read_text(encoding="utf-8"))
+            found = re.search(r"VmRSS:\s*(\d+) kB", Path(f"/proc/{process.pid}/status").read_text(encoding="utf-8"))
             if found:
                 sizes[service] = int(found[1]) / 1024
     return sizes

@@ -16,10 +16,11 @@ from rig.chaos.observer import Observer
 from rig.chaos.plan import Plan
 from rig.chaos.proxy import LinkProxy
 from rig.chaos.trace import ChaosTrace
-from rig.local_services import Detours, LocalServices, free_ports
+from rig.local_services import LocalServices
 from rig.network import NetworkRig
 from rig.scenario import Scenario
 from rig.settings import Settings
+from rig.wiring import Detours, free_ports
 
 SLOWEST: Final = 20.0
 """Seconds of plant time in a second that lock-step should reach with proxies and all."""
@@ -42,11 +43,14 @@ async def conduct(
         Link.OPTIMIZER: LinkProxy(detours.control_plc, services.endpoints.control_plc.port, f"{plan.seed}/optimizer"),
     }
     async with AsyncExitStack() as stack:
-        for proxy in proxies.values():
+        await stack.enter_async_context(services)
+        rig = NetworkRig(services.endpoints, settings)
+        stack.callback(rig.close)
+        await services.during(rig.connect(services.endpoints.plant.patience_s))
+        for proxy in proxies.values():  # until now nobody listened there, as nobody did behind
             await proxy.start()
             stack.push_async_callback(proxy.close)
-        await stack.enter_async_context(services)
-        session = await services.during(_started(services, settings, scenario))
+        session = await services.during(rig.start(scenario))
         observer = Observer(services.endpoints, trace, session)
         stack.callback(observer.close)
         injector = Injector(services, proxies, observer, folder)
@@ -69,15 +73,6 @@ def _retained(folder: Path) -> dict[str, str]:
     for file in files.values():
         file.unlink(missing_ok=True)
     return {f"{PREFIX}{service.upper()}__RETAIN__FILE": str(file) for service, file in files.items()}
-
-
-async def _started(services: LocalServices, settings: Settings, scenario: Scenario) -> int:
-    rig = NetworkRig(services.endpoints, settings)
-    try:
-        await rig.connect(services.endpoints.plant.patience_s)
-        return await rig.start(scenario)
-    finally:
-        rig.close()
 
 
 def _patience_s(plan: Plan) -> float:

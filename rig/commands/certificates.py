@@ -10,7 +10,7 @@ from pathlib import Path
 from coldloop.errors import ResultsError, UsageError
 from coldloop.registers.declaration import Role
 from rig.certificates import Authority, Pair
-from rig.local_services import SERVICES
+from rig.wiring import SERVICES
 
 CLIENTS = {**{role.value: role.value for role in Role}, "reader": None}
 """Clients and their roles."""
