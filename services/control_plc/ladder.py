@@ -22,7 +22,7 @@ class Situation:
     row: bool
     """There is a row to be played."""
     late: bool
-    """It is the rest of a sequence whose successor is late."""
+    """It is the rest of a sequence whose successor is late, or will not come: the optimiser is lost."""
 
 
 class Ladder:

@@ -176,7 +176,7 @@ class ControlProgram:
                 operator=OperatorMode(self.operator.mode),
                 sensors_unusable=bool(self._sensors.unusable),
                 row=row is not None,
-                late=self._player.late,
+                late=self._player.late or not self.optimizer_present,
             ),
         )
         if not changed:

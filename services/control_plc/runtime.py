@@ -9,7 +9,8 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Sequence
+from typing import NamedTuple
 
 from coldloop import __version__
 from coldloop.clock import Pacer, Schedule
@@ -61,6 +62,15 @@ def make_program(header: ModelHeader, section: ControlSection, limits: InputLimi
     """Return the program that the configuration asks for, at the operating point of its model file."""
     point = OperatingPoint(header.u0, header.y0, header.short_digest)
     return ControlProgram(limits=limits, point=point, section=section)
+
+
+class _PlantPosition(NamedTuple):
+    """Where the plant is."""
+
+    session: int
+    tick: int
+    applied: Sequence[float]
+    """What it applies; in a session that is not ours, what we applied last."""
 
 
 class ControlPlc:
@@ -175,12 +185,13 @@ class ControlPlc:
         except LinkError as error:
             await self._find_plant(str(error))
             return
+        elsewhere = measurement.session != program.session
         if not is_intact(measurement):
             await self._find_plant("a measurement arrived damaged")
-        elif measurement.session != program.session:
-            await self._leave(measurement)
-        elif measurement.tick != program.tick and not self._pace.realtime:
-            await self._find_plant(f"the plant is at tick {measurement.tick}, not {program.tick}")
+        elif elsewhere and not self._settings.session.autostart:
+            self._leave(measurement.session, measurement.tick)
+        elif elsewhere or (measurement.tick != program.tick and not self._pace.realtime):
+            await self._find_plant(f"it is at tick {measurement.tick} of session {measurement.session}")
         else:
             self._take(measurement)
 
@@ -208,27 +219,31 @@ class ControlPlc:
     async def _begin(self) -> None:
         """Go on with the session of before a restart, or with the plant's, or wait for one."""
         state = self._state_of_before()
-        measurement = await self._plant.read(Measurement)
-        if state is not None and state.session == measurement.session != 0:
+        plant = await self._look_at_plant()
+        if state is not None and state.session == plant.session != 0:
             self._program.alarms.rows = list(state.alarms)
             self._pace = state.pace
-            await self._join(measurement, state.updates, state.operator)
+            await self._join(plant, state.updates, state.operator)
         elif self._settings.session.autostart:
-            if measurement.tick:
-                await self._join(measurement, 0, self._program.operator)
+            if plant.tick:
+                await self._join(plant, 0, self._program.operator)
             else:
-                self._start(ControlSession(measurement.session or 1, self._pace.realtime, self._pace.factor))
+                self._start(ControlSession(plant.session or 1, self._pace.realtime, self._pace.factor))
 
-    async def _join(self, measurement: Measurement, updates: int, operator: Operator) -> None:
+    async def _look_at_plant(self) -> _PlantPosition:
+        """Find out which session and tick the plant is at, and what it applies."""
+        identity, actuators = await self._plant.read(Identity), await self._plant.read(Actuators)
+        ours = actuators.session == identity.session
+        return _PlantPosition(identity.session, identity.tick, actuators[1:4] if ours else self._program.applied)
+
+    async def _join(self, plant: _PlantPosition, updates: int, operator: Operator) -> None:
         """Go on with the plant's session where the plant is."""
-        actuators = await self._plant.read(Actuators)
-        applied = actuators[1:4] if actuators.session == measurement.session else self._program.applied
-        tick = await self._in_step(measurement.tick) if self._pace.realtime else measurement.tick
-        self._program.resume(measurement.session, tick, applied, updates=updates, operator=operator)
+        tick = await self._in_step(plant.tick) if self._pace.realtime else plant.tick
+        self._program.resume(plant.session, tick, plant.applied, updates=updates, operator=operator)
         self._running = True
         self.bank.put(operator)
         self._publish_all()
-        log.warning("session resumed", extra={"session": measurement.session, "tick": tick})
+        log.warning("session resumed", extra={"session": plant.session, "tick": tick})
 
     async def _in_step(self, tick: int) -> int:
         """Set the pacer by the plant's clock, which ticks half-way between our scans; return the tick to come."""
@@ -241,20 +256,18 @@ class ControlPlc:
         self._pacer = Pacer(Schedule(time.monotonic() + phase - present * tick_s, self._pace.factor))
         return present
 
-    async def _leave(self, measurement: Measurement) -> None:
-        """The plant was restarted, or is driven by somebody else: wait for a session, or begin with its own."""
+    def _leave(self, session: int, tick: int) -> None:
+        """The plant was restarted, or is driven by somebody else: wait for a session."""
+        self._running = False
         log.error(
             "session ended: the plant has left it",
             extra={
                 "session": self._program.session,
                 "tick": self._program.tick,
-                "plant_session": measurement.session,
-                "plant_tick": measurement.tick,
+                "plant_session": session,
+                "plant_tick": tick,
             },
         )
-        self._running = False
-        if self._settings.session.autostart and measurement.session:
-            await self._join(measurement, self._program.player.updates, self._program.operator)
         self._publish_all()
 
     async def _find_plant(self, reason: str) -> None:
@@ -266,17 +279,18 @@ class ControlPlc:
             self.publication.safety()
             with contextlib.suppress(LinkError):
                 await self._plant.connect(SEARCH_S)
-                measurement, actuators = await self._plant.read(Measurement), await self._plant.read(Actuators)
-                break
+                plant = await self._look_at_plant()
+                if plant.session == program.session:
+                    break
+                if self._settings.session.autostart and plant.session:
+                    await self._join(plant, program.player.updates, program.operator)
+                else:
+                    self._leave(plant.session, plant.tick)
+                return
             await asyncio.sleep(SEARCH_S / 5)
             program.alarms.now = self._clock_tick()
-        if measurement.session != program.session:
-            await self._leave(measurement)
-            return
-        applied = actuators[1:4] if actuators.session == program.session else program.applied
-        tick = self._clock_tick() if self._pace.realtime else measurement.tick
-        program.rejoin(tick, applied)
-        program.alarms.now = tick
+        program.rejoin(self._clock_tick() if self._pace.realtime else plant.tick, plant.applied)
+        program.alarms.now = program.tick
         program.alarms.returned(AlarmKind.PLANT_LOST)
         self._publish_all()
 
@@ -369,6 +383,7 @@ class ControlPlc:
             latched = program.player.update
             if latched is not None and not (program.awaiting_plan and latched.tick == program.tick - 1):
                 program.abandon()
+                self.bank.put(latched._replace(session=0))  # what waits in vain is not given this one
                 wanted = latched.update + 1
             else:
                 wanted = latched.update if latched else 0

@@ -76,7 +76,8 @@ class OptimizerPlc:
             try:
                 await self._control.connect(SEARCH_S)
                 await self._introduce()
-            except LinkError:
+            except (LinkError, ModelFileError) as error:
+                log.warning("control PLC not found", extra={"reason": str(error)})
                 await asyncio.sleep(SEARCH_S)
             else:
                 return
