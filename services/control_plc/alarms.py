@@ -2,6 +2,7 @@
 
 from collections import deque
 
+from coldloop.process import TICK_S
 from coldloop.registers.safety import (
     ALL_ALARMS,
     EVENT_ROWS,
@@ -13,6 +14,9 @@ from coldloop.registers.safety import (
     Event,
     EventKind,
 )
+
+PASSING_TICKS = round(60 / TICK_S)
+"""An alarm for something that happens at an instant returns when it has not happened again for so long."""
 
 
 class Journal:
@@ -39,6 +43,7 @@ class AlarmPanel:
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
+        self._happened: dict[AlarmKind, int] = {}
         self.rows = [Alarm()] * len(AlarmKind)
         self.now = 0
         self.changes = 0
@@ -73,6 +78,18 @@ class AlarmPanel:
             self.raised(kind, cause)
         else:
             self.returned(kind)
+
+    def happened(self, kind: AlarmKind) -> None:
+        """Raise an alarm for something that happens at an instant; `pass_by` returns it."""
+        self._happened[kind] = self.now
+        self.raised(kind)
+
+    def pass_by(self) -> None:
+        """Return the alarms of what has not happened again for a while."""
+        for kind, tick in list(self._happened.items()):
+            if self.now - tick > PASSING_TICKS:
+                del self._happened[kind]
+                self.returned(kind)
 
     def command(self, command: AlarmCommand) -> None:
         """Do what an operator asks for; what makes no sense changes nothing."""

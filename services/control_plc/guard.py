@@ -59,7 +59,14 @@ class OutputGuard:
             return wanted
         applied = SequenceRow(
             *[
-                _clamped(wanted[i], window.anchor[i], limits.rate[i] * window.share, limits.low[i], limits.high[i])
+                _clamped(
+                    wanted[i],
+                    window.anchor[i],
+                    self.applied[i],
+                    limits.rate[i] * window.share,
+                    limits.low[i],
+                    limits.high[i],
+                )
                 for i in range(len(wanted))
             ]
         )
@@ -76,8 +83,10 @@ class OutputGuard:
             window = window.at(tick, before, limits, update=tick == first_tick)
             if row == before:
                 continue
-            for value, anchor, rate, slack in zip(row, window.anchor, limits.rate, self._slack, strict=True):
-                if abs(value - anchor) > rate * window.share + slack:
+            for value, anchor, last, rate, slack in zip(
+                row, window.anchor, before, limits.rate, self._slack, strict=True
+            ):
+                if max(abs(value - anchor), abs(value - last)) > rate * window.share + slack:
                     return True
             window = window._replace(moved=tick)
             before = row
@@ -92,16 +101,19 @@ class OutputGuard:
         return False
 
 
-def _clamped(wanted: float, anchor: float, reach: float, low: float, high: float) -> float:
-    """Return the single-precision value nearest to `wanted` that lies in low..high and within `reach` of `anchor`.
+def _clamped(wanted: float, anchor: float, applied: float, reach: float, low: float, high: float) -> float:
+    """Return the single-precision value nearest to `wanted` in low..high, within `reach` of `anchor` and of `applied`.
 
     From an anchor outside low..high it goes towards them, as far as `reach` lets it.
     """
     if not math.isfinite(wanted):
         wanted = anchor
-    lowest, highest = min(max(low, anchor - reach), anchor + reach), max(min(high, anchor + reach), anchor - reach)
+    down, up = max(anchor, applied) - reach, min(anchor, applied) + reach
+    lowest, highest = min(max(low, down), up), max(min(high, up), down)
     value = _single(min(max(wanted, lowest), highest))
-    while value != anchor and not (lowest <= value <= highest and abs(value - anchor) <= reach):
+    while value != anchor and not (
+        lowest <= value <= highest and abs(value - anchor) <= reach and abs(value - applied) <= reach
+    ):
         value = _neighbour(value, anchor)  # rounding has crossed a limit
     return value
 

@@ -23,15 +23,21 @@ class Publication:
         self._model_digest = model_digest
         self._told_events = 0
         self._told_alarms = -1
+        self.running = False
+        """A session is under way."""
+        self.overruns = 0
+        """Scans that began too late."""
+        self.lateness: LatenessRecord | None = None
+        """That of all scans; None in lock-step."""
 
-    def identity(self, *, running: bool) -> None:
+    def identity(self) -> None:
         """Show who we are, and the tick."""
         program = self._program
         self._bank.put(
             Identity(
                 map_digest=CONTROL_MAP.digest,
                 map_version=CONTROL_MAP.version,
-                state=ServiceState.RUNNING if running else ServiceState.READY,
+                state=ServiceState.RUNNING if self.running else ServiceState.READY,
                 model_digest=self._model_digest,
                 session=program.session,
                 tick=program.tick,
@@ -39,9 +45,9 @@ class Publication:
             )
         )
 
-    def status(self, overruns: int, lateness: LatenessRecord | None) -> None:
-        """Show the sequence player and the scan cycle; there is no lateness in lock-step."""
-        program = self._program
+    def status(self) -> None:
+        """Show the sequence player and the scan cycle."""
+        program, lateness = self._program, self.lateness
         player = program.player
         self._bank.put(
             Status(
@@ -53,7 +59,7 @@ class Publication:
                 accepted=player.accepted,
                 rejected=player.rejected,
                 deadline_misses=player.deadline_misses,
-                overruns=overruns,
+                overruns=self.overruns,
                 lateness_max=lateness.maximum_s * 1000 if lateness else 0.0,
                 lateness_p99=lateness.percentile_s(0.99) * 1000 if lateness else 0.0,
             )

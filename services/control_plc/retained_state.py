@@ -1,16 +1,21 @@
 """What the control PLC keeps over a restart."""
 
+import logging
+from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coldloop.registers.control_plc import Operator
 from coldloop.registers.safety import Alarm, AlarmKind
-from coldloop.retained import RetainedStateError
+from coldloop.retained import RetainedFile, RetainedStateError
 from coldloop.session import Pace
 from control_plc.program import ControlProgram
 
+log = logging.getLogger("coldloop.control_plc")
+
 OWNER = "control_plc/1"
+"""Who retained states belong to, and the version of what they hold."""
 
 Count = Annotated[int, Field(ge=0, lt=2**32)]
 
@@ -47,3 +52,31 @@ class RetainedState(BaseModel):
             return cls.model_validate(content)
         except ValidationError as error:
             raise RetainedStateError(f"the retained state is not used: {error.errors()[0]['msg']}") from None
+
+
+class Memory:
+    """Keeps the state in a file, if one is configured; what cannot be trusted or written is told once."""
+
+    def __init__(self, file: Path | None, model_digest: int) -> None:
+        self._file = RetainedFile(file, OWNER, model_digest) if file else None
+
+    def recall(self) -> RetainedState | None:
+        """Return the state of before, if there is one."""
+        if self._file is None:
+            return None
+        try:
+            content = self._file.load()
+            return None if content is None else RetainedState.parsed(content)
+        except RetainedStateError as error:
+            log.warning("retained state refused", extra={"reason": str(error)})
+            return None
+
+    def keep(self, program: ControlProgram, pace: Pace) -> None:
+        """Keep the state of now."""
+        if self._file is None:
+            return
+        try:
+            self._file.save(RetainedState.of(program, pace).model_dump())
+        except RetainedStateError as error:
+            log.error("no state is retained any more", extra={"reason": str(error)})  # noqa: TRY400 one line
+            self._file = None

@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Awaitable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from coldloop import __version__
@@ -24,38 +24,25 @@ from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import (
     CONTROL_MAP,
-    AwaitUpdate,
     ControlSession,
-    Grant,
-    Heartbeat,
     Operator,
-    Plan,
-    SequenceHeader,
-    SequenceRow,
-    Verdict,
 )
-from coldloop.registers.declaration import Block, Role
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
-from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
-from coldloop.retained import RetainedFile, RetainedStateError
+from coldloop.registers.safety import AlarmKind
 from coldloop.seal import is_intact, sealed
-from coldloop.sequence import InputSequence
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
+from control_plc.clients import Clients
 from control_plc.program import ControlProgram, OperatingPoint
 from control_plc.publication import Publication
-from control_plc.retained_state import OWNER, RetainedState
+from control_plc.retained_state import Memory
 from control_plc.settings import ControlSection, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
 
 TICKS_PER_SECOND = round(1 / TICK_S)
-LONGEST_WAIT_S = 1.0
-"""Longest time that a read of the latch waits for an update; the optimiser then asks again."""
 SEARCH_S = 0.5
 """How long one attempt to reach a lost plant may take."""
-TROUBLE_TICKS = round(60 / TICK_S)
-"""An alarm for something that happens at an instant returns when it has not happened again for so long."""
 
 
 def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:
@@ -84,19 +71,11 @@ class ControlPlc:
         self._plant = RegisterClient.at(PLANT_MAP, section.plant)
         self.bank = RegisterBank(CONTROL_MAP, section.word_order)
         self.publication = Publication(self._program, self.bank, header.short_digest)
-        file = section.retain.file
-        self._retained = RetainedFile(file, OWNER, header.short_digest) if file else None
+        self.clients = Clients(self._program, self.bank, self.publication)
+        self._memory = Memory(section.retain.file, header.short_digest)
         self._pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
         self._pacer = self._new_pacer()
-        self._running = False
-        self._granted = 0
-        self._overruns = 0
-        self._optimizer_waits = 0
-        self._trouble: dict[AlarmKind, int] = {}
-        self._news = asyncio.Event()
-        self._changed = asyncio.Event()
-        self._asked: ControlSession | None = None
-        self._publish_all()
+        self._publish()
 
     def close(self) -> None:
         """Let go of the plant."""
@@ -120,11 +99,11 @@ class ControlPlc:
         """Wait until the next scan may begin."""
         waiting_since = time.monotonic()
         while True:
-            if self._asked is not None:
-                self._start(self._asked)
-            if self._running and self._pace.realtime:
+            if self.clients.asked is not None:
+                self._start(self.clients.asked)
+            if self.publication.running and self._pace.realtime:
                 await self._until_clock()
-                if self._asked is None:
+                if self.clients.asked is None:
                     return
             elif self._may_go_on():
                 return
@@ -138,8 +117,8 @@ class ControlPlc:
             self._pacer = self._new_pacer()
         lateness = await self._pacer.until(program.tick)
         if lateness * 1000 > self._settings.control_plc.scan_tolerance_ms:
-            self._overruns += 1
-            self._note_trouble(AlarmKind.DEADLINE_MISSED)
+            self.publication.overruns += 1
+            program.alarms.happened(AlarmKind.DEADLINE_MISSED)
         if lateness * self._pace.factor > TICK_S:
             program.rejoin(self._clock_tick(), program.applied)
 
@@ -152,33 +131,32 @@ class ControlPlc:
 
     async def _until_changed(self, waiting_since: float) -> None:
         """Wait until somebody writes something; an optimiser that is waited for too long is lost."""
-        self._changed.clear()
+        self.clients.changed.clear()
         program = self._program
-        awaited = (
-            self._running and program.tick < self._granted and (program.awaiting_plan or program.awaiting_sequence)
-        )
+        granted = self.publication.running and program.tick < self.clients.granted
+        awaited = granted and (program.awaiting_plan or program.awaiting_sequence)
         if not awaited:
-            await self._changed.wait()
+            await self.clients.changed.wait()
             return
         patience = self._settings.control_plc.ladder.optimizer_patience_s
         try:
             async with asyncio.timeout(waiting_since + patience - time.monotonic()):
-                await self._changed.wait()
+                await self.clients.changed.wait()
         except TimeoutError:
             program.optimizer_lost()
 
     def _may_go_on(self) -> bool:
         program = self._program
         return (
-            self._running
-            and program.tick < self._granted
+            self.publication.running
+            and program.tick < self.clients.granted
             and not program.awaiting_plan
             and not program.awaiting_sequence
         )
 
     async def _scan(self) -> None:
         program = self._program
-        if self._optimizer_waits:
+        if self.clients.optimizer_waits:
             program.optimizer_seen()
         try:
             measurement = await self._plant.exchange(sealed(program.begin_scan()), Measurement)
@@ -200,25 +178,23 @@ class ControlPlc:
         program = self._program
         events = program.journal.count
         update = program.end_scan(measurement)
-        self._end_troubles()
+        program.alarms.pass_by()
         if program.process is not None:
             self.bank.put(program.process)
         if update is not None or program.tick % TICKS_PER_SECOND == 0:
-            self._publish_status()
+            self.publication.status()
         if program.journal.count != events or program.tick % TICKS_PER_SECOND == 0:
             self.publication.safety()
         if update is not None:
-            self.bank.put(update)
-            self._news.set()
-            self._news = asyncio.Event()
-        self.publication.identity(running=self._running)
-        self._keep()
+            self.clients.tell(update)
+        self.publication.identity()
+        self._memory.keep(program, self._pace)
 
     # -- sessions ------------------------------------------------------------------------------------------------------
 
     async def _begin(self) -> None:
         """Go on with the session of before a restart, or with the plant's, or wait for one."""
-        state = self._state_of_before()
+        state = self._memory.recall()
         plant = await self._look_at_plant()
         if state is not None and state.session == plant.session != 0:
             self._program.alarms.rows = list(state.alarms)
@@ -240,9 +216,9 @@ class ControlPlc:
         """Go on with the plant's session where the plant is."""
         tick = await self._in_step(plant.tick) if self._pace.realtime else plant.tick
         self._program.resume(plant.session, tick, plant.applied, updates=updates, operator=operator)
-        self._running = True
+        self.publication.running = True
         self.bank.put(operator)
-        self._publish_all()
+        self._publish()
         log.warning("session resumed", extra={"session": plant.session, "tick": tick})
 
     async def _in_step(self, tick: int) -> int:
@@ -253,12 +229,12 @@ class ControlPlc:
         while present == tick and time.monotonic() < deadline:
             present = (await self._plant.read(Identity)).tick
         phase = 0.5 * tick_s if present != tick else 0.0
-        self._pacer = Pacer(Schedule(time.monotonic() + phase - present * tick_s, self._pace.factor))
+        self._pacer = self._new_pacer(time.monotonic() + phase - present * tick_s)
         return present
 
     def _leave(self, session: int, tick: int) -> None:
         """The plant was restarted, or is driven by somebody else: wait for a session."""
-        self._running = False
+        self.publication.running = False
         log.error(
             "session ended: the plant has left it",
             extra={
@@ -268,7 +244,7 @@ class ControlPlc:
                 "plant_tick": tick,
             },
         )
-        self._publish_all()
+        self._publish()
 
     async def _find_plant(self, reason: str) -> None:
         """Look for the plant until it is there, and go on where it is."""
@@ -292,154 +268,28 @@ class ControlPlc:
         program.rejoin(self._clock_tick() if self._pace.realtime else plant.tick, plant.applied)
         program.alarms.now = program.tick
         program.alarms.returned(AlarmKind.PLANT_LOST)
-        self._publish_all()
+        self._publish()
 
     def _start(self, asked: ControlSession) -> None:
-        self._asked = None
+        self.clients.asked = None
         self._program.restart(asked.session)
         self._pace = Pace(bool(asked.realtime), asked.factor)
-        self._granted = self._overruns = 0
-        self._running = True
+        self.clients.granted = self.publication.overruns = 0
+        self.publication.running = True
         self._pacer = self._new_pacer()
         self.bank.put(self._program.operator)
-        self._publish_all()
+        self._publish()
         log.info("session started", extra={"session": asked.session, "realtime": bool(asked.realtime)})
 
-    def _new_pacer(self) -> Pacer:
-        return Pacer(Schedule(time.monotonic(), self._pace.factor))
+    def _new_pacer(self, start: float | None = None) -> Pacer:
+        pacer = Pacer(Schedule(time.monotonic() if start is None else start, self._pace.factor))
+        self.publication.lateness = pacer.record if self._pace.realtime else None
+        return pacer
 
-    # -- retained state ------------------------------------------------------------------------------------------------
-
-    def _state_of_before(self) -> RetainedState | None:
-        if self._retained is None:
-            return None
-        try:
-            content = self._retained.load()
-            return None if content is None else RetainedState.parsed(content)
-        except RetainedStateError as error:
-            log.warning("retained state refused", extra={"reason": str(error)})
-            return None
-
-    def _keep(self) -> None:
-        if self._retained is None:
-            return
-        try:
-            self._retained.save(RetainedState.of(self._program, self._pace).model_dump())
-        except RetainedStateError as error:
-            log.error("no state is retained any more", extra={"reason": str(error)})  # noqa: TRY400 one line
-            self._retained = None
-
-    # -- what clients write --------------------------------------------------------------------------------------------
-
-    def on_write(self, block: Block) -> Awaitable[None] | None:
-        """Take what a client has written; an awaitable lets its answer wait."""
-        record, program = block.record, self._program
-        if record is AwaitUpdate:
-            return self._await_update(self.bank.get(AwaitUpdate))
-        if record is Plan:
-            program.accept_plan(self.bank.get(Plan))
-        elif record is SequenceHeader:
-            self._offer(self.bank.get(SequenceHeader))
-        elif record is Grant:
-            self._granted = self.bank.get(Grant).until_tick
-        elif record is ControlSession:
-            self._asked = self.bank.get(ControlSession)
-        elif record is Heartbeat:
-            program.heartbeat(self.bank.get(Heartbeat))
-        else:
-            self._command(record)
-        if record is not SequenceRow:
-            self._changed.set()
-        return None
-
-    def _command(self, record: type[object]) -> None:
-        """Do what an operator has written."""
-        program = self._program
-        if record is Operator:
-            program.operate(self.bank.get(Operator))
-        elif record is AlarmCommand:
-            program.alarms.command(self.bank.get(AlarmCommand))
-        elif record is WatchdogTime:
-            program.watchdog.set(self.bank.get(WatchdogTime).time, program.tick)
-        else:
-            return
+    def _publish(self) -> None:
+        self.publication.status()
         self.publication.safety()
-
-    def _offer(self, header: SequenceHeader) -> None:
-        rows = [self.bank.get(SequenceRow, row) for row in range(header.length)]
-        answer = self._program.offer(InputSequence(header, rows))
-        self.bank.put(answer)
-        if answer.verdict != Verdict.ACCEPTED:
-            self.publication.safety()
-        if self._pace.realtime:
-            self._publish_status()
-
-    def _await_update(self, asked: AwaitUpdate) -> Awaitable[None] | None:
-        """Let the answer wait for the update asked for; one who asks out of session gets the next fresh one."""
-        program = self._program
-        program.optimizer_seen()
-        wanted = asked.update
-        if asked.session != program.session or not self._running:
-            latched = program.player.update
-            if latched is not None and not (program.awaiting_plan and latched.tick == program.tick - 1):
-                program.abandon()
-                self.bank.put(latched._replace(session=0))  # what waits in vain is not given this one
-                wanted = latched.update + 1
-            else:
-                wanted = latched.update if latched else 0
-            self._changed.set()
-        return None if self._latched(wanted) else self._wait_for(wanted)
-
-    def _latched(self, wanted: int) -> bool:
-        latched = self._program.player.update
-        return latched is not None and latched.update >= wanted
-
-    async def _wait_for(self, wanted: int) -> None:
-        """Wait for an update; an update of a newer session, which counts from 0 again, will do."""
-        session = self._program.session
-        self._optimizer_waits += 1
-        try:
-            async with asyncio.timeout(LONGEST_WAIT_S):
-                while not self._latched(wanted):
-                    await self._news.wait()
-                    if self._program.session != session:
-                        return
-        except TimeoutError:
-            return
-        finally:
-            self._optimizer_waits -= 1
-
-    def on_departure(self, role: Role) -> None:
-        """Nobody of this role is connected any more: an optimiser is not waited for."""
-        if role is Role.OPTIMIZER:
-            self._program.optimizer_lost()
-            self._changed.set()
-
-    def on_refusal(self, kind: str) -> None:
-        """A server has refused something to somebody."""
-        if kind == "access_refused":
-            self._note_trouble(AlarmKind.ACCESS_REFUSED)
-
-    def _note_trouble(self, kind: AlarmKind) -> None:
-        """Raise an alarm for something that happens at an instant."""
-        self._trouble[kind] = self._program.tick
-        self._program.alarms.raised(kind)
-
-    def _end_troubles(self) -> None:
-        for kind, tick in list(self._trouble.items()):
-            if self._program.tick - tick > TROUBLE_TICKS:
-                del self._trouble[kind]
-                self._program.alarms.returned(kind)
-
-    # -- what others see -----------------------------------------------------------------------------------------------
-
-    def _publish_status(self) -> None:
-        self.publication.status(self._overruns, self._pacer.record if self._pace.realtime else None)
-
-    def _publish_all(self) -> None:
-        self._publish_status()
-        self.publication.safety()
-        self.publication.identity(running=self._running)
+        self.publication.identity()
 
 
 async def serve(settings: ControlSettings) -> None:
@@ -447,8 +297,8 @@ async def serve(settings: ControlSettings) -> None:
     plc = ControlPlc(settings)
     identity = DeviceIdentity(product="Coldloop control PLC", revision=__version__)
     server = ModbusServer(
-        plc.bank, settings=settings.control_plc.server, on_write=plc.on_write, identity=identity,
-        on_departure=plc.on_departure, on_refusal=plc.on_refusal,
+        plc.bank, settings=settings.control_plc.server, on_write=plc.clients.on_write, identity=identity,
+        on_departure=plc.clients.on_departure, on_refusal=plc.clients.on_refusal,
     )  # fmt: skip
     await server.start()
     log.info("serving", extra={"host": settings.control_plc.server.host, "port": server.port})

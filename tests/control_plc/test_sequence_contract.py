@@ -184,22 +184,28 @@ def test_rounding_to_single_precision_is_no_violation_and_the_guard_still_allows
     assert applied == pytest.approx(second, abs=1e-5)
 
 
+def test_a_swing_from_one_edge_of_the_window_to_the_other_is_too_large_a_step(bench: "Bench", at: At) -> None:
+    assert bench.plan(4)
+    swing = bench.sequence([at(0.5), at(-0.5)])
+    assert bench.offer(swing).verdict == Verdict.RATE_EXCEEDED
+
+
 def test_a_sequence_is_judged_against_what_is_played_just_before_it_begins(bench: "Bench", at: At) -> None:
-    bench.play([*[at(0.5)] * 6, *[at(-0.5)] * 34], ticks=4)
+    bench.play([*[at(0.4)] * 6, *[at(0.0)] * 2, *[at(-0.4)] * 32], ticks=4)
     bench.scan()
     assert bench.plan(10)
-    assert bench.offer(bench.sequence([at(0.1)] * 20)).verdict == Verdict.RATE_EXCEEDED
-    assert bench.offer(bench.sequence([at(-1.0)] * 20)).verdict == Verdict.ACCEPTED
+    assert bench.offer(bench.sequence([at(0.2)] * 20)).verdict == Verdict.RATE_EXCEEDED
+    assert bench.offer(bench.sequence([at(-0.8)] * 20)).verdict == Verdict.ACCEPTED
 
 
 def test_a_sequence_is_judged_against_the_last_row_when_the_one_before_will_have_run_out(
     bench: "Bench", at: At
 ) -> None:
-    bench.play([*[at(0.5)] * 3, *[at(-0.5)] * 3], ticks=4)
+    bench.play([*[at(0.4)] * 3, at(), *[at(-0.4)] * 3], ticks=4)
     bench.scan()
     assert bench.plan(10)
-    assert bench.offer(bench.sequence([at(0.1)] * 20)).verdict == Verdict.RATE_EXCEEDED
-    assert bench.offer(bench.sequence([at(-1.0)] * 20)).verdict == Verdict.ACCEPTED
+    assert bench.offer(bench.sequence([at(0.2)] * 20)).verdict == Verdict.RATE_EXCEEDED
+    assert bench.offer(bench.sequence([at(-0.8)] * 20)).verdict == Verdict.ACCEPTED
 
 
 def test_with_elapsed_rates_a_missed_deadline_does_not_widen_what_is_accepted(

@@ -74,7 +74,7 @@ class Link(RuleBasedStateMachine):
         applied = SequenceRow(*actuators[1:4])
         if due and self.promised is not None:
             assert applied == self.promised.rows[0], "an accepted sequence begins at its tick"
-            assert program.mode is Mode.MPC
+            assert program.mode in (Mode.MPC, Mode.REST)
             self.promised = None
         if program.mode in (Mode.MPC, Mode.REST):
             assert applied in self.accepted_rows, "only what was accepted whole is played"
