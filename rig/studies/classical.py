@@ -37,6 +37,7 @@ class ClassicalStudy:
                 runs[0].J_BF / runs[1].J_BF
             )
         result.figures["closed-loop cost"] = _figure(result)
+        result.remarks.append(_table(result))
         return result
 
 
@@ -46,6 +47,21 @@ def _loads(options: StudyOptions) -> list[Load]:
 
 def _runs(load: Load) -> list[RunRequest]:
     return [load.request(period, *assignments) for period, assignments in CASES.values()]
+
+
+def _table(result: StudyResult) -> str:
+    """Return a table: J_BF and the time outside the bands of each case."""
+    lines = [
+        "**J_BF (time outside the bands, %: L1 / T5)**",
+        "",
+        "| hour | " + " | ".join(CASES) + " |",
+        "|---|" + "---|" * len(CASES),
+    ]
+    for name in dict.fromkeys(row[0] for row in result.rows):
+        mine = [row for row in result.rows if row[0] == name]
+        cells = [f"{float(row[2]):,.0f} ({float(row[3]):.1f} / {float(row[4]):.1f})" for row in mine]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 def _figure(result: StudyResult) -> Figure:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -104,10 +105,9 @@ class UpdatingPeriodStudy:
         if fresh:
             _judge(result, "fresh hours", fresh)
         for policy in (LITERAL, OWN_INTERRUPT):
-            after, quiet = _response(list(hours.values()), policy)
-            result.values[f"tau_u just after a load step over that in quiet, {policy.label}"] = [after / quiet]
+            _judge_response(result, list(hours.values()), policy)
         result.remarks += [_table("Hours a to f", first), *([_table("Fresh hours", fresh)] if fresh else [])]
-        result.remarks.append(_variant_table(result))
+        result.remarks += [_response_table(list(hours.values())), _variant_table(result)]
         return result
 
 
@@ -209,25 +209,56 @@ def _geometric_mean(ratios: Series) -> float:
 
 
 RESPONSE_EDGES_S: Final = np.array([0.0, 2.5, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0])
+SOON_S: Final = (0.0, 5.0)
+LATER_S: Final = (5.0, 20.0)
+QUIET_S: Final = (60.0, np.inf)
 
 
-def _response(hours: Sequence[_Hour], policy: Policy) -> tuple[float, float]:
-    """Return the mean updating period that begins 0 to 5 s after a load step, and beyond 60 s, s."""
+def _periods_since_step(hours: Sequence[_Hour], policy: Policy) -> tuple[Series, Series]:
+    """Return, for all updates of all hours, the time since the load step (s) and the updating period (s)."""
     runs = [(hour.policies[policy.label], hour.load) for hour in hours]
     since = np.concatenate([seconds_since_step(run, load) for run, load in runs])
-    tau = np.concatenate([run.column("tau_u") for run, _ in runs]) * TICK_S
-    soon, late = tau[since < 5.0], tau[since >= 60.0]
-    return (float(soon.mean()) if len(soon) else np.nan, float(late.mean()) if len(late) else np.nan)
+    return since, np.concatenate([run.column("tau_u") for run, _ in runs]) * TICK_S
+
+
+def _judge_response(result: StudyResult, hours: Sequence[_Hour], policy: Policy) -> None:
+    """Compare the mean period just after a load step, and a little later, with that in quiet."""
+    since, tau = _periods_since_step(hours, policy)
+
+    def mean(span: tuple[float, float]) -> float:
+        chosen = tau[(span[0] <= since) & (since < span[1])]
+        return float(chosen.mean()) if len(chosen) else np.nan
+
+    quiet = mean(QUIET_S)
+    result.values[f"tau_u just after a load step over that in quiet, {policy.label}"] = [mean(SOON_S) / quiet]
+    result.values[f"tau_u 5 to 20 s after a load step over that in quiet, {policy.label}"] = [mean(LATER_S) / quiet]
+
+
+def _response_means(hours: Sequence[_Hour], policy: Policy) -> list[float]:
+    """Return the mean period in each span of time since the step; not a number where there is none."""
+    since, tau = _periods_since_step(hours, policy)
+    bins = np.digitize(since, RESPONSE_EDGES_S)
+    return [float(tau[bins == i].mean()) if (bins == i).any() else np.nan for i in range(1, len(RESPONSE_EDGES_S))]
+
+
+def _response_table(hours: Sequence[_Hour]) -> str:
+    spans = [f"{low:g}-{high:g} s" for low, high in pairwise(RESPONSE_EDGES_S.tolist())]
+    lines = [
+        "**Mean updating period (s) against the time since the load step**, all hours together.",
+        "",
+        "| policy | " + " | ".join(spans) + " |",
+        "|---|" + "---|" * len(spans),
+    ]
+    for policy in (LITERAL, OWN, OWN_INTERRUPT):
+        cells = ["" if np.isnan(mean) else f"{mean:.2f}" for mean in _response_means(hours, policy)]
+        lines.append(f"| {policy.label} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 def _response_figure(hours: Sequence[_Hour]) -> Figure:
     with panels(1, 1, (8.0, 3.6)) as (figure, (place,)):
         for policy, colour in zip((LITERAL, OWN, OWN_INTERRUPT), COLOURS, strict=False):
-            runs = [(hour.policies[policy.label], hour.load) for hour in hours]
-            since = np.concatenate([seconds_since_step(run, load) for run, load in runs])
-            tau = np.concatenate([run.column("tau_u") for run, _ in runs]) * TICK_S
-            bins = np.digitize(since, RESPONSE_EDGES_S)
-            means = [tau[bins == i].mean() if (bins == i).any() else np.nan for i in range(1, len(RESPONSE_EDGES_S))]
+            means = _response_means(hours, policy)
             place.stairs(means, RESPONSE_EDGES_S, color=colour, baseline=None, linewidth=1.4, label=policy.label)
         place.set_xlabel("time since the load step (s)")
         place.set_ylabel("mean updating period (s)")
