@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rig.chaos.plan import shipped_plans
 
 if TYPE_CHECKING:
-    from tests.chaos.conftest import Coldloop
+    from tests.conftest import Coldloop
 
 PLAN = """
 name = "short"

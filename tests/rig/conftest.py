@@ -2,15 +2,14 @@
 
 import asyncio
 import contextlib
-import inspect
 import os
 import socket
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import pytest
 from pydantic import BaseModel
@@ -27,7 +26,6 @@ from optimizer_plc.settings import OptimizerSettings
 from plant.load import find_load
 from plant.program import LoadProfile
 from plant.settings import PlantSettings
-from rig import cli
 from rig.network import NetworkRig, RigEndpoints
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder, Recording
@@ -40,28 +38,6 @@ PATIENCE_S = 120.0
 S = TypeVar("S", bound=BaseModel)
 
 SERVICES = ("plant", "control_plc", "optimizer_plc")
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run a test that is a coroutine, in a loop of its own and within `PATIENCE_S`."""
-    if not inspect.iscoroutinefunction(pyfuncitem.obj):
-        return None
-    arguments = {name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters}
-
-    async def story() -> None:
-        async with asyncio.timeout(PATIENCE_S):
-            await pyfuncitem.obj(**arguments)
-
-    asyncio.run(story())
-    return True
-
-
-@pytest.fixture(autouse=True)
-def _no_configuration_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in tuple(os.environ):
-        if name.startswith(PREFIX):
-            monkeypatch.delenv(name)
 
 
 # -- scenarios and the rig in one process ------------------------------------------------------------------------------
@@ -234,37 +210,6 @@ def three_processes() -> Iterator[Bus]:
 
 
 # -- the command line --------------------------------------------------------------------------------------------------
-
-
-class Outcome(NamedTuple):
-    """What a command left behind."""
-
-    code: int
-    out: str
-    complaints: list[str]
-    """Lines on standard error."""
-
-
-Coldloop = Callable[..., Outcome]
-
-
-@pytest.fixture
-def coldloop(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Coldloop:
-    """`coldloop` with its arguments, in this process: what it does not report as its own error fails the test."""
-
-    def run(*arguments: object, environment: Mapping[str, str] | None = None) -> Outcome:
-        with monkeypatch.context() as context:
-            for name, value in (environment or {}).items():
-                context.setenv(name, value)
-            capsys.readouterr()
-            try:
-                code: Any = cli.main([str(argument) for argument in arguments])
-            except SystemExit as end:
-                code = end.code
-        out, err = capsys.readouterr()
-        return Outcome(code, out, err.splitlines())
-
-    return run
 
 
 @pytest.fixture

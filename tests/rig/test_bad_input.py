@@ -17,7 +17,8 @@ from coldloop.model_file import read_document, write_document
 from coldloop.model_settings import DEFAULT_MODEL_FILE
 
 if TYPE_CHECKING:
-    from tests.rig.conftest import Bus, Coldloop, Outcome
+    from tests.conftest import Coldloop, Outcome
+    from tests.rig.conftest import Bus
 
 USAGE, FAILURE = 2, 1
 

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from tests.rig.conftest import Coldloop
+    from tests.conftest import Coldloop
 
 
 def row(out: str, start: str) -> list[str]:

@@ -15,7 +15,7 @@ from coldloop.modbus.tls import client_context, server_context
 from rig.settings import Settings
 
 if TYPE_CHECKING:
-    from tests.rig.conftest import Coldloop
+    from tests.conftest import Coldloop
 
 USAGE, FAILURE = 2, 1
 CLIENTS = {"control", "optimizer", "operator", "reader"}

@@ -15,7 +15,7 @@ from coldloop.model_settings import DEFAULT_MODEL_FILE
 from rig.register_listing import COLUMNS, MAPS
 
 if TYPE_CHECKING:
-    from tests.rig.conftest import Coldloop
+    from tests.conftest import Coldloop
 
 WORDS = {"uint16": 1, "uint32": 2, "float32": 2}
 

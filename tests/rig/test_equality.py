@@ -18,7 +18,8 @@ from rig.settings import Settings
 
 if TYPE_CHECKING:
     from rig.recording import Recording
-    from tests.rig.conftest import Bus, Coldloop, OnTheBus, Simulate
+    from tests.conftest import Coldloop
+    from tests.rig.conftest import Bus, OnTheBus, Simulate
 
 NOISY = PlantSection(sensors=SensorSettings(level=0.02, speed=0.5, temperature=0.02, pressure=0.002))
 

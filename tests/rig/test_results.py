@@ -25,7 +25,8 @@ from rig.scenario import Scenario
 
 if TYPE_CHECKING:
     from plant.program import LoadProfile
-    from tests.rig.conftest import Coldloop, Simulate
+    from tests.conftest import Coldloop
+    from tests.rig.conftest import Simulate
 
 TICKS = 240
 

@@ -9,7 +9,7 @@ import pytest
 from rig.studies import STUDIES
 
 if TYPE_CHECKING:
-    from tests.rig.conftest import Coldloop
+    from tests.conftest import Coldloop
 
 WANTED = {
     "cholesky", "unlimited", "limited", "solver-comparison", "trajectories", "updating-period", "plc-2h", "adaptive-2h",

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import inspect
 import json
 import os
 import shutil
@@ -19,23 +18,6 @@ import aiomqtt
 import pytest
 
 from coldloop.config import PREFIX
-
-PATIENCE_S = 60.0
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run a test that is a coroutine, in a loop of its own and within `PATIENCE_S`."""
-    if not inspect.iscoroutinefunction(pyfuncitem.obj):
-        return None
-    arguments = {name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters}
-
-    async def story() -> None:
-        async with asyncio.timeout(PATIENCE_S):
-            await pyfuncitem.obj(**arguments)
-
-    asyncio.run(story())
-    return True
 
 
 @pytest.fixture

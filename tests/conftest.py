@@ -1,17 +1,18 @@
-"""Coroutines as tests, and the command line."""
+"""What all tests share: coroutines as tests, no configuration from outside, and the command line."""
 
 import asyncio
 import inspect
 import os
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import pytest
 
 from coldloop.config import PREFIX
 from rig import cli
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
+"""A coroutine has failed when it takes longer; the first one on a bus may have to compile the kernels."""
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -39,7 +40,7 @@ def _no_configuration_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
 class Outcome(NamedTuple):
     """What a command left behind."""
 
-    code: object
+    code: int
     out: str
     complaints: list[str]
     """Lines on standard error."""
@@ -49,15 +50,18 @@ Coldloop = Callable[..., Outcome]
 
 
 @pytest.fixture
-def coldloop(capsys: pytest.CaptureFixture[str]) -> Coldloop:
-    """`coldloop` with its arguments, in this process."""
+def coldloop(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Coldloop:
+    """`coldloop` with its arguments, in this process: what it does not report as its own error fails the test."""
 
-    def run(*arguments: object) -> Outcome:
-        capsys.readouterr()
-        try:
-            code: object = cli.main([str(argument) for argument in arguments])
-        except SystemExit as end:
-            code = end.code
+    def run(*arguments: object, environment: Mapping[str, str] | None = None) -> Outcome:
+        with monkeypatch.context() as context:
+            for name, value in (environment or {}).items():
+                context.setenv(name, value)
+            capsys.readouterr()
+            try:
+                code: Any = cli.main([str(argument) for argument in arguments])
+            except SystemExit as end:
+                code = end.code
         out, err = capsys.readouterr()
         return Outcome(code, out, err.splitlines())
 
