@@ -52,11 +52,15 @@ def make_plan(options: argparse.Namespace) -> Plan:
 def tell(evaluation: Evaluation) -> None:
     """Print what became of it."""
     rows = evaluation.rows
-    first_alarms = [row.alarms[0].after_s for row in rows if row.alarms]
+    alarms = [row.alarms[0] for row in rows if row.alarms]
+    earliest, latest = (max(times, default=0.0) for times in (
+        [alarm.after_done_s for alarm in alarms], [alarm.after_s for alarm in alarms],
+    ))  # fmt: skip
     back = [row.back_s for row in rows if row.back_s is not None]
     print(f"{len(rows)} instants")
     print(f"largest step/limit: {max((row.largest_step for row in rows), default=0.0):.6f}")
-    print(f"first alarm after at most {max(first_alarms, default=0.0):g} s; none in {len(rows) - len(first_alarms)}")
+    print(f"first alarm at most {latest:g} s after the last tick seen before the signal, {earliest:g} s after the "
+          f"first one seen when it had worked; none in {len(rows) - len(alarms)}")  # fmt: skip
     print(f"back to MPC after at most {max(back, default=0.0):g} s; not before the next one in {len(rows) - len(back)}")
 
 

@@ -130,6 +130,8 @@ class Driver:
         self._marks[id(fault)] = mark
         self._trace.marks.append(mark)
         await self._injector.begin(fault)
+        await self._look()
+        mark.done = self.tick
         if isinstance(fault, WrongModel) and not self._plan.realtime:
             await self._until_refused()
         self._timeline.begun(moment, self._seconds)

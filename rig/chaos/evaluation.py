@@ -28,6 +28,8 @@ class RaisedAlarm(NamedTuple):
 
     name: str
     after_s: float
+    after_done_s: float
+    """The same from the tick at which the fault was certainly there; in lock-step ticks go by between the two."""
 
 
 class Row(NamedTuple):
@@ -100,7 +102,11 @@ def _row(
         lasted_s=None if mark.end is None else (mark.end - mark.begin) * TICK_S,
         modes=tuple(mode.name for mode in _different([*before, *(Mode(event.subject) for event in changes)])),
         alarms=tuple(
-            RaisedAlarm(AlarmKind(event.subject).name, max(0, event.tick - mark.begin) * TICK_S)
+            RaisedAlarm(
+                AlarmKind(event.subject).name,
+                max(0, event.tick - mark.begin) * TICK_S,
+                max(0, event.tick - (mark.begin if mark.done is None else mark.done)) * TICK_S,
+            )
             for event in trace.events[mark.first_event : last_event]
             if event.kind == EventKind.ALARM_RAISED
         ),

@@ -19,12 +19,14 @@ class Mark:
 
     fault: AnyFault
     begin: int
-    """Tick at which it began."""
+    """Last tick that was seen before it began."""
     end: int | None = None
     """Tick at which it ended, and what it had stopped answered again."""
     first_event: int = 0
     """Index in `ChaosTrace.events` of the first one after its beginning. Ticks alone do not tell: a control PLC that
     was restarted goes on one tick back."""
+    done: int | None = None
+    """First tick that was seen when it had been brought about: a process had ended by then."""
 
 
 class Resources(NamedTuple):

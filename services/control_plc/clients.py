@@ -54,6 +54,13 @@ class Clients:
 
     def on_write(self, block: Block) -> Awaitable[None] | None:
         """Take what a client has written; an awaitable lets its answer wait."""
+        present = self._program.optimizer_present
+        wait = self._take(block)
+        if self._program.optimizer_present is not present:
+            self._publication.safety()
+        return wait
+
+    def _take(self, block: Block) -> Awaitable[None] | None:
         record, program = block.record, self._program
         if record is AwaitUpdate:
             return self._await_update(self._bank.get(AwaitUpdate))
@@ -133,6 +140,7 @@ class Clients:
         """Nobody of this role is connected any more: an optimiser is not waited for."""
         if role is Role.OPTIMIZER:
             self._program.optimizer_lost()
+            self._publication.safety()
             self.changed.set()
 
     def on_refusal(self, kind: str) -> None:

@@ -60,10 +60,10 @@ def killed() -> ChaosTrace:
 def test_modes_alarms_and_the_way_back_belong_to_the_fault_before_them(killed: ChaosTrace) -> None:
     first, second = evaluated(killed).rows
     assert first.modes == ("MPC", "HOLD", "CLASSICAL", "MPC")
-    assert first.alarms == (RaisedAlarm("OPTIMIZER_LOST", 0.25),)
+    assert first.alarms == (RaisedAlarm("OPTIMIZER_LOST", 0.25, 0.25),)
     assert (first.at_s, first.lasted_s, first.back_s) == (25.0, 25.0, 12.5)
     assert second.modes == ("MPC",)
-    assert second.alarms == (RaisedAlarm("PLANT_LOST", 0.5),)
+    assert second.alarms == (RaisedAlarm("PLANT_LOST", 0.5, 0.5),)
     assert second.back_s == 0.0
 
 
