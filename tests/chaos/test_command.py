@@ -55,3 +55,35 @@ def test_faults_that_only_cost_time_leave_the_trace_as_it_is(coldloop: "Coldloop
     assert [fault["fault"] for fault in result["faults"]] == ["pause optimizer", "delay link plant"]
     assert result["missing_ticks"] == 0
     assert {"chaos.md", "chaos.png", "logs"} <= {path.name for path in out.iterdir()}
+
+
+KILLS = """
+name = "kills"
+description = "Each process is killed in turn"
+load = "a"
+duration_s = 500
+faults = [
+    {kind = "kill", process = "optimizer", at_s = 60, duration_s = 60},
+    {kind = "kill", process = "control", at_s = 200, duration_s = 1},
+    {kind = "kill", process = "plant", at_s = 300, duration_s = 1},
+    {kind = "reset", link = "plant", at_s = 400, duration_s = 1},
+]
+"""
+
+
+def test_whatever_is_killed_the_plant_is_not_hurt_and_mpc_comes_back(coldloop: "Coldloop", tmp_path: Path) -> None:
+    plan, out = tmp_path / "kills.toml", tmp_path / "out"
+    plan.write_text(KILLS)
+    outcome = coldloop("chaos", plan, "--out", out)
+    assert (outcome.code, outcome.complaints[1:]) == (0, [])
+    faults = json.loads((out / "chaos.json").read_text())["faults"]
+    assert [fault["fault"] for fault in faults] == [
+        "kill optimizer", "kill control", "kill plant", "reset link plant",
+    ]  # fmt: skip
+    for fault in faults:
+        assert max(fault["largest_steps"]) <= 1.0, fault
+        assert fault["back_s"] <= 30.0, fault
+        assert fault["outside_s"] == fault["undisturbed_s"], fault
+    optimizer = faults[0]
+    assert optimizer["modes"] == ["MPC", "REST", "HOLD", "CLASSICAL", "MPC"]
+    assert next(a["after_done_s"] for a in optimizer["alarms"] if a["name"] == "OPTIMIZER_LOST") <= 0.25
