@@ -35,7 +35,8 @@ def optimizer_plc() -> None:
 def _answer_two_updates(settings: "ProgramSettings") -> None:
     from coldloop.limits import InputLimits  # noqa: PLC0415
     from coldloop.lti_model import load  # noqa: PLC0415
-    from control_plc.program import ControlProgram  # noqa: PLC0415
+    from control_plc.runtime import make_program  # noqa: PLC0415
+    from control_plc.settings import ControlSection  # noqa: PLC0415
     from optimizer_plc.arithmetic import Arithmetic  # noqa: PLC0415
     from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
 
@@ -43,10 +44,10 @@ def _answer_two_updates(settings: "ProgramSettings") -> None:
     limits = InputLimits()
     OptimizerProgram(model, settings.model_copy(update={"arithmetic": Arithmetic.FLOAT32}), limits)
     optimizer = OptimizerProgram(model, settings, limits)
-    control = ControlProgram(limits=limits, model_digest=optimizer.model_digest, initial_inputs=model.u0)
+    header = read_header(DEFAULT_MODEL_FILE)
+    control = make_program(header, ControlSection(), limits)
     control.restart(1)
     updates = 0
-    header = read_header(DEFAULT_MODEL_FILE)
     while updates < 2:
         if control.awaiting_sequence:
             control.offer(optimizer.solve())

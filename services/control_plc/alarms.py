@@ -1,6 +1,7 @@
 """Alarms with the states of ANSI/ISA-18.2, and the sequence of events."""
 
 from collections import deque
+from collections.abc import Sequence
 
 from coldloop.process import TICK_S
 from coldloop.registers.safety import (
@@ -15,8 +16,10 @@ from coldloop.registers.safety import (
     EventKind,
 )
 
+PASSING = (AlarmKind.DEADLINE_MISSED, AlarmKind.ACCESS_REFUSED)
+"""Alarms for something that happens at an instant."""
 PASSING_TICKS = round(60 / TICK_S)
-"""An alarm for something that happens at an instant returns when it has not happened again for so long."""
+"""They return when it has not happened again for so long."""
 
 
 class Journal:
@@ -78,6 +81,17 @@ class AlarmPanel:
             self.raised(kind, cause)
         else:
             self.returned(kind)
+
+    def begin_at(self, tick: int) -> None:
+        """Go on at a tick that may lie before the present one."""
+        self.now = tick
+        self._happened = {kind: min(happened, tick) for kind, happened in self._happened.items()}
+
+    def restore(self, rows: Sequence[Alarm]) -> None:
+        """Take the alarms of before a restart; what happened at an instant may pass by again."""
+        self.rows = list(rows)
+        self._happened = {kind: self.now for kind in PASSING if self.rows[kind].active}
+        self.changes += 1
 
     def happened(self, kind: AlarmKind) -> None:
         """Raise an alarm for something that happens at an instant; `pass_by` returns it."""

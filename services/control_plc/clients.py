@@ -18,6 +18,7 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.declaration import Block, Role
 from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
+from coldloop.seal import sealed
 from coldloop.sequence import InputSequence
 from control_plc.program import ControlProgram
 from control_plc.publication import Publication
@@ -48,7 +49,7 @@ class Clients:
 
     def tell(self, update: Update) -> None:
         """Show a new update, and answer who waits for it."""
-        self._bank.put(update)
+        self._bank.put(sealed(update))
         self._news.set()
         self._news = asyncio.Event()
 
@@ -72,6 +73,7 @@ class Clients:
             self.granted = self._bank.get(Grant).until_tick
         elif record is ControlSession:
             self.asked = self._bank.get(ControlSession)
+            self.granted = 0
         elif record is Heartbeat:
             program.heartbeat(self._bank.get(Heartbeat))
         else:
@@ -110,7 +112,7 @@ class Clients:
             latched = program.player.update
             if latched is not None and not (program.awaiting_plan and latched.tick == program.tick - 1):
                 program.abandon()
-                self._bank.put(latched._replace(session=0))  # what waits in vain is not given this one
+                self._bank.put(sealed(latched._replace(session=0)))  # what waits in vain is not given this one
                 wanted = latched.update + 1
             else:
                 wanted = latched.update if latched else 0

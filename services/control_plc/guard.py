@@ -46,10 +46,19 @@ class OutputGuard:
         self._window = Window(self.applied, 0, 1.0, -TICKS_PER_SAMPLE)
 
     def begin_at(self, tick: int, applied: SequenceRow) -> None:
-        """Go on from what is applied at `tick`, wherever that is; it counts as having moved just then."""
+        """Go on from what is applied at `tick`, wherever that is; it counts as having moved just then.
+
+        A window that is open stays open: breaks that follow one another would else give a full rate each.
+        """
+        window = self._window
+        goes_on = 0 <= tick - window.start < TICKS_PER_SAMPLE and all(
+            abs(value - anchor) <= rate * window.share
+            for value, anchor, rate in zip(applied, window.anchor, self._limits.rate, strict=True)
+        )
         self.applied = applied
         self._astray = self.out_of_range([applied])
-        self._window = Window(applied, tick, self._limits.rate_share(0), tick)
+        if not goes_on:
+            self._window = Window(applied, tick, self._limits.rate_share(0), tick)
 
     def admit(self, tick: int, wanted: SequenceRow, *, update: bool) -> SequenceRow:
         """Return what may be applied at `tick`, and remember it as applied."""

@@ -33,9 +33,9 @@ class Ladder:
         self.mode, self.cause, self.since = mode, cause, tick
 
     def step(self, tick: int, situation: Situation) -> bool:
-        """Choose the mode of this scan; tell whether it has changed."""
+        """Choose the mode of this scan; tell whether it, or its cause, has changed."""
         mode, cause = self._chosen(tick, situation)
-        if mode is self.mode:
+        if (mode, cause) == (self.mode, self.cause) or (mode is self.mode and mode is Mode.MPC):
             return False
         self.mode, self.cause, self.since = mode, cause, tick
         return True
@@ -53,7 +53,7 @@ class Ladder:
 
     def _without_sequence(self, tick: int) -> tuple[Mode, Cause]:
         if self.mode is Mode.CLASSICAL:
-            return self.mode, self.cause
+            return self.mode, Cause.HOLD_EXPIRED if self.cause is Cause.OPERATOR else self.cause
         if self.mode is Mode.HOLD:
             expired = tick - self.since >= self._hold_ticks
             return (Mode.CLASSICAL, Cause.HOLD_EXPIRED) if expired else (self.mode, self.cause)

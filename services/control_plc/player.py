@@ -44,6 +44,11 @@ class SequencePlayer:
         return self.invited and wanted and self._spare is None and not self._abandoned and not self._refused
 
     @property
+    def has_answer(self) -> bool:
+        """A sequence has been accepted that has not begun."""
+        return self._spare is not None
+
+    @property
     def answering(self) -> bool:
         """The optimiser has planned the update under way, so its sequence is to be expected."""
         return self._planned and not self._refused
@@ -153,7 +158,8 @@ class SequencePlayer:
             self.accepted += 1
         else:
             self.rejected += 1
-            self._refused = self.update is not None and sequence.header.update == self.update.update
+            answers = self.update is not None and sequence.header.update == self.update.update
+            self._refused = self._refused or (answers and self._spare is None)
         self.acknowledgement = Acknowledgement(sequence.header.number, verdict)
         return self.acknowledgement
 

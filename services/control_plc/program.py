@@ -92,7 +92,7 @@ class ControlProgram:
         self.process: Process | None = None
         self.optimizer_present = True
         self._guard = OutputGuard(self._limits, self._initial)
-        if tick:
+        if applied != self._initial:
             self._guard.begin_at(tick, applied)
         self._before = self._guard.applied
         self._player = SequencePlayer(self._guard, self._point.model_digest, updates=updates)
@@ -102,7 +102,8 @@ class ControlProgram:
         self._in_scan = False
         self.watchdog.set(self.watchdog.time, tick)
         self._loops.restart()
-        self.alarms.now = tick
+        self._bad_before: frozenset[int] = frozenset()
+        self.alarms.begin_at(tick)
 
     # -- what others see -----------------------------------------------------------------------------------------------
 
@@ -182,8 +183,9 @@ class ControlProgram:
         if not changed:
             return
         if self._ladder.mode is Mode.CLASSICAL:
-            self._loops.restart()
             self._player.drop()
+            if before is not Mode.CLASSICAL:
+                self._loops.restart()
         elif before is Mode.CLASSICAL:
             self._failed_handshake = -math.inf
         self.journal.note(tick, safety.EventKind.MODE, self._ladder.mode, self._ladder.cause)
@@ -199,6 +201,8 @@ class ControlProgram:
 
     def _handing_over(self, tick: int) -> bool:
         """Tell whether the loops stand still, so that the optimiser's first sequence begins where it was told."""
+        if self._player.has_answer:  # it was judged from where the inputs are
+            return True
         rested = tick - self._failed_handshake > HANDSHAKE_PAUSE_S / TICK_S
         return rested and self.operator.mode == OperatorMode.AUTO and self._player.answering
 
@@ -207,7 +211,8 @@ class ControlProgram:
         applied = tuple(self._guard.applied)
         y = tuple(self._sensors.check(measurement.y))
         self.process = Process(self.tick, measurement.load, applied, y)
-        self._let_play(usable=not self._sensors.unusable and all(map(math.isfinite, measurement.x)))
+        finite = math.isfinite(measurement.load) and all(map(math.isfinite, measurement.x))
+        self._let_play(usable=finite and not self._sensors.unusable)
         latched = None
         if self._player.latches(self.tick, measurement.load):
             latched = self._player.latch(
@@ -230,8 +235,8 @@ class ControlProgram:
             self._player.dismiss()
 
     def rejoin(self, tick: int, applied: Sequence[float]) -> None:
-        """Go on at a later tick: the plant was away, or time has leapt; `applied` is what the rack applies."""
-        self.tick = max(tick, self.tick)
+        """Go on at another tick: the plant was away, or time has leapt; `applied` is what the rack applies."""
+        self.tick = tick
         self._in_scan = False
         self._guard.begin_at(self.tick, SequenceRow(*applied))
 
@@ -249,8 +254,16 @@ class ControlProgram:
         holds(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
         holds(AlarmKind.SEQUENCE_LATE, condition=self._player.late)
         holds(AlarmKind.OPTIMIZER_LOST, condition=not self.optimizer_present)
-        bad = self._sensors.bad
-        holds(AlarmKind.SENSOR_BAD, condition=bool(bad), cause=min(bad, default=0))
+        self._watch_sensors()
+
+    def _watch_sensors(self) -> None:
+        """Raise the alarm for each sensor that has become bad; the cause is the newest one's output."""
+        bad = frozenset(self._sensors.bad)
+        for output in sorted(bad - self._bad_before):
+            self.alarms.raised(AlarmKind.SENSOR_BAD, output)
+        if not bad:
+            self.alarms.returned(AlarmKind.SENSOR_BAD)
+        self._bad_before = bad
 
     def _watch_band(self, kind: AlarmKind, value: float, band: tuple[float, float]) -> None:
         self._outside[kind] = 0 if band[0] <= value <= band[1] else self._outside[kind] + 1
@@ -293,6 +306,14 @@ class ControlProgram:
         return answer
 
     # -- the operator's side -------------------------------------------------------------------------------------------
+
+    def track(self) -> bool:
+        """Let the manual setpoints follow what is applied, so that manual begins without a bump; tell if they moved."""
+        applied = self._guard.applied
+        if self.operator.mode == OperatorMode.MANUAL or self.operator[1:] == applied[:]:
+            return False
+        self.operator = Operator(self.operator.mode, *applied)
+        return True
 
     def operate(self, operator: Operator) -> None:
         """Let an operator decide who drives, from the next scan on."""

@@ -65,6 +65,11 @@ class Publication:
             )
         )
 
+    @property
+    def is_behind(self) -> bool:
+        """There are events that have not been shown."""
+        return self._program.journal.count != self._told_events
+
     def safety(self) -> None:
         """Show ladder, watchdog, alarms and events, as far as they have changed, and log the events."""
         program = self._program

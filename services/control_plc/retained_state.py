@@ -78,5 +78,4 @@ class Memory:
         try:
             self._file.save(RetainedState.of(program, pace).model_dump())
         except RetainedStateError as error:
-            log.error("no state is retained any more", extra={"reason": str(error)})  # noqa: TRY400 one line
-            self._file = None
+            log.error("the state is not retained", extra={"reason": str(error)})  # noqa: TRY400 one line

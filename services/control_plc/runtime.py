@@ -75,6 +75,7 @@ class ControlPlc:
         self._memory = Memory(section.retain.file, header.short_digest)
         self._pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
         self._pacer = self._new_pacer()
+        self._failures = 0
         self._publish()
 
     def close(self) -> None:
@@ -90,14 +91,14 @@ class ControlPlc:
             PeerUnreachableError: The plant has never been there.
         """
         await self._plant.connect(self._settings.control_plc.plant.patience_s)
-        await self._begin()
+        await self._begin_at_last()
         while True:
             await self._until_due()
             await self._scan()
 
     async def _until_due(self) -> None:
         """Wait until the next scan may begin."""
-        waiting_since = time.monotonic()
+        self._awaiting_since: float | None = None
         while True:
             if self.clients.asked is not None:
                 self._start(self.clients.asked)
@@ -108,7 +109,7 @@ class ControlPlc:
             elif self._may_go_on():
                 return
             else:
-                await self._until_changed(waiting_since)
+                await self._until_changed()
 
     async def _until_clock(self) -> None:
         """Wait for the tick; when a whole one or more has been slept through, go on at the present one."""
@@ -120,7 +121,10 @@ class ControlPlc:
             self.publication.overruns += 1
             program.alarms.happened(AlarmKind.DEADLINE_MISSED)
         if lateness * self._pace.factor > TICK_S:
-            program.rejoin(self._clock_tick(), program.applied)
+            applied: Sequence[float] = program.applied
+            with contextlib.suppress(LinkError):  # the next exchange will tell
+                applied = (await self._look_at_plant()).applied
+            program.rejoin(self._clock_tick(), applied)
 
     def _clock_tick(self) -> int:
         """Return the tick that the clock shows; in lock-step, the program's."""
@@ -129,21 +133,24 @@ class ControlPlc:
         elapsed = (time.monotonic() - self._pacer.schedule.start) * self._pace.factor
         return max(self._program.tick, int(elapsed / TICK_S))
 
-    async def _until_changed(self, waiting_since: float) -> None:
+    async def _until_changed(self) -> None:
         """Wait until somebody writes something; an optimiser that is waited for too long is lost."""
         self.clients.changed.clear()
         program = self._program
         granted = self.publication.running and program.tick < self.clients.granted
         awaited = granted and (program.awaiting_plan or program.awaiting_sequence)
         if not awaited:
+            self._awaiting_since = None
             await self.clients.changed.wait()
             return
-        patience = self._settings.control_plc.ladder.optimizer_patience_s
+        now = time.monotonic()
+        since = self._awaiting_since = self._awaiting_since or now
         try:
-            async with asyncio.timeout(waiting_since + patience - time.monotonic()):
+            async with asyncio.timeout(since + self._settings.control_plc.ladder.optimizer_patience_s - now):
                 await self.clients.changed.wait()
         except TimeoutError:
             program.optimizer_lost()
+            self._awaiting_since = None
 
     def _may_go_on(self) -> bool:
         program = self._program
@@ -168,6 +175,8 @@ class ControlPlc:
             await self._find_plant("a measurement arrived damaged")
         elif elsewhere and not self._settings.session.autostart:
             self._leave(measurement.session, measurement.tick)
+        elif not measurement.crc:
+            await self._find_plant("it has not taken the outputs")
         elif elsewhere or (measurement.tick != program.tick and not self._pace.realtime):
             await self._find_plant(f"it is at tick {measurement.tick} of session {measurement.session}")
         else:
@@ -176,14 +185,17 @@ class ControlPlc:
     def _take(self, measurement: Measurement) -> None:
         """End the scan with its measurement, and tell what is new."""
         program = self._program
-        events = program.journal.count
+        self._failures = 0
+        program.alarms.returned(AlarmKind.PLANT_LOST)
         update = program.end_scan(measurement)
+        if program.track():
+            self.bank.put(program.operator)
         program.alarms.pass_by()
         if program.process is not None:
             self.bank.put(program.process)
         if update is not None or program.tick % TICKS_PER_SECOND == 0:
             self.publication.status()
-        if program.journal.count != events or program.tick % TICKS_PER_SECOND == 0:
+        if self.publication.is_behind or program.tick % TICKS_PER_SECOND == 0:
             self.publication.safety()
         if update is not None:
             self.clients.tell(update)
@@ -192,12 +204,23 @@ class ControlPlc:
 
     # -- sessions ------------------------------------------------------------------------------------------------------
 
+    async def _begin_at_last(self) -> None:
+        """Begin, however long it takes until the plant lets us."""
+        while True:
+            try:
+                await self._begin()
+            except LinkError as error:
+                log.warning("plant not ready", extra={"reason": str(error)})
+                await asyncio.sleep(SEARCH_S)
+            else:
+                return
+
     async def _begin(self) -> None:
         """Go on with the session of before a restart, or with the plant's, or wait for one."""
         state = self._memory.recall()
         plant = await self._look_at_plant()
         if state is not None and state.session == plant.session != 0:
-            self._program.alarms.rows = list(state.alarms)
+            self._program.alarms.restore(state.alarms)
             self._pace = state.pace
             await self._join(plant, state.updates, state.operator)
         elif self._settings.session.autostart:
@@ -209,7 +232,7 @@ class ControlPlc:
     async def _look_at_plant(self) -> _PlantPosition:
         """Find out which session and tick the plant is at, and what it applies."""
         identity, actuators = await self._plant.read(Identity), await self._plant.read(Actuators)
-        ours = actuators.session == identity.session
+        ours = actuators.crc and is_intact(actuators) and actuators.session == identity.session
         return _PlantPosition(identity.session, identity.tick, actuators[1:4] if ours else self._program.applied)
 
     async def _join(self, plant: _PlantPosition, updates: int, operator: Operator) -> None:
@@ -235,6 +258,7 @@ class ControlPlc:
     def _leave(self, session: int, tick: int) -> None:
         """The plant was restarted, or is driven by somebody else: wait for a session."""
         self.publication.running = False
+        self._program.alarms.raised(AlarmKind.PLANT_LOST)
         log.error(
             "session ended: the plant has left it",
             extra={
@@ -251,7 +275,10 @@ class ControlPlc:
         program = self._program
         log.warning("plant lost", extra={"reason": reason, "tick": program.tick})
         program.alarms.raised(AlarmKind.PLANT_LOST)
-        while True:
+        if self._failures:  # it is there, and does not do what it is asked
+            await asyncio.sleep(SEARCH_S / 5)
+        self._failures += 1
+        while self.clients.asked is None:
             self.publication.safety()
             with contextlib.suppress(LinkError):
                 await self._plant.connect(SEARCH_S)
@@ -265,16 +292,17 @@ class ControlPlc:
                 return
             await asyncio.sleep(SEARCH_S / 5)
             program.alarms.now = self._clock_tick()
+        else:
+            return
         program.rejoin(self._clock_tick() if self._pace.realtime else plant.tick, plant.applied)
         program.alarms.now = program.tick
-        program.alarms.returned(AlarmKind.PLANT_LOST)
         self._publish()
 
     def _start(self, asked: ControlSession) -> None:
         self.clients.asked = None
         self._program.restart(asked.session)
         self._pace = Pace(bool(asked.realtime), asked.factor)
-        self.clients.granted = self.publication.overruns = 0
+        self.publication.overruns = 0
         self.publication.running = True
         self._pacer = self._new_pacer()
         self.bank.put(self._program.operator)

@@ -93,6 +93,7 @@ class SensorMonitor:
             self.bad[output] = self.bad.get(output, 0) + 1
             self._recovering.pop(output, None)
         elif output in self.bad:
+            self.bad[output] += 1  # it is still substituted
             self._recovering[output] = self._recovering.get(output, 0) + 1
             if self._recovering[output] >= RECOVERY_TICKS:
                 del self.bad[output], self._recovering[output]

@@ -13,7 +13,7 @@ from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Plan, SequenceHeader, SequenceRow, Update, Verdict
+from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.sequence import InputSequence, sealed
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
@@ -33,6 +33,9 @@ from optimizer_plc.updating_period import (
 )
 
 Array = NDArray[np.float64]
+
+LONGEST_GAP_TICKS = 4 * SEQUENCE_ROWS
+"""After a longer time without an update nothing is predicted from the last one."""
 
 UNDECIDED = Assessment(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -118,7 +121,8 @@ class OptimizerProgram:
 
     def plan(self, update: Update) -> Plan:
         """Take the update latched at t_i and decide the updating period that begins there."""
-        if not update.playing and self._playing.sequence is not None:
+        elapsed = update.tick - self._last.update.tick if self._last else 0
+        if not 0 <= elapsed <= LONGEST_GAP_TICKS or (not update.playing and self._playing.sequence is not None):
             self._begin_again(update)
         interrupted = self._return_to(update)
         estimate = self._estimator.correct(update)

@@ -16,6 +16,7 @@ from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import CONTROL_MAP, Acknowledgement, AwaitUpdate, Heartbeat, Status, Update, Verdict
 from coldloop.registers.declaration import Block
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, OPTIMIZER_MAP, Optimization, OptimizerSession
+from coldloop.seal import is_intact
 from coldloop.sequence import InputSequence
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
@@ -87,6 +88,8 @@ class OptimizerPlc:
         while True:
             update = await self._control.exchange(wanted, Update)
             asked_at = time.monotonic()
+            if not is_intact(update):
+                raise LinkError(f"{self._control.peer}: an update arrived damaged")
             if self._is_news(update, wanted):
                 verdict = await self._optimise(update, asked_at)
                 # a plan that came too late: this update leads to no other, unless a load step has led to one
@@ -167,6 +170,8 @@ class OptimizerPlc:
         rows = sequence.rows
         await self._control.write_rows(rows[ROWS_WITH_HEADER:], start=ROWS_WITH_HEADER)
         answer = await self._control.exchange(sequence.header, Acknowledgement, rows=rows[:ROWS_WITH_HEADER])
+        if answer.number != sequence.header.number or answer.verdict not in Verdict.__members__.values():
+            raise LinkError(f"{self._control.peer}: an acknowledgement arrived damaged")
         verdict = Verdict(answer.verdict)
         if verdict is not Verdict.ACCEPTED:
             log.warning("sequence rejected", extra={"update": sequence.header.update, "verdict": verdict.name.lower()})

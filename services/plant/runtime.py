@@ -17,7 +17,7 @@ from coldloop.clock import Pacer, Schedule
 from coldloop.errors import ModelFileError
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import ModelHeader, read_header
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.declaration import Block
@@ -49,6 +49,8 @@ log = logging.getLogger("coldloop.plant")
 
 OWNER = "plant/1"
 """Who retained states belong to, and the version of what they hold."""
+STALE_TICKS = 8
+"""In real time, outputs that are older than this are not applied."""
 
 
 def own_header(file: Path) -> ModelHeader:
@@ -87,9 +89,10 @@ class PlantRack:
         self._faults: dict[int, float] = {}
         file = settings.plant.retain.file
         self._retained = RetainedFile(file, OWNER, self._header.short_digest) if file else None
-        load = find_load(settings.plant.load, self._header.w0)
-        self._begin(1 if settings.session.autostart else 0, self._configured_pace(), load, settings.plant.seed)
-        self._resume()
+        self._failure: asyncio.Future[None] | None = None
+        if not self._resume():
+            load = find_load(settings.plant.load, self._header.w0)
+            self._begin(1 if settings.session.autostart else 0, self._configured_pace(), load, settings.plant.seed)
 
     def _configured_pace(self) -> Pace:
         session = self._settings.session
@@ -103,33 +106,35 @@ class PlantRack:
         self._clock: asyncio.Task[None] | None = None
         self._watchdog.set(self._watchdog.time, 0)
         self._faults.clear()
+        self._show_applied()
         self.bank.put(self._measurement())
         self._publish()
 
     # -- retained state ------------------------------------------------------------------------------------------------
 
-    def _resume(self) -> None:
-        """Go on where a session was when the rack was ended, if that was kept."""
+    def _resume(self) -> bool:
+        """Go on where a session was when the rack was ended; tell whether that was kept."""
         if self._retained is None:
-            return
+            return False
         try:
             content = self._retained.load()
             if content is None:
-                return
+                return False
             load = LoadProfile(tuple(content["times"]), tuple(content["watts"]))
             self._begin(content["session"], Pace(*content["pace"]), load, content["seed"])
             self._program.resume(**content["program"])
         except (RetainedStateError, KeyError, TypeError, ValueError) as error:
             log.warning("retained state refused", extra={"reason": str(error)})
-            return
+            return False
         tick = self._program.tick
         cv155, ncr22, cv156 = content["program"]["u"]
         self._applied = cv155, ncr22, cv156
         self._watchdog.set(self._watchdog.time, tick)
-        self.bank.put(sealed(Actuators(tick, *self._applied, self._session)))
+        self._show_applied()
         self.bank.put(self._measurement())
         self._publish()
         log.warning("session resumed", extra={"session": self._session, "tick": tick})
+        return True
 
     def _keep(self) -> None:
         if self._retained is None or not self._session:
@@ -141,8 +146,7 @@ class PlantRack:
         try:
             self._retained.save(state)
         except RetainedStateError as error:
-            log.error("no state is retained any more", extra={"reason": str(error)})  # noqa: TRY400 one line
-            self._retained = None
+            log.error("the state is not retained", extra={"reason": str(error)})  # noqa: TRY400 one line
 
     def on_write(self, block: Block) -> None:
         """Take what a client has written."""
@@ -179,21 +183,32 @@ class PlantRack:
     # -- exchange ------------------------------------------------------------------------------------------------------
 
     def _exchange(self, asked: Actuators) -> None:
-        if asked.session != self._session or not is_intact(asked):
-            return
         if self._moving:  # the next request came in before the plant had moved on
             self._advance()
+        if asked.session != self._session or not is_intact(asked) or not self._is_timely(asked.tick):
+            self._show_applied()
+            self.bank.put(self._measurement())  # not sealed: not taken
+            return
         self._applied = (asked.cv155, asked.ncr22, asked.cv156)
         self._program.apply(self._applied)
         self._watchdog.trigger(self._program.tick)
         self.bank.put(sealed(self._measurement()))
-        loop = asyncio.get_running_loop()
         if self._pace.realtime:
-            if self._clock is None:
-                self._clock = loop.create_task(self._run_by_the_clock(), name="plant clock")
-        elif asked.tick == self._program.tick:
+            self._start_clock()
+        else:
             self._moving = True
-            loop.call_soon(self._advance)  # after the answer is on its way
+            asyncio.get_running_loop().call_soon(self._advance)  # after the answer is on its way
+
+    def _is_timely(self, tick: int) -> bool:
+        """Tell whether outputs of this tick are for now: what a network has held up is not applied late."""
+        if self._pace.realtime:
+            return tick >= self._program.tick - STALE_TICKS
+        return tick == self._program.tick
+
+    def _show_applied(self) -> None:
+        """Put what is applied into the registers, for the control PLC to read back."""
+        cv155, ncr22, cv156 = self._applied
+        self.bank.put(sealed(Actuators(self._program.tick, cv155, ncr22, cv156, self._session)))
 
     def _advance(self) -> None:
         """Record the tick that ends and move on to the next."""
@@ -219,10 +234,32 @@ class PlantRack:
         if watchdog.action is SafeAction.SAFE:
             self._applied = watchdog.safe_state
             self._program.apply(self._applied)
-            self.bank.put(sealed(Actuators(tick, *self._applied, self._session)))  # the control PLC reads them back
+            self._show_applied()
+
+    def _start_clock(self) -> None:
+        """Let the plant move by the clock from its present tick on, if it does not yet."""
+        if self._clock is None:
+            self._clock = asyncio.get_running_loop().create_task(self._run_by_the_clock(), name="plant clock")
+            self._clock.add_done_callback(self._clock_ended)
+
+    def _clock_ended(self, clock: "asyncio.Task[None]") -> None:
+        if not clock.cancelled() and self._failure is not None and not self._failure.done():
+            self._failure.set_exception(clock.exception() or RuntimeError("the plant's clock has ended"))
+
+    async def run(self) -> None:
+        """Keep an eye on the plant's clock until cancelled; a session that was resumed moves on at once.
+
+        Raises:
+            Exception: What the clock has failed of.
+        """
+        self._failure = asyncio.get_running_loop().create_future()
+        if self._pace.realtime and self._program.tick:
+            self._start_clock()
+        await self._failure
 
     async def _run_by_the_clock(self) -> None:
-        pacer = Pacer(Schedule(time.monotonic(), self._pace.factor))
+        begun = time.monotonic() - self._program.tick * TICK_S / self._pace.factor
+        pacer = Pacer(Schedule(begun, self._pace.factor))
         while True:
             await pacer.until(self._program.tick + 0.5)
             self._moving = True
@@ -273,7 +310,8 @@ async def serve(settings: PlantSettings) -> None:
     await server.start()
     log.info("serving", extra={"host": settings.plant.server.host, "port": server.port})
     try:
-        await Telemetry(settings.telemetry, "plant", rack.snapshot).run()
-        await asyncio.Event().wait()
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(rack.run(), name="plant")
+            tasks.create_task(Telemetry(settings.telemetry, "plant", rack.snapshot).run(), name="telemetry")
     finally:
         await server.close()

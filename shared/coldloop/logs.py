@@ -33,6 +33,10 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(line, default=str, ensure_ascii=False)
 
 
+MOST_EVENTS = 1000
+"""Different events that are counted at a time."""
+
+
 class FloodFilter(logging.Filter):
     """Lets at most `lines` of one event through in an interval; the next one says how many were left out."""
 
@@ -41,11 +45,14 @@ class FloodFilter(logging.Filter):
         self._lines = lines
         self._interval_s = interval_s
         self._now = now
-        self._seen: dict[tuple[str, str], tuple[float, int]] = {}
+        self._seen: dict[tuple[str, ...], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Tell whether a record is to be written."""
-        event, now = (record.name, str(record.msg)), self._now()
+        about = tuple(str(getattr(record, name, "")) for name in ("alarm", "mode"))
+        event, now = (record.name, str(record.msg), *about), self._now()
+        if len(self._seen) > MOST_EVENTS:
+            self._seen.clear()
         since, count = self._seen.get(event, (now, 0))
         if now - since >= self._interval_s:
             if count > self._lines:

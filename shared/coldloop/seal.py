@@ -1,19 +1,23 @@
-"""An end-to-end check of what crosses between the control PLC and the rack.
+"""An end-to-end check of what crosses the links.
 
 TCP's checksum does not see what a gateway, a proxy or a memory does to a value. A sealed record ends with the CRC-32 of
-all before it, as big-endian words whatever the word order of the link; 0 is "not sealed", for simple clients.
+all before it, as big-endian words whatever the word order of the link; 0 is "not sealed": a simple client's outputs,
+and the rack's answer to outputs that it has not taken.
 """
 
 import zlib
 from typing import Any, TypeVar
 
 from coldloop.registers.codec import RecordCodec, codec_of
+from coldloop.registers.control_plc import CONTROL_MAP, Update
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
 
-S = TypeVar("S", Actuators, Measurement)
+S = TypeVar("S", Actuators, Measurement, Update)
 
 _CODECS: dict[type[tuple[Any, ...]], RecordCodec] = {
-    record: codec_of(PLANT_MAP.block_of(record)) for record in (Actuators, Measurement)
+    Actuators: codec_of(PLANT_MAP.block_of(Actuators)),
+    Measurement: codec_of(PLANT_MAP.block_of(Measurement)),
+    Update: codec_of(CONTROL_MAP.block_of(Update)),
 }
 _CRC_BYTES = 4
 
@@ -27,6 +31,6 @@ def sealed(record: S) -> S:
     return record._replace(crc=_checksum(record))
 
 
-def is_intact(record: Actuators | Measurement) -> bool:
+def is_intact(record: Actuators | Measurement | Update) -> bool:
     """Tell whether a record that arrived is what was sent."""
     return not record.crc or record.crc == _checksum(record)

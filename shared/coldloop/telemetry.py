@@ -69,7 +69,7 @@ class Telemetry:
         while True:
             try:
                 await self._publish()
-            except aiomqtt.MqttError as error:
+            except Exception as error:  # noqa: BLE001 - a service never ends because of its telemetry
                 log.warning("broker lost", extra={"broker": self._settings.broker, "reason": str(error)})
             await asyncio.sleep(self._settings.timeout_s)
 

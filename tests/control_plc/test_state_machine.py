@@ -13,6 +13,7 @@ from coldloop.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process import L1, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import (
+    Cause,
     Heartbeat,
     Mode,
     Operator,
@@ -36,6 +37,7 @@ SECTION = ControlSection.model_validate(
     {"ladder": {"hold_s": 3.0, "optimizer_timeout_s": 8.0}, "sensors": {"bridged_s": 2.0}}
 )
 WINDOW = 20
+SAFE_STATE = SequenceRow(30.0, 50.0, 40.0)
 SLACK = (4e-6, 1e-5, 4e-6)
 """Half a unit of the last place of what is applied, twice."""
 
@@ -55,6 +57,11 @@ class Link(RuleBasedStateMachine):
         self.number = 0
         self.load = HEADER.w0
         self.readings: dict[int, float] = {}
+        self.drift = (0.0, 0.0)
+        """Level and temperature, off their setpoints: the loops have something to do."""
+        self.ticks: list[int] = [-1]
+        self.began: list[int] = []
+        """Places in the trace at which a sequence began, or a restart forgot the window."""
         self.trace: list[SequenceRow] = [SequenceRow(*HEADER.u0)]
         """Every value that has reached the actuators, tick by tick."""
         self.promised: InputSequence | None = None
@@ -75,15 +82,20 @@ class Link(RuleBasedStateMachine):
         if due and self.promised is not None:
             assert applied == self.promised.rows[0], "an accepted sequence begins at its tick"
             assert program.mode in (Mode.MPC, Mode.REST)
+            self.began.append(len(self.trace))
             self.promised = None
         if program.mode in (Mode.MPC, Mode.REST):
             assert applied in self.accepted_rows, "only what was accepted whole is played"
         self.trace.append(applied)
+        self.ticks.append(actuators.tick)
         y = list(HEADER.y0)
+        y[L1] += self.drift[0]
+        y[T5] += self.drift[1]
         for output, reading in self.readings.items():
             y[output] = reading
         before = program.player.update
         program.end_scan(Measurement(program.tick, self.load, tuple(y), HEADER.x0, program.session))
+        self.scanned = True
         if program.player.update is not before:
             self.promised = None  # a load step, a bad sensor: the update that it answered is over
 
@@ -96,6 +108,10 @@ class Link(RuleBasedStateMachine):
     def the_load_moves(self, step: float) -> None:
         self.load = HEADER.w0 + step
 
+    @rule(level=st.floats(-3.0, 3.0), temperature=st.floats(-3.0, 3.0))
+    def the_process_drifts(self, level: float, temperature: float) -> None:
+        self.drift = (level, temperature)
+
     @rule(output=st.sampled_from([L1, T5, 4]), reading=st.sampled_from([math.nan, math.inf, -1e9, 60.0]))
     def a_sensor_fails(self, output: int, reading: float) -> None:
         self.readings[output] = reading
@@ -104,12 +120,24 @@ class Link(RuleBasedStateMachine):
     def the_sensors_are_repaired(self) -> None:
         self.readings.clear()
 
-    @rule(ticks=st.integers(0, 60))
-    def time_leaps(self, ticks: int) -> None:
+    @rule(ticks=st.integers(-1, 60))
+    def time_leaps_or_the_rack_is_one_tick_back(self, ticks: int) -> None:
         program = self.program
-        if self.promised is not None and self.promised.header.first_tick < program.tick + ticks:
+        tick = max(0, program.tick + ticks)
+        if self.promised is not None and self.promised.header.first_tick < tick:
             self.promised = None
-        program.rejoin(program.tick + ticks, self.trace[-1])
+        if ticks < 0:
+            self.promised = None
+        program.rejoin(tick, self.trace[-1])
+
+    @rule()
+    def the_rack_has_gone_to_its_safe_state(self) -> None:
+        """Not by our doing: what we do from there on is what counts."""
+        self.trace.append(SAFE_STATE)
+        self.ticks.append(self.program.tick)
+        self.began.append(len(self.trace))
+        self.promised = None
+        self.program.rejoin(self.program.tick, SAFE_STATE)
 
     # -- the optimiser -------------------------------------------------------------------------------------------------
 
@@ -189,28 +217,50 @@ class Link(RuleBasedStateMachine):
         self.program.alarms.rows = list(kept.alarms)
         self.program.resume(kept.session, kept.tick, self.trace[-1], updates=kept.updates, operator=kept.operator)
         self.promised = None
+        self.began.append(len(self.trace))
+        self.scanned = False
 
     # -- what must hold ------------------------------------------------------------------------------------------------
 
     @invariant()
     def bounds_and_rates_are_kept(self) -> None:
         for earlier, later in pairwise(self.trace[-2 * WINDOW :]):
+            if later is SAFE_STATE:
+                continue
             for i, value in enumerate(later):
                 assert self.limits.low[i] <= value <= self.limits.high[i]
                 assert abs(value - earlier[i]) <= self.limits.rate[i] + SLACK[i]
 
     @invariant()
-    def what_lock_step_waits_for_can_come(self) -> None:
+    def no_longer_span_gains_more_than_its_windows_give(self) -> None:
+        """Over three windows without a sequence that begins: one for each, and one that was open."""
+        first = max(0, len(self.trace) - 3 * WINDOW)
+        ticks = self.ticks[first:]
+        begun = sum(place >= first for place in self.began)
+        windows = (max(ticks) - min(ticks)) // WINDOW + 2 + begun
+        if any(row is SAFE_STATE for row in self.trace[first:]):
+            return
+        for i, rate in enumerate(self.limits.rate):
+            values = [row[i] for row in self.trace[first:]]
+            assert max(values) - min(values) <= windows * (rate + SLACK[i])
+
+    @invariant()
+    def lock_step_waits_only_while_mpc_is_wanted(self) -> None:
         program = self.program
         if program.awaiting_plan or program.awaiting_sequence:
-            assert program.optimizer_present
             assert program.operator.mode == OperatorMode.AUTO
+            assert program.ladder.cause is not Cause.SENSOR_BAD
 
     @invariant()
     def the_mode_alarm_tells_the_truth(self) -> None:
-        row = self.program.alarms.rows[AlarmKind.MODE]
-        if row.active and row.state != AlarmState.SHELVED:
-            assert row.state in (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED)
+        program = self.program
+        row = program.alarms.rows[AlarmKind.MODE]
+        if not self.scanned:
+            return
+        own_doing = program.ladder.cause in (Cause.SESSION_STARTED, Cause.OPERATOR)
+        assert bool(row.active) == (program.mode is not Mode.MPC and not own_doing)
+        if row.active:
+            assert row.state in (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED, AlarmState.SHELVED)
 
     @invariant()
     def each_change_of_mode_is_an_event(self) -> None:

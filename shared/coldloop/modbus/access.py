@@ -14,6 +14,7 @@ from coldloop.modbus.settings import AccessSettings, Networks
 from coldloop.registers.declaration import Role
 
 ROLE_EXTENSION: Final = x509.ObjectIdentifier("1.3.6.1.4.1.50316.802.1")
+ODD_CERTIFICATE: Final = (x509.DuplicateExtension, x509.UnsupportedGeneralNameType, x509.InvalidVersion)
 UTF8_STRING: Final = 0x0C
 """Tag of a UTF8String in DER."""
 MAX_LENGTH: Final = 127
@@ -62,7 +63,7 @@ def _subject_and_role(der: bytes) -> tuple[str, str]:
         certificate = x509.load_der_x509_certificate(der)
         subject = certificate.subject.rfc4514_string()
         extension = certificate.extensions.get_extension_for_oid(ROLE_EXTENSION).value
-    except (x509.ExtensionNotFound, x509.DuplicateExtension, ValueError):
+    except (x509.ExtensionNotFound, ValueError, *ODD_CERTIFICATE):
         return subject, ""
     return subject, decoded_role(extension.public_bytes())
 

@@ -65,6 +65,8 @@ class Connection(asyncio.Protocol):
         self.written_as: set[Role | None] = set()
         self.last_request = monotonic()  # not the loop's time, which uvloop rounds to milliseconds
         self.peer = "?"
+        self.has_role = False
+        """Whether it may write anything."""
 
     @property
     def idle(self) -> bool:
@@ -88,8 +90,6 @@ class Connection(asyncio.Protocol):
             self.abort()
             return
         self.peer = f"{address[0]}:{address[1]}"
-        if not self._opened(self):
-            return
         secure = transport.get_extra_info("ssl_object")
         if secure is None:
             self._welcome(caller_at(address[0], self.peer, self._settings.access))
@@ -102,7 +102,9 @@ class Connection(asyncio.Protocol):
             self.close()
             return
         self.peer = caller.name
+        self.has_role = bool(caller.roles)
         self._handle = self._handler_for(caller.roles).handle
+        self._opened(self)
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - why it was lost changes nothing
         """Cancel what the client no longer waits for (event loop callback)."""

@@ -167,13 +167,18 @@ class ModbusServer:
         return True
 
     def _make_room(self, newcomer: Connection) -> bool:
-        """Close the connection that has been idle longest, first those that never made a request."""
+        """Close the connection that has been idle longest, first those that never made a request.
+
+        For a newcomer with a role one that only reads makes room, however busy: readers do not keep a PLC out.
+        """
         before = monotonic() - self._settings.replaceable_after_s
         idle = [
             connection
             for connection in self._connections
             if connection.idle and (not connection.requests or connection.last_request <= before)
         ]
+        if not idle and newcomer.has_role:
+            idle = [connection for connection in self._connections if not connection.has_role]
         if not idle:
             return False
         oldest = min(idle, key=lambda connection: (connection.requests > 0, connection.last_request))

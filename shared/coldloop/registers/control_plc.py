@@ -123,6 +123,7 @@ class Update(NamedTuple):
     u: Annotated[tuple[float, ...], f32_array("Input applied from this instant on", INPUT_NAMES, INPUT_UNITS)]
     y: Annotated[tuple[float, ...], f32_array("Output measured at this instant", OUTPUT_NAMES, OUTPUT_UNITS)]
     x: Annotated[tuple[float, ...], f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS)]
+    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none")] = 0
 
 
 class AwaitUpdate(NamedTuple):
