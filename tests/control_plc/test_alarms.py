@@ -122,3 +122,18 @@ def test_no_alarm_is_forgotten_before_it_is_acknowledged_unless_it_was_shelved(a
         if owed:
             assert state in (AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED)
         assert panel.rows[KIND].active == (action == "raise" or (before.active and action != "return"))
+
+
+def test_what_happened_at_an_instant_passes_by_also_over_a_restart_and_a_new_session(panel: AlarmPanel) -> None:
+    panel.now = 1000
+    panel.happened(AlarmKind.ACCESS_REFUSED)
+    again = AlarmPanel(Journal())
+    again.begin_at(1010)
+    again.restore(panel.rows)
+    for board, start in ((again, 1010), (panel, 0)):
+        board.begin_at(start)
+        board.pass_by()
+        assert board.rows[AlarmKind.ACCESS_REFUSED].active
+        board.now = start + 241
+        board.pass_by()
+        assert not board.rows[AlarmKind.ACCESS_REFUSED].active

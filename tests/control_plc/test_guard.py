@@ -149,3 +149,19 @@ def test_per_update_rates_allow_the_full_step_at_every_update_and_elapsed_rates_
         reached[reference] = guard.applied.ncr22 - INITIAL.ncr22
     assert reached[RateReference.PER_UPDATE] == pytest.approx(5 * 10.0)
     assert reached[RateReference.ELAPSED] == pytest.approx(10.0 + 4 * 2.5)
+
+
+def test_breaks_that_follow_one_another_do_not_give_a_full_rate_each() -> None:
+    limits = InputLimits()
+    guard = OutputGuard(limits, SequenceRow(43.0, 75.0, 36.0))
+    wanted = SequenceRow(60.0, 150.0, 60.0)
+    for tick in range(1, 20):
+        guard.begin_at(tick, guard.admit(tick, wanted, update=False))
+    assert guard.applied.cv155 == pytest.approx(43.5)
+    assert guard.applied.ncr22 == pytest.approx(85.0)
+
+
+def test_what_is_applied_outside_an_open_window_begins_a_new_one() -> None:
+    guard = OutputGuard(InputLimits(), SequenceRow(43.0, 75.0, 36.0))
+    guard.begin_at(5, SequenceRow(50.0, 75.0, 36.0))
+    assert guard.admit(6, SequenceRow(43.0, 75.0, 36.0), update=False).cv155 == pytest.approx(49.5)

@@ -12,7 +12,7 @@ from coldloop.process import L1, OUTPUT_NAMES, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, SequenceRow, Update, Verdict
 from coldloop.registers.plant import Measurement
-from coldloop.registers.safety import AlarmKind, AlarmState, EventKind
+from coldloop.registers.safety import AlarmAction, AlarmCommand, AlarmKind, AlarmState, EventKind
 from control_plc.program import ControlProgram
 from control_plc.settings import ControlSection
 
@@ -273,3 +273,67 @@ def test_after_a_leap_of_time_the_sequence_goes_on_where_it_would_be(rig: "Bench
     assert rig.program.mode is Mode.HOLD
     assert update is not None
     assert update.tick == 100
+
+
+# -- what a review found -----------------------------------------------------------------------------------------------
+
+
+def test_a_rack_that_comes_back_one_tick_behind_is_followed(rig: "Bench", at: At) -> None:
+    rig.play([at(0.2)] * 40, ticks=2)
+    rig.scans(5)
+    tick = rig.program.tick
+    rig.program.rejoin(tick - 1, rig.program.applied)
+    rig.scan()
+    assert rig.program.tick == tick
+
+
+def test_a_commit_that_arrives_twice_does_not_let_the_loops_move_before_it_begins(rig: "Bench", at: At) -> None:
+    rig.play([at()] * 2, ticks=2)
+    rig.level = 1.0
+    rig.scans(2 + 20 + HOLD_TICKS + 60)
+    assert rig.program.mode is Mode.CLASSICAL
+    rig.program.abandon()
+    rig.scan()
+    assert rig.plan(20)
+    sequence = rig.sequence([rig.program.applied] * 20)
+    assert rig.offer(sequence).verdict == Verdict.ACCEPTED
+    assert rig.offer(sequence).verdict == Verdict.REPEATED
+    assert len(set(rig.scans(20))) == 1
+
+
+def test_each_sensor_that_fails_raises_the_alarm_again(rig: "Bench") -> None:
+    rig.readings[L1] = math.nan
+    rig.scans(2)
+    rig.program.alarms.command(AlarmCommand(AlarmKind.SENSOR_BAD, AlarmAction.ACKNOWLEDGE))
+    rig.readings[T5] = math.nan
+    rig.scans(2)
+    row = rig.program.alarms.rows[AlarmKind.SENSOR_BAD]
+    assert (row.state, row.cause, row.times) == (AlarmState.UNACKNOWLEDGED, T5, 2)
+
+
+def test_a_sensor_that_fails_now_and_then_is_not_bridged_for_ever(rig: "Bench") -> None:
+    for tick in range(200):
+        rig.readings[L1] = math.nan if tick % 8 == 0 else 60.0
+        rig.scan()
+    assert rig.program.mode is Mode.CLASSICAL
+    assert rig.program.ladder.cause is Cause.SENSOR_BAD
+
+
+def test_an_operator_who_gives_back_the_loops_to_nobody_sees_the_alarm(rig: "Bench") -> None:
+    program = rig.program
+    program.operate(Operator(OperatorMode.CLASSICAL, *AT_REST))
+    rig.scans(5)
+    assert (program.ladder.cause, alarm(rig, AlarmKind.MODE)) == (Cause.OPERATOR, AlarmState.NORMAL)
+    program.operate(Operator(OperatorMode.AUTO, *AT_REST))
+    rig.scan()
+    assert (program.mode, alarm(rig, AlarmKind.MODE)) == (Mode.CLASSICAL, AlarmState.UNACKNOWLEDGED)
+
+
+def test_manual_begins_with_what_is_applied(rig: "Bench", at: At) -> None:
+    rig.play([at(0.4, 8.0)] * 40, ticks=2)
+    rig.scans(3)
+    assert rig.program.track()
+    assert rig.program.operator[1:] == rig.program.applied[:]
+    rig.program.operate(rig.program.operator._replace(mode=OperatorMode.MANUAL))
+    assert set(rig.scans(40)) == {as_transmitted(at(0.4, 8.0))}
+    assert not rig.program.track()

@@ -18,6 +18,7 @@ from coldloop.registers.plant import (
 )
 from coldloop.registers.safety import Watchdog, WatchdogState, WatchdogTime
 from coldloop.seal import is_intact, sealed
+from coldloop.session import Pace
 from plant.runtime import PlantRack
 from plant.settings import PlantSettings
 
@@ -156,3 +157,28 @@ def test_a_state_that_cannot_be_trusted_is_refused_and_said_so(
     rack = Rack(monkeypatch, retain={"file": str(tmp_path / "plant")})
     assert rack.tick == 0
     assert "retained state refused" in caplog.text
+
+
+def test_outputs_of_another_tick_are_not_applied_and_the_answer_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    rack = Rack(monkeypatch)
+    rack.exchange(*U)
+    for changed in ({"tick": 0}, {"tick": 7}, {"session": 9}, {"cv155": 50}):
+        answer = rack.exchange(44.0, 70.0, 37.0, **changed)
+        assert answer.crc == 0, "not taken"
+        assert (rack.tick, tuple(rack.outputs())) == (1, U)
+        shown = rack.rack.bank.get(Actuators)
+        assert shown[1:4] == U
+        assert is_intact(shown), "what is applied is read back, not what was refused"
+    assert rack.exchange(44.0, 70.0, 37.0).crc
+
+
+def test_in_real_time_what_a_network_held_up_is_not_applied(monkeypatch: pytest.MonkeyPatch) -> None:
+    rack = Rack(monkeypatch)
+    monkeypatch.setattr(PlantRack, "_start_clock", lambda _self: None)
+    rack.rack._pace = Pace(realtime=True, factor=1.0)  # noqa: SLF001
+    rack.write(sealed(Actuators(0, *U, 1)))
+    rack.passes(40)
+    rack.write(sealed(Actuators(10, 30.0, 10.0, 30.0, 1)))
+    assert tuple(rack.outputs()) == U
+    rack.write(sealed(Actuators(39, 43.5, 80.0, 36.0, 1)))
+    assert tuple(rack.outputs()) == (43.5, 80.0, 36.0)
