@@ -14,6 +14,10 @@ TOLERANCE = 1e-5
 itself allows nothing."""
 
 
+ROUNDING_STEPS = 4
+"""Neighbours that are tried when rounding to single precision has crossed a limit; one or two will do."""
+
+
 class Window(NamedTuple):
     """The rate window: the inputs may stray from `anchor` by `share` of the rate until the window ends.
 
@@ -119,12 +123,14 @@ def _clamped(wanted: float, anchor: float, applied: float, reach: float, low: fl
         wanted = anchor
     down, up = max(anchor, applied) - reach, min(anchor, applied) + reach
     lowest, highest = min(max(low, down), up), max(min(high, up), down)
+    inside = low <= anchor <= high
     value = _single(min(max(wanted, lowest), highest))
-    while value != anchor and not (
-        lowest <= value <= highest and abs(value - anchor) <= reach and abs(value - applied) <= reach
-    ):
+    for _ in range(ROUNDING_STEPS):
+        reachable = abs(value - anchor) <= reach and abs(value - applied) <= reach
+        if reachable and (low <= value <= high or not inside):
+            return value
         value = _neighbour(value, anchor)  # rounding has crossed a limit
-    return value
+    return applied
 
 
 def _inside(value: float, low: float, high: float) -> float:

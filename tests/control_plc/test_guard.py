@@ -165,3 +165,28 @@ def test_what_is_applied_outside_an_open_window_begins_a_new_one() -> None:
     guard = OutputGuard(InputLimits(), SequenceRow(43.0, 75.0, 36.0))
     guard.begin_at(5, SequenceRow(50.0, 75.0, 36.0))
     assert guard.admit(6, SequenceRow(43.0, 75.0, 36.0), update=False).cv155 == pytest.approx(49.5)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    applied=st.tuples(*[st.floats(0.0, 200.0, width=32)] * 3),
+    wanted=st.tuples(*[st.floats(0.0, 200.0)] * 3),
+    reference=st.sampled_from(RateReference),
+)
+def test_from_anywhere_at_all_outputs_come_into_their_bounds_within_the_rate(
+    applied: tuple[float, ...], wanted: tuple[float, ...], reference: RateReference
+) -> None:
+    limits = InputLimits(rate_reference=reference)
+    guard = OutputGuard(limits, SequenceRow(43.0, 75.0, 36.0))
+    guard.begin_at(1000, SequenceRow(*applied))
+    before = guard.applied
+    for tick in range(1001, 1001 + 20 * 30, 20):
+        after = guard.admit(tick, SequenceRow(*wanted), update=False)
+        for i, value in enumerate(after):
+            assert abs(value - before[i]) <= limits.rate[i] + 1e-5
+            if limits.low[i] <= before[i] <= limits.high[i]:
+                assert limits.low[i] <= value <= limits.high[i]
+            else:
+                middle = (limits.low[i] + limits.high[i]) / 2
+                assert abs(value - middle) < abs(before[i] - middle), "towards the bounds"
+        before = after
