@@ -107,6 +107,9 @@ class PiController:
             return applied
         error = self._setpoint - measured
         change = self._gain * (error - (error if self._error is None else self._error) + self._share * error)
+        if not math.isfinite(change):  # beyond all numbers: as good as none
+            self.restart()
+            return applied
         self._error = error
         return min(max(applied + change, applied - self._reach, self._low), applied + self._reach, self._high)
 

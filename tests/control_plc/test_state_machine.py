@@ -249,7 +249,6 @@ class Link(RuleBasedStateMachine):
         program = self.program
         if program.awaiting_plan or program.awaiting_sequence:
             assert program.operator.mode == OperatorMode.AUTO
-            assert program.ladder.cause is not Cause.SENSOR_BAD
 
     @invariant()
     def the_mode_alarm_tells_the_truth(self) -> None:
