@@ -5,6 +5,7 @@ import random
 import tempfile
 from pathlib import Path
 
+from coldloop.config import load_configuration
 from coldloop.process import TICK_S
 from coldloop.session import TimeMode
 from rig.chaos.evaluation import Evaluation
@@ -64,6 +65,12 @@ def tell(evaluation: Evaluation) -> None:
     print(f"back to MPC after at most {max(back, default=0.0):g} s; not before the next one in {len(rows) - len(back)}")
 
 
+def patient(patience_s: float) -> Settings:
+    """Return the default settings with another patience: with hundreds of instants, what lock-step waits adds up."""
+    assignment = f"control_plc.ladder.optimizer_patience_s={patience_s}"
+    return load_configuration(Settings, environment={}, assignments=[assignment]).settings
+
+
 def main() -> int:
     """Do all of it in one run, and print; return 1 when the run failed."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -73,6 +80,9 @@ def main() -> int:
     parser.add_argument("--mode", choices=[mode.value for mode in TimeMode], default="lockstep")
     parser.add_argument("--factor", type=float, default=20.0, help="in real time")
     parser.add_argument("--outage", type=float, default=20.0, help="plant time until it is started again, s")
+    parser.add_argument(
+        "--patience", type=float, default=5.0, help="control_plc.ladder.optimizer_patience_s, real time"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder for chaos.json, chaos.md and logs (default: none are kept)")
     options = parser.parse_args()
@@ -81,7 +91,7 @@ def main() -> int:
         prepare_folder(folder)
         plan = make_plan(options)
         with ChaosProgress(plan.ticks) as progress:
-            experiment = perform(plan, Settings(), folder, progress)
+            experiment = perform(plan, patient(options.patience), folder, progress)
         write_report(folder, plan, experiment.trace, experiment.evaluation, {}, experiment.failure)
     tell(experiment.evaluation)
     print(*summary_lines(experiment.trace, experiment.evaluation), sep="\n")
