@@ -145,11 +145,10 @@ def _write(
     hashes = {"model_sha256": model.digest, "plant_parameters_sha256": model.parameters_digest,
               "trace_sha256": recording.trace_sha256}  # fmt: skip
     arguments = {name: str(value) for name, value in vars(options).items() if name != "execute" and value is not None}
+    configured = {key: value for key, value, _ in effective.effective() if value is not None}  # None is "not set"
     write_trace(out / "trace.parquet", recording)
     write_updates(out / "updates.parquet", recording)
-    write_json(
-        out / "manifest.json", manifest({key: value for key, value, _ in effective.effective()}, arguments, hashes)
-    )
+    write_json(out / "manifest.json", manifest(configured, arguments, hashes))
     plot_run(out / "run.png", recording, design, f"load {settings.plant.load}, {_driven_by(settings)}", cost)
     write_json(out / "summary.json", summary)
     return summary
