@@ -275,7 +275,7 @@ def test_after_a_leap_of_time_the_sequence_goes_on_where_it_would_be(rig: "Bench
     assert update.tick == 100
 
 
-# -- what a review found -----------------------------------------------------------------------------------------------
+# -- corners -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_rack_that_comes_back_one_tick_behind_is_followed(rig: "Bench", at: At) -> None:
