@@ -17,8 +17,6 @@ from rig.chaos.report import summary_lines, write_report
 from rig.results import prepare_folder
 from rig.settings import Settings
 
-GAP_S = 120.0
-"""Plant time from one instant to the next, about: enough to come back to MPC in between."""
 IN_FLIGHT_MS = 20.0
 """In real time the signal comes up to so much after a tick, with the rig moving on: anywhere in a scan or a solve."""
 HOURS = 8
@@ -31,12 +29,12 @@ def make_plan(options: argparse.Namespace) -> Plan:
     for number in range(1, options.count + 1):
         values = {
             "process": options.service,
-            "at_s": number * GAP_S + TICK_S * draw.randrange(round(0.5 * GAP_S / TICK_S)),
+            "at_s": number * options.gap + TICK_S * draw.randrange(round(0.5 * options.gap / TICK_S)),
             "duration_s": options.outage,
             "offset_ms": draw.uniform(0, IN_FLIGHT_MS),
         }
         faults.append(Kill(kind="kill", **values) if options.signal == "kill" else Pause(kind="pause", **values))
-    duration_s = (options.count + 2) * GAP_S
+    duration_s = (options.count + 2) * options.gap
     draws = int(duration_s // (HOURS * 3600)) + 1
     return Plan(
         name=f"{options.signal}-{options.service}",
@@ -83,6 +81,9 @@ def main() -> int:
     parser.add_argument(
         "--patience", type=float, default=5.0, help="control_plc.ladder.optimizer_patience_s, real time"
     )
+    parser.add_argument("--gap", type=float, default=120.0,
+                        help="plant time from one instant to the next, about, s; in real time a process takes some "
+                        "seconds to start, which at factor 20 is a hundred of plant time")  # fmt: skip
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder for chaos.json, chaos.md and logs (default: none are kept)")
     options = parser.parse_args()
