@@ -93,7 +93,9 @@ class OptimizerPlc:
             if self._is_news(update, wanted):
                 verdict = await self._optimise(update, asked_at)
                 # a plan that came too late: this update leads to no other, unless a load step has led to one
-                lost = verdict is Verdict.WRONG_UPDATE and not await self._interrupted(update)
+                unplanned = verdict is Verdict.WRONG_UPDATE and not await self._interrupted(update)
+                # late once is late for ever with updates that have been waiting: begin again with a fresh one
+                lost = unplanned or verdict is Verdict.LATE
                 wanted = STRANGER if lost else AwaitUpdate(update.session, update.update + 1)
             elif update.session != wanted.session:
                 wanted = STRANGER
