@@ -22,6 +22,7 @@ from pathlib import Path
 
 from coldloop.registers.common import STATISTICS_BLOCK
 from coldloop.registers.declaration import RegisterMap
+from rig.chaos.resources import resident_mb
 from rig.local_services import LocalServices
 from rig.register_listing import MAPS
 from rig.settings import Settings
@@ -177,14 +178,6 @@ async def up(port: int) -> None:
             return
 
 
-def resident_mb(process: int) -> float:
-    """Return the resident memory of a process."""
-    for line in Path(f"/proc/{process}/status").read_text(encoding="utf-8").splitlines():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1]) / 1024
-    return 0.0
-
-
 def text_of(log: Path) -> str:
     """Return a log."""
     return log.read_text(encoding="utf-8", errors="replace")
@@ -193,7 +186,6 @@ def text_of(log: Path) -> str:
 async def fuzz(service: str, services: LocalServices, log: Path, options: argparse.Namespace) -> tuple[str, bool]:
     """Fuzz one service; return its line of the table, and whether it stood."""
     port = getattr(services.endpoints, service).port
-    pid = services.processes[service].pid
     requests = Requests(MAPS[service], random.Random(f"{options.seed} {service}"))  # noqa: S311 - must be repeatable
     await up(port)
     tally = Tally()
@@ -201,7 +193,7 @@ async def fuzz(service: str, services: LocalServices, log: Path, options: argpar
     try:
         for count, data in requests.batches(options.frames):
             if not before and tally.frames >= min(WARM_UP_FRAMES, options.frames // 2):
-                before = resident_mb(pid)
+                before = resident_mb(services)[service]
             await provoke(port, data, tally)
             tally.frames += count
         for data in requests.garbage(options.bytes):
@@ -218,7 +210,7 @@ async def fuzz(service: str, services: LocalServices, log: Path, options: argpar
         tally.failures.append("ended")
     if "Traceback" in text_of(log):
         tally.failures.append("traceback in its log")
-    after = resident_mb(pid) if not ended else 0.0
+    after = 0.0 if ended else resident_mb(services)[service]
     outcome = ", ".join(dict.fromkeys(tally.failures)) or "stood"
     line = _row(
         service, tally.frames, tally.served, tally.sent, tally.received, tally.connections,

@@ -12,7 +12,27 @@ from rig.recording import Recorder
 REFRESH_S = 0.1
 
 
-class RunProgress:
+class PlantTimeBar:
+    """A progress bar that appears with its first sign of progress; what goes wrong before stands alone."""
+
+    _bar: Progress
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar.live.is_started:
+            self._bar.refresh()
+            self._bar.stop()
+
+
+def clock(seconds: float) -> str:
+    """Return plant time as hours, minutes and seconds."""
+    hours, rest = divmod(int(seconds), 3600)
+    return f"{hours}:{rest // 60:02}:{rest % 60:02}"
+
+
+class RunProgress(PlantTimeBar):
     """A progress bar on standard error, with the loop's live line on a terminal."""
 
     def __init__(self, ticks: int) -> None:
@@ -31,14 +51,6 @@ class RunProgress:
         self._task = self._bar.add_task("", total=ticks, clock="0:00:00", speed="", line="")
         self._shown = time.monotonic()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar.live.is_started:
-            self._bar.refresh()
-            self._bar.stop()
-
     def __call__(self, recorder: Recorder) -> None:
         """Show where the run is, a few times a second."""
         done = len(recorder.samples)
@@ -51,11 +63,10 @@ class RunProgress:
         self._bar.start()  # not before there is something to show: an error then stands alone
         seconds = done * TICK_S
         speed = seconds / max(recorder.wall_seconds, 1e-9)
-        hours, rest = divmod(int(seconds), 3600)
         self._bar.update(
             self._task,
             completed=done,
-            clock=f"{hours}:{rest // 60:02}:{rest % 60:02}",
+            clock=clock(seconds),
             speed=f"{speed:,.0f} x real time",
             line=_line(recorder),
         )

@@ -1,7 +1,7 @@
 """What is seen while a plan is run."""
 
 import time
-from typing import Final, Self
+from typing import Final
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
@@ -9,11 +9,12 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from coldloop.process import TICK_S
 from coldloop.registers.control_plc import Mode
 from rig.chaos.observer import Sight
+from rig.progress import PlantTimeBar, clock
 
 REFRESH_S: Final = 0.2
 
 
-class ChaosProgress:
+class ChaosProgress(PlantTimeBar):
     """A progress bar on standard error: plant time, mode, and the faults that are on."""
 
     def __init__(self, ticks: int) -> None:
@@ -24,14 +25,6 @@ class ChaosProgress:
         self._task = self._bar.add_task("", total=ticks, clock="0:00:00", line="")
         self._shown = time.monotonic()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar.live.is_started:
-            self._bar.refresh()
-            self._bar.stop()
-
     def __call__(self, tick: int, sight: Sight, faults: list[str]) -> None:
         """Show where the run is, a few times a second."""
         now = time.monotonic()
@@ -39,10 +32,9 @@ class ChaosProgress:
             return
         self._shown = now
         self._bar.start()
-        hours, rest = divmod(int(tick * TICK_S), 3600)
         mode = Mode(sight.ladder.mode).name if sight.ladder is not None else "control PLC away"
         self._bar.update(
-            self._task, completed=tick, clock=f"{hours}:{rest // 60:02}:{rest % 60:02}",
+            self._task, completed=tick, clock=clock(tick * TICK_S),
             line="  ".join([mode, *faults]),
         )  # fmt: skip
         self._bar.refresh()

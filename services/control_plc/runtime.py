@@ -76,6 +76,7 @@ class ControlPlc:
         self._pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
         self._pacer = self._new_pacer()
         self._failures = 0
+        self._awaiting_since: float | None = None
         self._publish()
 
     def close(self) -> None:
@@ -98,7 +99,7 @@ class ControlPlc:
 
     async def _until_due(self) -> None:
         """Wait until the next scan may begin."""
-        self._awaiting_since: float | None = None
+        self._awaiting_since = None
         while True:
             if self.clients.asked is not None:
                 self._start(self.clients.asked)

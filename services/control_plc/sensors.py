@@ -5,7 +5,7 @@ it stands to the last bit for a while in which most of the others move.
 """
 
 from collections.abc import Sequence
-from operator import le
+from operator import le, ne
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
@@ -65,10 +65,10 @@ class SensorMonitor:
     def check(self, y: Sequence[float]) -> Sequence[float]:
         """Return the outputs with bad ones replaced by their last good value."""
         self._watch_standing(y)
-        if not self.bad and all(map(le, self._low, y)) and all(map(le, y, self._high)) and not self._frozen():
+        frozen = self._frozen()
+        if not self.bad and not frozen and all(map(le, self._low, y)) and all(map(le, y, self._high)):
             self._good[:] = y
             return y
-        frozen = self._frozen()
         for output, value in enumerate(y):
             self._judge(output, ok=self._low[output] <= value <= self._high[output] and output not in frozen)
             if output not in self.bad:
@@ -77,11 +77,10 @@ class SensorMonitor:
 
     def _watch_standing(self, y: Sequence[float]) -> None:
         """Count for how long each controlled output has stood while most of the others moved."""
-        moved = sum(now != before for now, before in zip(y, self._before, strict=True))
         for output in CONTROLLED:
             if y[output] != self._before[output]:
                 self._stands[output] = 0
-            elif 2 * moved > len(OUTPUT_NAMES):
+            elif 2 * sum(map(ne, y, self._before)) > len(OUTPUT_NAMES):
                 self._stands[output] += 1
         self._before = tuple(y)
 
