@@ -6,10 +6,10 @@ from typing import NamedTuple
 from coldloop.errors import LinkError
 from coldloop.lti_model import load as load_model
 from coldloop.service import run_event_loop
-from rig.chaos.driver import Progress
 from rig.chaos.evaluation import Evaluation, evaluate
 from rig.chaos.plan import Plan
 from rig.chaos.runner import conduct
+from rig.chaos.sequencer import Progress
 from rig.chaos.trace import ChaosTrace
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder, Recording

@@ -8,7 +8,7 @@ from coldloop.endpoints import Endpoint
 from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, Grant, Ladder
+from coldloop.registers.control_plc import CONTROL_MAP, Grant, LadderStatus
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, PlantSample, SensorFault
 from coldloop.registers.safety import EVENT_ROWS, Alarm, AlarmKind, Event
@@ -26,7 +26,7 @@ class Sight(NamedTuple):
 
     tick: int | None
     """Where the plant is; None while it does not answer."""
-    ladder: Ladder | None
+    ladder: LadderStatus | None
     """None while the control PLC does not answer."""
 
 
@@ -107,8 +107,8 @@ class Observer:
         self._recorded = last
         return identity.tick
 
-    async def _read_control(self) -> Ladder:
-        ladder = await self._control.read(Ladder)
+    async def _read_control(self) -> LadderStatus:
+        ladder = await self._control.read(LadderStatus)
         if ladder.events < self._last_event:
             self.expect_new_events()
         first = max(self._last_event + 1, ladder.events - EVENT_ROWS + 1)

@@ -8,13 +8,13 @@ from typing import Final
 from coldloop.config import PREFIX
 from coldloop.errors import LinkError
 from coldloop.process import TICK_S
-from rig.chaos.driver import Driver, Progress
 from rig.chaos.faults import Link, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
 from rig.chaos.observer import Observer
 from rig.chaos.plan import Plan
 from rig.chaos.proxy import LinkProxy
+from rig.chaos.sequencer import FaultSequencer, Progress
 from rig.chaos.trace import ChaosTrace
 from rig.local_services import LocalServices
 from rig.network import NetworkRig
@@ -54,7 +54,7 @@ async def conduct(
         observer = Observer(services.endpoints, trace, session)
         stack.callback(observer.close)
         injector = Injector(services, proxies, observer, folder)
-        driver = Driver(plan, services, observer, injector, trace, progress)
+        driver = FaultSequencer(plan, services, observer, injector, trace, progress)
         try:
             async with asyncio.timeout(_patience_s(plan)):
                 await services.during(driver.run())

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
-from coldloop.registers.control_plc import Ladder
+from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.plant import PlantSample
 from coldloop.registers.safety import Alarm, Event, EventKind
 from rig.chaos.faults import AnyFault
@@ -47,7 +47,7 @@ class ChaosTrace:
     events: list[Event] = field(default_factory=list)
     """As they came; one with the number 0 was not told, but seen."""
     alarms: list[Alarm] = field(default_factory=list)
-    ladder: Ladder | None = None
+    ladder: LadderStatus | None = None
     marks: list[Mark] = field(default_factory=list)
     resources: list[Resources] = field(default_factory=list)
     log_lines: dict[str, int] = field(default_factory=dict)
@@ -65,7 +65,7 @@ class ChaosTrace:
         for rows, values in zip(self._rows, ((sample.load,), sample.u, sample.y, sample.x), strict=True):
             rows[sample.tick] = np.array(values)
 
-    def sight_mode(self, tick: int, ladder: Ladder) -> None:
+    def sight_mode(self, tick: int, ladder: LadderStatus) -> None:
         """Take the mode of a control PLC that was started again: it makes no event of it."""
         self.events.append(Event(tick=tick, kind=EventKind.MODE, subject=ladder.mode, cause=ladder.cause))
 

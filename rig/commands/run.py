@@ -12,7 +12,7 @@ from coldloop.lti_model import load as load_model
 from coldloop.process import TICK_S
 from coldloop.service import add_configuration_options, run_event_loop
 from coldloop.session import TimeMode
-from control_plc.settings import Driver
+from control_plc.settings import ControlStrategy
 from plant.load import NAMED, find_load
 from rig.commands.options import configuration, duration, endpoint, updating_period
 from rig.indicators import evaluate, instantaneous_cost
@@ -155,7 +155,7 @@ def _write(
 
 
 def _driven_by(settings: Settings) -> str:
-    if settings.control_plc.driver is Driver.CLASSICAL:
+    if settings.control_plc.driver is ControlStrategy.CLASSICAL:
         return "classical loops"
     period = settings.optimizer_plc.program.updating_period_s
     return f"tau_u {period:g} s" if period else "tau_u adaptive"

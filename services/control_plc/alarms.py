@@ -16,7 +16,7 @@ from coldloop.registers.safety import (
     EventKind,
 )
 
-PASSING = (AlarmKind.DEADLINE_MISSED, AlarmKind.ACCESS_REFUSED)
+PASSING = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED)
 """Alarms for something that happens at an instant."""
 PASSING_TICKS = round(60 / TICK_S)
 """They return when it has not happened again for so long."""

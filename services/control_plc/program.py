@@ -37,7 +37,7 @@ from control_plc.guard import OutputGuard
 from control_plc.ladder import Ladder, Situation
 from control_plc.player import SequencePlayer
 from control_plc.sensors import SensorMonitor
-from control_plc.settings import ControlSection, Driver
+from control_plc.settings import ControlSection, ControlStrategy
 
 HANDSHAKE_PAUSE_S = 30.0
 """After a handshake that came to nothing the classical loops are not held again for so long."""
@@ -73,7 +73,7 @@ class ControlProgram:
 
     def restart(self, session: int) -> None:
         """Begin a session at tick 0 with the initial inputs applied."""
-        classical = self._section.driver is Driver.CLASSICAL
+        classical = self._section.driver is ControlStrategy.CLASSICAL
         self.operator = Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, *self._initial)
         self._begin(session, 0, self._initial, updates=0)
         mode = Mode.CLASSICAL if classical else Mode.HOLD

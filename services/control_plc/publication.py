@@ -7,7 +7,7 @@ from coldloop.clock import LatenessRecord
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
-from coldloop.registers.control_plc import CONTROL_MAP, Cause, Ladder, Mode, Process, Status
+from coldloop.registers.control_plc import CONTROL_MAP, Cause, LadderStatus, Mode, Process, Status
 from coldloop.registers.safety import EVENT_ROWS, AlarmKind, AlarmState, Event, EventKind
 from control_plc.program import ControlProgram
 
@@ -83,7 +83,7 @@ class Publication:
             for row, alarm in enumerate(program.alarms.rows):
                 self._bank.put(alarm, row)
         self._bank.put(
-            Ladder(
+            LadderStatus(
                 mode=program.mode,
                 cause=program.ladder.cause,
                 since=program.ladder.since,

@@ -120,7 +120,7 @@ class ControlPlc:
         lateness = await self._pacer.until(program.tick)
         if lateness * 1000 > self._settings.control_plc.scan_tolerance_ms:
             self.publication.overruns += 1
-            program.alarms.happened(AlarmKind.DEADLINE_MISSED)
+            program.alarms.happened(AlarmKind.SCAN_OVERRUN)
         if lateness * self._pace.factor > TICK_S:
             applied: Sequence[float] = program.applied
             with contextlib.suppress(LinkError):  # the next exchange will tell

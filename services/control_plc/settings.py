@@ -30,7 +30,7 @@ class PlantEndpoint(Endpoint):
     port: Annotated[int, Field(ge=1, le=0xFFFF)] = PLANT_PORT
 
 
-class Driver(StrEnum):
+class ControlStrategy(StrEnum):
     """Who drives the inputs."""
 
     MPC = "mpc"
@@ -90,7 +90,7 @@ class ControlSection(BaseModel):
     plant: PlantEndpoint = PlantEndpoint()
     scan_tolerance_ms: Annotated[float, Field(gt=0)] = 5.0
     """Lateness of a scan, in real time, that counts as an overrun."""
-    driver: Driver = Driver.MPC
+    driver: ControlStrategy = ControlStrategy.MPC
     classical: ClassicalSettings = ClassicalSettings()
     ladder: LadderSettings = LadderSettings()
     sensors: SensorCheckSettings = SensorCheckSettings()

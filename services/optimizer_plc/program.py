@@ -15,7 +15,7 @@ from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.sequence import InputSequence, sealed
+from coldloop.sequence import InputSequence, with_checksum
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.costs import augmented_cost, indicators
 from optimizer_plc.estimator import Estimate, Estimator, EstimatorKind, KalmanFilter, StateFeedback
@@ -256,7 +256,7 @@ class OptimizerProgram:
             model_digest=self.model_digest,
             crc=0,
         )
-        return sealed(header, rows)
+        return with_checksum(header, rows)
 
     def _cost(self, qp: QuadraticProblem, z: Array) -> float:
         return self._whole(augmented_cost(qp, z, self._real(self._solver.alpha)), qp)

@@ -30,6 +30,6 @@ def checksum(header: SequenceHeader, rows: Rows[SequenceRow]) -> int:
     return zlib.crc32(struct.pack(f">{len(_ROW_LETTERS) * len(rows)}f", *chain.from_iterable(rows)), crc)
 
 
-def sealed(header: SequenceHeader, rows: Rows[SequenceRow]) -> InputSequence:
+def with_checksum(header: SequenceHeader, rows: Rows[SequenceRow]) -> InputSequence:
     """Return the sequence with its CRC filled in."""
     return InputSequence(header._replace(crc=checksum(header, rows)), rows)

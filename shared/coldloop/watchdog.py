@@ -36,9 +36,9 @@ class Watchdog:
     def _remaining(self, tick: int) -> int:
         return min(self.time, max(0, self.time - (tick - self._triggered)))
 
-    def registers(self, tick: int) -> safety.Watchdog:
+    def registers(self, tick: int) -> safety.WatchdogStatus:
         """Return what its registers show at `tick`."""
         running = safety.WatchdogState.RUNNING if self.time else safety.WatchdogState.OFF
         state = safety.WatchdogState.EXPIRED if self.expired else running
         remaining = 0 if self.expired else self._remaining(tick)
-        return safety.Watchdog(self.time, state, remaining, self.lowest, self.trips & 0xFFFF)
+        return safety.WatchdogStatus(self.time, state, remaining, self.lowest, self.trips & 0xFFFF)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from coldloop.registers.codec import WordOrder, as_transmitted, codec_of
 from coldloop.registers.control_plc import CONTROL_MAP, SequenceHeader, SequenceRow
-from coldloop.sequence import InputSequence, checksum, sealed
+from coldloop.sequence import InputSequence, checksum, with_checksum
 
 ROWS = [SequenceRow(43.0 + 0.01 * tick, 75.0 - tick, 36.0) for tick in range(20)]
 HEADER = SequenceHeader(number=7, update=6, first_tick=140, length=20, tau_u=20, model_digest=0x2B8F1A90, crc=0)
@@ -56,7 +56,7 @@ def test_the_crc_does_not_depend_on_the_crc_that_stands_in_the_header(
 
 @given(header=headers, rows=rows)
 def test_a_seal_survives_the_bus(header: SequenceHeader, rows: list[SequenceRow]) -> None:
-    sequence = sealed(header, rows)
+    sequence = with_checksum(header, rows)
     assert sequence.header.crc == checksum(header, rows)
     arrived = InputSequence(as_transmitted(sequence.header), [as_transmitted(row) for row in sequence.rows])
     assert checksum(*arrived) == arrived.header.crc

@@ -11,7 +11,7 @@ from coldloop.process import L1, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.sequence import InputSequence, sealed
+from coldloop.sequence import InputSequence, with_checksum
 from control_plc.program import ControlProgram, OperatingPoint
 from control_plc.settings import ControlSection
 
@@ -67,7 +67,7 @@ class Bench:
         return self.program.accept_plan(Plan(update.update, update.tick + ticks, load_step))
 
     def sequence(self, rows: Sequence[SequenceRow], **changed: int) -> InputSequence:
-        """Return a sealed answer to the last update, with header fields changed before it is sealed."""
+        """Return an answer to the last update, with header fields changed before its checksum is taken."""
         update = self.program.player.update
         assert update is not None
         first = self.program.player.next_update_tick or 0
@@ -81,7 +81,7 @@ class Bench:
             model_digest=MODEL,
             crc=0,
         )
-        return sealed(header._replace(**changed), [as_transmitted(row) for row in rows])
+        return with_checksum(header._replace(**changed), [as_transmitted(row) for row in rows])
 
     def play(self, rows: Sequence[SequenceRow], ticks: int) -> list[SequenceRow]:
         """Plan an update `ticks` after the last one, answer it, and scan up to it; return what was applied."""

@@ -19,7 +19,7 @@ from coldloop.registers.plant import Measurement
 from control_plc.classical import CV156, NCR22, ClassicalLoops, ClassicalSettings, LevelLoop, PiController, PiSettings
 from control_plc.program import ControlProgram
 from control_plc.runtime import make_program
-from control_plc.settings import ControlSection, Driver
+from control_plc.settings import ControlSection, ControlStrategy
 from plant.load import find_load
 from plant.runtime import make_program as make_plant
 from plant.settings import SensorSettings
@@ -52,7 +52,7 @@ def measured(tick: int, y: tuple[float, ...]) -> Measurement:
 
 def classical_program(limits: InputLimits | None = None, **section: object) -> ControlProgram:
     """Return a control program in its first session, driven by the loops."""
-    asked = ControlSection.model_validate({"driver": Driver.CLASSICAL, **section})
+    asked = ControlSection.model_validate({"driver": ControlStrategy.CLASSICAL, **section})
     program = make_program(HEADER, asked, limits or InputLimits())
     program.restart(session=1)
     return program

@@ -25,7 +25,7 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState, EventKind
-from coldloop.sequence import InputSequence, sealed
+from coldloop.sequence import InputSequence, with_checksum
 from coldloop.session import Pace
 from control_plc.program import ControlProgram
 from control_plc.retained_state import RetainedState
@@ -164,7 +164,7 @@ class Link(RuleBasedStateMachine):
             self.number, update.update if update else 0, first, len(rows), first - update.tick if update else 0,
             HEADER.short_digest, 0,
         )  # fmt: skip
-        sequence = sealed(header, rows)
+        sequence = with_checksum(header, rows)
         if damage:
             rows = [*rows[:-1], rows[-1]._replace(cv155=rows[-1].cv155 + 0.001)]
             sequence = InputSequence(sequence.header, [as_transmitted(row) for row in rows])

@@ -16,7 +16,7 @@ from coldloop.registers.plant import (
     SensorFault,
     SensorFaultKind,
 )
-from coldloop.registers.safety import Watchdog, WatchdogState, WatchdogTime
+from coldloop.registers.safety import WatchdogState, WatchdogStatus, WatchdogTime
 from coldloop.seal import is_intact, sealed
 from coldloop.session import Pace
 from plant.runtime import PlantRack
@@ -76,15 +76,15 @@ def test_outputs_hold_or_go_to_the_safe_state_when_the_control_plc_is_silent(
     rack.exchange(*U)
     rack.passes(18)
     assert tuple(rack.outputs()) == U
-    assert rack.rack.bank.get(Watchdog).state == WatchdogState.RUNNING
+    assert rack.rack.bank.get(WatchdogStatus).state == WatchdogState.RUNNING
     rack.passes(2)
     assert tuple(rack.outputs()) == expected
-    shown = rack.rack.bank.get(Watchdog)
+    shown = rack.rack.bank.get(WatchdogStatus)
     assert (shown.time, shown.state, shown.trips) == (20, WatchdogState.EXPIRED, 1)
     assert rack.rack.bank.get(Actuators)[1:4] == expected, "the control PLC reads back what is applied"
     rack.exchange(*U)
     assert tuple(rack.outputs()) == U
-    assert rack.rack.bank.get(Watchdog).state == WatchdogState.RUNNING
+    assert rack.rack.bank.get(WatchdogStatus).state == WatchdogState.RUNNING
 
 
 def test_the_watchdog_is_set_by_register(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,11 +92,11 @@ def test_the_watchdog_is_set_by_register(monkeypatch: pytest.MonkeyPatch) -> Non
     rack.exchange(*U)
     rack.write(WatchdogTime(4))
     rack.passes(4)
-    assert rack.rack.bank.get(Watchdog).trips == 1
+    assert rack.rack.bank.get(WatchdogStatus).trips == 1
     rack.write(WatchdogTime(0))
     rack.passes(100)
-    assert rack.rack.bank.get(Watchdog).trips == 1
-    assert rack.rack.bank.get(Watchdog).state == WatchdogState.OFF
+    assert rack.rack.bank.get(WatchdogStatus).trips == 1
+    assert rack.rack.bank.get(WatchdogStatus).state == WatchdogState.OFF
 
 
 def test_outputs_that_arrive_damaged_are_not_applied(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.registers.codec import WordOrder
-from control_plc.settings import ControlSection, Driver
+from control_plc.settings import ControlSection, ControlStrategy
 from optimizer_plc.settings import AdaptiveSettings, OptimizerSection, ProgramSettings, RuleName
 from plant.load import find_load
 from plant.program import LoadProfile
@@ -95,7 +95,7 @@ def test_without_noise_the_seed_decides_nothing(lively: LoadProfile, simulate: "
 async def test_the_classical_loops_leave_one_trace_too_and_no_updates(
     lively: LoadProfile, simulate: "Simulate", on_the_bus: "OnTheBus"
 ) -> None:
-    section = ControlSection(driver=Driver.CLASSICAL)
+    section = ControlSection(driver=ControlStrategy.CLASSICAL)
     scenario = three_minutes(lively)
     async with on_the_bus(Settings(control_plc=section)) as bus:
         first, second = await bus.record(scenario), await bus.record(scenario)

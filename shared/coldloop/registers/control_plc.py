@@ -6,7 +6,7 @@ from typing import Annotated, Final, NamedTuple
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
-from coldloop.registers.safety import EVENT_ROWS, Alarm, AlarmCommand, AlarmKind, Event, Watchdog, WatchdogTime
+from coldloop.registers.safety import EVENT_ROWS, Alarm, AlarmCommand, AlarmKind, Event, WatchdogStatus, WatchdogTime
 
 SEQUENCE_ROWS: Final = 240
 
@@ -94,7 +94,7 @@ class Status(NamedTuple):
     lateness_p99: Annotated[float, f32("99th percentile of the lateness of a scan in real time", unit="ms")]
 
 
-class Ladder(NamedTuple):
+class LadderStatus(NamedTuple):
     """Where the fail-safe ladder stands, and what it knows of those it depends on."""
 
     mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops, 3 rest of a sequence, 4 manual")]
@@ -216,7 +216,7 @@ CONTROL_MAP: Final = RegisterMap(
     blocks=(
         IDENTITY_BLOCK,
         Block("status", 30, Status, "Sequence player and scan cycle"),
-        Block("ladder", 50, Ladder, "The fail-safe ladder"),
+        Block("ladder", 50, LadderStatus, "The fail-safe ladder"),
         STATISTICS_BLOCK,
         Block("process", 100, Process, "The process at the last scan"),
         Block("update", 200, Update, "Latched at the last updating instant"),
@@ -224,7 +224,7 @@ CONTROL_MAP: Final = RegisterMap(
         Block("plan", 410, Plan, "Decided updating period", Role.OPTIMIZER),
         Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence"),
         Block("heartbeat", 430, Heartbeat, "Sign of life of the optimiser", Role.OPTIMIZER),
-        Block("watchdog", 436, Watchdog, "Watches the optimiser"),
+        Block("watchdog", 436, WatchdogStatus, "Watches the optimiser"),
         Block("watchdog time", 444, WatchdogTime, "Sets that watchdog", Role.OPERATOR),
         Block("session", 450, ControlSession, "Start of a session", Role.OPERATOR),
         Block("grant", 460, Grant, "How far to go in lock-step", Role.OPERATOR),

@@ -6,7 +6,7 @@ from typing import Annotated, Final, NamedTuple
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
-from coldloop.registers.safety import Watchdog, WatchdogTime
+from coldloop.registers.safety import WatchdogStatus, WatchdogTime
 
 HISTORY_ROWS: Final = 256
 LOAD_ROWS: Final = 2048
@@ -88,7 +88,9 @@ PLANT_MAP: Final = RegisterMap(
         STATISTICS_BLOCK,
         Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL),
         Block("measurement", 200, Measurement, "Inputs of the control PLC"),
-        Block("watchdog", 310, Watchdog, "Watches the control PLC; outputs go to their safe state when it expires"),
+        Block(
+            "watchdog", 310, WatchdogStatus, "Watches the control PLC; outputs go to their safe state when it expires"
+        ),
         Block("watchdog time", 320, WatchdogTime, "Sets that watchdog", Role.CONTROL),
         Block("sensor faults", 330, SensorFault, "Faults put into the outputs", Role.OPERATOR, len(OUTPUT_NAMES)),
         Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),

@@ -16,7 +16,7 @@ class WatchdogState(IntEnum):
     EXPIRED = 2
 
 
-class Watchdog(NamedTuple):
+class WatchdogStatus(NamedTuple):
     """A watchdog, in the manner of the WAGO 750's block of watchdog registers."""
 
     time: Annotated[int, u16("Time-out in use; 0 is off", unit="0.25 s")] = 0
@@ -45,7 +45,7 @@ class AlarmKind(IntEnum):
     PLANT_LOST = 7
     SENSOR_BAD = 8
     MODEL_MISMATCH = 9
-    DEADLINE_MISSED = 10
+    SCAN_OVERRUN = 10
     ACCESS_REFUSED = 11
 
 

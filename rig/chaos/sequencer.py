@@ -29,7 +29,7 @@ RESOURCE_TICKS: Final = 1200
 LOOK_S: Final = 0.005
 
 
-class Driver:
+class FaultSequencer:
     """Takes a session from fault to fault."""
 
     def __init__(
