@@ -1,44 +1,16 @@
-"""Alarms with the states of ANSI/ISA-18.2, and the sequence of events."""
+"""Alarms with the states of ANSI/ISA-18.2."""
 
-from collections import deque
 from collections.abc import Sequence
 
+from coldloop.journal import Journal
 from coldloop.process import TICK_S
-from coldloop.registers.safety import (
-    ALL_ALARMS,
-    EVENT_ROWS,
-    Alarm,
-    AlarmAction,
-    AlarmCommand,
-    AlarmKind,
-    AlarmState,
-    Event,
-    EventKind,
-)
+from coldloop.registers.audit import EventKind
+from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 
 PASSING = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED)
 """Alarms for something that happens at an instant."""
 PASSING_TICKS = round(60 / TICK_S)
 """They return when it has not happened again for so long."""
-
-
-class Journal:
-    """Numbers events and keeps the last ones."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._events: deque[Event] = deque(maxlen=EVENT_ROWS)
-
-    def note(self, tick: int, kind: EventKind, subject: int, cause: int = 0) -> None:
-        """Add an event."""
-        self.count += 1
-        self._events.append(Event(self.count, tick, kind, subject, cause))
-
-    def since(self, number: int) -> list[Event]:
-        """Return the events after event `number`, those that are still kept."""
-        if number == self.count:
-            return []
-        return [event for event in self._events if event.number > number]
 
 
 class AlarmPanel:

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable
 
-from coldloop.registers.bank import RegisterBank
+from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.control_plc import (
     AwaitUpdate,
     ControlSession,
@@ -53,7 +53,7 @@ class Clients:
         self._news.set()
         self._news = asyncio.Event()
 
-    def on_write(self, block: Block) -> Awaitable[None] | None:
+    def on_write(self, block: Block, caller: Caller) -> Awaitable[None] | None:  # noqa: ARG002
         """Take what a client has written; an awaitable lets its answer wait."""
         present = self._program.optimizer_present
         wait = self._take(block)
@@ -98,7 +98,7 @@ class Clients:
     def _offer(self, header: SequenceHeader) -> None:
         rows = [self._bank.get(SequenceRow, row) for row in range(header.length)]
         answer = self._program.offer(InputSequence(header, rows))
-        self._bank.put(answer)
+        self._bank.put(sealed(answer))
         if answer.verdict != Verdict.ACCEPTED:
             self._publication.safety()
         self._publication.status()

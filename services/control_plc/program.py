@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from coldloop.errors import ConfigurationError
+from coldloop.journal import Journal
 from coldloop.limits import InputLimits
 from coldloop.process import L1, T5, TICK_S
-from coldloop.registers import safety
+from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
     Acknowledgement,
     Cause,
@@ -31,7 +32,7 @@ from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.safety import AlarmKind
 from coldloop.sequence import InputSequence
 from coldloop.watchdog import Watchdog
-from control_plc.alarms import AlarmPanel, Journal
+from control_plc.alarms import AlarmPanel
 from control_plc.classical import ClassicalLoops
 from control_plc.guard import OutputGuard
 from control_plc.ladder import Ladder, Situation
@@ -188,7 +189,7 @@ class ControlProgram:
                 self._loops.restart()
         elif before is Mode.CLASSICAL:
             self._failed_handshake = -math.inf
-        self.journal.note(tick, safety.EventKind.MODE, self._ladder.mode, self._ladder.cause)
+        self.journal.note(tick, EventKind.MODE, self._ladder.mode, self._ladder.cause)
 
     def _wanted(self, tick: int, row: SequenceRow | None) -> SequenceRow:
         """Return what is asked for by whom the ladder has chosen."""

@@ -4,11 +4,13 @@ import logging
 from collections.abc import Mapping
 
 from coldloop.clock import LatenessRecord
+from coldloop.journal import JournalPublication
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
+from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import CONTROL_MAP, Cause, LadderStatus, Mode, Process, Status
-from coldloop.registers.safety import EVENT_ROWS, AlarmKind, AlarmState, Event, EventKind
+from coldloop.registers.safety import AlarmKind, AlarmState
 from control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")
@@ -21,7 +23,7 @@ class Publication:
         self._program = program
         self._bank = bank
         self._model_digest = model_digest
-        self._told_events = 0
+        self.journal = JournalPublication(program.journal, bank)
         self._told_alarms = -1
         self.running = False
         """A session is under way."""
@@ -68,16 +70,13 @@ class Publication:
     @property
     def is_behind(self) -> bool:
         """There are events that have not been shown."""
-        return self._program.journal.count != self._told_events
+        return self.journal.is_behind
 
     def safety(self) -> None:
         """Show ladder, watchdog, alarms and events, as far as they have changed, and log the events."""
         program = self._program
-        events = program.journal.since(self._told_events)
-        for event in events:
-            self._bank.put(event, event.number % EVENT_ROWS)
+        for event in self.journal.show():
             self._log(event)
-        self._told_events = program.journal.count
         if program.alarms.changes != self._told_alarms:
             self._told_alarms = program.alarms.changes
             for row, alarm in enumerate(program.alarms.rows):

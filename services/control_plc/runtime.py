@@ -27,9 +27,8 @@ from coldloop.registers.control_plc import (
     ControlSession,
     Operator,
 )
-from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
+from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind
-from coldloop.seal import is_intact, sealed
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
 from control_plc.clients import Clients
@@ -167,16 +166,14 @@ class ControlPlc:
         if self.clients.optimizer_waits:
             program.optimizer_seen()
         try:
-            measurement = await self._plant.exchange(sealed(program.begin_scan()), Measurement)
+            measurement = await self._plant.exchange(program.begin_scan(), Measurement)
         except LinkError as error:
             await self._find_plant(str(error))
             return
         elsewhere = measurement.session != program.session
-        if not is_intact(measurement):
-            await self._find_plant("a measurement arrived damaged")
-        elif elsewhere and not self._settings.session.autostart:
+        if elsewhere and not self._settings.session.autostart:
             self._leave(measurement.session, measurement.tick)
-        elif not measurement.crc:
+        elif measurement.verdict != OutputVerdict.TAKEN:
             await self._find_plant("it has not taken the outputs")
         elif elsewhere or (measurement.tick != program.tick and not self._pace.realtime):
             await self._find_plant(f"it is at tick {measurement.tick} of session {measurement.session}")
@@ -233,7 +230,7 @@ class ControlPlc:
     async def _look_at_plant(self) -> _PlantPosition:
         """Find out which session and tick the plant is at, and what it applies."""
         identity, actuators = await self._plant.read(Identity), await self._plant.read(Actuators)
-        ours = actuators.crc and is_intact(actuators) and actuators.session == identity.session
+        ours = actuators.session == identity.session
         return _PlantPosition(identity.session, identity.tick, actuators[1:4] if ours else self._program.applied)
 
     async def _join(self, plant: _PlantPosition, updates: int, operator: Operator) -> None:

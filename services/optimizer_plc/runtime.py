@@ -11,12 +11,11 @@ from coldloop.lti_model import load
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process import TICK_S
-from coldloop.registers.bank import RegisterBank
+from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import CONTROL_MAP, Acknowledgement, AwaitUpdate, Heartbeat, Status, Update, Verdict
 from coldloop.registers.declaration import Block
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, OPTIMIZER_MAP, Optimization, OptimizerSession
-from coldloop.seal import is_intact
 from coldloop.sequence import InputSequence
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
@@ -88,8 +87,6 @@ class OptimizerPlc:
         while True:
             update = await self._control.exchange(wanted, Update)
             asked_at = time.monotonic()
-            if not is_intact(update):
-                raise LinkError(f"{self._control.peer}: an update arrived damaged")
             if self._is_news(update, wanted):
                 verdict = await self._optimise(update, asked_at)
                 # a plan that came too late: this update leads to no other, unless a load step has led to one
@@ -179,7 +176,7 @@ class OptimizerPlc:
             log.warning("sequence rejected", extra={"update": sequence.header.update, "verdict": verdict.name.lower()})
         return verdict
 
-    def on_write(self, block: Block) -> None:
+    def on_write(self, block: Block, caller: Caller) -> None:
         """Session settings are read when the session begins."""
 
     def _publish_identity(self, tick: int) -> None:

@@ -18,7 +18,7 @@ from coldloop.errors import ModelFileError
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import ModelHeader, read_header
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S
-from coldloop.registers.bank import RegisterBank
+from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import (
@@ -27,6 +27,7 @@ from coldloop.registers.plant import (
     Actuators,
     LoadStep,
     Measurement,
+    OutputVerdict,
     PlantSample,
     PlantSession,
     SensorFault,
@@ -34,7 +35,7 @@ from coldloop.registers.plant import (
 )
 from coldloop.registers.safety import WatchdogTime
 from coldloop.retained import RetainedFile, RetainedStateError
-from coldloop.seal import is_intact, sealed
+from coldloop.seal import sealed
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
 from coldloop.watchdog import Watchdog
@@ -107,7 +108,7 @@ class PlantRack:
         self._watchdog.set(self._watchdog.time, 0)
         self._faults.clear()
         self._show_applied()
-        self.bank.put(self._measurement())
+        self.bank.put(sealed(self._measurement()))
         self._publish()
 
     # -- retained state ------------------------------------------------------------------------------------------------
@@ -131,7 +132,7 @@ class PlantRack:
         self._applied = cv155, ncr22, cv156
         self._watchdog.set(self._watchdog.time, tick)
         self._show_applied()
-        self.bank.put(self._measurement())
+        self.bank.put(sealed(self._measurement()))
         self._publish()
         log.warning("session resumed", extra={"session": self._session, "tick": tick})
         return True
@@ -148,7 +149,7 @@ class PlantRack:
         except RetainedStateError as error:
             log.error("the state is not retained", extra={"reason": str(error)})  # noqa: TRY400 one line
 
-    def on_write(self, block: Block) -> None:
+    def on_write(self, block: Block, caller: Caller) -> None:  # noqa: ARG002
         """Take what a client has written."""
         if block.record is Actuators:
             self._exchange(self.bank.get(Actuators))
@@ -185,14 +186,14 @@ class PlantRack:
     def _exchange(self, asked: Actuators) -> None:
         if self._moving:  # the next request came in before the plant had moved on
             self._advance()
-        if asked.session != self._session or not is_intact(asked) or not self._is_timely(asked.tick):
+        if asked.session != self._session or not self._is_timely(asked.tick):
             self._show_applied()
-            self.bank.put(self._measurement())  # not sealed: not taken
+            self.bank.put(sealed(self._measurement()))
             return
         self._applied = (asked.cv155, asked.ncr22, asked.cv156)
         self._program.apply(self._applied)
         self._watchdog.trigger(self._program.tick)
-        self.bank.put(sealed(self._measurement()))
+        self.bank.put(sealed(self._measurement()._replace(verdict=OutputVerdict.TAKEN)))
         if self._pace.realtime:
             self._start_clock()
         else:
@@ -264,7 +265,7 @@ class PlantRack:
             await pacer.until(self._program.tick + 0.5)
             self._moving = True
             self._advance()
-            self.bank.put(self._measurement())
+            self.bank.put(sealed(self._measurement()))
 
     # -- what others see -----------------------------------------------------------------------------------------------
 
@@ -273,7 +274,7 @@ class PlantRack:
         y = program.measure()
         if self._faults:
             y = tuple(self._faults.get(output, value) for output, value in enumerate(y))
-        return Measurement(program.tick, program.load, y, program.state, self._session)
+        return Measurement(program.tick, program.load, y, program.state, self._session, self._applied)
 
     def _publish(self) -> None:
         program = self._program

@@ -4,15 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.registers.safety import (
-    ALL_ALARMS,
-    EVENT_ROWS,
-    AlarmAction,
-    AlarmCommand,
-    AlarmKind,
-    AlarmState,
-    EventKind,
-)
+from coldloop.registers.audit import EVENT_ROWS, EventKind
+from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from control_plc.alarms import AlarmPanel, Journal
 
 KIND = AlarmKind.LEVEL_BAND

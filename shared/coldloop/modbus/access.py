@@ -6,11 +6,12 @@ A certificate says its role in the X.509v3 extension of the Modbus/TCP Security 
 
 import json
 from ipaddress import IPv4Address, IPv6Address, ip_address
-from typing import Final, NamedTuple
+from typing import Final
 
 from cryptography import x509
 
 from coldloop.modbus.settings import AccessSettings, Networks
+from coldloop.registers.bank import Caller
 from coldloop.registers.declaration import Role
 
 ROLE_EXTENSION: Final = x509.ObjectIdentifier("1.3.6.1.4.1.50316.802.1")
@@ -19,13 +20,6 @@ UTF8_STRING: Final = 0x0C
 """Tag of a UTF8String in DER."""
 MAX_LENGTH: Final = 127
 """Longest role, in bytes: what DER says the length of in one byte."""
-
-
-class Caller(NamedTuple):
-    """A client as the server knows it: its name in messages, and its roles."""
-
-    name: str
-    roles: frozenset[Role]
 
 
 def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:

@@ -12,7 +12,7 @@ from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusException
 
 from coldloop.endpoints import Endpoint
-from coldloop.errors import PeerUnreachableError, RequestRefusedError, UntrustedPeerError
+from coldloop.errors import DamagedAnswerError, PeerUnreachableError, RequestRefusedError, UntrustedPeerError
 from coldloop.modbus.peer_check import check_peer
 from coldloop.modbus.raw_pdu import RawDecoder, RawPdu
 from coldloop.modbus.requests import (
@@ -27,6 +27,7 @@ from coldloop.modbus.tls import client_context
 from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
+from coldloop.seal import Seal, seal_of, sealed
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -42,6 +43,7 @@ _EXCEPTIONS: Final = {
     2: "no such register, or not for this client to write",
     3: "illegal value",
     4: "failure in the server",
+    6: "somebody else holds the lease of this role",
     11: "no such unit id",
 }
 
@@ -62,8 +64,10 @@ class RegisterClient:
 
     Requests of several tasks are sent one after the other. After a lost connection the next request connects again.
 
-    All requests raise `PeerUnreachableError` when there is no answer in time and `RequestRefusedError` when the
-    answer is a Modbus exception.
+    Records of sealed blocks are sealed when they are written, and their seals are checked when they are read.
+
+    All requests raise `PeerUnreachableError` when there is no answer in time, `RequestRefusedError` when the answer is
+    a Modbus exception, and `DamagedAnswerError` when a record that should be sealed is not, or its seal is broken.
     """
 
     def __init__(
@@ -150,6 +154,8 @@ class RegisterClient:
         for first in range(start, start + count, rows_at_once):
             here = min(rows_at_once, start + count - first)
             raw = await self._read_words(block, block.address + first * row_words, here * row_words)
+            for row in range(here if block.sealed else 0):
+                self._check_seal(block, codec, raw, row * codec.size)
             rows += [cast("R", codec.decode(raw, row * codec.size)) for row in range(here)]
         return rows
 
@@ -165,7 +171,7 @@ class RegisterClient:
         row_words = codec.size // 2
         rows_at_once = MAX_WRITE_WORDS // row_words
         for first in range(0, len(records), rows_at_once):
-            data = b"".join([codec.encode(record) for record in records[first : first + rows_at_once]])
+            data = b"".join([_encoded(block, codec, record) for record in records[first : first + rows_at_once]])
             head = _WRITE.pack(block.address + (start + first) * row_words, len(data) // 2, len(data))
             answer = await self._transact(RawPdu(WRITE_MULTIPLE_REGISTERS, head + data), block)
             if answer != head[: _READ.size]:
@@ -189,10 +195,13 @@ class RegisterClient:
         """
         block, codec = self._places[type(record)]
         answer_block, answer_codec = self._places[answer]
-        data = codec.encode(record) + b"".join([self._places[type(row)][1].encode(row) for row in rows])
+        data = _encoded(block, codec, record) + b"".join([self._places[type(row)][1].encode(row) for row in rows])
         head = _READ_WRITE.pack(answer_block.address, answer_codec.size // 2, block.address, len(data) // 2, len(data))
         raw = await self._transact(RawPdu(READ_WRITE_REGISTERS, head + data), block, patience_s)
-        return cast("R", answer_codec.decode(self._checked(raw, answer_codec.size, answer_block), 1))
+        words = self._checked(raw, answer_codec.size, answer_block)
+        if answer_block.sealed:
+            self._check_seal(answer_block, answer_codec, words, 1)
+        return cast("R", answer_codec.decode(words, 1))
 
     def close(self) -> None:
         """Close the connection."""
@@ -206,6 +215,10 @@ class RegisterClient:
         if len(raw) != size + 1 or raw[0] != size:
             raise self._nonsense(block)
         return raw
+
+    def _check_seal(self, block: Block, codec: RecordCodec, raw: bytes, offset: int) -> None:
+        if seal_of(codec, raw, offset) is not Seal.INTACT:
+            raise DamagedAnswerError(f"{self.peer}: block '{block.name}' arrived damaged, or is not sealed there")
 
     async def _transact(self, request: RawPdu, block: Block, patience_s: float | None = None) -> bytes:
         """Send a request, connecting first where needed; return the bytes behind the answer's function code."""
@@ -292,6 +305,10 @@ class RegisterClient:
         return PeerUnreachableError(
             f"{self.peer} answered a request for block '{block.name}' with something else: check host and port"
         )
+
+
+def _encoded(block: Block, codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
+    return codec.encode(sealed(record) if block.sealed else record)
 
 
 def _raise_lost_cancellation() -> None:

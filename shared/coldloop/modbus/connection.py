@@ -7,16 +7,17 @@ wait; then requests that arrive behind it stay in the buffer until its answer is
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator
 from functools import partial
+from itertools import count
 from time import monotonic
 from typing import Final, cast
 
-from coldloop.modbus.access import Caller, caller_at, caller_with
+from coldloop.modbus.access import caller_at, caller_with
 from coldloop.modbus.framing import Frame, MalformedFrameError, framed, next_frame
 from coldloop.modbus.rate_limit import RateLimit
 from coldloop.modbus.refusals import RefusalLog
 from coldloop.modbus.requests import NO_SUCH_UNIT, SERVER_FAILURE, RequestHandler, Written, exception_answer
 from coldloop.modbus.settings import ServerSettings
-from coldloop.registers.bank import ForbiddenWriteError, RefusedAccessError
+from coldloop.registers.bank import ANYBODY, Caller, ForbiddenWriteError, RefusedAccessError
 from coldloop.registers.declaration import Block, Role
 
 INPUT_LIMIT: Final = 64 * 1024
@@ -25,9 +26,10 @@ INPUT_LIMIT: Final = 64 * 1024
 OUTPUT_CHUNK: Final = 16 * 1024
 """Bytes of answers that are written at once; a client that does not take them is not served further."""
 
-OnWrite = Callable[[Block], Awaitable[None] | None]
+OnWrite = Callable[[Block, Caller], Awaitable[None] | None]
 
-_KINDS: Final = {1: "illegal_function", 2: "illegal_address", 3: "illegal_value"}
+_KINDS: Final = {1: "illegal_function", 2: "illegal_address", 3: "illegal_value", 6: "second_writer"}
+_numbers = count(1)
 
 
 class Connection(asyncio.Protocol):
@@ -41,7 +43,7 @@ class Connection(asyncio.Protocol):
     def __init__(
         self,
         *,
-        handler_for: Callable[[frozenset[Role]], RequestHandler],
+        handler_for: Callable[[Caller], RequestHandler],
         settings: ServerSettings,
         on_write: OnWrite,
         refusals: RefusalLog,
@@ -65,6 +67,7 @@ class Connection(asyncio.Protocol):
         self.written_as: set[Role | None] = set()
         self.last_request = monotonic()  # not the loop's time, which uvloop rounds to milliseconds
         self.peer = "?"
+        self.caller = ANYBODY._replace(roles=frozenset())
         self.has_role = False
         """Whether it may write anything."""
 
@@ -101,9 +104,10 @@ class Connection(asyncio.Protocol):
             self._refusals.note("access_refused", self.peer, "this address has no role and may not read")
             self.close()
             return
+        self.caller = caller = caller._replace(connection=next(_numbers))
         self.peer = caller.name
         self.has_role = bool(caller.roles)
-        self._handle = self._handler_for(caller.roles).handle
+        self._handle = self._handler_for(caller).handle
         self._opened(self)
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - why it was lost changes nothing
@@ -208,7 +212,7 @@ class Connection(asyncio.Protocol):
         """Tell the program about the blocks; return the answer, or nothing when the program makes it wait."""
         try:
             for block in blocks:
-                waiting = self._on_write(block)
+                waiting = self._on_write(block, self.caller)
                 if waiting is not None:
                     self._wait = asyncio.ensure_future(waiting)
                     self._wait.add_done_callback(partial(self._go_on, frame, written, blocks))
