@@ -77,7 +77,7 @@ class AlarmPanel:
                 del self._happened[kind]
                 self.returned(kind)
 
-    def command(self, command: AlarmCommand) -> None:
+    def command(self, command: AlarmCommand, who: str = "") -> None:  # noqa: ARG002
         """Do what an operator asks for; what makes no sense changes nothing."""
         kinds = list(AlarmKind) if command.alarm == ALL_ALARMS else [k for k in AlarmKind if k == command.alarm]
         for kind in kinds:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from coldloop.errors import ConfigurationError
 from coldloop.journal import Journal
 from coldloop.limits import InputLimits
-from coldloop.process import L1, T5, TICK_S
+from coldloop.process import L1, T5, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
     Acknowledgement,
@@ -42,6 +42,10 @@ from control_plc.settings import ControlSection, ControlStrategy
 
 HANDSHAKE_PAUSE_S = 30.0
 """After a handshake that came to nothing the classical loops are not held again for so long."""
+SET_BACK_TICKS = TICKS_PER_SAMPLE
+"""Time that goes back by more than this begins anew: what was sent was for a time that is to come again."""
+LOST_TICKS = 4
+"""A rack that has been out of step for longer takes no new sequences: they would be played late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +60,9 @@ class OperatingPoint:
 class ControlProgram:
     """One session of the control PLC. `tick` is the tick of the next scan, or of the one in progress."""
 
-    def __init__(self, *, limits: InputLimits, point: OperatingPoint, section: ControlSection) -> None:
+    def __init__(
+        self, *, limits: InputLimits, point: OperatingPoint, section: ControlSection, journal: Journal | None = None
+    ) -> None:
         self._limits = limits
         self._point = point
         self._section = section
@@ -68,7 +74,7 @@ class ControlProgram:
             )
         self._loops = ClassicalLoops(section.classical, limits, point.outputs)
         self.watchdog = Watchdog(section.ladder.optimizer_ticks)
-        self.journal = Journal()
+        self.journal = journal or Journal()
         self.alarms = AlarmPanel(self.journal)
         self.restart(session=0)
 
@@ -80,11 +86,29 @@ class ControlProgram:
         mode = Mode.CLASSICAL if classical else Mode.HOLD
         self._ladder = Ladder(self._section.ladder.hold_ticks, mode, Cause.SESSION_STARTED)
 
-    def resume(self, session: int, tick: int, applied: Sequence[float], *, updates: int, operator: Operator) -> None:
-        """Go on with a session after a restart: `applied` is what the rack applies at this tick."""
+    def resume(
+        self,
+        session: int,
+        tick: int,
+        applied: Sequence[float],
+        *,
+        updates: int,
+        operator: Operator,
+        playing: InputSequence | None = None,
+    ) -> None:
+        """Go on with a session after a restart.
+
+        Args:
+            session: Its number.
+            tick: Where the rack is.
+            applied: What it applies.
+            updates: Number of the next update.
+            operator: What operators have said.
+            playing: What was being played: its rest is played on.
+        """
         self.operator = operator
         self._begin(session, tick, SequenceRow(*applied), updates=updates)
-        self._player.invite(tick)
+        self._player.resume(playing, tick)
         self._ladder = Ladder(self._section.ladder.hold_ticks, Mode.HOLD, Cause.RESTARTED, tick)
 
     def _begin(self, session: int, tick: int, applied: SequenceRow, *, updates: int) -> None:
@@ -210,7 +234,7 @@ class ControlProgram:
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
         applied = tuple(self._guard.applied)
-        y = tuple(self._sensors.check(measurement.y))
+        y = tuple(self._sensors.check(self.tick, measurement.y))
         self.process = Process(self.tick, measurement.load, applied, y)
         finite = math.isfinite(measurement.load) and all(map(math.isfinite, measurement.x))
         self._let_play(usable=finite and not self._sensors.unusable)
@@ -235,11 +259,34 @@ class ControlProgram:
         elif not invited and self._player.invited:
             self._player.dismiss()
 
+    def interrupt(self) -> None:
+        """Give up the scan under way: what the rack has done with its outputs is not known."""
+        self._in_scan = False
+
     def rejoin(self, tick: int, applied: Sequence[float]) -> None:
-        """Go on at another tick: the plant was away, or time has leapt; `applied` is what the rack applies."""
-        self.tick = tick
+        """Go on at another tick: the rack was away, or time has leapt.
+
+        Forward, all timers count the time that has passed. Back by a little, they begin at the present tick at the
+        latest; back by more than `SET_BACK_TICKS`, sequences are dropped too, and the optimiser is invited anew.
+
+        Args:
+            tick: Tick of the next scan.
+            applied: What the rack applies, read back from it.
+        """
+        if tick < self.tick:
+            self._set_back(tick)
+        self.tick = self.alarms.now = tick
         self._in_scan = False
         self._guard.begin_at(self.tick, SequenceRow(*applied))
+
+    def _set_back(self, tick: int) -> None:
+        if self.tick - tick > SET_BACK_TICKS:
+            self._player.set_back(tick)
+        self._sensors.set_back(tick)
+        self._ladder.set_back(tick)
+        self.watchdog.set_back(tick)
+        self._failed_handshake = min(self._failed_handshake, tick)
+        self.alarms.begin_at(tick)
 
     # -- alarms --------------------------------------------------------------------------------------------------------
 
@@ -275,7 +322,7 @@ class ControlProgram:
     def optimizer_seen(self) -> None:
         """Note a sign of life of the optimiser."""
         self.optimizer_present = True
-        self.watchdog.trigger(self.tick)
+        self.watchdog.trigger(max(self.tick, self.alarms.now))
 
     def optimizer_lost(self) -> None:
         """Go on without the optimiser until it shows a sign of life; the alarm is raised by the next scan's end."""
@@ -299,7 +346,8 @@ class ControlProgram:
     def offer(self, sequence: InputSequence) -> Acknowledgement:
         """Check a committed sequence; accept it for its first tick, or reject it with a reason."""
         self.optimizer_seen()
-        answer = self._player.offer(sequence, self._earliest)
+        lost = self.alarms.now - self.tick > LOST_TICKS
+        answer = self._player.offer(sequence, self._earliest, plant_lost=lost)
         accepted = answer.verdict == Verdict.ACCEPTED
         self.alarms.holds(AlarmKind.SEQUENCE_REJECTED, condition=not accepted, cause=answer.verdict)
         if accepted or answer.verdict == Verdict.WRONG_MODEL:

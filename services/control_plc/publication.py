@@ -1,17 +1,23 @@
 """What the control PLC shows: registers, log and telemetry, made from the program's state."""
 
 import logging
+import math
 from collections.abc import Mapping
 
 from coldloop.clock import LatenessRecord
 from coldloop.journal import JournalPublication
+from coldloop.lease import Lease
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
-from coldloop.registers.control_plc import CONTROL_MAP, Cause, LadderStatus, Mode, Process, Status
+from coldloop.registers.control_plc import CONTROL_MAP, Cause, LadderStatus, Mode, PlantLinkStatus, Process, Status
 from coldloop.registers.safety import AlarmKind, AlarmState
+from control_plc.plant_link import PlantLink
 from control_plc.program import ControlProgram
+from control_plc.rack_clock import Skew
+
+ALARM_EVENTS = range(EventKind.ALARM_RAISED, EventKind.ALARM_IN_SERVICE + 1)
 
 log = logging.getLogger("coldloop.control_plc")
 
@@ -19,8 +25,9 @@ log = logging.getLogger("coldloop.control_plc")
 class Publication:
     """Puts the program's state into the registers."""
 
-    def __init__(self, program: ControlProgram, bank: RegisterBank, model_digest: int) -> None:
+    def __init__(self, program: ControlProgram, link: PlantLink, bank: RegisterBank, model_digest: int) -> None:
         self._program = program
+        self._link = link
         self._bank = bank
         self._model_digest = model_digest
         self.journal = JournalPublication(program.journal, bank)
@@ -29,8 +36,20 @@ class Publication:
         """A session is under way."""
         self.overruns = 0
         """Scans that began too late."""
-        self.lateness: LatenessRecord | None = None
-        """That of all scans; None in lock-step."""
+        self.lateness = LatenessRecord()
+        """That of all scans of this session in real time."""
+        self.skew = Skew(0.0, math.inf)
+        """How much faster the rack's clock is than ours, and its phase error."""
+        self.offset_ms = 0.0
+        self.lease: Lease | None = None
+        """That of the optimiser."""
+
+    def begin(self) -> None:
+        """Count anew: a session begins."""
+        self.running = True
+        self.overruns = 0
+        self.lateness = LatenessRecord()
+        self.skew, self.offset_ms = Skew(0.0, math.inf), 0.0
 
     def identity(self) -> None:
         """Show who we are, and the tick."""
@@ -62,8 +81,8 @@ class Publication:
                 rejected=player.rejected,
                 deadline_misses=player.deadline_misses,
                 overruns=self.overruns,
-                lateness_max=lateness.maximum_s * 1000 if lateness else 0.0,
-                lateness_p99=lateness.percentile_s(0.99) * 1000 if lateness else 0.0,
+                lateness_max=lateness.maximum_s * 1000,
+                lateness_p99=lateness.percentile_s(0.99) * 1000,
             )
         )
 
@@ -92,6 +111,25 @@ class Publication:
             )
         )
         self._bank.put(program.watchdog.registers(program.tick))
+        self._bank.put(self._plant_link())
+        if self.lease is not None:
+            self._bank.put(self.lease.registers())
+
+    def _plant_link(self) -> PlantLinkStatus:
+        link = self._link
+        return PlantLinkStatus(
+            state=link.state,
+            cause=link.cause,
+            since=link.since,
+            breaks=link.breaks & 0xFFFFFFFF,
+            holder=link.holder,
+            generation=link.generation,
+            plant_session=link.session,
+            plant_tick=link.tick,
+            offset=self.offset_ms,
+            skew=self.skew.ppm,
+            skew_error=self.skew.error_ppm,
+        )
 
     @staticmethod
     def _log(event: Event) -> None:
@@ -106,7 +144,8 @@ class Publication:
             )  # fmt: skip
             return
         what = kind.name.lower().replace("_", " ")
-        extra = {"alarm": AlarmKind(event.subject).name.lower(), "tick": event.tick, "cause": event.cause}
+        about = {"alarm": AlarmKind(event.subject).name.lower()} if kind in ALARM_EVENTS else {"subject": event.subject}
+        extra = {**about, "tick": event.tick, "cause": event.cause}
         log.log(logging.WARNING if kind is EventKind.ALARM_RAISED else logging.INFO, what, extra=extra)
 
     def snapshot(self) -> Mapping[str, object]:

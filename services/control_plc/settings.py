@@ -90,6 +90,8 @@ class ControlSection(BaseModel):
     plant: PlantEndpoint = PlantEndpoint()
     scan_tolerance_ms: Annotated[float, Field(gt=0)] = 5.0
     """Lateness of a scan, in real time, that counts as an overrun."""
+    skew_alarm_ppm: Annotated[float, Field(gt=0)] = 500.0
+    """How much the rack's clock and ours may differ in real time before the alarm is raised."""
     driver: ControlStrategy = ControlStrategy.MPC
     classical: ClassicalSettings = ClassicalSettings()
     ladder: LadderSettings = LadderSettings()

@@ -1,5 +1,6 @@
 """Whatever the interleaving of writes, losses, restarts and ticks: the contract and the ladder as a state machine."""
 
+import json
 import math
 from itertools import pairwise
 
@@ -29,7 +30,7 @@ from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, Ala
 from coldloop.sequence import InputSequence, with_checksum
 from coldloop.session import Pace
 from control_plc.program import ControlProgram
-from control_plc.retained_state import RetainedState
+from control_plc.retained_state import Memory, RetainedState
 from control_plc.runtime import make_program
 from control_plc.settings import ControlSection
 
@@ -212,8 +213,8 @@ class Link(RuleBasedStateMachine):
     @precondition(lambda self: self.program.tick > 0)
     @rule()
     def the_control_plc_is_killed_and_comes_back(self) -> None:
-        state = RetainedState.of(self.program, Pace(realtime=False, factor=1.0)).model_dump(mode="json")
-        kept = RetainedState.parsed(state)
+        content = Memory(None, HEADER.short_digest).content(self.program, Pace(realtime=False, factor=1.0))
+        kept = RetainedState.parsed(json.loads(json.dumps(content)))
         self.program = self.new_program()
         self.program.alarms.rows = list(kept.alarms)
         self.program.resume(kept.session, kept.tick, self.trace[-1], updates=kept.updates, operator=kept.operator)

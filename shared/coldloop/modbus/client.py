@@ -112,6 +112,11 @@ class RegisterClient:
         """The server, as messages name it."""
         return f"{self._map.service} at {self._host}:{self._port}"
 
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection; without one the next request makes one."""
+        return bool(self._client.connected)
+
     async def connect(self, patience_s: float) -> None:
         """Connect, and make sure that the peer speaks this register map in this word order.
 

@@ -68,8 +68,6 @@ class Verdict(IntEnum):
     """No sequence is played now: an operator drives, or a sensor that MPC needs is bad."""
     PLANT_LOST = 12
     """The rack has not been in step for a while."""
-    TOO_FAST = 13
-    """It uses a rate more often than the slew limit allows."""
 
 
 class PlantLinkState(IntEnum):
@@ -204,7 +202,7 @@ class Acknowledgement(NamedTuple):
         int,
         u16(
             "0 none, 1 accepted, 2 late, 3 wrong update, 4 wrong tick, 5 wrong length, 6 wrong model, 7 bad CRC, "
-            "8 out of range, 9 rate exceeded, 10 repeated, 11 not invited, 12 plant lost, 13 too fast"
+            "8 out of range, 9 rate exceeded, 10 repeated, 11 not invited, 12 plant lost"
         ),
     ]
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
