@@ -3,13 +3,14 @@
 import asyncio
 import inspect
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import pytest
 
 from coldloop.config import PREFIX
 from rig import cli
+from rig.ports import ReservedPorts
 
 PATIENCE_S = 120.0
 """A coroutine has failed when it takes longer; the first one on a bus may have to compile the kernels."""
@@ -35,6 +36,13 @@ def _no_configuration_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in tuple(os.environ):
         if name.startswith(PREFIX):
             monkeypatch.delenv(name)
+
+
+@pytest.fixture
+def free_port() -> Iterator[int]:
+    """A port on localhost that nobody else gets during the test; connections are refused until a server listens."""
+    with ReservedPorts(1) as reserved:
+        yield reserved.numbers[0]
 
 
 class Outcome(NamedTuple):

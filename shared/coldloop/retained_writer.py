@@ -21,7 +21,8 @@ CLOSING_S: Final = 2.0
 class RetainedStateWriter:
     """Writes the newest state to a file, whenever there is a newer one than that on the disk.
 
-    A failure is logged once, and so is the first write after it that succeeds; meanwhile the newest state is tried again.
+    A failure is logged once, and so is the first write after it that succeeds; until then the newest state is tried
+    again and again.
 
     Args:
         file: Where to.
@@ -41,7 +42,7 @@ class RetainedStateWriter:
         self._newest: Mapping[str, Any] | None = None
         self._kept = self._written = 0
         """Number of the newest state, and of the one on the disk."""
-        self._closed = False
+        self._closed = self._ended = False
         self._thread = threading.Thread(target=self._run, name="retained state", daemon=True)
         self._thread.start()
 
@@ -60,22 +61,18 @@ class RetainedStateWriter:
         """Wait until the newest state is on the disk; return whether it is, in time."""
         end = time.monotonic() + within_s
         with self._changed:
-            while self._written < self._kept:
-                if self.failed is not None and self._closed:
-                    return False
+            while self._written < self._kept and not self._ended:
                 if not self._changed.wait(end - time.monotonic()):
                     return False
-        return True
+            return self._written == self._kept
 
     def close(self, within_s: float = CLOSING_S) -> bool:
         """Write the newest state and end the thread; return whether the state is on the disk, in time."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        done = self.flush(within_s)
-        if done:
-            self._thread.join(within_s)
-        return done
+        self._thread.join(within_s)
+        return self.flush(0.0)
 
     def _run(self) -> None:
         while True:
@@ -86,9 +83,12 @@ class RetainedStateWriter:
             if state is not None and self._written < number:
                 self._write(state, number)
             if closing:
-                return
+                break
             with self._changed:  # a close ends the pause
                 self._changed.wait_for(lambda: self._closed, self._retry_s if self.failed else self._pause_s)
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
 
     def _write(self, state: Mapping[str, Any], number: int) -> None:
         try:
@@ -107,5 +107,3 @@ class RetainedStateWriter:
             log.error("the state is not retained", extra={"reason": failure})
         elif failure is None and before is not None:
             log.warning("the state is retained again", extra={"file": str(self._file.path)})
-        with self._changed:
-            self._changed.notify_all()

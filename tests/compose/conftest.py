@@ -3,16 +3,16 @@
 import json
 import os
 import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from rig.ports import ReservedPorts
 
 ROOT = Path(__file__).parents[2]
 SERVICES = ("plant", "control-plc", "optimizer-plc")
@@ -57,7 +57,8 @@ def rig() -> Iterator[ComposedRig]:
         if "CONTAINER_ENGINE_REQUIRED" in os.environ:
             pytest.fail("no container engine runs, or it has no `docker compose`", pytrace=False)
         pytest.skip("no container engine runs here")
-    ports = _free_ports(4)
+    reserved = ReservedPorts(4)
+    ports = reserved.numbers
     names = ("COLDLOOP_PLANT_PORT", "COLDLOOP_CONTROL_PLC_PORT", "COLDLOOP_OPTIMIZER_PLC_PORT", "COLDLOOP_MQTT_PORT")
     published = {name: str(port) for name, port in zip(names, ports, strict=True)}
     rig = ComposedRig({**os.environ, **published, "COMPOSE_PROJECT_NAME": f"coldloop-test-{os.getpid()}"}, *ports)
@@ -67,6 +68,7 @@ def rig() -> Iterator[ComposedRig]:
         yield rig
     finally:
         rig.compose("down", "--volumes", "--rmi", "local", "--timeout", "5", check=False)
+        reserved.release()
 
 
 def _bring_up(rig: ComposedRig) -> None:
@@ -88,12 +90,6 @@ def _engine_runs() -> bool:
         )
     except (OSError, subprocess.TimeoutExpired):
         return False
-
-
-def _free_ports(count: int) -> list[int]:
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
-        return [one.getsockname()[1] for one in sockets]
 
 
 @pytest.fixture

@@ -14,11 +14,6 @@ import pytest
 PROGRAM = Path(__file__).parents[2] / "docker" / "healthcheck.py"
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
-
-
 def check(port: int) -> "subprocess.CompletedProcess[str]":
     environment = {**os.environ, "SERVICE": "control_plc", "COLDLOOP__CONTROL_PLC__SERVER__PORT": str(port)}
     command = [sys.executable, "-I", "-S", str(PROGRAM)]
@@ -26,13 +21,12 @@ def check(port: int) -> "subprocess.CompletedProcess[str]":
 
 
 @pytest.fixture(params=["high-first", "low-first"])
-def control_plc(request: pytest.FixtureRequest) -> Iterator[int]:
-    port = free_port()
-    settings = [f"server.port={port}", f"word_order={request.param}", "plant.port=1", "plant.patience_s=60"]
+def control_plc(request: pytest.FixtureRequest, free_port: int) -> Iterator[int]:
+    settings = [f"server.port={free_port}", f"word_order={request.param}", "plant.port=1", "plant.patience_s=60"]
     command = [sys.executable, "-m", "control_plc", *[f"--set=control_plc.{setting}" for setting in settings]]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     try:
-        yield port
+        yield free_port
     finally:
         process.terminate()
         process.wait(timeout=20)
@@ -45,8 +39,8 @@ def test_a_service_that_answers_is_healthy(control_plc: int) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_port_on_which_nobody_listens_is_not() -> None:
-    done = check(free_port())
+def test_a_port_on_which_nobody_listens_is_not(free_port: int) -> None:
+    done = check(free_port)
     assert done.returncode == 1
     assert "control_plc on port" in done.stderr
 

@@ -38,12 +38,6 @@ async def client_of(
         client.close()
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.mark.parametrize("order", WordOrder)
 async def test_records_travel_both_ways_in_either_word_order(serve: "Serve", order: WordOrder) -> None:
     async with serve(order=order) as running, client_of(running.server.port, order=order) as client:
@@ -92,19 +86,17 @@ async def test_a_refusal_says_who_refused_what(serve: "Serve") -> None:
         assert await client.read(Actuators) == Actuators(0, 0.0, 0.0, 0.0, 0)
 
 
-async def test_nobody_listens() -> None:
-    port = free_port()
-    async with client_of(port) as client:
-        with pytest.raises(PeerUnreachableError, match=rf"^nobody listens as plant at 127.0.0.1:{port}: start it"):
+async def test_nobody_listens(free_port: int) -> None:
+    async with client_of(free_port) as client:
+        with pytest.raises(PeerUnreachableError, match=rf"^nobody listens as plant at 127.0.0.1:{free_port}: start it"):
             await client.connect(0.0)
 
 
-async def test_patience_outlasts_a_server_that_starts_late(serve: "Serve") -> None:
-    port = free_port()
-    async with client_of(port) as client:
+async def test_patience_outlasts_a_server_that_starts_late(serve: "Serve", free_port: int) -> None:
+    async with client_of(free_port) as client:
         connecting = asyncio.ensure_future(client.connect(15.0))
         await asyncio.sleep(0)
-        async with serve(port=port):
+        async with serve(port=free_port):
             await connecting
             assert (await client.read(Identity)).map_digest == PLANT_MAP.digest
 

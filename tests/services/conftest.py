@@ -5,7 +5,6 @@ import contextlib
 import json
 import os
 import shutil
-import socket
 import struct
 import subprocess
 import sys
@@ -18,13 +17,7 @@ import aiomqtt
 import pytest
 
 from coldloop.config import PREFIX
-
-
-@pytest.fixture
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as one:
-        return int(one.getsockname()[1])
-
+from rig.ports import ReservedPorts
 
 # -- processes ---------------------------------------------------------------------------------------------------------
 
@@ -33,15 +26,24 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Start a service with `--set` assignments; what is still running at the end of the test is killed."""
-    started: list[subprocess.Popen[str]] = []
+    """Start a service with `--set` assignments; what is still running at the end of the test is killed.
 
-    def one(service: str, *assignments: str, level: str = "error") -> subprocess.Popen[str]:
+    It listens on any free port, and looks for its peer where nobody listens, unless the assignments say otherwise.
+    """
+    started: list[subprocess.Popen[str]] = []
+    nobody = ReservedPorts(1)
+
+    def one(
+        service: str, *assignments: str, level: str = "error", stderr: int = subprocess.PIPE
+    ) -> subprocess.Popen[str]:
+        ports = {"plant": [], "control_plc": ["plant"], "optimizer_plc": ["control_plc"]}[service]
+        peers = [f"{service}.{peer}.port={nobody.numbers[0]}" for peer in ports]
+        chosen = [f"--set={text}" for text in (f"{service}.server.port=0", *peers, *assignments)]
         started.append(
             subprocess.Popen(
-                [sys.executable, "-m", service, "--log-level", level, *[f"--set={text}" for text in assignments]],
+                [sys.executable, "-m", service, "--log-level", level, *chosen],
                 env={name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
-                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stderr, text=True,
             )
         )  # fmt: skip
         return started[-1]
@@ -50,6 +52,25 @@ def start() -> Iterator[Start]:
     for process in started:
         process.kill()
         process.communicate()
+    nobody.release()
+
+
+ServingPort = Callable[["subprocess.Popen[str]"], int]
+
+
+@pytest.fixture
+def serving_port() -> ServingPort:
+    """Wait until a service that was started with `level="info"` serves; return the port that it got."""
+
+    def read(process: "subprocess.Popen[str]") -> int:
+        assert process.stderr is not None
+        for line in process.stderr:
+            said = json.loads(line)
+            if said["event"] == "serving":
+                return int(said["port"])
+        raise AssertionError(f"ended with {process.wait()} before it served")
+
+    return read
 
 
 # -- brokers -----------------------------------------------------------------------------------------------------------

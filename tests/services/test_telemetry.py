@@ -58,7 +58,7 @@ async def test_a_service_is_online_shows_itself_and_goes_offline_in_good_order(b
 async def test_a_service_that_is_killed_leaves_its_last_will(broker: "Serve", free_port: int, start: "Start") -> None:
     async with broker(free_port) as known:
         service = start(
-            "control_plc", "control_plc.server.port=0", "telemetry.broker=127.0.0.1", f"telemetry.port={free_port}",
+            "control_plc", "telemetry.broker=127.0.0.1", f"telemetry.port={free_port}",
             "telemetry.prefix=hall-3",
         )  # fmt: skip
         await keeps(known, "hall-3/control_plc/state", ONLINE)
