@@ -17,7 +17,7 @@ import pytest
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, OnWrite, ServerSettings
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import client_context
-from coldloop.registers.bank import RegisterBank
+from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap, Role
@@ -101,7 +101,7 @@ async def served(
     bank.put(Identity(map_digest=register_map.digest, map_version=register_map.version))
     written: list[str] = []
 
-    def note(block: Block) -> None:
+    def note(block: Block, _caller: Caller) -> None:
         written.append(block.name)
 
     server = ModbusServer(

@@ -14,7 +14,7 @@ from coldloop.modbus.identification import DeviceIdentity
 from coldloop.modbus.refusals import RefusalLog
 from coldloop.modbus.requests import RequestHandler, Written
 from coldloop.modbus.settings import ServerSettings
-from coldloop.registers.bank import RefusedAccessError, RegisterBank
+from coldloop.registers.bank import Caller, RefusedAccessError, RegisterBank
 from coldloop.registers.declaration import Role
 from rig.register_listing import MAPS
 
@@ -69,7 +69,7 @@ def test_a_request_is_carried_out_or_refused_and_only_writers_store(
 ) -> None:
     bank = BANKS[service]
     before = memory(bank)
-    outcome = carried_out(RequestHandler(bank, IDENTITY, roles), pdu)
+    outcome = carried_out(RequestHandler(bank, IDENTITY, Caller("client", roles)), pdu)
     if isinstance(outcome, Written):
         assert_stored_by_writers_only(bank, before, roles)
         outcome = outcome.answer()
@@ -111,9 +111,9 @@ def connected(
     bank: RegisterBank, refusals: RefusalLog, access: dict[str, list[str]]
 ) -> tuple[Connection, FakeTransport]:
     connection = Connection(
-        handler_for=lambda roles: RequestHandler(bank, IDENTITY, roles),
+        handler_for=lambda caller: RequestHandler(bank, IDENTITY, caller),
         settings=ServerSettings.model_validate({"port": 0, "access": access}),
-        on_write=lambda _block: None,
+        on_write=lambda _block, _caller: None,
         refusals=refusals,
         opened=lambda _connection: True,
         lost=lambda _connection: None,
