@@ -39,8 +39,8 @@ _READ: Final = struct.Struct(">HH")
 _WRITE: Final = struct.Struct(">HHB")
 _READ_WRITE: Final = struct.Struct(">HHHHB")
 _EXCEPTIONS: Final = {
-    1: "illegal function",
-    2: "no such register, or not for this client to write",
+    1: "no such function, or not for the role of this client",
+    2: "no such register, or read-only",
     3: "illegal value",
     4: "failure in the server",
     6: "somebody else holds the lease of this role",

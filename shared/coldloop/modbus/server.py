@@ -17,6 +17,7 @@ from coldloop.modbus.requests import RequestHandler
 from coldloop.modbus.settings import ServerSettings
 from coldloop.modbus.tls import server_context
 from coldloop.modbus.tls_listener import TlsListener
+from coldloop.modbus.turns import Turns
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import ServerStatistics
 from coldloop.registers.declaration import Role
@@ -70,6 +71,7 @@ class ModbusServer:
         self._on_close = on_close
         self._handler_for = partial(RequestHandler, bank, identity)
         self._refusals = RefusalLog(bank.map.service, on_refusal)
+        self._turns = Turns()
         self._closing = False
         self._accepted = self._past_requests = 0
         self._connections: dict[Connection, None] = {}  # in the order of their arrival
@@ -154,6 +156,7 @@ class ModbusServer:
             settings=self._settings,
             on_write=self._on_write,
             refusals=self._refusals,
+            turns=self._turns,
             opened=self._admit,
             lost=self._forget,
         )

@@ -46,8 +46,11 @@ class IllegalAddressError(RefusedAccessError):
         super().__init__(2, reason)
 
 
-class ForbiddenWriteError(IllegalAddressError):
-    """Exception 02: a register that somebody else writes."""
+class ForbiddenWriteError(RefusedAccessError):
+    """Exception 01: a register that another role writes, as Modbus/TCP Security asks for where a role is refused."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(1, reason)
 
 
 class BusyError(RefusedAccessError):
