@@ -4,12 +4,12 @@ import logging
 from collections.abc import Mapping
 
 from coldloop.clock import LatenessRecord
+from coldloop.event_text import log_event
 from coldloop.journal import JournalPublication
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
-from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
-from coldloop.registers.control_plc import CONTROL_MAP, Cause, LadderStatus, Mode, Process, Status
+from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, Process, Status
 from coldloop.registers.safety import AlarmKind, AlarmState
 from control_plc.program import ControlProgram
 
@@ -76,7 +76,7 @@ class Publication:
         """Show ladder, watchdog, alarms and events, as far as they have changed, and log the events."""
         program = self._program
         for event in self.journal.show():
-            self._log(event)
+            log_event(log, event)
         if program.alarms.changes != self._told_alarms:
             self._told_alarms = program.alarms.changes
             for row, alarm in enumerate(program.alarms.rows):
@@ -92,22 +92,6 @@ class Publication:
             )
         )
         self._bank.put(program.watchdog.registers(program.tick))
-
-    @staticmethod
-    def _log(event: Event) -> None:
-        kind = EventKind(event.kind)
-        if kind is EventKind.MODE:
-            log.warning(
-                "mode changed",
-                extra={
-                    "mode": Mode(event.subject).name.lower(), "tick": event.tick,
-                    "cause": Cause(event.cause).name.lower(),
-                },
-            )  # fmt: skip
-            return
-        what = kind.name.lower().replace("_", " ")
-        extra = {"alarm": AlarmKind(event.subject).name.lower(), "tick": event.tick, "cause": event.cause}
-        log.log(logging.WARNING if kind is EventKind.ALARM_RAISED else logging.INFO, what, extra=extra)
 
     def snapshot(self) -> Mapping[str, object]:
         """Return what telemetry publishes."""
