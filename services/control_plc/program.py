@@ -75,7 +75,7 @@ class ControlProgram:
         self._loops = ClassicalLoops(section.classical, limits, point.outputs)
         self.watchdog = Watchdog(section.ladder.optimizer_ticks)
         self.journal = journal or Journal()
-        self.alarms = AlarmPanel(self.journal)
+        self.alarms = AlarmPanel(self.journal, section.alarms)
         self.restart(session=0)
 
     def restart(self, session: int) -> None:
@@ -122,7 +122,6 @@ class ControlProgram:
         self._before = self._guard.applied
         self._player = SequencePlayer(self._guard, self._point.model_digest, updates=updates)
         self._sensors = SensorMonitor(self._section.sensors, self._point.outputs)
-        self._outside = {AlarmKind.LEVEL_BAND: 0, AlarmKind.T5_BAND: 0}
         self._failed_handshake = -math.inf
         self._in_scan = False
         self.watchdog.set(self.watchdog.time, tick)
@@ -293,8 +292,11 @@ class ControlProgram:
     def _watch(self, y: Sequence[float]) -> None:
         """Raise and return the alarms that depend on the process and on the ladder."""
         holds, bands = self.alarms.holds, self._section.alarms
-        self._watch_band(AlarmKind.LEVEL_BAND, y[L1], bands.level_band)
-        self._watch_band(AlarmKind.T5_BAND, y[T5], bands.t5_band)
+        for kind, value, (low, high) in (
+            (AlarmKind.LEVEL_BAND, y[L1], bands.level_band),
+            (AlarmKind.T5_BAND, y[T5], bands.t5_band),
+        ):
+            holds(kind, condition=not low <= value <= high)
         mode, cause = self._ladder.mode, self._ladder.cause
         fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR)
         holds(AlarmKind.MODE, condition=fallen, cause=cause)
@@ -312,10 +314,6 @@ class ControlProgram:
         if not bad:
             self.alarms.returned(AlarmKind.SENSOR_BAD)
         self._bad_before = bad
-
-    def _watch_band(self, kind: AlarmKind, value: float, band: tuple[float, float]) -> None:
-        self._outside[kind] = 0 if band[0] <= value <= band[1] else self._outside[kind] + 1
-        self.alarms.holds(kind, condition=self._outside[kind] > self._section.alarms.band_ticks)
 
     # -- the optimiser's side ------------------------------------------------------------------------------------------
 

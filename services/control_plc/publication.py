@@ -5,19 +5,17 @@ import math
 from collections.abc import Mapping
 
 from coldloop.clock import LatenessRecord
+from coldloop.event_text import log_event
 from coldloop.journal import JournalPublication
 from coldloop.lease import Lease
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
-from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
-from coldloop.registers.control_plc import CONTROL_MAP, Cause, LadderStatus, Mode, PlantLinkStatus, Process, Status
+from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, PlantLinkStatus, Process, Status
 from coldloop.registers.safety import AlarmKind, AlarmState
 from control_plc.plant_link import PlantLink
 from control_plc.program import ControlProgram
 from control_plc.rack_clock import Skew
-
-ALARM_EVENTS = range(EventKind.ALARM_RAISED, EventKind.ALARM_IN_SERVICE + 1)
 
 log = logging.getLogger("coldloop.control_plc")
 
@@ -95,7 +93,7 @@ class Publication:
         """Show ladder, watchdog, alarms and events, as far as they have changed, and log the events."""
         program = self._program
         for event in self.journal.show():
-            self._log(event)
+            log_event(log, event)
         if program.alarms.changes != self._told_alarms:
             self._told_alarms = program.alarms.changes
             for row, alarm in enumerate(program.alarms.rows):
@@ -130,23 +128,6 @@ class Publication:
             skew=self.skew.ppm,
             skew_error=self.skew.error_ppm,
         )
-
-    @staticmethod
-    def _log(event: Event) -> None:
-        kind = EventKind(event.kind)
-        if kind is EventKind.MODE:
-            log.warning(
-                "mode changed",
-                extra={
-                    "mode": Mode(event.subject).name.lower(), "tick": event.tick,
-                    "cause": Cause(event.cause).name.lower(),
-                },
-            )  # fmt: skip
-            return
-        what = kind.name.lower().replace("_", " ")
-        about = {"alarm": AlarmKind(event.subject).name.lower()} if kind in ALARM_EVENTS else {"subject": event.subject}
-        extra = {**about, "tick": event.tick, "cause": event.cause}
-        log.log(logging.WARNING if kind is EventKind.ALARM_RAISED else logging.INFO, what, extra=extra)
 
     def snapshot(self) -> Mapping[str, object]:
         """Return what telemetry publishes."""

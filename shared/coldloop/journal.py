@@ -5,7 +5,6 @@ shown in registers (the last ones, and those that a query selects) and are writt
 """
 
 import time
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable
 from itertools import islice
@@ -26,6 +25,8 @@ from coldloop.registers.text import to_words
 
 KEPT: Final = 10_000
 """Events kept in memory."""
+LOOKED_AT: Final = 500
+"""Events that one query looks at, so that its answer takes a fraction of a millisecond."""
 ANY_SUBJECT: Final = 0xFFFF
 
 
@@ -40,51 +41,83 @@ class Journal:
 
     def __init__(self, *, boot: int = 1, count: int = 0, now: Callable[[], float] = time.time) -> None:
         self.boot = boot
-        self.count = count
+        self.before = count
+        """Number of the last event before this start."""
+        self.noted = 0
+        """Events of this start."""
         self._now = now
         self._events: deque[Event] = deque(maxlen=KEPT)
 
-    def continue_from(self, boot: int, count: int) -> None:
-        """Number on from before a restart; the events of this start so far keep their order."""
-        kept = [event._replace(number=count + place, boot=boot) for place, event in enumerate(self._events, 1)]
-        self.boot, self.count = boot, count + len(kept)
-        self._events = deque(kept, maxlen=KEPT)
-
-    def note(
-        self, tick: int, kind: EventKind, subject: int = 0, cause: int = 0, *, value: float = 0.0, who: str = ""
-    ) -> None:
-        """Add an event."""
-        self.count += 1
-        seconds = self._now()
-        self._events.append(
-            Event(
-                self.count, self.boot & 0xFFFF, tick & 0xFFFFFFFF, int(seconds), int(seconds % 1 * 1000), kind,
-                subject & 0xFFFF, cause & 0xFFFF, value, to_words(who, WHO_WORDS),
-            )
-        )  # fmt: skip
+    @property
+    def count(self) -> int:
+        """Number of the newest event; 0 is none."""
+        return self.before + self.noted
 
     @property
     def oldest(self) -> int:
         """Number of the oldest event kept; 0 is none."""
         return self._events[0].number if self._events else 0
 
+    def continue_from(self, boot: int, count: int) -> None:
+        """Number on from before a restart.
+
+        Args:
+            boot: Number of this start.
+            count: Number of the last event before it; those of this start so far are numbered anew behind it.
+        """
+        moved = count - self.before
+        self._events = deque(
+            [event._replace(number=event.number + moved, boot=boot & 0xFFFF) for event in self._events], maxlen=KEPT
+        )
+        self.boot, self.before = boot, count
+
+    def note(
+        self, tick: int, kind: EventKind, subject: int = 0, cause: int = 0, *, value: float = 0.0, who: str = ""
+    ) -> None:
+        """Add an event.
+
+        Args:
+            tick: Tick of plant time.
+            kind: What happened.
+            subject: Of what; depends on the kind.
+            cause: Why; depends on the kind.
+            value: A value; depends on the kind.
+            who: Whose request it was: address, role, certificate.
+        """
+        self.noted += 1
+        milliseconds = max(0, int(self._now() * 1000))
+        self._events.append(
+            Event(
+                self.count, self.boot & 0xFFFF, tick & 0xFFFFFFFF, milliseconds // 1000 & 0xFFFFFFFF,
+                milliseconds % 1000, kind, subject & 0xFFFF, cause & 0xFFFF, value, to_words(who, WHO_WORDS),
+            )
+        )  # fmt: skip
+
     def since(self, number: int) -> list[Event]:
         """Return the events after event `number`, those that are still kept."""
-        if number >= self.count:
-            return []
-        return list(islice(self._events, max(0, number + 1 - self.oldest), None))
+        return self.last(self.count - number)
+
+    def last(self, events: int) -> list[Event]:
+        """Return the last events, oldest first, at most so many and those that are still kept."""
+        newest_first = islice(reversed(self._events), max(0, events))
+        return list(newest_first)[::-1]
 
     def select(self, query: JournalQuery) -> tuple[JournalPage, list[JournalAnswer]]:
-        """Return the first events that a query selects, and where to go on."""
+        """Return the first events that a query selects, and where to go on.
+
+        At most `LOOKED_AT` events are looked at: a page may have fewer events than fit, even none, and `next_first`
+        still says that there is more.
+        """
+        place = max(0, query.first - self.oldest)
         found: list[JournalAnswer] = []
-        numbers = range(self.oldest, self.count + 1)
-        for event in islice(self._events, bisect_left(numbers, query.first), None):
-            if len(found) == QUERY_ROWS:
-                return JournalPage(self.oldest, self.count, len(found), event.number), found
-            kind, subject = query.kind in (0, event.kind), query.subject in (ANY_SUBJECT, event.subject)
-            if kind and subject:
+        for event in islice(self._events, place, place + LOOKED_AT):
+            place += 1
+            if query.kind in (0, event.kind) and query.subject in (ANY_SUBJECT, event.subject):
                 found.append(JournalAnswer(*event))
-        return JournalPage(self.oldest, self.count, len(found), 0), found
+                if len(found) == QUERY_ROWS:
+                    break
+        next_first = self.oldest + place if place < len(self._events) else 0
+        return JournalPage(self.oldest, self.count, len(found), next_first), found
 
 
 class JournalPublication:
@@ -93,22 +126,34 @@ class JournalPublication:
     def __init__(self, journal: Journal, bank: RegisterBank) -> None:
         self._journal = journal
         self._bank = bank
-        self._shown = journal.count
+        self._shown = journal.noted
+        self._start = journal.boot, journal.before
 
     @property
     def is_behind(self) -> bool:
-        """There are events that have not been shown."""
-        return self._journal.count != self._shown
+        """There are events that have not been shown, or not with the numbers that they have by now."""
+        return self._journal.noted != self._shown or self._renumbered
+
+    @property
+    def _renumbered(self) -> bool:
+        return self._start != (self._journal.boot, self._journal.before)
 
     def show(self) -> list[Event]:
         """Put new events into the registers; return them."""
-        events = self._journal.since(self._shown)
-        for event in events[-EVENT_ROWS:]:
+        journal = self._journal
+        if not self.is_behind:
+            return []
+        new = shown = journal.last(journal.noted - self._shown)
+        if self._renumbered:
+            shown = journal.last(journal.noted)
+            for row in range(EVENT_ROWS):
+                self._bank.put(Event(), row)
+        for event in shown[-EVENT_ROWS:]:
             self._bank.put(event, event.number % EVENT_ROWS)
-        self._shown = self._journal.count
-        if events:
-            self._bank.put(JournalPage(self._journal.oldest, self._journal.count))
-        return events
+        self._shown, self._start = journal.noted, (journal.boot, journal.before)
+        page = self._bank.get(JournalPage)  # what the last query found may still have to be read
+        self._bank.put(page._replace(oldest=journal.oldest, newest=journal.count))
+        return new
 
     def answer(self, query: JournalQuery) -> None:
         """Put what a query selects into the registers."""
