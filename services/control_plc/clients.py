@@ -5,10 +5,12 @@ from collections.abc import Awaitable
 
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.control_plc import (
+    Acknowledgement,
     AwaitUpdate,
     ControlSession,
     Grant,
     Heartbeat,
+    LatchedUpdate,
     Operator,
     Plan,
     SequenceHeader,
@@ -41,6 +43,8 @@ class Clients:
         """Lock-step scans every tick before this one."""
         self.asked: ControlSession | None = None
         """A session that is to begin."""
+        for empty in (bank.get(Update), LatchedUpdate(), Acknowledgement(0, Verdict.NONE)):
+            bank.put(sealed(empty))
 
     @property
     def optimizer_waits(self) -> bool:
@@ -50,6 +54,7 @@ class Clients:
     def tell(self, update: Update) -> None:
         """Show a new update, and answer who waits for it."""
         self._bank.put(sealed(update))
+        self._bank.put(sealed(LatchedUpdate(update.session, update.update, update.tick)))
         self._news.set()
         self._news = asyncio.Event()
 
