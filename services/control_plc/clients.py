@@ -10,6 +10,7 @@ from coldloop.process import INPUT_NAMES, TICK_S
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
 from coldloop.registers.control_plc import (
+    Acknowledgement,
     AwaitUpdate,
     ControlSession,
     Grant,
@@ -75,6 +76,8 @@ class Clients:
         publication.lease = self.lease
         bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader, SequenceRow)
         bank.judged_by(self._judge_operator, Operator)
+        for empty in (bank.get(Update), LatchedUpdate(), Acknowledgement(0, Verdict.NONE)):
+            bank.put(sealed(empty))
 
     # -- judged before anything is stored ------------------------------------------------------------------------------
 

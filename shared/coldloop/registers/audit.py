@@ -50,6 +50,8 @@ class EventKind(IntEnum):
     """Subject 1 expires soon, 2 expired; value days left."""
     LOST = 20
     """Events or log lines were lost: value how many."""
+    CONTROL_LINK = 21
+    """Subject is the new state of the optimiser's link to the control PLC; 2 is up."""
 
 
 class Event(NamedTuple):
@@ -65,7 +67,7 @@ class Event(NamedTuple):
         u16(
             "1 mode, 2 alarm raised, 3 returned, 4 acknowledged, 5 shelved, 6 unshelved, 7 out of service, 8 in "
             "service, 9 boot, 10 session, 11 operator mode, 12 setpoint, 13 watchdog time, 14 watchdog expired, "
-            "15 plant link, 16 lease, 17 sensor fault, 18 load, 19 certificate, 20 lost"
+            "15 plant link, 16 lease, 17 sensor fault, 18 load, 19 certificate, 20 lost, 21 control link"
         ),
     ] = 0
     subject: Annotated[int, u16("The mode, the alarm, ...: depends on the kind")] = 0
