@@ -65,9 +65,8 @@ class WriterLease:
 
     def take(self, caller: Caller, holder: int) -> None:
         """Give the lease to a client that `check` has let pass, or renew it."""
-        self.note_end()
         if self._lease.take(caller, holder):
-            if self._name is not None:
+            if self._name is not None:  # it has lapsed, or the same connection has given itself another number
                 self._note(LeaseEvent.ENDED, self._name)
             self._note(LeaseEvent.GRANTED, caller.name)
         self._name = caller.name
