@@ -129,7 +129,7 @@ class RequestHandler:
         _check_quantity(read_count, MAX_READ_WORDS)
         _check_quantity(count, MAX_READ_WRITE_WORDS)
         _check_byte_count(byte_count, 2 * count, data)
-        self._bank.read(read_address, read_count)  # refuses before anything is stored
+        self._bank.check_readable(read_address, read_count)  # before anything is stored
         blocks = self._write(address, data)
         return Written(blocks, partial(self._registers, READ_WRITE_REGISTERS, read_address, read_count))
 

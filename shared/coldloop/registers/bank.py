@@ -92,7 +92,7 @@ class RegisterBank:
         self._checks: list[tuple[int, Kind, Field, str]] = []
         self._spans: dict[tuple[int, int], _Span] = {}
         self._judges: dict[type[tuple[Any, ...]], Judge] = {}
-        self._live: tuple[int, int, Callable[[], tuple[Any, ...]]] = (0x10000, 0, tuple)
+        self._live: list[tuple[int, int, Callable[[], tuple[Any, ...] | None]]] = []
         for block in register_map.blocks:
             self._declare(block)
         self._check_addresses = [address for address, *_ in self._checks]
@@ -130,13 +130,13 @@ class RegisterBank:
             self._judges[record] = judge
         self._spans.clear()
 
-    def keep_fresh(self, record: type[tuple[Any, ...]], present: Callable[[], tuple[Any, ...]]) -> None:
-        """Store `present()` whenever a client reads from the block that holds `record`; one block may have this."""
+    def keep_fresh(self, record: type[tuple[Any, ...]], present: Callable[[], tuple[Any, ...] | None]) -> None:
+        """Store `present()` whenever a client reads from the block that holds `record`; None leaves it as it is."""
         block, _ = self._places[record]
-        self._live = block.address, block.end, present
+        self._live.append((block.address, block.end, present))
 
-    def read(self, address: int, count: int) -> bytes:
-        """Return `count` words from `address` on.
+    def check_readable(self, address: int, count: int) -> None:
+        """Check that `count` words from `address` on may be read.
 
         Raises:
             IllegalAddressError: One of them is not declared.
@@ -144,9 +144,20 @@ class RegisterBank:
         end = address + count
         if end > 0x10000 or self._declared.find(0, address, end) >= 0:
             raise IllegalAddressError(f"no register at some of {address}..{end - 1}")
-        start, behind, present = self._live
-        if address < behind and start < end:
-            self.put(present())
+
+    def read(self, address: int, count: int) -> bytes:
+        """Return `count` words from `address` on.
+
+        Raises:
+            IllegalAddressError: One of them is not declared.
+        """
+        self.check_readable(address, count)
+        end = address + count
+        for start, behind, present in self._live:
+            if address < behind and start < end:
+                record = present()
+                if record is not None:
+                    self.put(record)
         return bytes(self._memory[2 * address : 2 * end])
 
     def write(self, address: int, data: bytes, caller: Caller = ANYBODY) -> list[Block]:
