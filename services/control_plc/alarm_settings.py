@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, 
 from coldloop.process import TICK_S
 from coldloop.registers.safety import AlarmKind, AlarmPriority
 
-PASSING: Final = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED, AlarmKind.SECOND_OPTIMIZER)
+PASSING: Final = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED, AlarmKind.SECOND_WRITER)
 """Alarms for something that happens at an instant: their off-delay is how long ago the last time must be."""
 BANDS: Final = (AlarmKind.LEVEL_BAND, AlarmKind.T5_BAND)
 
@@ -52,7 +52,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     AlarmKind.OPTIMIZER_LOST: AlarmRule(MEDIUM),  # no new sequence will come by itself
     AlarmKind.SENSOR_BAD: AlarmRule(MEDIUM),  # substituted; the ladder reacts to those that matter
     AlarmKind.MODEL_MISMATCH: AlarmRule(MEDIUM),  # no sequence is accepted until somebody changes a configuration
-    AlarmKind.SECOND_OPTIMIZER: AlarmRule(MEDIUM, off_delay_s=60.0),  # refused, but wired or configured wrongly
+    AlarmKind.SECOND_WRITER: AlarmRule(MEDIUM, off_delay_s=60.0),  # refused, but wired or configured wrongly
     AlarmKind.CERTIFICATE: AlarmRule(MEDIUM),  # clients will not connect once it has expired
     AlarmKind.STATE_NOT_RETAINED: AlarmRule(MEDIUM),  # a restart would not continue from here
     # Nothing is to be done at once: a hint for maintenance.

@@ -150,12 +150,12 @@ class AlarmPanel:
         """Tell that the condition of an alarm has ended."""
         self.holds(kind, condition=False)
 
-    def happened(self, kind: AlarmKind) -> None:
+    def happened(self, kind: AlarmKind, cause: int = 0) -> None:
         """Tell of something that happens at an instant: the alarm returns an off-delay after the last time.
 
         An alarm with an on-delay is not raised by it.
         """
-        self.raised(kind)
+        self.raised(kind, cause)
         self.returned(kind)
 
     def _settle(self, kind: AlarmKind) -> None:

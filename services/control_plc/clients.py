@@ -36,6 +36,8 @@ LONGEST_WAIT_S: Final = 1.0
 """Longest time that a read of the latch waits for an update; the optimiser then asks again."""
 UNWATCHED_S: Final = 10.0
 """Silence that ends the lease of the optimiser where its watchdog is off, in real time."""
+SECOND_OPTIMIZER: Final = 1
+"""Cause of the alarm SECOND_WRITER."""
 TRACKED: Final = 1e-4
 """Setpoints that an operator writes back as they were read have not been changed."""
 
@@ -92,7 +94,7 @@ class Clients:
         try:
             self.lease.check(caller, record.holder if isinstance(record, Heartbeat) else None)
         except BusyError:
-            self._program.alarms.happened(AlarmKind.SECOND_OPTIMIZER)
+            self._program.alarms.happened(AlarmKind.SECOND_WRITER, SECOND_OPTIMIZER)
             if caller.connection not in self._refused:
                 self._refused.add(caller.connection)
                 self._note(EventKind.LEASE, 2, caller)

@@ -34,6 +34,8 @@ ALARMS: Final = {
     PlantLinkState.FOREIGN: AlarmKind.PLANT_FOREIGN,
     PlantLinkState.FROZEN: AlarmKind.PLANT_FROZEN,
 }
+SECOND_MASTER: Final = 2
+"""Cause of the alarm SECOND_WRITER."""
 HARMLESS: Final = (LinkCause.STARTED, LinkCause.OVERSLEPT, LinkCause.LEAPT)
 """Causes of JOINING that raise no alarm: what is read back is expected to be what we applied."""
 REFUSED_OUTPUTS: Final = {
@@ -65,6 +67,7 @@ class PlantLink:
         """That of the rack when it last answered; so the tick."""
         self.tick = 0
         self._moved_at = 0.0
+        self._refused = 0
 
     @property
     def in_step(self) -> bool:
@@ -107,6 +110,7 @@ class PlantLink:
         """
         changed = reading.generation != self.generation
         stands = self._stands(reading, now)
+        self._refused = reading.refused
         if reading.session != session or not session:
             self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
         elif not all(map(math.isfinite, reading.u)):
@@ -130,6 +134,7 @@ class PlantLink:
         In real time the rack's tick may differ by one: it changes between two scans, and a scan may be late.
         """
         stands = self._stands(answer, now)
+        self._watch_others(answer)
         if answer.verdict != OutputVerdict.TAKEN:
             self._enter(*REFUSED_OUTPUTS.get(answer.verdict, REFUSED_OUTPUTS[OutputVerdict.NONE]))  # type: ignore[call-overload]
         elif answer.session != sent.session:
@@ -150,6 +155,12 @@ class PlantLink:
             self._alarms.returned(alarm)
 
     # -- inside --------------------------------------------------------------------------------------------------------
+
+    def _watch_others(self, answer: Measurement) -> None:
+        """Raise the alarm when the rack has refused somebody else's outputs."""
+        if answer.refused != self._refused:
+            self._refused = answer.refused
+            self._alarms.happened(AlarmKind.SECOND_WRITER, SECOND_MASTER)
 
     def _stands(self, reading: Measurement, now: float | None) -> bool:
         """Note where the rack is; tell whether its clock stands. At tick 0 it waits for the first outputs."""

@@ -170,13 +170,18 @@ class Rack:
 
     # -- what others see -----------------------------------------------------------------------------------------------
 
-    def measurement(self, age: float) -> Measurement:
-        """Return what the sensors show, and what is applied; `age` is the time since the tick began, in ticks."""
+    def measurement(self, age: float, refused: int = 0) -> Measurement:
+        """Return what the sensors show, and what is applied.
+
+        Args:
+            age: Time since the tick began, in ticks.
+            refused: Writes of others that the lease has refused so far.
+        """
         program, outputs = self._program, self.outputs
         y = self.faults.on(program.measure())
         return Measurement(
             program.tick, program.load, y, program.state, self.session.number, outputs.u, outputs.holder,
-            outputs.generation, outputs.verdict, age,
+            outputs.generation, outputs.verdict, refused & 0xFFFF, age,
         )  # fmt: skip
 
     def snapshot(self) -> Mapping[str, object]:

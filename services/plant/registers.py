@@ -218,7 +218,7 @@ class RackRegisters:
         if not (age or self._outdated):
             return None
         self._outdated = False
-        return sealed(self.rack.measurement(age))
+        return sealed(self.rack.measurement(age, self.lease.refused))
 
     def _identity(self) -> Identity:
         rack = self.rack

@@ -83,6 +83,11 @@ class WriterLease:
             self._note(LeaseEvent.ENDED, self._name)
             self._name = None
 
+    @property
+    def refused(self) -> int:
+        """Writes of others that were refused so far."""
+        return self._lease.refused
+
     def registers(self) -> LeaseStatus:
         """Return what its registers show."""
         return self._lease.registers()

@@ -59,6 +59,7 @@ class Measurement(NamedTuple):
     verdict: Annotated[
         int, u16("Outputs sent last: 0 none, 1 taken, 2 wrong session, 3 untimely, 4 changed since they were read back")
     ] = OutputVerdict.NONE
+    refused: Annotated[int, u16("Writes of others that were refused so far; wraps")] = 0
     age: Annotated[float, f32("Time since this tick began, by the rack's clock, in ticks; 0 in lock-step")] = 0.0
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 

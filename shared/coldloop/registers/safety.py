@@ -71,7 +71,8 @@ class AlarmKind(IntEnum):
     OUTPUTS_NOT_TAKEN = 14
     CLOCK_SKEW = 15
     """The rack's clock and ours differ by too much."""
-    SECOND_OPTIMIZER = 16
+    SECOND_WRITER = 16
+    """A second writer was refused: cause 1 an optimiser here, 2 a control PLC at the rack."""
     CERTIFICATE = 17
     """Our certificate has expired, or will soon."""
     STATE_NOT_RETAINED = 18
