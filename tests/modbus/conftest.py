@@ -200,7 +200,7 @@ class Site:
         certificate, key = self.folder / f"{name}.crt", self.folder / f"{name}.key"
         certificate.write_bytes(pair.certificate_pem)
         key.write_bytes(pair.key_pem)
-        return TlsSettings(certificate=certificate, key=key, ca=self.folder / "ca.crt")
+        return TlsSettings(certificate=certificate, key=key, ca=self.folder / "ca.crt", warn_days=0)
 
     def client(self, role: str | None) -> ssl.SSLContext:
         name = f"client-{role}"[:20]
