@@ -7,7 +7,7 @@ import asyncio
 import math
 import struct
 import zlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 from hypothesis import given, settings
@@ -35,6 +35,7 @@ COMMANDS = {
 }
 BANKS = {service: RegisterBank(register_map) for service, register_map in MAPS.items()}
 ODD_WORDS = (0, 1, 2, 3, 20, 2048, 2049, 0x3F80, 0x42C8, 0x42C9, 0x7F80, 0x7FA0, 0x7FC0, 0x8000, 0xBF80, 0xFF80, 0xFFFF)
+BEFORE = ("zeros", "valid", "sealed")
 words = st.sampled_from(ODD_WORDS) | st.integers(0, 0xFFFF)
 
 
@@ -69,61 +70,101 @@ def memory(bank: RegisterBank) -> bytes:
     return bytes(bank._memory)  # noqa: SLF001 - all of it
 
 
-def request(registers: list[Register], data: st.DataObject) -> tuple[int, bytes, bytes, bool]:
-    """Draw a request to one or more of a row's registers.
+class Write(NamedTuple):
+    """A request: its first address, its PDU, the words that it results in, and whether it halves a 32-bit value."""
 
-    Returns its first address, its PDU, the words that it results in, and whether it halves a 32-bit value.
-    """
+    address: int
+    pdu: bytes
+    result: bytes
+    halves: bool
+
+
+def a_word(function: int, register: Register, half: int, word: int) -> Write:
+    """Return FC6, or FC22 that replaces the word."""
+    at, raw = register.address + half, struct.pack(">H", word)
+    pdu = struct.pack(">BHH", 22, at, 0) + raw if function == 22 else struct.pack(">BH", 6, at) + raw
+    return Write(at, pdu, raw, register.kind.words == 2)
+
+
+def some_words(function: int, first: Register, last: Register, values: list[int]) -> Write:
+    """Return FC16 or FC23 of the registers from one to another."""
+    count = last.address + last.kind.words - first.address
+    raw = struct.pack(f">{count}H", *values[:count])
+    write = struct.pack(">HHB", first.address, count, len(raw)) + raw
+    head = b"\x10" if function == 16 else bytes.fromhex("17 0000 0002")
+    return Write(first.address, head + write, raw, halves=False)
+
+
+def any_write(registers: list[Register], data: st.DataObject) -> Write:
+    """Draw a request to one or more of a row's registers."""
     function = data.draw(st.sampled_from((6, 16, 22, 23)))
     chosen = data.draw(st.integers(0, len(registers) - 1))
-    register = registers[chosen]
+    first = registers[chosen]
     if function in (6, 22):
-        at = register.address + data.draw(st.integers(0, register.kind.words - 1))
-        word = struct.pack(">H", data.draw(words))
-        masked = struct.pack(">BHH", 22, at, 0) + word
-        pdu = masked if function == 22 else struct.pack(">BH", 6, at) + word
-        return at, pdu, word, register.kind.words == 2
+        return a_word(function, first, data.draw(st.integers(0, first.kind.words - 1)), data.draw(words))
     last = registers[data.draw(st.integers(chosen, len(registers) - 1))]
-    count = last.address + last.kind.words - register.address
-    value = b"".join(struct.pack(">H", data.draw(words)) for _ in range(count))
-    write = struct.pack(">HHB", register.address, count, len(value)) + value
-    head = b"\x10" if function == 16 else bytes.fromhex("17 0000 0002")
-    return register.address, head + write, value, False
+    return some_words(function, first, last, data.draw(st.lists(words, min_size=20, max_size=20)))
 
 
-@pytest.mark.parametrize(("register_map", "block"), COMMANDS.values(), ids=COMMANDS.keys())
+each_command = pytest.mark.parametrize(("register_map", "block"), COMMANDS.values(), ids=COMMANDS.keys())
+
+
+def check(plug: "Plug", bank: RegisterBank, block: Block, row: int, write: Write) -> None:
+    """Send a write, and compare what becomes of it with what should."""
+    told: list[str] = []
+    refusals = RefusalLog("test")
+    connection, transport = plug(bank, refusals, on_write=lambda written, _: told.append(written.name))
+    first, was = block.address + row * block.row_words, memory(bank)
+    result = bytearray(bank.read(first, block.row_words))
+    offset = 2 * (write.address - first)
+    result[offset : offset + len(write.result)] = write.result
+    connection.data_received(struct.pack(">HHHB", 1, 0, len(write.pdu) + 1, 1) + write.pdu)
+    answer = transport.written[7:]
+    if is_right(block, bytes(result)) and not write.halves:
+        assert answer[0] == write.pdu[0]
+        assert bank.read(first, block.row_words) == result
+        assert told == [block.name]
+    else:
+        assert answer == bytes((write.pdu[0] | 0x80, 3))
+        assert memory(bank) == was
+        assert told == []
+    assert refusals.counters.server_failure == 0
+    connection.connection_lost(None)
+
+
+def bank_with(register_map: RegisterMap, block: Block, before: str, row: int) -> RegisterBank:
+    bank = BANKS[register_map.service]
+    bank._memory[:] = bytes(2 * 0x10000)  # noqa: SLF001 - as at boot
+    bank.put(starting_record(block, before), row)
+    return bank
+
+
+@each_command
 @settings(max_examples=100, deadline=None)
-@given(data=st.data(), before=st.sampled_from(("zeros", "valid", "sealed")))
+@given(data=st.data(), before=st.sampled_from(BEFORE))
 def test_a_part_of_a_command_makes_a_valid_record_or_is_refused_and_nothing_has_happened(
     plug: "Plug", register_map: RegisterMap, block: Block, data: st.DataObject, before: str
 ) -> None:
     async def story() -> None:
-        bank, refusals = BANKS[register_map.service], RefusalLog("test")
-        bank._memory[:] = bytes(2 * 0x10000)  # noqa: SLF001 - as at boot
         row = data.draw(st.integers(0, block.rows - 1))
-        bank.put(starting_record(block, before), row)
-        told: list[str] = []
-        connection, transport = plug(bank, refusals, on_write=lambda written, _: told.append(written.name))
-        at, pdu, value, halves = request(list(block.registers(row)), data)
-        first = block.address + row * block.row_words
-        was = memory(bank)
-        offset = 2 * (at - first)
-        result = bank.read(first, block.row_words)
-        result = result[:offset] + value + result[offset + len(value) :]
-        connection.data_received(struct.pack(">HHHB", 1, 0, len(pdu) + 1, 1) + pdu)
-        answer = transport.written[7:]
-        if is_right(block, result) and not halves:
-            assert answer[0] == pdu[0]
-            assert bank.read(first, block.row_words) == result
-            assert told == [block.name]
-        else:
-            assert answer == bytes((pdu[0] | 0x80, 3))
-            assert memory(bank) == was
-            assert told == []
-        assert refusals.counters.server_failure == 0
-        connection.connection_lost(None)
+        bank = bank_with(register_map, block, before, row)
+        check(plug, bank, block, row, any_write(list(block.registers(row)), data))
 
     asyncio.run(story())
+
+
+@each_command
+@pytest.mark.parametrize("before", BEFORE)
+async def test_so_does_each_of_its_registers_alone_with_each_function(
+    plug: "Plug", register_map: RegisterMap, block: Block, before: str
+) -> None:
+    row = block.rows - 1
+    for register in block.registers(row):
+        for word in (0, 1, 3, 0x42C8, 0x7F80, 0xFFFF):
+            writes = [some_words(function, register, register, [word, 0]) for function in (16, 23)]
+            writes += [a_word(function, register, 0, word) for function in (6, 22)]
+            for write in writes:
+                check(plug, bank_with(register_map, block, before, row), block, row, write)
 
 
 async def test_at_boot_a_part_of_a_session_does_not_start_one(serve: "Serve") -> None:
