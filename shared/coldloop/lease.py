@@ -43,7 +43,7 @@ class Lease:
     @property
     def holder(self) -> int:
         """Number of the holder; 0 is a simple client, or none."""
-        return self._holder
+        return SIMPLE_CLIENT if self.state is LeaseState.FREE else self._holder
 
     @property
     def state(self) -> LeaseState:

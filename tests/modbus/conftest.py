@@ -160,6 +160,7 @@ def plugged(
     bank: RegisterBank,
     refusals: RefusalLog,
     turns: Turns | None = None,
+    on_write: OnWrite = lambda _block, _caller: None,
     **settings: Any,  # noqa: ANN401 - any field of ServerSettings
 ) -> tuple[Connection, FakeTransport]:
     """Return a connection of which a test is the wire."""
@@ -167,7 +168,7 @@ def plugged(
     connection = Connection(
         handler_for=lambda caller: RequestHandler(bank, identity, caller),
         settings=ServerSettings.model_validate({"port": 0, **settings}),
-        on_write=lambda _block, _caller: None,
+        on_write=on_write,
         refusals=refusals,
         turns=turns or Turns(),
         opened=lambda _connection: True,
@@ -199,7 +200,7 @@ class Site:
         certificate, key = self.folder / f"{name}.crt", self.folder / f"{name}.key"
         certificate.write_bytes(pair.certificate_pem)
         key.write_bytes(pair.key_pem)
-        return TlsSettings(certificate=certificate, key=key, ca=self.folder / "ca.crt")
+        return TlsSettings(certificate=certificate, key=key, ca=self.folder / "ca.crt", warn_days=0)
 
     def client(self, role: str | None) -> ssl.SSLContext:
         name = f"client-{role}"[:20]

@@ -234,7 +234,7 @@ async def test_a_server_that_goes_away_is_noticed_at_once_and_found_again(serve:
 async def test_both_ends_send_small_packets_without_delay(serve: "Serve") -> None:
     async with serve() as running, client_of(running.server.port) as client:
         await client.connect(1.0)
-        transport = client._client.ctx.transport  # noqa: SLF001 - pymodbus' own, through our client
+        transport = client._transport._client.ctx.transport  # noqa: SLF001 - pymodbus' own, through our client
         assert transport.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 

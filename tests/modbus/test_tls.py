@@ -208,8 +208,6 @@ def bad_files(site: "Site", case: str) -> TlsSettings:
             pair.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret"))
         )
         return files
-    if case == "expired":
-        return site.keep("bad", site.authority.issue_client("bad", None, days=-1))
     junk = here / "junk.pem"
     junk.write_bytes(b"-----BEGIN CERTIFICATE-----\nnot base64!\n-----END CERTIFICATE-----\n")
     return {
@@ -226,7 +224,6 @@ def bad_files(site: "Site", case: str) -> TlsSettings:
         ("missing", r"certificate .*none.crt: No such file or directory; name a readable file, or make some"),
         ("a folder", r"key .*: Is a directory; name a readable file"),
         ("passphrase", r"key .*: has a passphrase; name a key without one"),
-        ("expired", r"certificate .*: expired on \d{4}-\d\d-\d\d; make a new one"),
         ("junk certificate", r"certificate .*: no PEM certificate in it; name a file that has one"),
         ("junk key", r"key .*: no PEM key in it; name a file that has one"),
         ("junk ca", r"ca .*: no PEM certificate in it; name a file that has one"),

@@ -1,20 +1,14 @@
 """A typed client of one server: records in, records out."""
 
 import asyncio
-import logging
-import ssl
 import struct
 from collections.abc import Sequence
-from functools import cached_property, partial
 from typing import Any, Final, Self, TypeVar, cast
-
-from pymodbus.client import AsyncModbusTcpClient
-from pymodbus.exceptions import ConnectionException, ModbusException
 
 from coldloop.endpoints import Endpoint
 from coldloop.errors import DamagedAnswerError, PeerUnreachableError, RequestRefusedError, UntrustedPeerError
 from coldloop.modbus.peer_check import check_peer
-from coldloop.modbus.raw_pdu import RawDecoder, RawPdu
+from coldloop.modbus.raw_pdu import RawPdu
 from coldloop.modbus.requests import (
     MAX_READ_WORDS,
     MAX_WRITE_WORDS,
@@ -24,6 +18,7 @@ from coldloop.modbus.requests import (
 )
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import client_context
+from coldloop.modbus.transport import NoAnswerError, Transport
 from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
@@ -32,9 +27,6 @@ from coldloop.seal import Seal, seal_of, sealed
 R = TypeVar("R", bound=tuple[Any, ...])
 
 CONNECT_PAUSE_S: Final = 0.1
-BUFFER_BYTES: Final = 4096
-"""pymodbus throws away what is received when more than two frames' length of it has come, stale answers included."""
-
 _READ: Final = struct.Struct(">HH")
 _WRITE: Final = struct.Struct(">HHB")
 _READ_WRITE: Final = struct.Struct(">HHHHB")
@@ -46,9 +38,6 @@ _EXCEPTIONS: Final = {
     6: "somebody else holds the lease of this role",
     11: "no such unit id",
 }
-
-# pymodbus logs each failure besides reporting it; here every one becomes an error of Coldloop's that says more.
-logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 
 class RegisterClient:
@@ -82,10 +71,10 @@ class RegisterClient:
     ) -> None:
         self._map = register_map
         self._order = order
-        self._host = host
-        self._port = port
         self._timeout_s = timeout_s
-        self._tls = client_context(tls, f"tls of the client of {self.peer}") if tls else None
+        context = client_context(tls, f"tls of the client of {register_map.service} at {host}:{port}") if tls else None
+        self._secure = context is not None
+        self._transport = Transport(register_map.service, host, port, timeout_s, context)
         self._turn = asyncio.Lock()
         self._places: dict[type[tuple[Any, ...]], tuple[Block, RecordCodec]] = {
             block.record: (block, codec_of(block, order)) for block in register_map.blocks
@@ -110,7 +99,7 @@ class RegisterClient:
     @property
     def peer(self) -> str:
         """The server, as messages name it."""
-        return f"{self._map.service} at {self._host}:{self._port}"
+        return self._transport.peer
 
     @property
     def connected(self) -> bool:
@@ -210,7 +199,7 @@ class RegisterClient:
 
     def close(self) -> None:
         """Close the connection."""
-        self._client.close()
+        self._transport.close()
 
     async def _read_words(self, block: Block, address: int, count: int) -> bytes:
         raw = await self._transact(RawPdu(READ_HOLDING_REGISTERS, _READ.pack(address, count)), block)
@@ -228,75 +217,23 @@ class RegisterClient:
     async def _transact(self, request: RawPdu, block: Block, patience_s: float | None = None) -> bytes:
         """Send a request, connecting first where needed; return the bytes behind the answer's function code."""
         async with self._turn:
-            client = self._client
-            if not client.connected:
-                await self._open()
-            client.ctx.comm_params.timeout_connect = patience_s or self._timeout_s
+            if not self._transport.connected:
+                await self._transport.open()
             try:
-                response = await client.execute(False, request)  # noqa: FBT003 - pymodbus takes it by position only
-            except (ModbusException, RuntimeError) as error:  # uvloop's, when the transport has just been closed
-                client.close()  # a late answer must not meet a later request
-                raise self._silent(block, error) from error
-            except asyncio.CancelledError:
-                client.close()
-                raise
-        _raise_lost_cancellation()
+                response = await self._transport.transact(request, patience_s or self._timeout_s)
+            except NoAnswerError as error:
+                raise self._silent(block, closed=error.closed) from error
         if not isinstance(response, RawPdu) or response.function_code & 0x7F != request.function_code:
             raise self._nonsense(block)
         if response.function_code != request.function_code:
             raise self._refused(request.function_code, block, response.payload)
         return response.payload
 
-    async def _open(self) -> None:
-        self._client.ctx.comm_params.timeout_connect = self._timeout_s
-        connected = await self._client.connect()
-        _raise_lost_cancellation()
-        if not connected:
-            raise PeerUnreachableError(f"nobody listens as {self.peer}: start it, or check host and port")
-
-    @cached_property
-    def _client(self) -> AsyncModbusTcpClient:
-        # Neither retries nor reconnection in the background: a request fails within its time, and the next one
-        # connects again. pymodbus only notices a lost connection by the time-out, so it is told here.
-        client = AsyncModbusTcpClient(
-            self._host,
-            port=self._port,
-            name=self._map.service,
-            timeout=self._timeout_s,
-            retries=0,
-            reconnect_delay=0,
-            trace_connect=self._connection_changed,
-        )
-        client.ctx.framer.decoder = RawDecoder(is_server=False)
-        client.ctx.max_buffer_size = BUFFER_BYTES
-        if self._tls is not None:
-            # pymodbus' own TLS client takes each TLS record for a whole answer, and does not say why it failed.
-            client.ctx.call_create = partial(self._create_secured, client, self._tls)
-        return client
-
-    async def _create_secured(self, client: AsyncModbusTcpClient, tls: ssl.SSLContext) -> Any:  # noqa: ANN401 - pymodbus' signature
-        try:
-            return await asyncio.get_running_loop().create_connection(
-                client.ctx.handle_new_connection, self._host, self._port, ssl=tls
-            )
-        except ssl.SSLCertVerificationError as error:
-            raise UntrustedPeerError(
-                f"{self.peer} cannot be trusted: {error.verify_message}: check the host name, and tls.ca here"
-            ) from None
-        except (ssl.SSLError, ConnectionResetError, ConnectionAbortedError):
-            raise PeerUnreachableError(f"{self.peer} does not speak TLS 1.3: check server.tls there") from None
-
-    def _connection_changed(self, connected: bool) -> None:  # noqa: FBT001 - pymodbus' signature
-        answer = self._client.ctx.response_future
-        if not connected and not answer.done():
-            answer.set_exception(ConnectionException("closed by the peer"))
-
-    def _silent(self, block: Block, error: Exception) -> PeerUnreachableError:
-        lost = isinstance(error, ConnectionException | RuntimeError)
-        what = "closed the connection" if lost else "did not answer in time"
+    def _silent(self, block: Block, *, closed: bool) -> PeerUnreachableError:
+        what = "closed the connection" if closed else "did not answer in time"
         return PeerUnreachableError(
             f"{self.peer} {what} at a request for block '{block.name}': check that it runs and is what listens there"
-            f"{', and that it accepts our certificate' if self._tls else ''}"
+            f"{', and that it accepts our certificate' if self._secure else ''}"
         )
 
     def _refused(self, function: int, block: Block, payload: bytes) -> RequestRefusedError:
@@ -314,10 +251,3 @@ class RegisterClient:
 
 def _encoded(block: Block, codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
     return codec.encode(sealed(record) if block.sealed else record)
-
-
-def _raise_lost_cancellation() -> None:
-    """Raise the cancellation that `asyncio.wait_for` loses before Python 3.12 when it meets what is waited for."""
-    task = asyncio.current_task()
-    if task is not None and task.cancelling():
-        raise asyncio.CancelledError

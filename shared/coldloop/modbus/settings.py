@@ -40,6 +40,9 @@ class TlsSettings(BaseModel):
         certificate: Our certificate, and the intermediate ones that lead to the peer's CA.
         key: Its key, without a passphrase.
         ca: Certificates of the authorities whose peers we accept.
+        crl: Revocation lists of these authorities: peers whose certificates are listed are refused. All peers are,
+            when the list has expired.
+        warn_days: How long before one of these files expires there is a warning, days.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -47,6 +50,8 @@ class TlsSettings(BaseModel):
     certificate: Path
     key: Path
     ca: Path
+    crl: Path | None = None
+    warn_days: float = Field(default=30.0, ge=0)
 
 
 class ServerSettings(BaseModel):
