@@ -228,7 +228,7 @@ moves = st.tuples(*[st.floats(-1.05, 1.05)] * 3)
 updates = st.tuples(st.integers(1, 20), st.lists(moves, min_size=1, max_size=4))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(reference=st.sampled_from(RateReference), script=st.lists(updates, max_size=8))
 def test_what_is_accepted_is_what_is_applied(
     new_bench: "Callable[[InputLimits], Bench]",
