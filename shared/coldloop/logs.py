@@ -85,8 +85,16 @@ class QueueingHandler(logging.Handler):
         dropped = self.writer.dropped
         if dropped > self._told:
             record.dropped = dropped - self._told
-        if self.writer.put(self.format(record)):
+        if self.writer.put(self._formatted(record)):
             self._told = dropped
+
+    def _formatted(self, record: logging.LogRecord) -> str:
+        try:
+            return self.format(record)
+        except Exception as error:  # noqa: BLE001 - a scan does not fail because of what it logs
+            about = {"name": record.name, "levelname": record.levelname, "created": record.created}
+            what = {"msg": "a record cannot be formatted", "reason": repr(error), "text": str(record.msg)}
+            return self.format(logging.makeLogRecord({**about, **what}))
 
     def flush(self) -> None:
         """Wait until all is written, for a bounded time."""

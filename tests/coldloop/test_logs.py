@@ -90,6 +90,19 @@ def test_the_time_is_that_of_the_record_in_utc() -> None:
     assert json.loads(JsonFormatter("plant").format(record))["time"] == "1970-01-01T00:00:01.500+00:00"
 
 
+class Unspeakable:
+    def __str__(self) -> str:
+        raise ValueError("no words")
+
+
+def test_a_record_that_cannot_be_formatted_is_told_and_does_not_fail_who_logs_it(stream: io.StringIO) -> None:
+    set_up_logs("plant", "info", stream)
+    logging.getLogger("coldloop.plant").warning("applied", extra={"outputs": Unspeakable()})
+    (line,) = lines(stream)
+    assert (line["logger"], line["event"]) == ("coldloop.plant", "a record cannot be formatted")
+    assert (line["text"], line["reason"]) == ("applied", "ValueError('no words')")
+
+
 def test_setting_up_again_replaces_what_was_there(stream: io.StringIO) -> None:
     later = io.StringIO()
     set_up_logs("plant", "info", stream)

@@ -271,4 +271,4 @@ class Link(RuleBasedStateMachine):
 
 
 TestLink = Link.TestCase
-TestLink.settings = settings(max_examples=60, stateful_step_count=60, deadline=None)
+TestLink.settings = settings(max_examples=60, stateful_step_count=60)

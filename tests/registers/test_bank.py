@@ -37,7 +37,7 @@ def control() -> RegisterBank:
 
 @pytest.mark.parametrize("order", WordOrder)
 @pytest.mark.parametrize(("register_map", "block"), WRITABLE.values(), ids=WRITABLE.keys())
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_what_is_written_is_what_is_read(
     records: "Records", order: WordOrder, register_map: RegisterMap, block: Block, data: st.DataObject
@@ -52,7 +52,7 @@ def test_what_is_written_is_what_is_read(
     assert bank.read(address, block.row_words) == raw
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(address=st.integers(0, 0xFFFF), data=st.binary(min_size=1, max_size=123).map(lambda half: half + half))
 def test_a_refused_write_stores_nothing_and_an_accepted_one_everything(address: int, data: bytes) -> None:
     bank = BANKS[WordOrder.HIGH_FIRST][CONTROL_MAP]

@@ -98,6 +98,8 @@ class SmallBroker:
 
     def __init__(self) -> None:
         self._kept: dict[str, bytes] = {}
+        self.password = b""
+        """Whoever connects has to know it, if there is one."""
         self.frozen = False
         """It takes what comes, and answers nothing."""
         self._connections: dict[asyncio.StreamWriter, asyncio.Task[object] | None] = {}
@@ -119,7 +121,10 @@ class SmallBroker:
                 if self.frozen:
                     continue
                 if kind >> 4 == 1:
-                    will = self._will(body)
+                    will, password = self._connect(body)
+                    if password != self.password:
+                        writer.write(b"\x20\x02\0\x05")
+                        break
                     writer.write(b"\x20\x02\0\0")
                 elif kind >> 4 == 3:
                     self._publish(kind, body, writer)
@@ -150,15 +155,20 @@ class SmallBroker:
         if kind & 0x01:
             self._kept[topic.decode()] = rest
 
-    def _will(self, body: bytes) -> tuple[str, bytes] | None:
+    def _connect(self, body: bytes) -> tuple[tuple[str, bytes] | None, bytes]:
+        """Return the last will and the password."""
         _, rest = self._text(body)
         flags = rest[1]
         _, rest = self._text(rest[4:])
-        if not flags & 0x04:
-            return None
-        assert flags & 0x20, "a last will that is not retained tells nobody who comes later"
-        topic, rest = self._text(rest)
-        return topic.decode(), self._text(rest)[0]
+        will = None
+        if flags & 0x04:
+            assert flags & 0x20, "a last will that is not retained tells nobody who comes later"
+            topic, rest = self._text(rest)
+            message, rest = self._text(rest)
+            will = topic.decode(), message
+        for flag in (0x80, 0x40):  # name, password
+            field, rest = self._text(rest) if flags & flag else (b"", rest)
+        return will, field
 
     @staticmethod
     def _text(data: bytes) -> tuple[bytes, bytes]:
