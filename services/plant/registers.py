@@ -129,7 +129,7 @@ class RackRegisters:
         try:
             self.lease.check(caller, holder)
         except BusyError:
-            self._show_events()
+            self._finish()
             raise
 
     def _judge_session(self, asked: PlantSession, _row: int, _caller: Caller) -> None:
@@ -241,7 +241,7 @@ class RackRegisters:
         self.rack.journal.note(self.rack.tick, EventKind.LEASE, event, who=who)
 
     def _finish(self) -> None:
-        """End a request: show what it has brought about, and retain it: a generation is never given out twice."""
+        """End a request: show its events, and retain them: no generation and no event number is given out twice."""
         if self._show_events():
             self._keep()
 

@@ -1,4 +1,4 @@
-"""One client writes the outputs of the rack: a second one is refused, counted and noted, until the first one is gone."""
+"""One client writes the outputs: a second one is refused, counted and noted, until the first one is gone."""
 
 from typing import TYPE_CHECKING
 

@@ -87,7 +87,11 @@ def test_a_part_of_a_session_is_judged_as_the_session_that_results(switch_on: "S
 
 @pytest.mark.parametrize(
     "steps",
-    [[LoadStep(1, 385.0)], [LoadStep(0, 1.0), LoadStep(0, 2.0)], [LoadStep(0, 1.0), LoadStep(9, 2.0), LoadStep(8, 1.0)]],
+    [
+        [LoadStep(1, 385.0)],
+        [LoadStep(0, 1.0), LoadStep(0, 2.0)],
+        [LoadStep(0, 1.0), LoadStep(9, 2.0), LoadStep(8, 1.0)],
+    ],
 )
 def test_a_load_that_does_not_begin_at_tick_0_and_go_on_is_refused(
     switch_on: "SwitchOn", steps: list[LoadStep]
