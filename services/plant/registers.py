@@ -63,8 +63,9 @@ class RackRegisters:
         self._age = age
         self.bank = RegisterBank(PLANT_MAP, settings.plant.word_order)
         self._memory = Memory(settings.plant.retain.file, header.short_digest)
-        self.rack = self._switched_on(settings, header, make_plant, utc)
+        self.rack, resumed = self._switched_on(settings, header, make_plant, utc)
         self._journal = JournalPublication(self.rack.journal, self.bank)
+        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed))
         self.lease = WriterLease(lambda: self.rack.silence_s, self._note_lease, now)
         self._written_row = 0
         self._outdated = True
@@ -75,8 +76,8 @@ class RackRegisters:
 
     def _switched_on(
         self, settings: PlantSettings, header: ModelHeader, make_plant: MakePlant, utc: Callable[[], float]
-    ) -> Rack:
-        """Return the rack where it was when it ended, or at the beginning of the configured session."""
+    ) -> tuple[Rack, bool]:
+        """Return the rack at the beginning of the configured session, or, and True, where it was when it ended."""
         section, configured = settings.plant, settings.session
         pace = Pace(configured.mode is TimeMode.REALTIME, configured.factor)
         load = find_load(section.load, header.w0)
@@ -88,15 +89,14 @@ class RackRegisters:
         rack = Rack(
             section.watchdog, (cv155, ncr22, cv156), make_plant, session, journal=journal, generation=generation
         )
-        resumed = False
-        if state is not None and state.session:
-            try:
-                rack.resume(state)
-                resumed = True
-            except (KeyError, TypeError, ValueError) as error:
-                refused(repr(error))
-        journal.note(rack.tick, EventKind.BOOT, int(resumed))
-        return rack
+        if state is None or not state.session:
+            return rack, False
+        try:
+            rack.resume(state)
+        except (KeyError, TypeError, ValueError) as error:
+            refused(repr(error))
+            return rack, False
+        return rack, True
 
     def _connect(self) -> None:
         """Let the bank ask us about what is written and what is read."""
@@ -129,7 +129,7 @@ class RackRegisters:
         try:
             self.lease.check(caller, holder)
         except BusyError:
-            self._show_events()
+            self._finish()
             raise
 
     def _judge_session(self, asked: PlantSession, _row: int, _caller: Caller) -> None:
@@ -241,7 +241,7 @@ class RackRegisters:
         self.rack.journal.note(self.rack.tick, EventKind.LEASE, event, who=who)
 
     def _finish(self) -> None:
-        """End a request: show what it has brought about, and retain it: a generation is never given out twice."""
+        """End a request: show its events, and retain them: no generation and no event number is given out twice."""
         if self._show_events():
             self._keep()
 
