@@ -260,7 +260,7 @@ class Link(RuleBasedStateMachine):
         own_doing = program.ladder.cause in (Cause.SESSION_STARTED, Cause.OPERATOR)
         assert bool(row.active) == (program.mode is not Mode.MPC and not own_doing)
         if row.active:
-            assert row.state in (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED, AlarmState.SHELVED)
+            assert row.state not in (AlarmState.NORMAL, AlarmState.RETURNED)
 
     @invariant()
     def each_change_of_mode_is_an_event(self) -> None:
