@@ -26,6 +26,7 @@ INSIDES: Final = {
     "response_future": "ended when the peer closes: pymodbus only notices by the time-out",
     "call_create": "makes a TLS connection: pymodbus' own TLS client takes each TLS record for a whole answer",
     "handle_new_connection": "the protocol for that connection",
+    "transport": "aborted when a TLS connection is closed",
 }
 """Attributes of pymodbus' transaction manager (`client.ctx`) that are used, and what for."""
 
@@ -105,7 +106,10 @@ class Transport:
 
     def close(self) -> None:
         """Close the connection."""
+        transport = self._client.ctx.transport
         self._client.close()
+        if transport is not None and self._tls is not None:
+            transport.abort()  # the farewell of TLS takes a round trip, and may outlast the event loop
 
     @cached_property
     def _client(self) -> AsyncModbusTcpClient:
