@@ -43,7 +43,7 @@ class Clients:
         """Lock-step scans every tick before this one."""
         self.asked: ControlSession | None = None
         """A session that is to begin."""
-        for empty in (bank.get(Update), LatchedUpdate(), Acknowledgement(0, Verdict.NONE)):
+        for empty in (bank.get(Update), LatchedUpdate(), Acknowledgement(0, Verdict.NONE), Plan(0, 0)):
             bank.put(sealed(empty))
 
     @property
