@@ -62,7 +62,7 @@ class Authority:
 
     def issue_client(self, name: str, role: str | None, days: float | None = None) -> Pair:
         """Return a client's certificate with a role, or with none."""
-        extension = x509.UnrecognizedExtension(ROLE_EXTENSION, encoded_role(role)) if role is not None else None
+        extension = _role_extension(role) if role is not None else None
         return self._issue(name, ExtendedKeyUsageOID.CLIENT_AUTH, extension, days)
 
     def _issue(
@@ -81,6 +81,10 @@ class Authority:
         if extension is not None:
             builder = builder.add_extension(extension, critical=False)
         return Pair(_signed(builder, self.pair.key.public_key(), self.pair.key), key)
+
+
+def _role_extension(role: str) -> x509.UnrecognizedExtension:
+    return x509.UnrecognizedExtension(x509.ObjectIdentifier(ROLE_EXTENSION), encoded_role(role))
 
 
 def _draft(name: str, issuer: str, key: ec.EllipticCurvePrivateKey, end: datetime) -> x509.CertificateBuilder:

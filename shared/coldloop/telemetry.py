@@ -12,10 +12,12 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import aiomqtt
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+
+if TYPE_CHECKING:
+    import aiomqtt
 
 log = logging.getLogger("coldloop.telemetry")
 
@@ -74,6 +76,8 @@ class Telemetry:
             await asyncio.sleep(self._settings.timeout_s)
 
     async def _publish(self) -> None:
+        import aiomqtt  # noqa: PLC0415 a tenth of what a service loads at its start, and most have no broker
+
         s = self._settings
         offline = aiomqtt.Will(f"{self._topic}/state", json.dumps({"state": "offline"}), qos=1, retain=True)
         async with aiomqtt.Client(s.broker, s.port, will=offline, timeout=s.timeout_s) as client:
@@ -86,7 +90,7 @@ class Telemetry:
                         await client.publish(f"{self._topic}/state", offline.payload, qos=1, retain=True)
                 raise
 
-    async def _forward(self, client: aiomqtt.Client) -> None:
+    async def _forward(self, client: "aiomqtt.Client") -> None:
         while True:
             await self._arrived.wait()
             self._arrived.clear()

@@ -23,7 +23,6 @@ from coldloop.modbus.requests import (
     WRITE_MULTIPLE_REGISTERS,
 )
 from coldloop.modbus.settings import TlsSettings
-from coldloop.modbus.tls import client_context
 from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
@@ -85,7 +84,7 @@ class RegisterClient:
         self._host = host
         self._port = port
         self._timeout_s = timeout_s
-        self._tls = client_context(tls, f"tls of the client of {self.peer}") if tls else None
+        self._tls = _secured(tls, f"tls of the client of {self.peer}") if tls else None
         self._turn = asyncio.Lock()
         self._places: dict[type[tuple[Any, ...]], tuple[Block, RecordCodec]] = {
             block.record: (block, codec_of(block, order)) for block in register_map.blocks
@@ -305,6 +304,12 @@ class RegisterClient:
         return PeerUnreachableError(
             f"{self.peer} answered a request for block '{block.name}' with something else: check host and port"
         )
+
+
+def _secured(tls: TlsSettings, name: str) -> ssl.SSLContext:
+    from coldloop.modbus.tls import client_context  # noqa: PLC0415 a service without TLS starts without cryptography
+
+    return client_context(tls, name)
 
 
 def _encoded(block: Block, codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
