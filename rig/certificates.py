@@ -62,7 +62,7 @@ class Authority:
 
     def issue_client(self, name: str, role: str | None, days: float | None = None) -> Pair:
         """Return a client's certificate with a role, or with none."""
-        extension = x509.UnrecognizedExtension(ROLE_EXTENSION, encoded_role(role)) if role is not None else None
+        extension = _role_extension(role) if role is not None else None
         return self._issue(name, ExtendedKeyUsageOID.CLIENT_AUTH, extension, days)
 
     def revocation_list(self, revoked: Iterable[x509.RevokedCertificate], days: float) -> bytes:
@@ -104,6 +104,10 @@ def revoked_now(certificate: x509.Certificate) -> x509.RevokedCertificate:
     """Return the entry of a certificate that is revoked now."""
     builder = x509.RevokedCertificateBuilder().serial_number(certificate.serial_number)
     return builder.revocation_date(datetime.now(UTC)).build()
+
+
+def _role_extension(role: str) -> x509.UnrecognizedExtension:
+    return x509.UnrecognizedExtension(x509.ObjectIdentifier(ROLE_EXTENSION), encoded_role(role))
 
 
 def _draft(name: str, issuer: str, key: ec.EllipticCurvePrivateKey, end: datetime) -> x509.CertificateBuilder:

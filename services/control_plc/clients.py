@@ -78,7 +78,7 @@ class Clients:
         publication.lease = self.lease
         bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader, SequenceRow)
         bank.judged_by(self._judge_operator, Operator)
-        for empty in (bank.get(Update), LatchedUpdate(), Acknowledgement(0, Verdict.NONE)):
+        for empty in (bank.get(Update), LatchedUpdate(), Acknowledgement(0, Verdict.NONE), Plan(0, 0)):
             bank.put(sealed(empty))
 
     # -- judged before anything is stored ------------------------------------------------------------------------------

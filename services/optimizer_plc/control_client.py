@@ -26,6 +26,8 @@ T = TypeVar("T")
 ATTEMPTS: Final = 3
 """Times that something is asked for that arrives damaged: on the way there (exception 03, bad CRC), or back."""
 ILLEGAL_VALUE: Final = 3
+DAMAGED_THERE: Final = (Verdict.BAD_CRC, Verdict.WRONG_LENGTH)
+"""Verdicts on a sequence that is not as it was sent; its number may not be either."""
 ROWS_WITH_HEADER: Final = 18
 """Rows that fit into one request with the header that commits them."""
 LONGEST_WAIT_S: Final = 1.0
@@ -128,18 +130,16 @@ class ControlClient:
 
     async def deliver(self, sequence: InputSequence) -> Verdict:
         """Send a sequence, the header that commits it last; return the verdict of the control PLC."""
-        verdict = Verdict.BAD_CRC
-        for _ in range(ATTEMPTS):
+        for attempt in range(1, ATTEMPTS + 1):
             answer = await self._again(lambda: self._commit(sequence))
-            if answer.number != sequence.header.number or answer.verdict not in Verdict.__members__.values():
-                raise LinkError(
-                    f"{self._client.peer} acknowledges sequence {answer.number} with verdict {answer.verdict} "
-                    f"after sequence {sequence.header.number}: look for a second optimiser"
-                )
-            verdict = Verdict(answer.verdict)
-            if verdict is not Verdict.BAD_CRC:
+            if answer.verdict not in DAMAGED_THERE or attempt == ATTEMPTS:
                 break
-        return verdict
+        if answer.number != sequence.header.number or answer.verdict not in Verdict.__members__.values():
+            raise LinkError(
+                f"{self._client.peer} acknowledges sequence {answer.number} with verdict {answer.verdict} after "
+                f"sequence {sequence.header.number}: look for a second optimiser"
+            )
+        return Verdict(answer.verdict)
 
     async def _commit(self, sequence: InputSequence) -> Acknowledgement:
         header, rows = sequence

@@ -11,7 +11,7 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.declaration import Block
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, OPTIMIZER_MAP, Optimization, OptimizerSession
-from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
+from optimizer_plc.budget import PlcBudget
 from optimizer_plc.control_link import ControlLink
 
 SHORTEST_PERIOD_TICKS: Final = 2
@@ -47,9 +47,9 @@ class Publication:
     def _judge(self, asked: OptimizerSession, _row: int, _caller: Caller) -> None:
         """Refuse an updating period that there is not, or whose answers would never be there in time."""
         ticks = asked.updating_period
-        if ticks and not SHORTEST_PERIOD_TICKS <= ticks <= MAX_PERIOD_TICKS:
+        if 0 < ticks < SHORTEST_PERIOD_TICKS:
             raise IllegalValueError(
-                f"session.updating_period is {ticks}: give {SHORTEST_PERIOD_TICKS} to {MAX_PERIOD_TICKS}, or 0 for adaptive"
+                f"session.updating_period = {ticks}: give {SHORTEST_PERIOD_TICKS} or more, or 0 (adaptive)"
             )
         if ticks and asked.realtime and not self._budget.is_enough(ticks):
             raise IllegalValueError(

@@ -13,10 +13,12 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
-import aiomqtt
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+
+if TYPE_CHECKING:
+    import aiomqtt
 
 log = logging.getLogger("coldloop.telemetry")
 
@@ -96,6 +98,8 @@ class Telemetry:
             await asyncio.sleep(self._settings.timeout_s)
 
     async def _publish(self) -> None:
+        import aiomqtt  # noqa: PLC0415 a tenth of what a service loads at its start, and most have no broker
+
         s = self._settings
         offline = aiomqtt.Will(f"{self._topic}/state", json.dumps({"state": "offline"}), qos=1, retain=True)
         name = s.username or None
@@ -111,7 +115,7 @@ class Telemetry:
                         await client.publish(f"{self._topic}/state", offline.payload, qos=1, retain=True)
                 raise
 
-    async def _forward(self, client: aiomqtt.Client) -> None:
+    async def _forward(self, client: "aiomqtt.Client") -> None:
         while True:
             await self._arrived.wait()
             self._arrived.clear()

@@ -8,14 +8,11 @@ import json
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Final
 
-from cryptography import x509
-
 from coldloop.modbus.settings import AccessSettings, Networks
 from coldloop.registers.bank import Caller
 from coldloop.registers.declaration import Role
 
-ROLE_EXTENSION: Final = x509.ObjectIdentifier("1.3.6.1.4.1.50316.802.1")
-ODD_CERTIFICATE: Final = (x509.DuplicateExtension, x509.UnsupportedGeneralNameType, x509.InvalidVersion)
+ROLE_EXTENSION: Final = "1.3.6.1.4.1.50316.802.1"
 UTF8_STRING: Final = 0x0C
 """Tag of a UTF8String in DER."""
 MAX_LENGTH: Final = 127
@@ -52,12 +49,15 @@ def _within(address: IPv4Address | IPv6Address, networks: Networks) -> bool:
 
 def _subject_and_role(der: bytes) -> tuple[str, str]:
     """Return both as they stand in a certificate; empty where it is too odd to be read, though OpenSSL took it."""
+    from cryptography import x509  # noqa: PLC0415 a service without TLS starts without it
+
+    odd = (x509.DuplicateExtension, x509.UnsupportedGeneralNameType, x509.InvalidVersion)
     subject = ""
     try:
         certificate = x509.load_der_x509_certificate(der)
         subject = certificate.subject.rfc4514_string()
-        extension = certificate.extensions.get_extension_for_oid(ROLE_EXTENSION).value
-    except (x509.ExtensionNotFound, ValueError, *ODD_CERTIFICATE):
+        extension = certificate.extensions.get_extension_for_oid(x509.ObjectIdentifier(ROLE_EXTENSION)).value
+    except (x509.ExtensionNotFound, ValueError, *odd):
         return subject, ""
     return subject, decoded_role(extension.public_bytes())
 

@@ -1,6 +1,7 @@
 """A typed client of one server: records in, records out."""
 
 import asyncio
+import ssl
 import struct
 from collections.abc import Sequence
 from typing import Any, Final, Self, TypeVar, cast
@@ -17,7 +18,6 @@ from coldloop.modbus.requests import (
     WRITE_MULTIPLE_REGISTERS,
 )
 from coldloop.modbus.settings import TlsSettings
-from coldloop.modbus.tls import client_context
 from coldloop.modbus.transport import NoAnswerError, Transport
 from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
 from coldloop.registers.common import Identity
@@ -73,7 +73,7 @@ class RegisterClient:
         self._map = register_map
         self._order = order
         self._timeout_s = timeout_s
-        context = client_context(tls, f"tls of the client of {register_map.service} at {host}:{port}") if tls else None
+        context = _secured(tls, f"tls of the client of {register_map.service} at {host}:{port}") if tls else None
         self._secure = context is not None
         self._transport = Transport(register_map.service, host, port, timeout_s, context)
         self._turn = asyncio.Lock()
@@ -105,7 +105,7 @@ class RegisterClient:
     @property
     def connected(self) -> bool:
         """Whether there is a connection; without one the next request makes one."""
-        return bool(self._client.connected)
+        return self._transport.connected
 
     async def connect(self, patience_s: float) -> None:
         """Connect, and make sure that the peer speaks this register map in this word order.
@@ -263,6 +263,12 @@ class RegisterClient:
         return PeerUnreachableError(
             f"{self.peer} answered a request for block '{block.name}' with something else: check host and port"
         )
+
+
+def _secured(tls: TlsSettings, name: str) -> ssl.SSLContext:
+    from coldloop.modbus.tls import client_context  # noqa: PLC0415 a service without TLS starts without cryptography
+
+    return client_context(tls, name)
 
 
 def _encoded(block: Block, codec: RecordCodec, record: tuple[Any, ...]) -> bytes:

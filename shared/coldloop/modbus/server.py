@@ -15,7 +15,6 @@ from coldloop.modbus.identification import DeviceIdentity
 from coldloop.modbus.refusals import ErrorCounters, RefusalLog
 from coldloop.modbus.requests import RequestHandler
 from coldloop.modbus.settings import ServerSettings
-from coldloop.modbus.tls import server_context
 from coldloop.modbus.tls_listener import TlsListener
 from coldloop.modbus.turns import Turns
 from coldloop.registers.bank import Caller, RegisterBank
@@ -127,6 +126,8 @@ class ModbusServer:
         tls = self._settings.tls
         if tls is None:
             return await asyncio.get_running_loop().create_server(self._new_connection, host, port)
+        from coldloop.modbus.tls import server_context  # noqa: PLC0415 without TLS, nothing needs cryptography
+
         return await TlsListener.at(
             host,
             port,

@@ -8,7 +8,7 @@ import asyncio
 import logging
 import ssl
 from functools import cached_property, partial
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusException
@@ -106,7 +106,7 @@ class Transport:
 
     def close(self) -> None:
         """Close the connection."""
-        transport = self._client.ctx.transport
+        transport = cast("asyncio.WriteTransport | None", self._client.ctx.transport)
         self._client.close()
         if transport is not None and self._tls is not None:
             transport.abort()  # the farewell of TLS takes a round trip, and may outlast the event loop
