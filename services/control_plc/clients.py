@@ -4,7 +4,6 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Final
 
-from coldloop.lease import Lease
 from coldloop.limits import InputLimits
 from coldloop.process import INPUT_NAMES, TICK_S
 from coldloop.registers.audit import EventKind, JournalQuery
@@ -29,6 +28,7 @@ from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
 from coldloop.seal import sealed
 from coldloop.sequence import InputSequence
 from coldloop.session import Pace
+from coldloop.writer_lease import LeaseEvent, WriterLease
 from control_plc.program import ControlProgram
 from control_plc.publication import Publication
 
@@ -68,8 +68,7 @@ class Clients:
         self._pace = pace
         self._news = asyncio.Event()
         self._waits = 0
-        self._refused: set[int] = set()
-        self.lease = Lease("the optimiser's registers", self._silence_s)
+        self.lease = WriterLease("the optimiser's registers", self._silence_s, self._note_lease)
         self.changed = asyncio.Event()
         self.granted = 0
         """Lock-step scans every tick before this one."""
@@ -95,9 +94,6 @@ class Clients:
             self.lease.check(caller, record.holder if isinstance(record, Heartbeat) else None)
         except BusyError:
             self._program.alarms.happened(AlarmKind.SECOND_WRITER, SECOND_OPTIMIZER)
-            if caller.connection not in self._refused:
-                self._refused.add(caller.connection)
-                self._note(EventKind.LEASE, 2, caller)
             raise
         if isinstance(record, Plan) and not record.crc:
             raise IllegalValueError("a plan without CRC: it decides when inputs change, so it is sealed")
@@ -139,8 +135,7 @@ class Clients:
         """Take what the optimiser has written."""
         record, program = block.record, self._program
         beat = self._bank.get(Heartbeat) if record is Heartbeat else None
-        if self.lease.take(caller, beat.holder if beat else None):
-            self._note(EventKind.LEASE, 1, caller)
+        self.lease.take(caller, beat.holder if beat else None)
         if record is SequenceRow:
             return None
         self.changed.set()
@@ -162,14 +157,14 @@ class Clients:
         elif record is ControlSession:
             self.asked = asked = self._bank.get(ControlSession)
             self.granted = 0
-            self._note(EventKind.SESSION, asked.realtime, caller, value=asked.factor)
+            self._note(EventKind.SESSION, asked.realtime, caller.name, value=asked.factor)
         elif record is Operator:
-            self._operate(self._bank.get(Operator), caller)
+            self._operate(self._bank.get(Operator), caller.name)
         elif record is AlarmCommand:
             program.alarms.command(self._bank.get(AlarmCommand), caller.name)
         elif record is WatchdogTime:
             time = self._bank.get(WatchdogTime).time
-            self._note(EventKind.WATCHDOG_TIME, time, caller, cause=program.watchdog.time)
+            self._note(EventKind.WATCHDOG_TIME, time, caller.name, cause=program.watchdog.time)
             program.watchdog.set(time, program.tick)
         elif record is JournalQuery:
             self._publication.journal.answer(self._bank.get(JournalQuery))
@@ -178,18 +173,21 @@ class Clients:
         if record is not Grant:
             self._publication.safety()
 
-    def _operate(self, operator: Operator, caller: Caller) -> None:
+    def _operate(self, operator: Operator, who: str) -> None:
         before = self._program.operator
         if operator.mode != before.mode:
-            self._note(EventKind.OPERATOR_MODE, operator.mode, caller)
+            self._note(EventKind.OPERATOR_MODE, operator.mode, who)
         for place, (value, last) in enumerate(zip(operator[1:], before[1:], strict=True)):
             if abs(value - last) > TRACKED:
-                self._note(EventKind.SETPOINT, place, caller, value=value)
+                self._note(EventKind.SETPOINT, place, who, value=value)
         self._program.operate(operator)
 
-    def _note(self, kind: EventKind, subject: int, caller: Caller, *, cause: int = 0, value: float = 0.0) -> None:
+    def _note_lease(self, event: LeaseEvent, who: str) -> None:
+        self._note(EventKind.LEASE, event, who)
+
+    def _note(self, kind: EventKind, subject: int, who: str, *, cause: int = 0, value: float = 0.0) -> None:
         now = max(self._program.tick, self._program.alarms.now)
-        self._program.journal.note(now, kind, subject, cause, value=value, who=caller.name)
+        self._program.journal.note(now, kind, subject, cause, value=value, who=who)
 
     def _offer(self, header: SequenceHeader) -> None:
         rows = [self._bank.get(SequenceRow, row) for row in range(header.length)]
@@ -242,7 +240,6 @@ class Clients:
 
     def on_close(self, caller: Caller) -> None:
         """Note that a connection has closed."""
-        self._refused.discard(caller.connection)
         self.lease.closed(caller)
 
     def on_refusal(self, kind: str) -> None:

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from coldloop.clock import LatenessRecord
 from coldloop.event_text import log_event
 from coldloop.journal import JournalPublication
-from coldloop.lease import Lease
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, PlantLinkStatus, Process, Status
 from coldloop.registers.safety import AlarmKind, AlarmState
+from coldloop.writer_lease import WriterLease
 from control_plc.plant_link import PlantLink
 from control_plc.program import ControlProgram
 from control_plc.rack_clock import Skew
@@ -39,7 +39,7 @@ class Publication:
         self.skew = Skew(0.0, math.inf)
         """How much faster the rack's clock is than ours, and its phase error."""
         self.offset_ms = 0.0
-        self.lease: Lease | None = None
+        self.lease: WriterLease | None = None
         """That of the optimiser."""
 
     def begin(self) -> None:
@@ -111,6 +111,7 @@ class Publication:
         self._bank.put(program.watchdog.registers(program.tick))
         self._bank.put(self._plant_link())
         if self.lease is not None:
+            self.lease.note_end()
             self._bank.put(self.lease.registers())
 
     def _plant_link(self) -> PlantLinkStatus:

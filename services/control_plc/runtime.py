@@ -15,6 +15,7 @@ from typing import Final
 from coldloop import __version__
 from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.limits import InputLimits
+from coldloop.logs import dropped
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import ModelHeader, read_header
@@ -45,6 +46,9 @@ LOOK_PAUSE_S: Final = 0.1
 ANSWER_TICKS: Final = 8
 """In real time an answer that takes longer is of no use: the rack is looked at anew."""
 SHORTEST_PATIENCE_S: Final = 0.1
+EXPIRES_SOON: Final = 1
+"""Causes of the alarm CERTIFICATE."""
+EXPIRED: Final = 2
 
 
 def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:
@@ -75,6 +79,7 @@ class ControlPlc:
         self.clients = Clients(program, settings.limits, self.bank, self.publication, lambda: self._pace)
         self._reached = False
         self._looks = 0
+        self._lost_lines = 0
         self._awaiting_since: float | None = None
         self._publish()
 
@@ -196,7 +201,7 @@ class ControlPlc:
         if program.track():
             self.bank.put(program.operator)
         if on_the_second:
-            self._watch_clock()
+            self._watch_ourselves()
         program.alarms.pass_by()
         if program.process is not None:
             self.bank.put(program.process)
@@ -207,16 +212,19 @@ class ControlPlc:
         publication.identity()
         self._memory.keep(program, self._pace)
 
-    def _watch_clock(self) -> None:
-        """Raise the alarm when the rack's clock and ours differ by too much."""
+    def _watch_ourselves(self) -> None:
+        """Raise the alarms about clock and memory, and note log lines that were lost."""
         if self._pace.realtime:
             skew = self.publication.skew = self._clock.skew()
             self.publication.offset_ms = self._clock.offset * self._clock.tick_s * 1000
             limit = self._settings.control_plc.skew_alarm_ppm
             known = skew.error_ppm < limit / 4
             self._program.alarms.holds(AlarmKind.CLOCK_SKEW, condition=known and abs(skew.ppm) > limit)
-        failed = self._memory.failure is not None
-        self._program.alarms.holds(AlarmKind.STATE_NOT_RETAINED, condition=failed)
+        program, lost = self._program, dropped()
+        program.alarms.holds(AlarmKind.STATE_NOT_RETAINED, condition=self._memory.failure is not None)
+        if lost > self._lost_lines:
+            program.journal.note(program.tick, EventKind.LOST, value=lost - self._lost_lines)
+            self._lost_lines = lost
 
     @property
     def _patience_s(self) -> float:
@@ -229,6 +237,21 @@ class ControlPlc:
     def _in_ticks(self, at: float) -> float | None:
         """Return a moment of real time in ticks; None in lock-step."""
         return at / self._clock.tick_s if self._pace.realtime else None
+
+    async def watch_certificates(self) -> None:
+        """Raise the alarm while a certificate has expired, or will soon; look again every hour, until cancelled."""
+        section = self._settings.control_plc
+        files = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]
+        if not files:
+            return
+        from coldloop.modbus.tls import certificate_days_left  # noqa: PLC0415 not needed without TLS
+
+        while True:
+            days, warn_days = min((certificate_days_left(tls), tls.warn_days) for tls in files)
+            cause = EXPIRED if days < 0 else EXPIRES_SOON
+            self._program.alarms.holds(AlarmKind.CERTIFICATE, condition=days < warn_days, cause=cause)
+            self.publication.safety()
+            await asyncio.sleep(3600)
 
     # -- out of step ---------------------------------------------------------------------------------------------------
 
@@ -334,6 +357,7 @@ async def serve(settings: ControlSettings) -> None:
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(plc.run(), name="scan cycle")
+            tasks.create_task(plc.watch_certificates(), name="certificates")
             telemetry = Telemetry(settings.telemetry, "control_plc", plc.publication.snapshot)
             tasks.create_task(telemetry.run(), name="telemetry")
     finally:

@@ -1,6 +1,7 @@
 """The registers of the rack: what clients write is judged and taken, and what they read is kept up to date."""
 
 import logging
+import secrets
 import time
 from collections.abc import Callable
 
@@ -25,6 +26,7 @@ from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 from coldloop.registers.text import from_words
 from coldloop.seal import sealed
 from coldloop.session import Pace, TimeMode
+from coldloop.writer_lease import LeaseEvent, WriterLease
 from plant.faults import HEALTHY
 from plant.load import find_load
 from plant.outputs import next_generation
@@ -32,7 +34,6 @@ from plant.program import LoadProfile
 from plant.rack import MakePlant, Rack, Session
 from plant.retained_state import Memory, refused
 from plant.settings import PlantSettings
-from plant.writer import LeaseEvent, WriterLease
 
 log = logging.getLogger("coldloop.plant")
 
@@ -66,7 +67,7 @@ class RackRegisters:
         self.rack, resumed = self._switched_on(settings, header, make_plant, utc)
         self._journal = JournalPublication(self.rack.journal, self.bank)
         self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed))
-        self.lease = WriterLease(lambda: self.rack.silence_s, self._note_lease, now)
+        self.lease = WriterLease("the outputs", lambda: self.rack.silence_s, self._note_lease, now)
         self._written_row = 0
         self._outdated = True
         """The measurement in the registers is not that of now."""
@@ -84,7 +85,8 @@ class RackRegisters:
         session = Session(1 if configured.autostart else 0, pace, load, section.seed)
         state = self._memory.recall()
         journal = Journal(now=utc) if state is None else Journal(boot=state.boot + 1, count=state.events, now=utc)
-        generation = 1 if state is None else next_generation(state.generation)
+        # The first number is drawn, so that nobody takes this rack for the one before its restart.
+        generation = secrets.randbelow(2**31) + 1 if state is None else next_generation(state.generation)
         cv155, ncr22, cv156 = header.u0
         rack = Rack(
             section.watchdog, (cv155, ncr22, cv156), make_plant, session, journal=journal, generation=generation

@@ -1,4 +1,4 @@
-"""The one client that writes outputs: its lease, and the events of the lease."""
+"""The one client that writes in a role: its lease, and the events of the lease."""
 
 import time
 from collections.abc import Callable
@@ -22,9 +22,10 @@ class LeaseEvent(IntEnum):
 
 
 class WriterLease:
-    """The lease of the outputs.
+    """A lease that notes who gets it, who is refused, and when it ends.
 
     Args:
+        what: What the lease is of, for messages.
         silence_s: Returns how long, in real time, the holder may be silent.
         note: Takes the events, with the name of the client.
         now: A clock, s.
@@ -32,11 +33,12 @@ class WriterLease:
 
     def __init__(
         self,
+        what: str,
         silence_s: Callable[[], float],
         note: Callable[[LeaseEvent, str], None],
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._lease = Lease("the outputs", silence_s, now)
+        self._lease = Lease(what, silence_s, now)
         self._note = note
         self._now = now
         self._name: str | None = None
@@ -63,7 +65,7 @@ class WriterLease:
             self._refused_at[caller.connection] = now
             self._note(LeaseEvent.REFUSED, caller.name)
 
-    def take(self, caller: Caller, holder: int) -> None:
+    def take(self, caller: Caller, holder: int | None) -> None:
         """Give the lease to a client that `check` has let pass, or renew it."""
         if self._lease.take(caller, holder):
             if self._name is not None:  # it has lapsed, or the same connection has given itself another number
