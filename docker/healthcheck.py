@@ -1,4 +1,4 @@
-"""Healthy is a service that runs a session and, where that is in real time, goes on from tick to tick.
+"""Healthy is a service that answers and, if it scans, runs a session that goes on from tick to tick in real time.
 
 Needs the standard library only and reads no configuration files, so that it costs next to nothing. The service, its
 port and its certificates are those of the environment.
@@ -13,10 +13,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 PORTS = {"plant": 5020, "control_plc": 5021, "optimizer_plc": 5022}
-SESSIONS = {"plant": 400, "control_plc": 450, "optimizer_plc": 30}
-"""Address of the block that starts a session: its number, and whether it is in real time."""
-SCANNING = ("plant", "control_plc")
-"""Who goes on at every tick. The optimiser has nothing to do while somebody else drives."""
+SESSIONS = {"plant": 400, "control_plc": 450}
+"""Who scans, and the address of the block that starts a session: its number, and whether it is in real time.
+
+The optimiser has nothing to do while somebody else drives, and before that no session."""
 IDENTITY_WORDS = 13
 MAGIC = struct.pack(">f", 123.456)
 RUNNING = 1
@@ -83,9 +83,11 @@ def reader_of(connection: socket.socket) -> Read:
 def examine(service: str, read: Read) -> None:
     """Raise what is wrong."""
     first = identity(read)
+    if service not in SESSIONS:
+        return
     if first.state != RUNNING:
         raise UnhealthyError("runs no session")
-    if service not in SCANNING or not in_real_time(service, first, read):
+    if not in_real_time(service, first, read):
         return
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:

@@ -194,21 +194,6 @@ def test_no_kernel_is_compiled_at_the_start(rig: "ComposedRig", service: str) ->
     assert rig.inside(service, "sh", "-c", count.format("/tmp/coldloop")) == baked  # noqa: S108
 
 
-def test_an_hour_in_lock_step_is_that_of_one_process(
-    rig: "ComposedRig", coldloop: "Callable[..., None]", tmp_path: Path
-) -> None:
-    scenario = ["--load", "a", "--duration", "1h"]
-    endpoints = [f"127.0.0.1:{port}" for port in (rig.plant, rig.control_plc, rig.optimizer_plc)]
-    coldloop("--attach", *endpoints, *scenario, "--out", str(tmp_path / "composed"))
-    coldloop("--in-process", *scenario, "--out", str(tmp_path / "one process"))
-    composed, one_process = (
-        json.loads((tmp_path / name / "summary.json").read_text()) for name in ("composed", "one process")
-    )
-    assert composed["ticks"] == 4 * 3600
-    assert composed["trace_sha256"] == one_process["trace_sha256"]
-    assert identity_of_plant(rig).session == 2
-
-
 def test_a_service_that_dies_is_started_again(rig: "ComposedRig") -> None:
     before = rig.inspect("optimizer-plc")["State"]["StartedAt"]
     rig.compose("exec", "-T", "optimizer-plc", "python", "-c", "import os; os.kill(1, 15)")
@@ -234,3 +219,18 @@ def test_new_containers_go_on_where_those_before_were(rig: "ComposedRig") -> Non
     after = identity_of_plant(rig)
     assert (after.session, after.tick >= before.tick) == (before.session, True)
     assert "session resumed" in rig.compose("logs", "--no-color", "plant")
+
+
+def test_an_hour_in_lock_step_is_that_of_one_process(
+    rig: "ComposedRig", coldloop: "Callable[..., None]", tmp_path: Path
+) -> None:
+    scenario = ["--load", "a", "--duration", "1h"]
+    endpoints = [f"127.0.0.1:{port}" for port in (rig.plant, rig.control_plc, rig.optimizer_plc)]
+    coldloop("--attach", *endpoints, *scenario, "--out", str(tmp_path / "composed"))
+    coldloop("--in-process", *scenario, "--out", str(tmp_path / "one process"))
+    composed, one_process = (
+        json.loads((tmp_path / name / "summary.json").read_text()) for name in ("composed", "one process")
+    )
+    assert composed["ticks"] == 4 * 3600
+    assert composed["trace_sha256"] == one_process["trace_sha256"]
+    assert identity_of_plant(rig).session == 2

@@ -21,7 +21,7 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession
 from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
+from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.plant import PLANT_MAP, PlantSession
 from rig.certificates import Authority
 
@@ -116,13 +116,15 @@ async def test_in_lock_step_a_service_may_stand_whatever_its_configuration_says(
         assert (await one.check({"COLDLOOP__SESSION__MODE": "lockstep"})).returncode == 1
 
 
-async def test_an_optimiser_may_have_nothing_to_do() -> None:
+@pytest.mark.parametrize("state", ServiceState)
+async def test_an_optimiser_may_have_nothing_to_do(state: ServiceState) -> None:
     async with served("optimizer_plc") as one:
+        one.show(7, state)
         assert (await one.check()).returncode == 0
 
 
-@pytest.mark.parametrize("service", MAPS)
-async def test_without_a_session_none_is_healthy(service: str) -> None:
+@pytest.mark.parametrize("service", ["plant", "control_plc"])
+async def test_without_a_session_nothing_is_scanned(service: str) -> None:
     async with served(service) as one:
         one.show(0, READY, session=0)
         done = await one.check()
@@ -178,9 +180,14 @@ def test_nor_is_a_server_of_something_else() -> None:
 
 def test_the_addresses_it_reads_are_those_of_the_register_maps() -> None:
     known = runpy.run_path(str(PROGRAM))
-    starters = {PlantSession, ControlSession, OptimizerSession}
-    for service, register_map in MAPS.items():
-        (block,) = [block for block in register_map.blocks if block.record in starters]
-        assert known["SESSIONS"][service] == block.address
+    starters = {"plant": PlantSession, "control_plc": ControlSession}
+    addresses = {
+        service: block.address
+        for service, starter in starters.items()
+        for block in MAPS[service].blocks
+        if block.record is starter
+    }
+    assert known["SESSIONS"] == addresses
+    for register_map in MAPS.values():
         (identity,) = [block for block in register_map.blocks if block.record is Identity]
         assert identity.address == 0
