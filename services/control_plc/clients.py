@@ -9,7 +9,6 @@ from coldloop.process import INPUT_NAMES, TICK_S
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
 from coldloop.registers.control_plc import (
-    Acknowledgement,
     AwaitUpdate,
     ControlSession,
     Grant,
@@ -77,8 +76,6 @@ class Clients:
         publication.lease = self.lease
         bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader, SequenceRow)
         bank.judged_by(self._judge_operator, Operator)
-        for empty in (bank.get(Update), LatchedUpdate(), Acknowledgement(0, Verdict.NONE), Plan(0, 0)):
-            bank.put(sealed(empty))
 
     # -- judged before anything is stored ------------------------------------------------------------------------------
 
@@ -210,6 +207,8 @@ class Clients:
                 wanted = latched.update + 1
             else:
                 wanted = latched.update if latched else 0
+        elif program.awaiting_plan and not self._latched(wanted):
+            program.abandon()  # it has seen this number before our restart, and will not plan it: latch another
         return None if self._latched(wanted) else self._wait_for(wanted)
 
     def _latched(self, wanted: int) -> bool:

@@ -99,9 +99,9 @@ class SequencePlayer:
 
     def _miss(self) -> None:
         """Count an updating instant without a sequence, once however often its scan is begun."""
-        self.late = self.update is not None
+        self.late = self.update is not None or self._playing is not None
         self.broken_promise = self.phase in PROMISED
-        if self.late and self._missed != self.next_update_tick:
+        if self.update is not None and self._missed != self.next_update_tick:
             self.deadline_misses += 1
         self._missed = self.next_update_tick
 

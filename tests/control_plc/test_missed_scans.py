@@ -173,3 +173,17 @@ def test_a_sensor_that_shows_nothing_new_for_a_while_without_scans_is_frozen_by_
         skip(bench, 3)
         assert bench.program.tick - began < 200
     assert 20.0 <= (bench.program.tick - began) * 0.25 <= 22.0
+
+
+def test_after_a_restart_the_rest_of_what_was_played_is_played_on(bench: "Bench", at: "At") -> None:
+    bench.play([at(0.3)] * 40, ticks=10)
+    bench.scans(3)
+    program = bench.program
+    playing, tick, applied = program.player.sequence, program.tick, program.applied
+    program.restart(session=0)
+    program.resume(1, tick + 5, applied, updates=7, operator=program.operator, playing=playing)
+    row, update = bench.scan()
+    assert row == as_transmitted(at(0.3))
+    assert program.mode is Mode.REST
+    assert update is not None
+    assert update.update == 7, "the optimiser is asked anew at once"

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 from coldloop.registers.codec import RecordCodec, ValueCodec, WordOrder, codec_of
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, Role, fields_of
-from coldloop.seal import Seal, seal_of
+from coldloop.seal import Seal, seal_of, sealed
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -103,6 +103,8 @@ class RegisterBank:
         self._places[block.record] = block, codec_of(block, self.order)
         if block.writer is not None:
             self._writable[block.address : block.end] = b"\1" * size
+        if block.sealed:  # also what nobody has written yet: no seal is damage to those who read
+            self.put(sealed(codec_of(block, self.order).decode(bytes(2 * size))))
         fields = {name: _with_stored_bounds(field) for name, field in fields_of(block.record).items()}
         for row in range(block.rows):
             for register in block.registers(row):
