@@ -2,16 +2,14 @@
 
 import contextlib
 import socket
+import struct
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.endpoints import Endpoint
-from coldloop.errors import RequestRefusedError
-from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import TlsSettings
-from coldloop.registers.common import Identity
+from coldloop.modbus.tls import client_context
 from coldloop.registers.plant import PLANT_MAP, Actuators, LoadStep
 
 if TYPE_CHECKING:
@@ -20,29 +18,47 @@ if TYPE_CHECKING:
     from conftest import ComposedRig
 
 
+READ_MAGIC = bytes.fromhex("000100000006ff0300000002")
 MAGIC = bytes.fromhex("42f6e979")
 
 
-def client_of_plant(rig: "ComposedRig", site: Path, name: str) -> RegisterClient:
-    tls = TlsSettings(certificate=site / f"{name}.crt", key=site / f"{name}.key", ca=site / "ca.crt")
-    return RegisterClient.at(PLANT_MAP, Endpoint(port=rig.plant, timeout_s=5.0, tls=tls))
+def certificates(site: Path, name: str) -> TlsSettings:
+    return TlsSettings(certificate=site / f"{name}.crt", key=site / f"{name}.key", ca=site / "ca.crt")
 
 
-async def test_the_rig_runs_and_its_certificates_say_who_writes(secured_rig: "ComposedRig", site: Path) -> None:
-    operator = client_of_plant(secured_rig, site, "operator")
-    try:
-        await operator.connect(5.0)
-        assert (await operator.read(Identity)).session == 1
-        await operator.write_rows([LoadStep(0, 385.0)])
-        with pytest.raises(RequestRefusedError):
-            await operator.write(Actuators(0, 50.0, 50.0, 50.0, 1))
-    finally:
-        operator.close()
+def function_of_answer(rig: "ComposedRig", tls: TlsSettings, request: bytes) -> int:
+    """Return the function code that the plant answers a request with."""
+    with (
+        socket.create_connection(("127.0.0.1", rig.plant), 5) as plain,
+        client_context(tls, "test").wrap_socket(plain, server_hostname="127.0.0.1") as connection,
+    ):
+        connection.sendall(struct.pack(">HHHB", 1, 0, len(request) + 1, 255) + request)
+        return connection.makefile("rb").read(8)[7]
+
+
+def write_of(record: type[tuple[object, ...]]) -> bytes:
+    """Return a request that writes zeros into the first row of a block."""
+    block = PLANT_MAP.block_of(record)
+    return struct.pack(">BHHB", 16, block.address, block.row_words, 2 * block.row_words) + bytes(2 * block.row_words)
+
+
+@pytest.mark.parametrize(("name", "answer"), [("operator", 16), ("control", 0x90), ("reader", 0x90)])
+def test_certificates_say_who_may_write_the_load(
+    secured_rig: "ComposedRig", site: Path, name: str, answer: int
+) -> None:
+    tls = certificates(site, name)
+    assert function_of_answer(secured_rig, tls, READ_MAGIC[7:]) == 3
+    assert function_of_answer(secured_rig, tls, write_of(LoadStep)) == answer
+
+
+@pytest.mark.parametrize("name", ["operator", "optimizer", "reader"])
+def test_none_but_the_control_plc_may_write_outputs(secured_rig: "ComposedRig", site: Path, name: str) -> None:
+    assert function_of_answer(secured_rig, certificates(site, name), write_of(Actuators)) == 0x90
 
 
 def test_nobody_is_answered_without_tls(secured_rig: "ComposedRig") -> None:
     with socket.create_connection(("127.0.0.1", secured_rig.plant), 5) as connection:
-        connection.sendall(bytes.fromhex("000100000006ff0300000002"))
+        connection.sendall(READ_MAGIC)
         with contextlib.suppress(ConnectionResetError):
             assert MAGIC not in connection.recv(1000)
 
