@@ -20,6 +20,8 @@ MAX_CORRECTION: Final = 0.1
 """Largest correction of the phase with one measurement, in ticks: the slew of our time."""
 MAX_RATE: Final = 0.1
 """Largest difference of rates that is followed."""
+SUREST_S: Final = 5e-5
+"""No measurement counts as surer than this."""
 MEMORY_S: Final = 600.0
 """Real time over which the skew is estimated."""
 
@@ -32,37 +34,43 @@ class Skew(NamedTuple):
 
 
 class SkewEstimator:
-    """Slope of the rack's time over ours: least squares that forgets with `MEMORY_S`."""
+    """Slope of the rack's time over ours: least squares, weighted by how sure each measurement is.
+
+    Old measurements are forgotten with `MEMORY_S`.
+    """
 
     def __init__(self) -> None:
-        self._weight = self._x = self._y = self._xx = self._xy = self._yy = 0.0
-        self._zero = 0.0
-        self._at: float | None = None
+        self._count = self._weight = 0.0
+        self._x = self._y = self._xx = self._xy = self._yy = 0.0
+        self._first: float | None = None
+        self._at = 0.0
 
-    def observe(self, ours: float, gained: float) -> None:
-        """Take how much the rack's clock has gained (s) at `ours` (s)."""
-        if self._at is None:
-            self._at, self._zero = ours, gained
+    def observe(self, ours: float, gained: float, uncertainty_s: float) -> None:
+        """Take how much the rack's clock has gained (s) at `ours` (s), known within `uncertainty_s`."""
+        if self._first is None:
+            self._first, self._at = gained, ours
         step, self._at = ours - self._at, ours
-        gained -= self._zero
+        gained -= self._first
         # Times are kept relative to the newest one, where the numbers stay small: shift the sums by the step.
         self._xx += step * (step * self._weight - 2 * self._x)
         self._xy -= step * self._y
         self._x -= step * self._weight
-        keep = math.exp(-step / MEMORY_S)
-        self._weight, self._x, self._y = keep * self._weight + 1.0, keep * self._x, keep * self._y + gained
-        self._xx, self._xy, self._yy = keep * self._xx, keep * self._xy, keep * self._yy + gained * gained
+        keep, weight = math.exp(-step / MEMORY_S), max(uncertainty_s, SUREST_S) ** -2
+        self._count = keep * self._count + 1.0
+        self._weight, self._x = keep * self._weight + weight, keep * self._x
+        self._y, self._yy = keep * self._y + weight * gained, keep * self._yy + weight * gained * gained
+        self._xx, self._xy = keep * self._xx, keep * self._xy
 
     def estimate(self) -> Skew:
         """Return the skew; its error is infinite while nothing is known."""
         n = self._weight
-        spread = self._xx - self._x * self._x / n if n > 2.0 else 0.0
+        spread = self._xx - self._x * self._x / n if self._count > 3.0 else 0.0
         if spread <= 0.0:
             return Skew(0.0, math.inf)
         covariance = self._xy - self._x * self._y / n
         slope = covariance / spread
         residual = max(0.0, self._yy - self._y * self._y / n - slope * covariance)
-        return Skew(slope * 1e6, math.sqrt(residual / ((n - 2.0) * spread)) * 1e6)
+        return Skew(slope * 1e6, math.sqrt(residual / ((self._count - 2.0) * spread)) * 1e6)
 
 
 class RackClock:
@@ -101,8 +109,14 @@ class RackClock:
         self._skew = SkewEstimator()
         self._begun = at
 
-    def observe(self, position: float, at: float) -> None:
-        """Take where the rack was at `at`, less than a tick from where it should be."""
+    def observe(self, position: float, at: float, uncertainty_s: float = SUREST_S) -> None:
+        """Take where the rack was, less than a tick from where it should be.
+
+        Args:
+            position: Its tick, and the share of it that had passed.
+            at: When, by our clock, s.
+            uncertainty_s: How well that is known: half the time that the exchange took.
+        """
         step_s = at - self._at
         expected = self.position_at(at)
         self.offset = error = position - expected
@@ -111,7 +125,7 @@ class RackClock:
         if step_s > 0.0:
             change = RATE_GAIN * min(max(error, -1.0), 1.0) * min(1.0, self.tick_s / step_s)
             self._rate = min(max(self._rate + change, -MAX_RATE), MAX_RATE)
-        self._skew.observe(at - self._begun, position * self.tick_s - at + self._begun)
+        self._skew.observe(at - self._begun, position * self.tick_s - at + self._begun, uncertainty_s)
 
     def skew(self) -> Skew:
         """Return how much faster the rack's clock is than ours."""

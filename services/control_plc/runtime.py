@@ -183,13 +183,14 @@ class ControlPlc:
             self._cycle.failed(error)
             self._say_lost(error)
             return
-        at = (asked_at + time.monotonic()) / 2
+        answered_at = time.monotonic()
+        at = (asked_at + answered_at) / 2
         update = self._cycle.answered(answer, self._in_ticks(at))
         if not self._link.in_step:
             self._publish()
             return
         if self._pace.realtime and answer.tick:
-            self._clock.observe(answer.tick + answer.age, at)
+            self._clock.observe(answer.tick + answer.age, at, (answered_at - asked_at) / 2)
         if update is not None:
             self.clients.tell(update)
         self._after_scan(latched=update is not None)
@@ -337,6 +338,7 @@ class ControlPlc:
         self._clock = RackClock(self._pace.factor, time.monotonic())
         self.publication.begin()
         self.bank.put(self._program.operator)
+        self.bank.put(ControlSession(self._program.session, int(self._pace.realtime), self._pace.factor))
 
     def _publish(self) -> None:
         self.publication.status()

@@ -14,6 +14,7 @@ from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import (
     HISTORY_ROWS,
+    LOAD_ROWS,
     PLANT_MAP,
     Actuators,
     LoadStep,
@@ -72,6 +73,7 @@ class RackRegisters:
         self._outdated = True
         """The measurement in the registers is not that of now."""
         self._connect()
+        self._show_session()
         self._show_applied()
         self._finish()
 
@@ -233,6 +235,17 @@ class RackRegisters:
             tick=rack.tick,
             heartbeat=rack.tick & 0xFFFF,
         )
+
+    def _show_session(self) -> None:
+        """Put the session that is under way from the start on into the registers, as its operator would have."""
+        session = self.rack.session
+        steps = list(zip(session.load.times, session.load.watts, strict=True))[:LOAD_ROWS]
+        if not session.number:
+            return
+        for row, (tick, watts) in enumerate(steps):
+            self.bank.put(LoadStep(tick, watts), row)
+        pace = session.pace
+        self.bank.put(PlantSession(session.number, int(pace.realtime), pace.factor, session.seed, len(steps)))
 
     def _show_applied(self) -> None:
         """Put what is applied into the registers of the outputs; the seal keeps others from completing it by a part."""

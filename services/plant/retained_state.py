@@ -58,11 +58,11 @@ class Memory:
         return None
 
     def keep(self, state: RetainedState) -> None:
-        """Keep the state of now."""
+        """Keep the state of now: it is the memory of a simulation, so every tick counts and no disk is waited for."""
         if self._file is None:
             return
         try:
-            self._file.save(state.model_dump())
+            self._file.save(state.model_dump(), synced=False)
         except RetainedStateError as error:
             log.error("the state is not retained", extra={"reason": str(error)})  # noqa: TRY400 one line
 

@@ -80,14 +80,19 @@ class RetainedFile:
         self._owner = owner
         self._digest = digest
 
-    def save(self, state: Mapping[str, Any]) -> None:
-        """Replace the state, and wait until the disk has it: milliseconds, or much longer on a slow disk.
+    def save(self, state: Mapping[str, Any], *, synced: bool = True) -> None:
+        """Replace the state.
+
+        Args:
+            state: The new one.
+            synced: Wait until the disk has it: milliseconds, or much longer on a slow disk. Without, the state survives
+                the end of the process, but not that of the machine.
 
         Raises:
             RetainedStateError: The file cannot be written.
         """
         try:
-            _replace(self.path, encoded(state, self._owner, self._digest))
+            _replace(self.path, encoded(state, self._owner, self._digest), synced=synced)
         except OSError as error:
             raise RetainedStateError(f"{self.path}: {error.strerror}; name another file in retain.file") from None
 
@@ -107,7 +112,7 @@ class RetainedFile:
             raise RetainedStateError(f"{self.path}: {error}") from None
 
 
-def _replace(path: Path, data: bytes) -> None:
+def _replace(path: Path, data: bytes, *, synced: bool) -> None:
     """Let a file have this content, or the one that it had."""
     draft = path.with_name(f"{path.name}.draft")
     try:
@@ -115,13 +120,15 @@ def _replace(path: Path, data: bytes) -> None:
             rest = memoryview(data)
             while rest:
                 rest = rest[file.write(rest) :]
-            os.fsync(file.fileno())
+            if synced:
+                os.fsync(file.fileno())
         draft.replace(path)
     except OSError:
         with contextlib.suppress(OSError):  # half a draft would only fill the disk further
             draft.unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
+    if synced:
+        _sync_folder(path.parent)
 
 
 def _sync_folder(folder: Path) -> None:
