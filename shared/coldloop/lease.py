@@ -84,7 +84,8 @@ class Lease:
 
     def closed(self, caller: Caller) -> bool:
         """Note that a connection has closed; tell whether it held the lease."""
-        if self._caller is None or self._caller.connection != caller.connection:
+        gone = self._caller is None or self._caller.connection != caller.connection
+        if gone or self._closed_at is not None:
             return False
         self._closed_at = self._now()
         if self._holder == SIMPLE_CLIENT:

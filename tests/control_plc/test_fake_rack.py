@@ -215,6 +215,7 @@ class RackLink(RuleBasedStateMachine):
     def adopt(self, reading: Measurement) -> bool:
         if reading.session != self.session:
             return False
+        self.accepted = None
         kept = RetainedState.parsed(self.kept) if self.kept and self.kept["session"] == reading.session else None
         self.program.resume(
             reading.session, reading.tick, reading.u, updates=kept.updates if kept else 0,
@@ -358,7 +359,6 @@ class RackLink(RuleBasedStateMachine):
         sequence = with_checksum(header, [as_transmitted(row)] * length)
         if self.program.offer(sequence).verdict == Verdict.ACCEPTED:
             self.accepted = sequence
-            self.accepted_journal = self.program.journal.count
 
     # -- what must hold ------------------------------------------------------------------------------------------------
 
