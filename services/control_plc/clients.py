@@ -76,6 +76,7 @@ class Clients:
         publication.lease = self.lease
         bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader, SequenceRow)
         bank.judged_by(self._judge_operator, Operator)
+        bank.put(sealed(Plan(0, 0)))
 
     # -- judged before anything is stored ------------------------------------------------------------------------------
 

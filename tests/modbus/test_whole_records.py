@@ -239,6 +239,7 @@ def sealed_raw(raw: bytes) -> bytes:
 
 async def test_an_unsealed_answer_of_a_sealed_block_is_damage(serve: "Serve") -> None:
     async with serve() as running:
+        running.bank.put(running.bank.get(Measurement)._replace(crc=0))
         client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=running.server.port, timeout_s=5.0)
         with pytest.raises(DamagedAnswerError):
             await client.read(Measurement)

@@ -103,7 +103,7 @@ class RegisterBank:
         self._places[block.record] = block, codec_of(block, self.order)
         if block.writer is not None:
             self._writable[block.address : block.end] = b"\1" * size
-        if block.sealed:  # also what nobody has written yet: no seal is damage to those who read
+        if block.sealed and block.writer is None:  # no seal is damage to those who read, also before there is anything
             self.put(sealed(codec_of(block, self.order).decode(bytes(2 * size))))
         fields = {name: _with_stored_bounds(field) for name, field in fields_of(block.record).items()}
         for row in range(block.rows):
