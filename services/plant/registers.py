@@ -46,6 +46,8 @@ class RackRegisters:
         settings: The configuration.
         header: Of the model file.
         make_plant: Makes the simulation of a session.
+        first_generation: Of the outputs, where no retained state tells one; drawn by default, so that nobody takes this
+            rack for the one before its restart.
         age: Returns the time since the present tick began, in ticks; 0 while no clock runs.
         now: A clock, s, by which the lease of the outputs ends.
         utc: Time of events, seconds since 1970.
@@ -57,6 +59,7 @@ class RackRegisters:
         header: ModelHeader,
         make_plant: MakePlant,
         *,
+        first_generation: int | None = None,
         age: Callable[[], float] = lambda: 0.0,
         now: Callable[[], float] = time.monotonic,
         utc: Callable[[], float] = time.time,
@@ -65,7 +68,9 @@ class RackRegisters:
         self._age = age
         self.bank = RegisterBank(PLANT_MAP, settings.plant.word_order)
         self._memory = Memory(settings.plant.retain.file, header.short_digest)
-        self.rack, resumed = self._switched_on(settings, header, make_plant, utc)
+        self.rack, resumed = self._switched_on(
+            settings, header, make_plant, utc, first_generation or secrets.randbelow(2**31) + 1
+        )
         self._journal = JournalPublication(self.rack.journal, self.bank)
         self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed))
         self.lease = WriterLease("the outputs", lambda: self.rack.silence_s, self._note_lease, now)
@@ -73,12 +78,18 @@ class RackRegisters:
         self._outdated = True
         """The measurement in the registers is not that of now."""
         self._connect()
-        self._show_session()
+        if resumed:
+            self._show_session()
         self._show_applied()
         self._finish()
 
     def _switched_on(
-        self, settings: PlantSettings, header: ModelHeader, make_plant: MakePlant, utc: Callable[[], float]
+        self,
+        settings: PlantSettings,
+        header: ModelHeader,
+        make_plant: MakePlant,
+        utc: Callable[[], float],
+        first_generation: int,
     ) -> tuple[Rack, bool]:
         """Return the rack at the beginning of the configured session, or, and True, where it was when it ended."""
         section, configured = settings.plant, settings.session
@@ -87,8 +98,7 @@ class RackRegisters:
         session = Session(1 if configured.autostart else 0, pace, load, section.seed)
         state = self._memory.recall()
         journal = Journal(now=utc) if state is None else Journal(boot=state.boot + 1, count=state.events, now=utc)
-        # The first number is drawn, so that nobody takes this rack for the one before its restart.
-        generation = secrets.randbelow(2**31) + 1 if state is None else next_generation(state.generation)
+        generation = first_generation if state is None else next_generation(state.generation)
         cv155, ncr22, cv156 = header.u0
         rack = Rack(
             section.watchdog, (cv155, ncr22, cv156), make_plant, session, journal=journal, generation=generation
@@ -237,11 +247,9 @@ class RackRegisters:
         )
 
     def _show_session(self) -> None:
-        """Put the session that is under way from the start on into the registers, as its operator would have."""
+        """Put the session that was resumed into the registers, as its operator had written it."""
         session = self.rack.session
         steps = list(zip(session.load.times, session.load.watts, strict=True))[:LOAD_ROWS]
-        if not session.number:
-            return
         for row, (tick, watts) in enumerate(steps):
             self.bank.put(LoadStep(tick, watts), row)
         pace = session.pace

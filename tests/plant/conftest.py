@@ -171,7 +171,13 @@ class RackOnTheBus:
         make_plant = partial(make_program, HEADER, settings.plant.sensors)
         self.now = 1000.0
         self.registers = RackRegisters(
-            settings, HEADER, make_plant, age=self._age, now=lambda: self.now, utc=lambda: 1e9 + self.now
+            settings,
+            HEADER,
+            make_plant,
+            first_generation=1,
+            age=self._age,
+            now=lambda: self.now,
+            utc=lambda: 1e9 + self.now,
         )
         self.bank = self.registers.bank
         self._connections = count(1)

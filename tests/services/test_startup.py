@@ -1,5 +1,6 @@
 """Services as programs of their own: how they end when they cannot begin, and when they are told to."""
 
+import asyncio
 import signal
 import socket
 import subprocess
@@ -8,13 +9,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.modbus.client import RegisterClient
 from coldloop.model_file import read_document, write_document
 from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.registers.control_plc import CONTROL_MAP, PlantLinkState, PlantLinkStatus
+from coldloop.registers.safety import Alarm, AlarmKind
 
 if TYPE_CHECKING:
     from tests.services.conftest import ServingPort, Start
 
 USAGE, FAILURE = 2, 1
+PATIENCE_S = 60.0
 SERVICES = ("plant", "control_plc", "optimizer_plc")
 
 
@@ -41,9 +46,28 @@ def test_a_port_in_use_is_named_with_what_to_do(start: "Start") -> None:
         assert_ended(process, FAILURE, f"127.0.0.1:{port}", "in use", "another port")
 
 
-def test_a_control_plc_without_a_plant_gives_up_after_its_patience(start: "Start", free_port: int) -> None:
-    process = start("control_plc", f"control_plc.plant.port={free_port}", "control_plc.plant.patience_s=0.2")
-    assert_ended(process, FAILURE, f"plant at 127.0.0.1:{free_port}", "start it")
+async def test_a_control_plc_waits_for_a_rack_that_is_absent_at_power_up(
+    start: "Start", serving_port: "ServingPort", free_port: int
+) -> None:
+    """It says so in its registers, and goes on by itself when the rack comes."""
+    alone = ("session.autostart=true", "session.mode=realtime", "session.factor=20")
+    process = start("control_plc", f"control_plc.plant.port={free_port}", *alone, level="info")
+    client = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=serving_port(process), timeout_s=5.0)
+    await becomes(client, PlantLinkState.SEARCHING)
+    assert (await client.read_rows(Alarm, AlarmKind.PLANT_LOST, 1))[0].active
+    assert process.poll() is None
+    start("plant", f"plant.server.port={free_port}", *alone)
+    await becomes(client, PlantLinkState.IN_STEP)
+    client.close()
+
+
+async def becomes(client: RegisterClient, state: PlantLinkState) -> None:
+    """Wait until the link to the rack is in a state."""
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            if (await client.read(PlantLinkStatus)).state == state:
+                return
+            await asyncio.sleep(0.02)
 
 
 def test_an_optimiser_refuses_a_control_plc_with_another_model(
