@@ -21,9 +21,9 @@ from coldloop.model_file import ModelHeader, read_header
 from coldloop.process import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, PlantLinkState
+from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, LinkCause, PlantLinkState
 from coldloop.registers.plant import PLANT_MAP, Measurement
-from coldloop.registers.safety import AlarmKind
+from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
 from control_plc.clients import Clients
@@ -183,6 +183,7 @@ class ControlPlc:
         if not self._link.in_step:
             self._publish()
             return
+        self._looks = 0
         if self._pace.realtime and answer.tick:
             self._clock.observe(answer.tick + answer.age, at)
         if update is not None:
@@ -239,10 +240,10 @@ class ControlPlc:
             if self.clients.asked is not None:
                 return
         self._looks += 1
-        asked_at = time.monotonic()
         try:
             if self._link.state is PlantLinkState.SEARCHING:
                 await self._plant.connect(SEARCH_S)
+            held = self._link.cause is LinkCause.SECOND_MASTER and await self._is_held_by_another()
             asked_at = time.monotonic()
             reading = await self._plant.read(Measurement)
         except LinkError as error:
@@ -250,19 +251,27 @@ class ControlPlc:
             self._say_lost(error)
         else:
             self._reached = True
-            at = (asked_at + time.monotonic()) / 2
-            self._cycle.answered(reading, self._in_ticks(at))
-            if self._link.in_step:
-                self._looks = 0
-                # at tick 0 the rack's clock waits for the first outputs
-                self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
-            elif not self.publication.running and not self._settings.session.autostart:
-                self._kept = None  # the rack has left the session that was retained
-                self._link.end()
+            if not held:
+                self._join(reading, (asked_at + time.monotonic()) / 2)
         if not self._link.in_step and self._pace.realtime:
             now = self._clock.tick_at(time.monotonic())
             self._program.alarms.now = max(self._program.tick, now)
         self._publish()
+
+    async def _is_held_by_another(self) -> bool:
+        """Tell whether another control PLC still holds the lease of the rack."""
+        lease = await self._plant.read(LeaseStatus)
+        return lease.state != LeaseState.FREE and lease.holder != self._link.holder
+
+    def _join(self, reading: Measurement, at: float) -> None:
+        """Go on from a reading, where that may be done; `at` is when the rack was read, s."""
+        self._cycle.answered(reading, self._in_ticks(at))
+        if self._link.in_step:
+            # at tick 0 the rack's clock waits for the first outputs
+            self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
+        elif not self.publication.running and not self._settings.session.autostart:
+            self._kept = None  # the rack has left the session that was retained
+            self._link.end()
 
     async def _pause(self) -> None:
         """Wait before the next look, unless somebody writes something."""
