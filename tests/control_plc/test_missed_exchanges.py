@@ -10,7 +10,12 @@ from coldloop.registers.control_plc import CONTROL_MAP, Cause, Mode, Status, Ver
 from coldloop.registers.safety import AlarmKind
 
 if TYPE_CHECKING:
-    from tests.control_plc.conftest import At, Bench
+    from collections.abc import Callable
+
+    from coldloop.registers.control_plc import SequenceRow
+    from tests.control_plc.conftest import Bench
+
+    At = Callable[..., SequenceRow]
 
 
 def test_an_exchange_that_fails_at_the_first_tick_of_a_sequence_is_neither_a_miss_nor_late(
