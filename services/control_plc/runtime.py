@@ -259,9 +259,10 @@ class ControlPlc:
         self._publish()
 
     async def _is_held_by_another(self) -> bool:
-        """Tell whether another control PLC still holds the lease of the rack."""
+        """Tell whether the control PLC that we were refused for still holds the lease of the rack."""
         lease = await self._plant.read(LeaseStatus)
-        return lease.state != LeaseState.FREE and lease.holder != self._link.holder
+        ours = lease.holder == self._link.holder
+        return lease.state == LeaseState.HELD or (lease.state == LeaseState.LINGERING and not ours)
 
     def _join(self, reading: Measurement, at: float) -> None:
         """Go on from a reading, where that may be done; `at` is when the rack was read, s."""

@@ -1,5 +1,7 @@
 """Of two control PLCs one drives the rack, and of two optimisers one answers the control PLC."""
 
+import shutil
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coldloop.modbus.client import RegisterClient
@@ -45,6 +47,55 @@ async def test_a_second_control_plc_is_refused_and_takes_over_when_the_first_is_
         await rack.until(lambda: drives(second.client, rack.client), within_s=TAKE_OVER_S)
         await rack.passes(60)
         await site.follows(second)
+        assert rack.violations() == []
+
+
+async def test_of_two_control_plcs_with_the_same_retained_number_one_drives_and_the_other_is_told(
+    field: "FieldAt", tmp_path: Path
+) -> None:
+    kept, copied = tmp_path / "kept", tmp_path / "copied"
+    async with field() as site:
+        first = await site.joined(f'control_plc.retain.file="{kept}"')
+        rack = site.rack
+        await first.drive(46.0, 100.0, 36.5)
+        await rack.passes(20)
+        shutil.copy(kept, copied)
+        second = site.control(f'control_plc.retain.file="{copied}"')
+        await rack.until(second.answers)
+        await second.drive(40.0, 50.0, 35.5)
+        assert (await second.link()).holder == (await first.link()).holder
+
+        async def told() -> bool:
+            alarms = [await one.alarm(AlarmKind.PLANT_FOREIGN) for one in (first, second)]
+            return any(alarm.active for alarm in alarms)
+
+        await rack.until(told)
+        await rack.passes(10)
+        begun = rack.tick
+        await rack.passes(200)
+        driven = [rack.applied[tick][0] for tick in range(begun, rack.tick)]
+        assert driven in (sorted(driven), sorted(driven, reverse=True)), "towards one setpoint, not to and fro"
+        assert rack.violations() == []
+
+
+async def test_a_control_plc_that_was_stopped_while_another_took_over_does_not_interfere(field: "FieldAt") -> None:
+    async with field() as site:
+        second = site.control()
+        first, rack = await site.joined(), site.rack
+        await first.drive(46.0, 100.0, 36.5)
+        await second.begin(rack.session)
+        await second.drive(40.0, 50.0, 35.5)
+        await rack.passes(40)
+        first.service.pause()
+        await rack.until(lambda: drives(second.client, rack.client), within_s=TAKE_OVER_S)
+        begun = rack.tick + 4
+        first.service.resume()
+        await rack.passes(200)
+        await site.follows(second)
+        assert (await first.link()).state == PlantLinkState.FOREIGN
+        assert (await first.alarm(AlarmKind.PLANT_FOREIGN)).active
+        driven = [rack.applied[tick][0] for tick in range(begun, rack.tick)]
+        assert driven == sorted(driven), "from the safe state towards the setpoint of the second"
         assert rack.violations() == []
 
 
