@@ -177,6 +177,7 @@ class ControlPlc:
         except LinkError as error:
             self._cycle.failed(error)
             self._say_lost(error)
+            self._publish()
             return
         at = (asked_at + time.monotonic()) / 2
         update = self._cycle.answered(answer, self._in_ticks(at))
@@ -241,22 +242,33 @@ class ControlPlc:
                 return
         self._looks += 1
         try:
-            if self._link.state is PlantLinkState.SEARCHING:
-                await self._plant.connect(SEARCH_S)
-            held = self._link.cause is LinkCause.SECOND_MASTER and await self._is_held_by_another()
-            asked_at = time.monotonic()
-            reading = await self._plant.read(Measurement)
+            await self._read_back()
         except LinkError as error:
             self._cycle.failed(error)
             self._say_lost(error)
-        else:
-            self._reached = True
-            if not held:
-                self._join(reading, (asked_at + time.monotonic()) / 2)
         if not self._link.in_step and self._pace.realtime:
             now = self._clock.tick_at(time.monotonic())
             self._program.alarms.now = max(self._program.tick, now)
         self._publish()
+
+    async def _read_back(self) -> None:
+        """Read what the rack applies; in real time an attempt is as short as a scan is urgent.
+
+        Raises:
+            LinkError: The rack does not answer, or not in time.
+        """
+        try:
+            async with asyncio.timeout(SEARCH_S if self._pace.realtime else None):
+                if self._link.state is PlantLinkState.SEARCHING:
+                    await self._plant.connect(SEARCH_S)
+                held = self._link.cause is LinkCause.SECOND_MASTER and await self._is_held_by_another()
+                asked_at = time.monotonic()
+                reading = await self._plant.read(Measurement)
+        except TimeoutError:
+            raise PeerUnreachableError(f"{self._plant.peer} has not answered within {SEARCH_S:g} s") from None
+        self._reached = True
+        if not held:
+            self._join(reading, (asked_at + time.monotonic()) / 2)
 
     async def _is_held_by_another(self) -> bool:
         """Tell whether the control PLC that we were refused for still holds the lease of the rack."""

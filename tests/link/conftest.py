@@ -400,8 +400,8 @@ class Field:
 
     async def joined(self, *assignments: str, factor: float = FACTOR, stderr: int | None = None) -> Control:
         """Start a control PLC and a session; return it in step."""
-        control = self.control(*assignments, stderr=stderr)
         await self.rack.begin(factor=factor)
+        control = self.control(*assignments, stderr=stderr)
         await control.begin(self.rack.session, factor=factor)
         await self.rack.until(control.in_step)
         await self.rack.passes(4)

@@ -1,5 +1,6 @@
 """Whatever came between them, a control PLC goes on from what the rack applies: judged at the rack, tick by tick."""
 
+import asyncio
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,8 +13,10 @@ from coldloop.registers.plant import PLANT_MAP, Actuators
 from coldloop.registers.safety import AlarmKind, WatchdogTime
 
 if TYPE_CHECKING:
-    from tests.link.conftest import FieldAt, Way, WireTo
+    from tests.link.conftest import FieldAt, Service, Way, WireTo
 
+PATIENCE_S = 20.0
+POLL_S = 0.02
 SAFE_STATE = (30.0, 50.0, 40.0)
 SETPOINTS = (44.0, 85.0, 36.2)
 MOVED = (25.0, 20.0, 30.0)
@@ -44,6 +47,7 @@ async def test_a_control_plc_that_was_stopped_goes_on_from_the_safe_state_though
         await rack.until(lambda: applied(SETPOINTS))
         control.service.pause()
         await rack.until(lambda: applied(SAFE_STATE))
+        await rack.passes(4)
         site.link.treat = reset_once()
         control.service.resume()
         await site.follows(control)
@@ -93,3 +97,22 @@ async def test_a_control_plc_that_was_restarted_goes_on_from_where_a_simple_clie
         assert rack.violations(since=moved_at) == []
         assert rack.applied[moved_at - 1] == MOVED
         assert rack.applied[rack.tick - 1] > MOVED, "it drives"
+
+
+async def test_a_rack_that_stood_still_is_gone_on_with_from_what_it_applies(field: "FieldAt", plant: "Service") -> None:
+    async with field() as site:
+        control, rack = await site.joined(), site.rack
+        await control.drive(*SETPOINTS)
+        await rack.passes(30)
+        plant.pause()
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                while (await control.link()).state != PlantLinkState.SEARCHING:  # noqa: ASYNC110 - a process
+                    await asyncio.sleep(POLL_S)
+        finally:
+            plant.resume()
+        await site.follows(control)
+        await rack.passes(60)
+        await site.follows(control)
+        assert rack.violations() == []
+        assert rack.applied[rack.tick - 1] != SAFE_STATE, "it drives again"
