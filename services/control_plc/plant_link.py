@@ -25,7 +25,9 @@ from coldloop.registers.safety import AlarmKind
 from control_plc.alarms import AlarmPanel
 
 FROZEN_TICKS: Final = 4
-"""In real time the rack is frozen when it shows the same tick for so long, in ticks of our clock."""
+"""In real time the rack is frozen when it shows the same tick for so many ticks of our clock, ..."""
+FROZEN_S: Final = 0.5
+"""... and for so long: a rack that is short of processor time is late, not frozen."""
 
 ALARMS: Final = {
     PlantLinkState.SEARCHING: AlarmKind.PLANT_LOST,
@@ -61,6 +63,11 @@ class PlantLink:
         self.holder = holder
         self.state, self.cause, self.since = PlantLinkState.IDLE, LinkCause.NONE, 0
         self.breaks = 0
+        """Times that outputs were no longer taken."""
+        self._noted = PlantLinkState.IDLE
+        """State that the journal knows of: in step when outputs have been taken, and not when they may be written."""
+        self.frozen_ticks = float(FROZEN_TICKS)
+        """How long the rack's tick may stand, in ticks of our clock."""
         self.generation = 0
         """Generation of the rack's outputs that was read back; 0 is none."""
         self.session = 0
@@ -151,6 +158,8 @@ class PlantLink:
 
     def settled(self) -> None:
         """Note a scan that was taken: what was wrong with the rack is over."""
+        if self._noted is not PlantLinkState.IN_STEP:
+            self._note(PlantLinkState.IN_STEP)
         for alarm in ALARMS.values():
             self._alarms.returned(alarm)
 
@@ -169,20 +178,25 @@ class PlantLink:
         if now is None or moved or reading.tick == 0:
             self._moved_at = now or 0.0
             return False
-        return now - self._moved_at >= FROZEN_TICKS
+        return now - self._moved_at >= self.frozen_ticks
 
     def _enter(self, state: PlantLinkState, cause: LinkCause) -> None:
         if (state, cause) == (self.state, self.cause):
             return
         left, before = self.state, self.cause
-        self.breaks += left is PlantLinkState.IN_STEP
         self.state, self.cause = state, cause
         if state is left:
             self._alarm(state, cause if before in HARMLESS else before)
             return
         self.since = self._alarms.now
-        self._journal.note(self._alarms.now, EventKind.PLANT_LINK, state, cause)
+        if state not in (PlantLinkState.IN_STEP, self._noted):
+            self.breaks += self._noted is PlantLinkState.IN_STEP
+            self._note(state)
         self._alarm(state, cause)
+
+    def _note(self, state: PlantLinkState) -> None:
+        self._noted = state
+        self._journal.note(self._alarms.now, EventKind.PLANT_LINK, state, self.cause)
 
     def _alarm(self, state: PlantLinkState, cause: LinkCause) -> None:
         """Raise the alarm of a state; those of the states before return when a scan is taken, or another is raised."""

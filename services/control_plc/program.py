@@ -28,7 +28,7 @@ from coldloop.registers.control_plc import (
     Update,
     Verdict,
 )
-from coldloop.registers.plant import Actuators, Measurement
+from coldloop.registers.plant import MAX_LOAD_W, Actuators, Measurement
 from coldloop.registers.safety import AlarmKind
 from coldloop.sequence import InputSequence
 from coldloop.watchdog import Watchdog
@@ -122,6 +122,8 @@ class ControlProgram:
         self._before = self._guard.applied
         self._player = SequencePlayer(self._guard, self._point.model_digest, updates=updates)
         self._sensors = SensorMonitor(self._section.sensors, self._point.outputs)
+        self._unknown = False
+        """The load or the state that was measured last makes no sense."""
         self._failed_handshake = -math.inf
         self._in_scan = False
         self.watchdog.set(self.watchdog.time, tick)
@@ -172,6 +174,11 @@ class ControlProgram:
         return self.optimizer_present and self._player.awaiting_sequence(self.tick)
 
     @property
+    def _usable(self) -> bool:
+        """MPC can work with what is measured."""
+        return not (self._unknown or self._sensors.unusable)
+
+    @property
     def _earliest(self) -> int:
         return self.tick + self._in_scan
 
@@ -199,7 +206,7 @@ class ControlProgram:
             tick,
             Situation(
                 operator=OperatorMode(self.operator.mode),
-                sensors_unusable=bool(self._sensors.unusable),
+                sensors_unusable=not self._usable,
                 row=row is not None,
                 late=self._player.late or not self.optimizer_present,
             ),
@@ -235,8 +242,8 @@ class ControlProgram:
         applied = tuple(self._guard.applied)
         y = tuple(self._sensors.check(self.tick, measurement.y))
         self.process = Process(self.tick, measurement.load, applied, y)
-        finite = math.isfinite(measurement.load) and all(map(math.isfinite, measurement.x))
-        self._let_play(usable=finite and not self._sensors.unusable)
+        self._unknown = not (0.0 <= measurement.load <= MAX_LOAD_W and all(map(math.isfinite, measurement.x)))
+        self._let_play(usable=self._usable)
         latched = None
         if self._player.latches(self.tick, measurement.load):
             latched = self._player.latch(
@@ -365,4 +372,4 @@ class ControlProgram:
     def operate(self, operator: Operator) -> None:
         """Let an operator decide who drives, from the next scan on."""
         self.operator = operator
-        self._let_play(usable=not self._sensors.unusable)
+        self._let_play(usable=self._usable)

@@ -22,6 +22,8 @@ MAX_RATE: Final = 0.1
 """Largest difference of rates that is followed."""
 SUREST_S: Final = 5e-5
 """No measurement counts as surer than this."""
+LEAP: Final = 1.0
+"""Ticks by which a rack whose clock runs on can be away from where it should be after a break."""
 MEMORY_S: Final = 600.0
 """Real time over which the skew is estimated."""
 
@@ -104,10 +106,14 @@ class RackClock:
         return self._position + (now - self._at) * (1.0 + self._rate) / self.tick_s
 
     def synchronise(self, position: float, at: float) -> None:
-        """Go by the rack from here on: the link was broken, or time has leapt. The rate found so far is kept."""
+        """Go by the rack from here on: the link was broken, or time has leapt. The rate found so far is kept.
+
+        So is the skew, unless the rack is not where its clock would have taken it: then it has leapt.
+        """
+        if abs(position - self.position_at(at)) > LEAP:
+            self._skew = SkewEstimator()
+            self._begun = at
         self._position, self._at, self.offset = position, at, 0.0
-        self._skew = SkewEstimator()
-        self._begun = at
 
     def observe(self, position: float, at: float, uncertainty_s: float = SUREST_S) -> None:
         """Take where the rack was, less than a tick from where it should be.

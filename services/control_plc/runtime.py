@@ -22,13 +22,13 @@ from coldloop.model_file import ModelHeader, read_header
 from coldloop.process import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, PlantLinkState
+from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, LinkCause, PlantLinkState
 from coldloop.registers.plant import PLANT_MAP, Measurement
-from coldloop.registers.safety import AlarmKind
+from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
 from control_plc.clients import Clients
-from control_plc.plant_link import PlantLink
+from control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
 from control_plc.program import ControlProgram, OperatingPoint
 from control_plc.publication import Publication
 from control_plc.rack_clock import PHASE, RackClock
@@ -136,7 +136,7 @@ class ControlPlc:
         if lateness * 1000 > self._settings.control_plc.scan_tolerance_ms:
             self.publication.overruns += 1
             program.alarms.happened(AlarmKind.SCAN_OVERRUN)
-        if lateness > self._clock.tick_s:
+        if lateness > self._clock.tick_s and program.tick:  # at tick 0 the rack's clock waits for us
             self._link.overslept()
         return self._link.in_step and self.clients.asked is None
 
@@ -182,6 +182,7 @@ class ControlPlc:
         except LinkError as error:
             self._cycle.failed(error)
             self._say_lost(error)
+            self._publish()
             return
         answered_at = time.monotonic()
         at = (asked_at + answered_at) / 2
@@ -189,6 +190,7 @@ class ControlPlc:
         if not self._link.in_step:
             self._publish()
             return
+        self._looks = 0
         if self._pace.realtime and answer.tick:
             self._clock.observe(answer.tick + answer.age, at, (answered_at - asked_at) / 2)
         if update is not None:
@@ -263,30 +265,50 @@ class ControlPlc:
             if self.clients.asked is not None:
                 return
         self._looks += 1
-        asked_at = time.monotonic()
         try:
-            if self._link.state is PlantLinkState.SEARCHING:
-                await self._plant.connect(SEARCH_S)
-            asked_at = time.monotonic()
-            reading = await self._plant.read(Measurement)
+            await self._read_back()
         except LinkError as error:
             self._cycle.failed(error)
             self._say_lost(error)
-        else:
-            self._reached = True
-            at = (asked_at + time.monotonic()) / 2
-            self._cycle.answered(reading, self._in_ticks(at))
-            if self._link.in_step:
-                self._looks = 0
-                # at tick 0 the rack's clock waits for the first outputs
-                self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
-            elif not self.publication.running and not self._settings.session.autostart:
-                self._kept = None  # the rack has left the session that was retained
-                self._link.end()
         if not self._link.in_step and self._pace.realtime:
             now = self._clock.tick_at(time.monotonic())
             self._program.alarms.now = max(self._program.tick, now)
         self._publish()
+
+    async def _read_back(self) -> None:
+        """Read what the rack applies; in real time an attempt is as short as a scan is urgent.
+
+        Raises:
+            LinkError: The rack does not answer, or not in time.
+        """
+        try:
+            async with asyncio.timeout(SEARCH_S if self._pace.realtime else None):
+                if self._link.state is PlantLinkState.SEARCHING:
+                    await self._plant.connect(SEARCH_S)
+                held = self._link.cause is LinkCause.SECOND_MASTER and await self._is_held_by_another()
+                asked_at = time.monotonic()
+                reading = await self._plant.read(Measurement)
+        except TimeoutError:
+            raise PeerUnreachableError(f"{self._plant.peer} has not answered within {SEARCH_S:g} s") from None
+        self._reached = True
+        if not held:
+            self._join(reading, (asked_at + time.monotonic()) / 2)
+
+    async def _is_held_by_another(self) -> bool:
+        """Tell whether the control PLC that we were refused for still holds the lease of the rack."""
+        lease = await self._plant.read(LeaseStatus)
+        ours = lease.holder == self._link.holder
+        return lease.state == LeaseState.HELD or (lease.state == LeaseState.LINGERING and not ours)
+
+    def _join(self, reading: Measurement, at: float) -> None:
+        """Go on from a reading, where that may be done; `at` is when the rack was read, s."""
+        self._cycle.answered(reading, self._in_ticks(at))
+        if self._link.in_step:
+            # at tick 0 the rack's clock waits for the first outputs
+            self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
+        elif not self.publication.running and not self._settings.session.autostart:
+            self._kept = None  # the rack has left the session that was retained
+            self._link.end()
 
     async def _pause(self) -> None:
         """Wait before the next look, unless somebody writes something."""
@@ -336,6 +358,7 @@ class ControlPlc:
     def _begin(self) -> None:
         self._looks = 0
         self._clock = RackClock(self._pace.factor, time.monotonic())
+        self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
         self.publication.begin()
         self.bank.put(self._program.operator)
         self.bank.put(ControlSession(self._program.session, int(self._pace.realtime), self._pace.factor))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Final
 
 from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
-from coldloop.registers.control_plc import LinkCause, PlantLinkState, Update
+from coldloop.registers.control_plc import LinkCause, Update
 from coldloop.registers.plant import Actuators, Measurement
 from control_plc.plant_link import PlantLink
 from control_plc.program import ControlProgram
@@ -84,8 +84,3 @@ class ScanCycle:
             return
         program.rejoin(reading.tick + (reading.age >= PHASE), reading.u)
         link.joined()
-
-    @property
-    def is_foreign(self) -> bool:
-        """Whether somebody else has the rack: looking again soon changes nothing."""
-        return self._link.state is PlantLinkState.FOREIGN

@@ -2,7 +2,8 @@
 
 A lease is granted to a connection with its first write, and refused to all others while it is held. It ends with
 silence, or by hand-over: when the connection of a simple client closes, at once; when that of a holder with a number
-closes, after a moment in which it may come back over another connection.
+closes, after a moment in which it may come back over another connection. A holder that comes back leaves its former
+connection for good: whoever writes over that one has the same number and is somebody else.
 """
 
 import time
@@ -38,6 +39,8 @@ class Lease:
         self._holder = SIMPLE_CLIENT
         self._heard_at = 0.0
         self._closed_at: float | None = None
+        self._left: set[int] = set()
+        """Open connections that the holder has left for the present one."""
         self.refused = 0
 
     @property
@@ -66,7 +69,7 @@ class Lease:
         held = self._caller
         if held is None or held.connection == caller.connection or self.state is LeaseState.FREE:
             return
-        if holder is not None and holder == self._holder != SIMPLE_CLIENT:
+        if holder is not None and holder == self._holder != SIMPLE_CLIENT and caller.connection not in self._left:
             return
         self.refused += 1
         raise BusyError(f"{held.name} holds the lease of {self._what}")
@@ -78,12 +81,17 @@ class Lease:
         number = self._holder if holder is None and same else holder or SIMPLE_CLIENT
         new = held is None or state is LeaseState.FREE or not (same or number == self._holder != SIMPLE_CLIENT)
         new = new or number != self._holder
+        if new:
+            self._left.clear()
+        elif held is not None and not same and self._closed_at is None:
+            self._left.add(held.connection)
         self._caller, self._holder = caller, number
         self._heard_at, self._closed_at = self._now(), None
         return new
 
     def closed(self, caller: Caller) -> bool:
         """Note that a connection has closed; tell whether it held the lease."""
+        self._left.discard(caller.connection)
         gone = self._caller is None or self._caller.connection != caller.connection
         if gone or self._closed_at is not None:
             return False

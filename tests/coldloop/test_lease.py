@@ -192,10 +192,12 @@ def test_another_party_writes_only_after_the_silence_or_the_departure_of_the_one
     lease = Lease("the rack", lambda: SILENCE_S, clock)
     last: tuple[int, float] | None = None  # connection and time of the last write that was taken
     departed: float | None = None
+    left: set[int] = set()  # connections that their holder has left for another one
     for step in story:
         clock.now += step.seconds if step.what == "wait" else 0.0
         if step.what == "close":
             assert lease.closed(caller(step.connection)) in {True, False}
+            left.discard(step.connection)
             if last is not None and last[0] == step.connection and departed is None:
                 departed = clock.now
         if step.what != "write":
@@ -204,7 +206,7 @@ def test_another_party_writes_only_after_the_silence_or_the_departure_of_the_one
         if last is not None and departed is not None:
             linger = LINGER_S if NUMBERS[last[0]] else 0.0
             free = free or NUMBERS[last[0]] == SIMPLE_CLIENT or clock.now - departed > linger
-        mine = last is not None and same_party(last[0], step.connection)
+        mine = last is not None and same_party(last[0], step.connection) and step.connection not in left
         if last is not None and last[0] == step.connection and departed is not None:
             continue  # a connection that has closed does not write
         try:
@@ -215,4 +217,8 @@ def test_another_party_writes_only_after_the_silence_or_the_departure_of_the_one
         else:
             assert free or mine
             assert new == (free or not mine)
+            if new:
+                left.clear()
+            elif last is not None and last[0] != step.connection and departed is None:
+                left.add(last[0])
             last, departed = (step.connection, clock.now), None

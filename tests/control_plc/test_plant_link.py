@@ -38,6 +38,7 @@ def link() -> PlantLink:
     made.begin()
     assert made.read_back(reading(), 1, None)
     made.joined()
+    made.settled()
     assert made.in_step
     return made
 

@@ -1,0 +1,23 @@
+"""Seals are of the bytes that travel, whatever the values are that they stand for."""
+
+import zlib
+
+import pytest
+
+from coldloop.registers.codec import WordOrder, codec_of
+from coldloop.registers.plant import PLANT_MAP, Measurement
+from coldloop.seal import CRC_BYTES, Seal, seal_of
+
+MEASUREMENT = PLANT_MAP.block_of(Measurement)
+RECORD = Measurement(7, 385.0, (1.0,) * 22, (2.0,) * 28, 1)
+
+
+@pytest.mark.parametrize("bits", [0x7FA00000, 0x7F800001, 0xFFA12345, 0x7FC00000])
+def test_the_seal_of_a_record_with_any_nan_is_intact(bits: int) -> None:
+    codec = codec_of(MEASUREMENT, WordOrder.HIGH_FIRST)
+    raw = bytearray(codec.encode(RECORD))
+    raw[8:12] = bits.to_bytes(4, "big")  # L1
+    raw[-CRC_BYTES:] = zlib.crc32(raw[:-CRC_BYTES]).to_bytes(CRC_BYTES, "big")
+    assert seal_of(codec, raw) is Seal.INTACT
+    raw[9] ^= 1
+    assert seal_of(codec, raw) is Seal.BROKEN

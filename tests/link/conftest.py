@@ -1,0 +1,448 @@
+"""Services as processes, a link between them that does what a test says, and the rack as its own history shows it."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from contextlib import AbstractAsyncContextManager
+from enum import Enum
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Self
+
+import pytest
+
+from coldloop.config import PREFIX
+from coldloop.errors import LinkError
+from coldloop.limits import InputLimits
+from coldloop.modbus.client import RegisterClient
+from coldloop.model_file import read_header
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
+from coldloop.registers.codec import WordOrder, codec_of
+from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import (
+    CONTROL_MAP,
+    ControlSession,
+    Operator,
+    OperatorMode,
+    PlantLinkState,
+    PlantLinkStatus,
+)
+from coldloop.registers.declaration import RegisterMap
+from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, LoadStep, Measurement, PlantSample, PlantSession
+from coldloop.registers.safety import Alarm, AlarmKind, LeaseState, LeaseStatus, WatchdogTime
+from rig.chaos.disturbance import take_frames
+from rig.ports import ReservedPorts
+
+HOST: Final = "127.0.0.1"
+HEADER: Final = read_header(DEFAULT_MODEL_FILE)
+LIMITS: Final = InputLimits()
+SAFE_STATE: Final = (30.0, 50.0, 40.0)
+WATCHDOG_TICKS: Final = 40
+FACTOR: Final = 25.0
+PATIENCE_S: Final = 20.0
+"""A condition that is waited for has failed after this real time."""
+START_S: Final = 90.0
+"""The first start on a machine compiles the kernels."""
+POLL_S: Final = 0.02
+ROUNDING: Final = 1e-4
+"""Of single precision, in % and W."""
+
+# -- processes ---------------------------------------------------------------------------------------------------------
+
+
+class Service:
+    """A service as a process, on a port of its own."""
+
+    def __init__(self, name: str, port: int, log: Path, assignments: Sequence[str], stderr: int | None) -> None:
+        self.name = name
+        self.port = port
+        with log.open("ab") as lines:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", name, *[f"--set={text}" for text in assignments]],
+                env={name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
+                stdin=subprocess.DEVNULL, stdout=lines, stderr=lines if stderr is None else stderr,
+            )  # fmt: skip
+
+    @property
+    def alive(self) -> bool:
+        return self.process.poll() is None
+
+    def pause(self) -> None:
+        self.process.send_signal(signal.SIGSTOP)
+
+    def resume(self) -> None:
+        self.process.send_signal(signal.SIGCONT)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    async def terminated(self, within_s: float) -> int:
+        """Tell it to stop; return its exit code."""
+        self.process.terminate()
+        return await asyncio.to_thread(self.process.wait, within_s)
+
+
+class Services:
+    """Starts services; each gets a port that nobody else gets, or that of the one it replaces."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._ports: list[ReservedPorts] = []
+        self._started: list[Service] = []
+
+    def start(self, name: str, *assignments: str, port: int | None = None, stderr: int | None = None) -> Service:
+        if port is None:
+            self._ports.append(ReservedPorts(1))
+            port = self._ports[-1].numbers[0]
+        log = self._folder / f"{name}-{port}.log"
+        own = (f"{name}.server.port={port}", *assignments)
+        self._started.append(Service(name, port, log, own, stderr))
+        return self._started[-1]
+
+    def end(self) -> None:
+        for service in self._started:
+            service.kill()
+        for ports in self._ports:
+            ports.release()
+
+
+@pytest.fixture
+def services(tmp_path: Path) -> Iterator[Services]:
+    """Services that end with the test."""
+    started = Services(tmp_path)
+    yield started
+    started.end()
+
+
+@pytest.fixture(scope="session")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """One rack for all tests, each of which has a session of its own; its watchdog leads to `SAFE_STATE`."""
+    started = Services(tmp_path_factory.mktemp("plant"))
+    yield started.start("plant", "plant.watchdog.action=safe", f"plant.watchdog.safe_state={list(SAFE_STATE)}")
+    started.end()
+
+
+# -- raw bytes ---------------------------------------------------------------------------------------------------------
+
+
+class Wire:
+    """A client that knows no seals and no records: a simple one."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader = reader
+        self.writer = writer
+
+    async def ask(self, pdu: bytes) -> bytes:
+        self.writer.write(struct.pack(">HHHB", 1, 0, len(pdu) + 1, 1) + pdu)
+        _, _, length, _ = struct.unpack(">HHHB", await self.reader.readexactly(7))
+        return await self.reader.readexactly(length - 1)
+
+    async def set_register(self, address: int, value: int) -> int:
+        """Write one register with function 6; return the exception code, 0 is none."""
+        answer = await self.ask(struct.pack(">BHH", 6, address, value))
+        return answer[1] if answer[0] & 0x80 else 0
+
+    async def write(self, register_map: RegisterMap, record: tuple[Any, ...]) -> int:
+        """Write a record as it stands, seal included; return the exception code, 0 is none."""
+        block = register_map.block_of(type(record))
+        data = codec_of(block, WordOrder.HIGH_FIRST).encode(record)
+        answer = await self.ask(struct.pack(">BHHB", 16, block.address, len(data) // 2, len(data)) + data)
+        return answer[1] if answer[0] & 0x80 else 0
+
+
+@contextlib.asynccontextmanager
+async def wire_to(port: int, source: str = HOST) -> AsyncIterator[Wire]:
+    reader, writer = await asyncio.open_connection(HOST, port, local_addr=(source, 0))
+    try:
+        yield Wire(reader, writer)
+    finally:
+        writer.close()
+
+
+WireTo = Callable[..., AbstractAsyncContextManager[Wire]]
+
+
+@pytest.fixture(scope="session")
+def wire() -> WireTo:
+    return wire_to
+
+
+# -- the link ----------------------------------------------------------------------------------------------------------
+
+
+class Way(Enum):
+    REQUEST = "request"
+    ANSWER = "answer"
+
+
+Treatment = Callable[[Way, bytes], bytes | None]
+"""Takes a frame; returns what goes on of it. None resets the connection."""
+
+
+def untouched(_way: Way, frame: bytes) -> bytes:
+    return frame
+
+
+class Link:
+    """A TCP proxy in front of a server."""
+
+    def __init__(self, target: int) -> None:
+        self._target = target
+        self._tasks: set[asyncio.Task[None]] = set()
+        self.treat: Treatment = untouched
+        self.port = 0
+
+    async def __aenter__(self) -> Self:
+        self._listener = await asyncio.start_server(self._serve, HOST, 0)
+        self.port = self._listener.sockets[0].getsockname()[1]
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._listener.close()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        with contextlib.suppress(OSError, asyncio.CancelledError):
+            far_reader, far_writer = await asyncio.open_connection(HOST, self._target)
+            pumps = (
+                asyncio.create_task(self._pump(reader, far_writer, Way.REQUEST)),
+                asyncio.create_task(self._pump(far_reader, writer, Way.ANSWER)),
+            )
+            try:
+                await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for pump in pumps:
+                    pump.cancel()
+                await asyncio.gather(*pumps, return_exceptions=True)
+                far_writer.close()
+        reset(writer)
+
+    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, way: Way) -> None:
+        buffer = bytearray()
+        while data := await reader.read(4096):
+            buffer += data
+            for frame in take_frames(buffer):
+                treated = self.treat(way, frame)
+                if treated is None:
+                    return
+                writer.write(treated)
+
+
+def reset(writer: asyncio.StreamWriter) -> None:
+    """Close with RST."""
+    connection = writer.get_extra_info("socket")
+    if connection is not None and not writer.is_closing():
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    writer.transport.abort()
+
+
+# -- what is there to be seen ------------------------------------------------------------------------------------------
+
+
+class Step(NamedTuple):
+    """A change of the outputs from one tick to the next."""
+
+    tick: int
+    before: tuple[float, ...]
+    after: tuple[float, ...]
+
+
+class Rack:
+    """The plant as one sees it who is connected to it directly: what it applied at each tick of its session."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+        self.client = RegisterClient(PLANT_MAP, host=HOST, port=port, timeout_s=5.0)
+        self.applied: dict[int, tuple[float, ...]] = {}
+        self.session = 0
+        self.tick = 0
+
+    async def begin(self, *, realtime: bool = True, factor: float = FACTOR) -> None:
+        """Start a session, when nobody holds the lease of the outputs any more."""
+        await self.client.connect(START_S)
+        await self.until(self._is_free)
+        self.session = (await self.client.read(Identity)).session + 1
+        await self.client.write(WatchdogTime(WATCHDOG_TICKS))
+        await self.client.write(LoadStep(0, HEADER.w0))
+        await self.client.write(PlantSession(self.session, int(realtime), factor, 1, 1))
+        self.applied, self.tick = {}, 0
+
+    async def _is_free(self) -> bool:
+        return (await self.client.read(LeaseStatus)).state == LeaseState.FREE
+
+    async def look(self) -> None:
+        """Read the history on."""
+        identity = await self.client.read(Identity)
+        if identity.session != self.session:
+            return
+        for tick in range(self.tick, identity.tick):
+            (sample,) = await self.client.read_rows(PlantSample, tick % HISTORY_ROWS, 1)
+            assert sample.tick == tick, f"tick {tick} was overwritten before it was read"
+            self.applied[tick] = sample.u
+        self.tick = identity.tick
+
+    async def until(self, condition: Callable[[], Awaitable[bool]], within_s: float = PATIENCE_S) -> None:
+        """Wait for a condition, and read the history meanwhile."""
+        async with asyncio.timeout(within_s):
+            while True:
+                await self.look()
+                if await condition():
+                    return
+                await asyncio.sleep(POLL_S)
+
+    async def passes(self, ticks: int) -> None:
+        """Wait until so many ticks have passed."""
+        end = self.tick + ticks
+
+        async def passed() -> bool:
+            return self.tick >= end
+
+        await self.until(passed)
+
+    async def measurement(self) -> Measurement:
+        return await self.client.read(Measurement)
+
+    def violations(self, since: int = 0) -> list[Step]:
+        """Return what nobody may do: values out of bounds, and steps beyond the rate except to the safe state."""
+        found: list[Step] = []
+        history = [(tick, u) for tick, u in self.applied.items() if tick >= since]
+        for (_, before), (tick, after) in pairwise(history):
+            if after == SAFE_STATE:
+                continue
+            inside = all(
+                low - ROUNDING <= value <= high + ROUNDING
+                for low, value, high in zip(LIMITS.low, after, LIMITS.high, strict=True)
+            )
+            if not inside or any(
+                abs(new - old) > rate + ROUNDING for old, new, rate in zip(before, after, LIMITS.rate, strict=True)
+            ):
+                found.append(Step(tick, before, after))
+        return found
+
+
+class Control:
+    """A control PLC, and what its registers show."""
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self.client = RegisterClient(CONTROL_MAP, host=HOST, port=service.port, timeout_s=5.0)
+
+    async def link(self) -> PlantLinkStatus:
+        return await self.client.read(PlantLinkStatus)
+
+    async def in_step(self) -> bool:
+        return (await self.link()).state == PlantLinkState.IN_STEP
+
+    async def alarm(self, kind: AlarmKind) -> Alarm:
+        return (await self.client.read_rows(Alarm, kind, 1))[0]
+
+    async def events(self, kind: EventKind) -> list[Event]:
+        """Return those events of the last ones that are of a kind, oldest first."""
+        events = await self.client.read_rows(Event, 0, EVENT_ROWS)
+        return sorted(event for event in events if event.number and event.kind == kind)
+
+    async def begin(self, session: int, *, realtime: bool = True, factor: float = FACTOR) -> None:
+        await self.client.connect(START_S)
+        await self.client.write(ControlSession(session, int(realtime), factor))
+
+    async def drive(self, cv155: float, ncr22: float, cv156: float) -> None:
+        """Let an operator drive."""
+        await self.client.write(Operator(OperatorMode.MANUAL, cv155, ncr22, cv156))
+
+    async def answers(self) -> bool:
+        """Tell whether it is there."""
+        try:
+            await self.client.connect(0.0)
+        except LinkError:
+            return False
+        return True
+
+
+@pytest.fixture(scope="session")
+def control_at() -> Callable[[Service], Control]:
+    return Control
+
+
+# -- put together ------------------------------------------------------------------------------------------------------
+
+
+class Field:
+    """A rack, a link to it that can be disturbed, and control PLCs behind the link."""
+
+    def __init__(self, services: Services, port: int, link: Link) -> None:
+        self.services = services
+        self.rack = Rack(port)
+        self.link = link
+        self._clients: list[RegisterClient] = [self.rack.client]
+
+    def control(self, *assignments: str, port: int | None = None, stderr: int | None = None) -> Control:
+        """Start a control PLC that is pointed at the link."""
+        service = self.services.start(
+            "control_plc", f"control_plc.plant.port={self.link.port}", *assignments, port=port, stderr=stderr
+        )
+        made = Control(service)
+        self._clients.append(made.client)
+        return made
+
+    async def joined(self, *assignments: str, factor: float = FACTOR, stderr: int | None = None) -> Control:
+        """Start a control PLC and a session; return it in step."""
+        await self.rack.begin(factor=factor)
+        control = self.control(*assignments, stderr=stderr)
+        await control.begin(self.rack.session, factor=factor)
+        await self.rack.until(control.in_step)
+        await self.rack.passes(4)
+        return control
+
+    async def follows(self, control: Control) -> None:
+        """Wait until a control PLC writes the outputs, in step with the rack."""
+        await self.rack.until(control.answers)
+
+        async def does() -> bool:
+            measured, link = await self.rack.measurement(), await control.link()
+            shown = await control.client.read(Identity)
+            return (
+                link.state == PlantLinkState.IN_STEP
+                and measured.holder == link.holder
+                and shown.session == self.rack.session
+                and abs(shown.tick - measured.tick) <= 2
+            )
+
+        await self.rack.until(does)
+
+    def close(self) -> None:
+        for client in self._clients:
+            client.close()
+
+
+FieldAt = Callable[..., AbstractAsyncContextManager[Field]]
+
+
+@pytest.fixture
+def field(services: Services, plant: Service) -> FieldAt:
+    """The rack of all tests, or another one, with a link in front of it."""
+
+    @contextlib.asynccontextmanager
+    async def made(at: Service = plant) -> AsyncIterator[Field]:
+        async with Link(at.port) as link:
+            field = Field(services, at.port, link)
+            try:
+                yield field
+            finally:
+                services.end()
+                field.close()
+
+    return made

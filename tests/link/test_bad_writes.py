@@ -1,0 +1,95 @@
+"""A record that is written in part is judged as the record that results: valid, or exception 03 and nothing happens."""
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from coldloop.modbus.client import RegisterClient
+from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Status
+from coldloop.registers.declaration import RegisterMap
+from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
+from coldloop.registers.plant import PLANT_MAP, LoadStep, PlantSession
+
+if TYPE_CHECKING:
+    from tests.link.conftest import FieldAt, Services, WireTo
+
+ILLEGAL_VALUE = 3
+START_S = 90.0
+
+
+def address_of(register_map: RegisterMap, record: type[tuple[object, ...]], field: str) -> int:
+    registers = {register.name: register.address for register in register_map.block_of(record).registers(0)}
+    return registers[field]
+
+
+@pytest.mark.parametrize(
+    ("service", "register_map", "session"),
+    [("plant", PLANT_MAP, PlantSession), ("control_plc", CONTROL_MAP, ControlSession)],
+    ids=["plant", "control PLC"],
+)
+async def test_real_time_without_a_factor_is_refused_and_the_service_lives(
+    service: str,
+    register_map: RegisterMap,
+    session: type[tuple[object, ...]],
+    services: "Services",
+    wire: "WireTo",
+) -> None:
+    process = services.start(service)
+    client = RegisterClient(register_map, host="127.0.0.1", port=process.port, timeout_s=5.0)
+    await client.connect(START_S)
+    async with wire(process.port) as simple:
+        for name, value in (("realtime", 1), ("session", 0), ("realtime", 0)):
+            address = address_of(register_map, session, name)
+            assert await simple.set_register(address, value) == ILLEGAL_VALUE
+    assert (await client.read(Identity)).session == 0
+    assert process.alive
+    client.close()
+
+
+async def test_a_number_of_load_steps_that_makes_no_load_is_refused_and_the_clock_of_the_plant_goes_on(
+    field: "FieldAt", wire: "WireTo"
+) -> None:
+    async with field() as site:
+        control, rack = await site.joined(), site.rack
+        steps = address_of(PLANT_MAP, PlantSession, "load_steps")
+        load = PLANT_MAP.block_of(LoadStep).address
+        async with wire(rack.port) as simple:
+            for wrong in (0, 2000, 2049, 65535):
+                assert await simple.set_register(steps, wrong) == ILLEGAL_VALUE
+                await rack.passes(4)
+            for watts in (float("nan"), float("inf"), 1e30, -1.0):
+                assert await simple.write(PLANT_MAP, LoadStep(0, watts)) == ILLEGAL_VALUE
+            assert await simple.set_register(load + 2, 0x7F80) == ILLEGAL_VALUE, "half of a number"
+        before = rack.tick
+        await rack.passes(20)
+        await site.follows(control)
+        assert (await rack.client.read(Identity)).session == rack.session
+        assert rack.tick > before
+        assert rack.violations() == []
+
+
+async def test_an_updating_period_out_of_range_is_refused_and_the_optimiser_serves_the_next_session(
+    field: "FieldAt", services: "Services", wire: "WireTo"
+) -> None:
+    async with field() as site:
+        control = site.control()
+        optimizer = services.start("optimizer_plc", f"optimizer_plc.control_plc.port={control.service.port}")
+        client = RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=optimizer.port, timeout_s=5.0)
+        await client.connect(START_S)
+        await site.rack.begin(factor=5.0)
+        session = site.rack.session
+        await client.write(OptimizerSession(session, 1, 5.0, 8))
+        async with wire(optimizer.port) as simple:
+            for wrong in (1, 21, 65535):
+                period = address_of(OPTIMIZER_MAP, OptimizerSession, "updating_period")
+                assert await simple.set_register(period, wrong) == ILLEGAL_VALUE
+        await control.begin(session, factor=5.0)
+
+        async def accepted() -> bool:
+            return (await control.client.read(Status)).accepted >= 2
+
+        await site.rack.until(accepted)
+        assert optimizer.alive
+        assert site.rack.violations() == []
+        client.close()

@@ -1,0 +1,122 @@
+"""A rack that reads back what is no number gets no outputs."""
+
+import asyncio
+import contextlib
+import math
+from collections.abc import AsyncIterator, Awaitable, Callable
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import pytest
+
+from coldloop.limits import InputLimits
+from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
+from coldloop.model_file import read_header
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.registers.bank import Caller, RegisterBank
+from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import ControlSession, Grant, LinkCause, PlantLinkState
+from coldloop.registers.declaration import Block
+from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
+from coldloop.registers.safety import AlarmKind
+from coldloop.seal import sealed
+
+if TYPE_CHECKING:
+    from tests.link.conftest import Control, Services
+
+HEADER = read_header(DEFAULT_MODEL_FILE)
+HOST = "127.0.0.1"
+START_S = 90.0
+POLL_S = 0.01
+
+
+class FakeRack:
+    """A rack in lock-step that shows what a test says."""
+
+    def __init__(self) -> None:
+        self.bank = RegisterBank(PLANT_MAP)
+        self.bank.put(Identity(map_digest=PLANT_MAP.digest, map_version=PLANT_MAP.version, session=1))
+        self.bank.keep_fresh(Measurement, self._measurement)
+        self.taken: list[Actuators] = []
+        self.reads = 0
+        self.tick = 0
+        self.shows: Callable[[Measurement], Measurement] = lambda measured: measured
+        self.server = ModbusServer(
+            self.bank,
+            settings=ServerSettings(port=0),
+            on_write=self._on_write,
+            identity=DeviceIdentity(product="fake rack", revision="0"),
+        )
+
+    def _measurement(self) -> Measurement:
+        self.reads += 1
+        u, holder = (self.taken[-1][1:4], self.taken[-1].holder) if self.taken else (HEADER.u0, 0)
+        verdict = OutputVerdict.TAKEN if self.taken else OutputVerdict.NONE
+        truth = Measurement(self.tick, HEADER.w0, HEADER.y0, HEADER.x0, 1, u, holder, 1, verdict)
+        return sealed(self.shows(truth))
+
+    def _on_write(self, _block: Block, _caller: Caller) -> None:
+        self.taken.append(self.bank.get(Actuators))
+        asyncio.get_running_loop().call_soon(self._advance)
+
+    def _advance(self) -> None:
+        self.tick += 1
+
+
+@contextlib.asynccontextmanager
+async def faked(
+    services: "Services", control_at: "Callable[..., Control]"
+) -> AsyncIterator[tuple[FakeRack, "Control"]]:
+    """A control PLC that drives a fake rack."""
+    rack = FakeRack()
+    await rack.server.start()
+    settings = (f"control_plc.plant.port={rack.server.port}", "control_plc.ladder.optimizer_patience_s=0.05")
+    control = control_at(services.start("control_plc", *settings))
+    try:
+        await control.client.connect(START_S)
+        await control.client.write(ControlSession(1, 0, 1.0))
+        await control.client.write(Grant(1_000_000))
+        yield rack, control
+    finally:
+        services.end()
+        control.client.close()
+        await rack.server.close()
+
+
+async def until(condition: Callable[[], Awaitable[bool]]) -> None:
+    async with asyncio.timeout(20.0):
+        while not await condition():  # noqa: ASYNC110 - another process is waited for
+            await asyncio.sleep(POLL_S)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+async def test_while_a_read_back_is_no_number_nothing_is_sent_and_afterwards_it_goes_on_from_what_is_applied(
+    value: float, services: "Services", control_at: "Callable[..., Control]"
+) -> None:
+    async with faked(services, control_at) as (rack, control):
+
+        async def sent(number: int) -> bool:
+            return len(rack.taken) >= number
+
+        async def not_finite() -> bool:
+            link = await control.link()
+            return (link.state, link.cause) == (PlantLinkState.JOINING, LinkCause.NOT_FINITE)
+
+        async def looked(reads: int) -> bool:
+            return rack.reads >= reads
+
+        await control.drive(46.0, 100.0, 36.5)
+        await until(lambda: sent(50))
+        rack.shows = lambda measured: measured._replace(u=(measured.u[0], value, measured.u[2]))
+        await until(not_finite)
+        before = len(rack.taken)
+        enough = rack.reads + 10
+        await until(lambda: looked(enough))
+        assert len(rack.taken) == before
+        assert (await control.alarm(AlarmKind.PLANT_LOST)).active
+        rack.shows = lambda measured: measured
+        await until(lambda: sent(before + 100))
+        assert all(math.isfinite(number) for outputs in rack.taken for number in outputs[1:4])
+        for first, second in pairwise(rack.taken):
+            steps = zip(first[1:4], second[1:4], InputLimits().rate, strict=True)
+            assert all(abs(new - old) <= rate for old, new, rate in steps)

@@ -1,0 +1,118 @@
+"""Whatever came between them, a control PLC goes on from what the rack applies: judged at the rack, tick by tick."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from coldloop.registers.audit import EventKind
+from coldloop.registers.control_plc import LinkCause, PlantLinkState
+from coldloop.registers.plant import PLANT_MAP, Actuators
+from coldloop.registers.safety import AlarmKind, WatchdogTime
+
+if TYPE_CHECKING:
+    from tests.link.conftest import FieldAt, Service, Way, WireTo
+
+PATIENCE_S = 20.0
+POLL_S = 0.02
+SAFE_STATE = (30.0, 50.0, 40.0)
+SETPOINTS = (44.0, 85.0, 36.2)
+MOVED = (25.0, 20.0, 30.0)
+"""Where a simple client brings the outputs, in one step."""
+
+
+def reset_once() -> "Callable[[Way, bytes], bytes | None]":
+    """Reset the connection at the next frame, and let all others pass."""
+    frames: list[bytes] = []
+
+    def treat(_way: "Way", frame: bytes) -> bytes | None:
+        frames.append(frame)
+        return None if len(frames) == 1 else frame
+
+    return treat
+
+
+async def test_a_control_plc_that_was_stopped_goes_on_from_the_safe_state_though_its_first_packet_is_reset(
+    field: "FieldAt",
+) -> None:
+    async with field() as site:
+        control, rack = await site.joined(), site.rack
+        await control.drive(*SETPOINTS)
+
+        async def applied(u: tuple[float, ...]) -> bool:
+            return (await rack.measurement()).u == pytest.approx(u)
+
+        await rack.until(lambda: applied(SETPOINTS))
+        control.service.pause()
+        await rack.until(lambda: applied(SAFE_STATE))
+        await rack.passes(4)
+        site.link.treat = reset_once()
+        control.service.resume()
+        await site.follows(control)
+        await rack.passes(60)
+        assert rack.violations() == []
+        assert SAFE_STATE in rack.applied.values()
+        assert rack.applied[rack.tick - 1] != SAFE_STATE, "it drives again"
+        raised = {(event.subject, event.cause) for event in await control.events(EventKind.ALARM_RAISED)}
+        assert (AlarmKind.PLANT_LOST, LinkCause.CHANGED) in raised
+        states = [event.subject for event in await control.events(EventKind.PLANT_LINK)]
+        assert PlantLinkState.SEARCHING in states
+
+
+@pytest.mark.parametrize("goes_on_by", ["retained state", "autostart", "the same session"])
+async def test_a_control_plc_that_was_restarted_goes_on_from_where_a_simple_client_has_moved_the_outputs(
+    goes_on_by: str, field: "FieldAt", wire: "WireTo", tmp_path: Path
+) -> None:
+    settings = {
+        "retained state": f'control_plc.retain.file="{tmp_path}/control"',
+        "autostart": "session.autostart=true",
+        "the same session": "session.autostart=false",
+    }[goes_on_by]
+    pace = ("session.mode=realtime", "session.factor=25")
+    async with field() as site:
+        control, rack = await site.joined(settings, *pace), site.rack
+        await control.drive(*SETPOINTS)
+        await rack.passes(40)
+        control.service.kill()
+        async with wire(rack.port) as simple:
+
+            async def moved() -> bool:
+                present = await rack.measurement()
+                await simple.write(PLANT_MAP, Actuators(present.tick, *MOVED, rack.session))
+                await simple.write(PLANT_MAP, WatchdogTime(0))  # they are to stay there
+                return present.u == MOVED
+
+            await rack.until(moved)
+        await rack.passes(2)
+        moved_at = rack.tick
+        again = site.control(settings, *pace, port=control.service.port)
+        if goes_on_by == "the same session":
+            await rack.until(again.answers)
+            await again.begin(rack.session)
+        await site.follows(again)
+        await again.drive(*SETPOINTS)
+        await rack.passes(100)
+        assert rack.violations(since=moved_at) == []
+        assert rack.applied[moved_at - 1] == MOVED
+        assert rack.applied[rack.tick - 1] > MOVED, "it drives"
+
+
+async def test_a_rack_that_stood_still_is_gone_on_with_from_what_it_applies(field: "FieldAt", plant: "Service") -> None:
+    async with field() as site:
+        control, rack = await site.joined(), site.rack
+        await control.drive(*SETPOINTS)
+        await rack.passes(30)
+        plant.pause()
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                while (await control.link()).state != PlantLinkState.SEARCHING:  # noqa: ASYNC110 - a process
+                    await asyncio.sleep(POLL_S)
+        finally:
+            plant.resume()
+        await site.follows(control)
+        await rack.passes(60)
+        await site.follows(control)
+        assert rack.violations() == []
+        assert rack.applied[rack.tick - 1] != SAFE_STATE, "it drives again"

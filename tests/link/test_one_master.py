@@ -1,0 +1,148 @@
+"""Of two control PLCs one drives the rack, and of two optimisers one answers the control PLC."""
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coldloop.modbus.client import RegisterClient
+from coldloop.registers.audit import EventKind
+from coldloop.registers.common import ServerStatistics
+from coldloop.registers.control_plc import LinkCause, PlantLinkState, PlantLinkStatus, Status
+from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, ControlLinkState, ControlLinkStatus
+from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus
+
+if TYPE_CHECKING:
+    from tests.link.conftest import FieldAt, Services
+
+START_S = 90.0
+TAKE_OVER_S = 5.0
+
+
+async def test_a_second_control_plc_is_refused_and_takes_over_when_the_first_is_killed(field: "FieldAt") -> None:
+    async with field() as site:
+        second = site.control()
+        first, rack = await site.joined(), site.rack
+        await first.drive(46.0, 100.0, 36.5)
+        await second.begin(rack.session)
+        await second.drive(40.0, 50.0, 35.5)
+
+        async def refused() -> bool:
+            return bool((await second.alarm(AlarmKind.PLANT_FOREIGN)).active)
+
+        await rack.until(refused)
+        await rack.passes(200)
+        holder = (await first.link()).holder
+        shown = await second.link()
+        assert (shown.state, shown.cause) == (PlantLinkState.FOREIGN, LinkCause.SECOND_MASTER)
+        assert (await second.alarm(AlarmKind.PLANT_FOREIGN)).times == 1
+        lease, counted = await rack.client.read(LeaseStatus), await rack.client.read(ServerStatistics)
+        assert (lease.state, lease.holder) == (LeaseState.HELD, holder)
+        assert lease.refused >= 1
+        assert counted.second_writer >= 1
+        driven = [u[0] for u in rack.applied.values()]
+        assert driven == sorted(driven), "towards the setpoint of the first, not to and fro"
+        assert len(await second.events(EventKind.PLANT_LINK)) < 10, "one that stands by does not fill its journal"
+
+        first.service.kill()
+        await rack.until(lambda: drives(second.client, rack.client), within_s=TAKE_OVER_S)
+        await rack.passes(60)
+        await site.follows(second)
+        assert rack.violations() == []
+
+
+async def test_of_two_control_plcs_with_the_same_retained_number_one_drives_and_the_other_is_told(
+    field: "FieldAt", tmp_path: Path
+) -> None:
+    kept, copied = tmp_path / "kept", tmp_path / "copied"
+    async with field() as site:
+        first = await site.joined(f'control_plc.retain.file="{kept}"')
+        rack = site.rack
+        await first.drive(46.0, 100.0, 36.5)
+        await rack.passes(20)
+        shutil.copy(kept, copied)
+        second = site.control(f'control_plc.retain.file="{copied}"')
+        await rack.until(second.answers)
+        await second.drive(40.0, 50.0, 35.5)
+        assert (await second.link()).holder == (await first.link()).holder
+
+        async def told() -> bool:
+            alarms = [await one.alarm(AlarmKind.PLANT_FOREIGN) for one in (first, second)]
+            return any(alarm.active for alarm in alarms)
+
+        await rack.until(told)
+        await rack.passes(10)
+        begun = rack.tick
+        await rack.passes(200)
+        driven = [rack.applied[tick][0] for tick in range(begun, rack.tick)]
+        assert driven in (sorted(driven), sorted(driven, reverse=True)), "towards one setpoint, not to and fro"
+        assert rack.violations() == []
+
+
+async def test_a_control_plc_that_was_stopped_while_another_took_over_does_not_interfere(field: "FieldAt") -> None:
+    async with field() as site:
+        second = site.control()
+        first, rack = await site.joined(), site.rack
+        await first.drive(46.0, 100.0, 36.5)
+        await second.begin(rack.session)
+        await second.drive(40.0, 50.0, 35.5)
+        await rack.passes(40)
+        first.service.pause()
+        await rack.until(lambda: drives(second.client, rack.client), within_s=TAKE_OVER_S)
+        begun = rack.tick + 4
+        first.service.resume()
+        await rack.passes(200)
+        await site.follows(second)
+        assert (await first.link()).state == PlantLinkState.FOREIGN
+        assert (await first.alarm(AlarmKind.PLANT_FOREIGN)).active
+        driven = [rack.applied[tick][0] for tick in range(begun, rack.tick)]
+        assert driven == sorted(driven), "from the safe state towards the setpoint of the second"
+        assert rack.violations() == []
+
+
+async def drives(control: RegisterClient, rack: RegisterClient) -> bool:
+    link, lease = await control.read(PlantLinkStatus), await rack.read(LeaseStatus)
+    return link.state == PlantLinkState.IN_STEP and lease.holder == link.holder
+
+
+async def test_a_second_optimiser_is_refused_and_takes_over_when_the_first_is_killed(
+    field: "FieldAt", services: "Services"
+) -> None:
+    async with field() as site:
+        control, rack = site.control(), site.rack
+        settings = (
+            f"optimizer_plc.control_plc.port={control.service.port}",
+            "session.mode=realtime",
+            "session.factor=10",
+            "optimizer_plc.program.updating_period_s=2.0",
+        )
+        optimizers = [services.start("optimizer_plc", *settings) for _ in range(2)]
+        clients = [RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=one.port, timeout_s=5.0) for one in optimizers]
+        for client in clients:
+            await client.connect(START_S)
+        await rack.begin(factor=10.0)
+        await control.begin(rack.session, factor=10.0)
+
+        async def accepted(count: int) -> bool:
+            return (await control.client.read(Status)).accepted >= count
+
+        async def states() -> list[int]:
+            return [(await client.read(ControlLinkStatus)).state for client in clients]
+
+        await rack.until(lambda: accepted(4))
+        found = await states()
+        standing_by = found.index(ControlLinkState.FOREIGN)
+        assert found[1 - standing_by] != ControlLinkState.FOREIGN
+        alarm, lease = await control.alarm(AlarmKind.SECOND_OPTIMIZER), await control.client.read(LeaseStatus)
+        assert alarm.active
+        assert lease.refused >= 1
+        working = await clients[1 - standing_by].read(ControlLinkStatus)
+        assert lease.holder == working.holder
+        assert working.rejected == 0
+
+        optimizers[1 - standing_by].kill()
+        before = (await control.client.read(Status)).accepted
+        await rack.until(lambda: accepted(before + 2), within_s=TAKE_OVER_S)
+        assert (await clients[standing_by].read(ControlLinkStatus)).state != ControlLinkState.FOREIGN
+        assert rack.violations() == []
+        for client in clients:
+            client.close()
