@@ -187,7 +187,9 @@ def same_party(one: int, other: int) -> bool:
 
 @settings(max_examples=500, deadline=None)
 @given(story=steps)
-def test_another_party_writes_only_after_the_silence_or_the_departure_of_the_one_before(story: list[Step]) -> None:
+def test_another_party_writes_only_after_the_silence_or_the_departure_of_the_one_before(  # noqa: C901 - a model
+    story: list[Step],
+) -> None:
     clock = Clock()
     lease = Lease("the rack", lambda: SILENCE_S, clock)
     last: tuple[int, float] | None = None  # connection and time of the last write that was taken
