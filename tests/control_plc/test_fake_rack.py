@@ -274,6 +274,7 @@ class RackLink(RuleBasedStateMachine):
 
     @rule(turns=st.integers(1, 45))
     def all_is_well_for_a_while(self, turns: int) -> None:
+        """But for what the rack itself does."""
         for _ in range(turns):
             self.turn("good")
 
@@ -302,13 +303,17 @@ class RackLink(RuleBasedStateMachine):
 
     # -- the rack and those around it ----------------------------------------------------------------------------------
 
-    @rule(frozen=st.booleans())
-    def the_rack_freezes_or_thaws(self, *, frozen: bool) -> None:
-        self.fake.frozen = frozen
+    @rule(turns=st.integers(1, 30))
+    def the_rack_freezes_for_a_while(self, turns: int) -> None:
+        self.fake.frozen = True
+        self.all_is_well_for_a_while(turns)
+        self.fake.frozen = False
 
-    @rule(lies=st.booleans())
-    def the_rack_shows_no_number(self, *, lies: bool) -> None:
-        self.fake.lies_not_a_number = lies
+    @rule(turns=st.integers(1, 10))
+    def the_rack_shows_no_number_for_a_while(self, turns: int) -> None:
+        self.fake.lies_not_a_number = True
+        self.all_is_well_for_a_while(turns)
+        self.fake.lies_not_a_number = False
 
     @rule(share=st.tuples(*[st.floats(0.0, 1.0)] * 3), holder=st.sampled_from([0, 0xBAD]), turns=st.integers(0, 60))
     def another_master_writes(self, share: tuple[float, ...], holder: int, turns: int) -> None:
@@ -400,7 +405,6 @@ class RackLink(RuleBasedStateMachine):
         """Whatever has happened: when all is well again the control PLC drives the rack within a second or two."""
         if not hasattr(self, "fake"):
             return
-        self.fake.frozen = self.fake.lies_not_a_number = False
         self.medium.delayed.clear()
         self.fake.passes(60.0 if self.fake.rack.watchdog.time else 15.0)
         self.program.operate(Operator(OperatorMode.AUTO, *HEADER.u0))
