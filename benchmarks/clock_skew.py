@@ -18,6 +18,7 @@ from rig.local_services import LocalServices
 from rig.network import NetworkRig
 from rig.scenario import Scenario
 from rig.settings import Settings
+from rig.wiring import START_PATIENCE_S
 
 
 class Followed(NamedTuple):
@@ -39,7 +40,7 @@ async def follow(ppm: float, factor: float, hours: float, folder: Path) -> Follo
         client = RegisterClient.at(CONTROL_MAP, services.endpoints.control_plc)
 
         async def work() -> Followed:
-            await rig.connect(services.endpoints.plant.patience_s)
+            await rig.connect(START_PATIENCE_S)
             await rig.start(Scenario(ticks, load, 0.0, 1, realtime=True, factor=factor))
             lost = 0
             while True:

@@ -16,7 +16,7 @@ from rig.ports import ReservedPorts
 from rig.recording import Recorder
 from rig.scenario import Scenario
 from rig.settings import Settings
-from rig.wiring import SERVICES, Detours, endpoints_on, wired
+from rig.wiring import SERVICES, START_PATIENCE_S, Detours, endpoints_on, wired
 
 T = TypeVar("T")
 
@@ -176,7 +176,7 @@ async def run_on_localhost(settings: Settings, scenario: Scenario, recorder: Rec
         rig = NetworkRig(services.endpoints, settings)
 
         async def work() -> None:
-            await rig.connect(services.endpoints.plant.patience_s)
+            await rig.connect(START_PATIENCE_S)
             await rig.run(scenario, recorder)
 
         try:

@@ -30,7 +30,6 @@ def _endpoint(settings: Settings, service: str, port: int) -> Endpoint:
     section = getattr(settings, service)
     return Endpoint(
         port=port,
-        patience_s=START_PATIENCE_S,
         word_order=section.word_order,
         tls=settings.rig.tls if section.server.tls else None,
     )

@@ -21,7 +21,7 @@ from rig.network import NetworkRig
 from rig.ports import ReservedPorts
 from rig.scenario import Scenario
 from rig.settings import Settings
-from rig.wiring import Detours
+from rig.wiring import START_PATIENCE_S, Detours
 
 SLOWEST: Final = 20.0
 """Seconds of plant time in a second that lock-step should reach with proxies and all."""
@@ -50,7 +50,7 @@ async def conduct(
         await stack.enter_async_context(services)
         rig = NetworkRig(services.endpoints, settings)
         stack.callback(rig.close)
-        await services.during(rig.connect(services.endpoints.plant.patience_s))
+        await services.during(rig.connect(START_PATIENCE_S))
         for proxy in proxies.values():  # until now nobody listened there, as nobody did behind
             await proxy.start()
             stack.push_async_callback(proxy.close)

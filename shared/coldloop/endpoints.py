@@ -13,7 +13,7 @@ OPTIMIZER_PORT = 5022
 
 
 class Endpoint(BaseModel):
-    """Address of a Modbus/TCP server, and how long to wait for it."""
+    """Address of a Modbus/TCP server."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -22,7 +22,5 @@ class Endpoint(BaseModel):
     word_order: WordOrder = WordOrder.HIGH_FIRST
     timeout_s: PositiveFloat = 3.0
     """How long an answer may take."""
-    patience_s: PositiveFloat = 20.0
-    """How long to wait at the start until somebody answers."""
     tls: TlsSettings | None = None
     """Modbus/TCP Security instead of plain Modbus/TCP."""

@@ -86,7 +86,7 @@ def wired(
     settings: Settings, ports: Sequence[int], order: WordOrder = WordOrder.HIGH_FIRST
 ) -> tuple[Settings, RigEndpoints]:
     """Return the settings with each server on its port and each client pointed at it; and where they are."""
-    ends = RigEndpoints(*(Endpoint(port=port, word_order=order, patience_s=PATIENCE_S) for port in ports))
+    ends = RigEndpoints(*(Endpoint(port=port, word_order=order) for port in ports))
     sections: dict[str, BaseModel] = {}
     for name, end in zip(SERVICES, ends, strict=True):
         section = getattr(settings, name)
