@@ -15,6 +15,7 @@ one that was read back. Pure: no sockets, no clock.
 """
 
 import math
+from collections.abc import Mapping
 from typing import Final
 
 from coldloop.journal import Journal
@@ -40,8 +41,8 @@ SECOND_MASTER: Final = 2
 """Cause of the alarm SECOND_WRITER."""
 HARMLESS: Final = (LinkCause.STARTED, LinkCause.OVERSLEPT, LinkCause.LEAPT)
 """Causes of JOINING that raise no alarm: what is read back is expected to be what we applied."""
-REFUSED_OUTPUTS: Final = {
-    OutputVerdict.NONE: (PlantLinkState.NOT_TAKEN, LinkCause.REFUSED),
+NOT_TAKEN: Final = (PlantLinkState.NOT_TAKEN, LinkCause.REFUSED)
+REFUSED_OUTPUTS: Final[Mapping[int, tuple[PlantLinkState, LinkCause]]] = {
     OutputVerdict.WRONG_SESSION: (PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION),
     OutputVerdict.UNTIMELY: (PlantLinkState.NOT_TAKEN, LinkCause.UNTIMELY),
     OutputVerdict.CHANGED: (PlantLinkState.JOINING, LinkCause.CHANGED),
@@ -84,7 +85,8 @@ class PlantLink:
     # -- events --------------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Begin a session: read back first."""
+        """Begin a session: read back first, from a rack of which nothing is known."""
+        self.generation = 0
         self._enter(PlantLinkState.JOINING, LinkCause.STARTED)
 
     def end(self) -> None:
@@ -143,7 +145,7 @@ class PlantLink:
         stands = self._stands(answer, now)
         self._watch_others(answer)
         if answer.verdict != OutputVerdict.TAKEN:
-            self._enter(*REFUSED_OUTPUTS.get(answer.verdict, REFUSED_OUTPUTS[OutputVerdict.NONE]))  # type: ignore[call-overload]
+            self._enter(*REFUSED_OUTPUTS.get(answer.verdict, NOT_TAKEN))
         elif answer.session != sent.session:
             self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
         elif answer.u != sent[1:4] or answer.holder != self.holder or answer.generation != self.generation:
