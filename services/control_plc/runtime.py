@@ -360,7 +360,7 @@ class ControlPlc:
         self._clock = RackClock(self._pace.factor, time.monotonic())
         self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
         self.publication.begin()
-        self.bank.put(self._program.operator)
+        self.clients.begin()
         self.bank.put(ControlSession(self._program.session, int(self._pace.realtime), self._pace.factor))
 
     def _publish(self) -> None:

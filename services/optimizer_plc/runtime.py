@@ -146,7 +146,8 @@ class OptimizerPlc:
                 self._wanted = FRESH_UPDATE  # should the link be lost before this one is planned
                 await self._answer(update, arrived_at)
                 continue
-            if update.session != self._wanted.session:
+            begun_anew = update.update + 1 < self._wanted.update  # under the same number: updates count from 0 again
+            if update.session != self._wanted.session or begun_anew:
                 self._wanted = FRESH_UPDATE
             if arrived_at - asked_at < SHORTEST_WAIT_S:
                 await asyncio.sleep(SHORTEST_WAIT_S)

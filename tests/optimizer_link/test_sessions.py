@@ -21,7 +21,7 @@ from optimizer_plc.budget import BudgetSettings, PlcBudget
 from optimizer_plc.publication import Publication
 
 if TYPE_CHECKING:
-    from tests.optimizer_link.conftest import Connect, Link, PlayedControlPlc
+    from tests.optimizer_link.conftest import Connect, Link, PlayedControlPlc, Until
 
 OPERATOR = Caller("panel", frozenset({Role.OPERATOR}))
 BLOCK = OPTIMIZER_MAP.block_of(OptimizerSession)
@@ -139,3 +139,19 @@ async def test_a_session_that_nobody_asked_for_here_runs_as_configured_and_is_no
         assert [event.kind for event in rows] == [EventKind.BOOT, EventKind.CONTROL_LINK, EventKind.SESSION]
         assert (rows[-1].subject, rows[-1].value, from_words(rows[-1].who)) == (0, 1.0, "")
         assert control.headers[0].tau_u != 14
+
+
+async def test_a_session_that_begins_anew_under_its_number_is_joined_at_once(
+    connect: "Connect", control: "PlayedControlPlc", until: "Until"
+) -> None:
+    """Its updates count from 0 again: the one that was awaited would be long in coming."""
+    control.latch()
+    async with connect(control) as link:
+        await link.answers(5)
+        control.latches_on = False
+        await until(lambda: control.awaited[-1].update == control.updates)
+        control.plans.clear()
+        control.updates, control.latches_on = 0, True
+        control.latch()
+        await until(lambda: len(control.plans) > 2)
+        assert [plan.update for plan in control.plans[:3]] == [0, 1, 2]
