@@ -84,7 +84,8 @@ class PlantLink:
     # -- events --------------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Begin a session: read back first."""
+        """Begin a session: read back first. What the rack applied in the one before does not matter."""
+        self.generation = 0
         self._enter(PlantLinkState.JOINING, LinkCause.STARTED)
 
     def end(self) -> None:

@@ -46,6 +46,11 @@ LOOK_PAUSE_S: Final = 0.1
 ANSWER_TICKS: Final = 8
 """In real time an answer that takes longer is of no use: the rack is looked at anew."""
 SHORTEST_PATIENCE_S: Final = 0.1
+LONGEST_SLEEP_S: Final = 0.5
+"""Between two looks for a new session while a scan is not due."""
+ADOPT_AFTER_S: Final = 1.0
+"""An operator who begins a session writes to one PLC after the other: one that the rack has begun is ours by
+`session.autostart` when it has not been asked for here meanwhile."""
 EXPIRES_SOON: Final = 1
 """Causes of the alarm CERTIFICATE."""
 EXPIRED: Final = 2
@@ -81,6 +86,8 @@ class ControlPlc:
         self._looks = 0
         self._lost_lines = 0
         self._awaiting_since: float | None = None
+        self._other = (0, 0.0)
+        """Another session that the rack was found in while ours ran, and since when (s)."""
         self._publish()
 
     def close(self) -> None:
@@ -130,6 +137,10 @@ class ControlPlc:
         It always yields, however late it is.
         """
         program, due = self._program, self._clock.due(self._program.tick)
+        while due - time.monotonic() > LONGEST_SLEEP_S:  # a tick may last half a minute: a session does not wait for it
+            await asyncio.sleep(LONGEST_SLEEP_S)
+            if self.clients.asked is not None:
+                return False
         await asyncio.sleep(max(0.0, due - time.monotonic()))
         lateness = max(0.0, time.monotonic() - due)
         self.publication.lateness.add(lateness)
@@ -273,6 +284,7 @@ class ControlPlc:
         if not self._link.in_step and self._pace.realtime:
             now = self._clock.tick_at(time.monotonic())
             self._program.alarms.now = max(self._program.tick, now)
+            self._program.alarms.pass_by()
         self._publish()
 
     async def _read_back(self) -> None:
@@ -333,7 +345,7 @@ class ControlPlc:
                 reading.session, reading.tick, reading.u,
                 updates=kept.updates, operator=kept.operator, playing=kept.sequence,
             )  # fmt: skip
-        elif not self._settings.session.autostart or not reading.session:
+        elif not self._settings.session.autostart or not self._is_ours_to_adopt(reading.session):
             return False
         elif reading.tick == 0:
             program.restart(reading.session)
@@ -344,6 +356,15 @@ class ControlPlc:
         log.warning("session resumed", extra={"session": reading.session, "tick": reading.tick})
         self._begin()
         return True
+
+    def _is_ours_to_adopt(self, session: int) -> bool:
+        """Tell whether a session of the rack has not been asked for by an operator, as far as one can tell by now."""
+        if not session or not self.publication.running:
+            return session > 0
+        now = time.monotonic()
+        if self._other[0] != session:
+            self._other = session, now
+        return now - self._other[1] >= ADOPT_AFTER_S
 
     def _start(self, asked: ControlSession) -> None:
         """Begin the session that an operator has asked for; nothing is written before the rack has been read."""
@@ -357,6 +378,7 @@ class ControlPlc:
 
     def _begin(self) -> None:
         self._looks = 0
+        self._other = (0, 0.0)
         self._clock = RackClock(self._pace.factor, time.monotonic())
         self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
         self.publication.begin()

@@ -1,0 +1,143 @@
+"""The control PLC as a whole, in this process, with a rack that is not there, or one of a few registers."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
+from coldloop.model_file import read_header
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.registers.bank import ANYBODY, Caller, RegisterBank
+from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, PlantLinkState, PlantLinkStatus
+from coldloop.registers.declaration import Block
+from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
+from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
+from coldloop.seal import sealed
+from control_plc.runtime import ControlPlc
+from control_plc.settings import ControlSettings
+from rig.ports import ReservedPorts
+
+WITHIN_S = 20.0
+HEADER = read_header(DEFAULT_MODEL_FILE)
+
+
+class SmallRack:
+    """A rack in a session, which takes all outputs and whose clock is the test's."""
+
+    def __init__(self, session: int) -> None:
+        self.bank = RegisterBank(PLANT_MAP)
+        self.bank.put(Identity(map_digest=PLANT_MAP.digest, map_version=PLANT_MAP.version))
+        self.written: list[Actuators] = []
+        self.generation = 0
+        self.begin(session)
+
+    def begin(self, session: int) -> None:
+        """Begin a session."""
+        self.generation += 1
+        self.session = session
+        self._show(0, (43.0, 75.0, 36.0), OutputVerdict.NONE)
+
+    def _show(self, holder: int, u: tuple[float, ...], verdict: OutputVerdict) -> None:
+        self.bank.put(
+            sealed(
+                Measurement(
+                    0, HEADER.w0, tuple(HEADER.y0), tuple(HEADER.x0), self.session, u, holder, self.generation, verdict
+                )
+            )
+        )
+
+    def on_write(self, block: Block, _caller: Caller) -> None:
+        """Take outputs."""
+        if block.record is Actuators:
+            asked = self.bank.get(Actuators)
+            if asked.session == self.session:
+                self.written.append(asked)
+                self._show(asked.holder, asked[1:4], OutputVerdict.TAKEN)
+            else:
+                self._show(0, (43.0, 75.0, 36.0), OutputVerdict.WRONG_SESSION)
+
+
+@contextlib.asynccontextmanager
+async def running(rack: SmallRack | None = None, **sections: Any) -> AsyncIterator[ControlPlc]:  # noqa: ANN401 - settings
+    """Run a control PLC without a server; where no rack is given, nobody listens where it looks for it."""
+    nobody = ReservedPorts(1)
+    port, server = nobody.numbers[0], None
+    if rack is not None:
+        identity = DeviceIdentity(product="test", revision="0")
+        server = ModbusServer(rack.bank, settings=ServerSettings(port=0), on_write=rack.on_write, identity=identity)
+        await server.start()
+        port = server.port
+    section = {**sections.pop("control_plc", {}), "plant": {"port": port}}
+    plc = ControlPlc(ControlSettings.model_validate({"control_plc": section, **sections}))
+    task = asyncio.create_task(plc.run())
+    try:
+        yield plc
+    finally:
+        task.cancel()
+        await asyncio.wait({task})
+        plc.close()
+        if server is not None:
+            await server.close()
+        nobody.release()
+
+
+def ask(plc: ControlPlc, record: tuple[Any, ...]) -> None:
+    """Write a record as an operator does."""
+    plc.bank.put(record)
+    plc.clients.on_write(CONTROL_MAP.block_of(type(record)), ANYBODY)
+
+
+async def until(condition: Callable[[], object], within_s: float = WITHIN_S) -> None:
+    """Wait for a condition."""
+    deadline = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.01)
+
+
+def alarm(plc: ControlPlc, kind: AlarmKind) -> AlarmState:
+    return AlarmState(plc.bank.get(Alarm, kind).state)
+
+
+async def test_an_alarm_with_a_delay_is_raised_also_while_no_scans_are_made() -> None:
+    rules = {"rules": {"plant_lost": {"on_delay_s": 1.0}}}
+    async with running(control_plc={"alarms": rules}) as plc:
+        ask(plc, ControlSession(3, 1, 10.0))
+        await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.SEARCHING)
+        await until(lambda: alarm(plc, AlarmKind.PLANT_LOST) is AlarmState.UNACKNOWLEDGED)
+
+
+async def test_a_new_session_does_not_wait_for_a_tick_that_lasts_long() -> None:
+    rack = SmallRack(1)
+    async with running(rack, session={"autostart": True, "mode": "realtime", "factor": 0.01}) as plc:
+        await until(lambda: rack.written)
+        rack.begin(2)
+        ask(plc, ControlSession(2, 1, 0.01))
+        await until(lambda: rack.written[-1].session == 2, within_s=5.0)
+
+
+async def test_a_new_session_of_an_operator_is_no_loss_of_the_plant() -> None:
+    rack = SmallRack(1)
+    async with running(rack) as plc:
+        for session in (1, 2):
+            rack.begin(session)
+            ask(plc, ControlSession(session, 0, 1.0))
+            plc.clients.granted = 1
+            plc.clients.changed.set()
+            await until(lambda: rack.written and rack.written[-1].session == session)  # noqa: B023 - awaited here
+        assert alarm(plc, AlarmKind.PLANT_LOST) is AlarmState.NORMAL
+
+
+async def test_autostart_leaves_a_session_to_the_operator_who_is_about_to_ask_for_it() -> None:
+    """He writes to the rack first, and then to the control PLC."""
+    rack = SmallRack(1)
+    async with running(rack, session={"autostart": True, "mode": "realtime", "factor": 50.0}) as plc:
+        await until(lambda: rack.written)
+        rack.begin(2)
+        await asyncio.sleep(0.4)
+        assert rack.written[-1].session == 1
+        await until(lambda: rack.written[-1].session == 2)  # nobody has asked
+        assert plc.publication.running
