@@ -23,6 +23,8 @@ log = logging.getLogger("coldloop.control_plc")
 OWNER: Final = "control_plc/2"
 """Who retained states belong to, and the version of what they hold."""
 ROW: Final = struct.Struct(">3f")
+OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing")
+"""What is retained of a session."""
 
 Count = Annotated[int, Field(ge=0, lt=2**32)]
 
@@ -105,11 +107,14 @@ class Memory:
         """Why the state cannot be written at present."""
         return self._writer.failed if self._writer else None
 
-    def keep(self, program: ControlProgram, pace: Pace) -> None:
-        """Keep the state of now."""
+    def keep(self, program: ControlProgram, pace: Pace, pending: RetainedState | None = None) -> None:
+        """Keep the state of now; of a `pending` session, which is still to be resumed, what was retained of it."""
         if self._writer is None:
             return
-        self._writer.keep(self.content(program, pace))
+        content = self.content(program, pace)
+        if pending is not None:
+            content |= {name: getattr(pending, name) for name in OF_THE_SESSION}
+        self._writer.keep(content)
 
     def content(self, program: ControlProgram, pace: Pace) -> dict[str, Any]:
         """Return the state of a program, as a file holds it; nothing in it changes later."""

@@ -70,17 +70,23 @@ class ControlPlc:
         section = settings.control_plc
         self._settings = settings
         self._memory = Memory(section.retain.file, header.short_digest)
-        self._kept: RetainedState | None = self._memory.recall()
+        recalled = self._memory.recall()
         self._program = program = make_program(header, section, settings.limits)
-        program.journal.continue_from(self._memory.boot, self._kept.events if self._kept else 0)
-        program.journal.note(0, EventKind.BOOT, int(self._kept is not None))
+        program.journal.continue_from(self._memory.boot, recalled.events if recalled else 0)
+        if recalled is not None:
+            program.recall(recalled.operator, recalled.alarms, recalled.tick)
+        self._kept: RetainedState | None = recalled if recalled is not None and recalled.session else None
+        """The session to be gone on with, until the rack has been found in it, or in another one."""
         self._link = PlantLink(program.alarms, program.journal, self._memory.holder)
         self._cycle = ScanCycle(program, self._link, self._adopt)
         self._plant = RegisterClient.at(PLANT_MAP, section.plant)
-        self._pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
+        configured = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
+        self._pace = self._kept.pace if self._kept else configured
         self._clock = RackClock(self._pace.factor, time.monotonic())
+        if self._kept is not None:
+            self._clock.synchronise(self._kept.tick + PHASE, time.monotonic())
         self.bank = RegisterBank(CONTROL_MAP, section.word_order)
-        self.publication = Publication(program, self._link, self.bank, header.short_digest)
+        self.publication = Publication(program, self._link, self.bank, header.short_digest, self._keep)
         self.clients = Clients(program, settings.limits, self.bank, self.publication, lambda: self._pace)
         self._reached = False
         self._looks = 0
@@ -88,11 +94,14 @@ class ControlPlc:
         self._awaiting_since: float | None = None
         self._other = (0, 0.0)
         """Another session that the rack was found in while ours ran, and since when (s)."""
+        self.bank.put(program.operator)
+        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None))
         self._publish()
 
     def close(self) -> None:
         """Let go of the rack, and keep what is to be kept."""
         self._plant.close()
+        self._keep()
         self._memory.close()
 
     # -- scan cycle ----------------------------------------------------------------------------------------------------
@@ -224,7 +233,11 @@ class ControlPlc:
         if publication.is_behind or on_the_second:
             publication.safety()
         publication.identity()
-        self._memory.keep(program, self._pace)
+        self._keep()
+
+    def _keep(self) -> None:
+        """Keep the state of now; of a session that is still to be gone on with, that of before the restart."""
+        self._memory.keep(self._program, self._pace, self._kept)
 
     def _watch_ourselves(self) -> None:
         """Raise the alarms about clock and memory, and note log lines that were lost."""
@@ -319,7 +332,7 @@ class ControlPlc:
             # at tick 0 the rack's clock waits for the first outputs
             self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
         elif not self.publication.running and not self._settings.session.autostart:
-            self._kept = None  # the rack has left the session that was retained
+            self._forget_kept()  # the rack has left the session that was retained
             self._link.end()
 
     async def _pause(self) -> None:
@@ -336,26 +349,41 @@ class ControlPlc:
 
     def _adopt(self, reading: Measurement) -> bool:
         """Go over to the session of the rack, where that is ours to do: after a restart, or by `session.autostart`."""
-        kept, self._kept = self._kept, None
-        program = self._program
+        kept, program = self._kept, self._program
         if kept is not None and kept.session == reading.session != 0:
-            program.alarms.restore(kept.alarms)
-            self._pace = kept.pace
+            self._kept = None
             program.resume(
                 reading.session, reading.tick, reading.u,
-                updates=kept.updates, operator=kept.operator, playing=kept.sequence,
+                updates=kept.updates, operator=program.operator, playing=kept.sequence,
             )  # fmt: skip
-        elif not self._settings.session.autostart or not self._is_ours_to_adopt(reading.session):
+            self._go_on(reading)
+            return True
+        self._forget_kept()
+        if not self._settings.session.autostart or not self._is_ours_to_adopt(reading.session):
             return False
-        elif reading.tick == 0:
+        if reading.tick == 0:
             program.restart(reading.session)
         else:
             program.resume(
                 reading.session, reading.tick, reading.u, updates=program.player.updates, operator=program.operator
             )
+        self._go_on(reading)
+        return True
+
+    def _go_on(self, reading: Measurement) -> None:
         log.warning("session resumed", extra={"session": reading.session, "tick": reading.tick})
         self._begin()
-        return True
+
+    def _forget_kept(self) -> None:
+        """Do without the session that was retained; what an operator has said since the start stays."""
+        kept, self._kept = self._kept, None
+        if kept is None:
+            return
+        configured = self._settings.session
+        self._pace = Pace(configured.mode is TimeMode.REALTIME, configured.factor)
+        if self._program.operator == kept.operator:
+            self._program.nobody_drives()
+            self.bank.put(self._program.operator)
 
     def _is_ours_to_adopt(self, session: int) -> bool:
         """Tell whether a session of the rack has not been asked for by an operator, as far as one can tell by now."""
@@ -368,7 +396,8 @@ class ControlPlc:
 
     def _start(self, asked: ControlSession) -> None:
         """Begin the session that an operator has asked for; nothing is written before the rack has been read."""
-        self.clients.asked = self._kept = None
+        self.clients.asked = None
+        self._forget_kept()
         self._program.restart(asked.session)
         self._pace = Pace(bool(asked.realtime), asked.factor)
         self._begin()

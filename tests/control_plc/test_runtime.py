@@ -4,17 +4,26 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 from typing import Any
 
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.model_file import read_header
 from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.registers.audit import EVENT_ROWS, Event
 from coldloop.registers.bank import ANYBODY, Caller, RegisterBank
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, PlantLinkState, PlantLinkStatus
+from coldloop.registers.control_plc import (
+    CONTROL_MAP,
+    ControlSession,
+    Operator,
+    OperatorMode,
+    PlantLinkState,
+    PlantLinkStatus,
+)
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
-from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
+from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.seal import sealed
 from control_plc.runtime import ControlPlc
 from control_plc.settings import ControlSettings
@@ -141,3 +150,53 @@ async def test_autostart_leaves_a_session_to_the_operator_who_is_about_to_ask_fo
         assert rack.written[-1].session == 1
         await until(lambda: rack.written[-1].session == 2)  # nobody has asked
         assert plc.publication.running
+
+
+async def test_no_number_of_a_start_or_of_an_event_is_given_out_twice(tmp_path: Path) -> None:
+    """Whether scans are made or not: here there is no rack."""
+    given: list[tuple[int, int]] = []
+    for start in (1, 2, 3):
+        async with running(control_plc={"retain": {"file": tmp_path / "state"}}) as plc:
+            await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.SEARCHING)
+            ask(plc, Operator(OperatorMode.CLASSICAL, 43.0, 75.0, 36.0))
+            events = [plc.bank.get(Event, row) for row in range(EVENT_ROWS)]
+            assert {event.boot for event in events if event.number > len(given)} == {start}
+            given += sorted((event.number, event.boot) for event in events if event.number > len(given))
+    assert [number for number, _ in given] == list(range(1, len(given) + 1))
+    assert {boot for _, boot in given} == {1, 2, 3}
+
+
+async def test_what_an_operator_says_before_the_rack_is_found_holds(tmp_path: Path) -> None:
+    settings = {"retain": {"file": tmp_path / "state"}}
+    async with running(SmallRack(4), control_plc=settings) as plc:
+        ask(plc, ControlSession(4, 0, 1.0))
+        await until(lambda: plc.publication.running)
+        ask(plc, AlarmCommand(AlarmKind.CLOCK_SKEW, AlarmAction.SHELVE, 600))
+    for asked in (Operator(OperatorMode.MANUAL, 43.0, 75.0, 36.0), None):
+        async with running(SmallRack(4), control_plc=settings) as plc:
+            if asked is not None:
+                ask(plc, asked)
+                ask(plc, AlarmCommand(AlarmKind.T5_BAND, AlarmAction.SHELVE, 600))
+            await until(lambda: plc.publication.running)
+            assert plc.bank.get(Identity).session == 4
+            assert plc.bank.get(Operator).mode == OperatorMode.MANUAL
+            assert alarm(plc, AlarmKind.T5_BAND) is AlarmState.SHELVED
+            assert alarm(plc, AlarmKind.CLOCK_SKEW) is AlarmState.SHELVED
+
+
+async def test_a_session_is_gone_on_with_after_several_starts_without_the_rack(tmp_path: Path) -> None:
+    settings = {"retain": {"file": tmp_path / "state"}}
+    async with running(SmallRack(4), control_plc=settings) as plc:
+        ask(plc, ControlSession(4, 0, 1.0))
+        await until(lambda: plc.publication.running)
+    for _ in range(2):
+        async with running(control_plc=settings) as plc:
+            ask(plc, Operator(OperatorMode.CLASSICAL, 43.0, 75.0, 36.0))
+    async with running(SmallRack(4), control_plc=settings) as plc:
+        await until(lambda: plc.publication.running)
+        assert plc.bank.get(Operator).mode == OperatorMode.CLASSICAL
+    async with running(SmallRack(5), control_plc=settings) as plc:
+        await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IDLE)
+        await asyncio.sleep(0.1)
+        assert not plc.publication.running
+        assert plc.bank.get(Operator).mode == OperatorMode.AUTO
