@@ -1,6 +1,7 @@
 """What an operator writes to the optimiser: judged whole, and nothing that is accepted can end the program."""
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
@@ -155,3 +156,19 @@ async def test_a_session_that_begins_anew_under_its_number_is_joined_at_once(
         control.latch()
         await until(lambda: len(control.plans) > 2)
         assert [plan.update for plan in control.plans[:3]] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("factor", "period"), [(0.01, 0), (0.01, 8)])
+async def test_a_new_session_does_not_wait_for_the_answer_of_a_slow_one(
+    connect: "Connect", control: "PlayedControlPlc", until: "Until", factor: float, period: int
+) -> None:
+    async with connect(control) as link, panel(link) as client:
+        await client.write(OptimizerSession(1, 1, factor, period))
+        control.latch()
+        await until(lambda: control.plans)
+        control.plans.clear()
+        control.session, control.updates = 2, 0
+        control.latch()
+        before = time.monotonic()
+        await until(lambda: control.plans)
+        assert time.monotonic() - before < 5.0
