@@ -13,7 +13,7 @@ import time
 from typing import Final
 
 from coldloop import __version__
-from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.errors import ConfigurationError, LinkError, PeerUnreachableError
 from coldloop.limits import InputLimits
 from coldloop.logs import dropped
 from coldloop.modbus.client import RegisterClient
@@ -54,6 +54,9 @@ ADOPT_AFTER_S: Final = 1.0
 EXPIRES_SOON: Final = 1
 """Causes of the alarm CERTIFICATE."""
 EXPIRED: Final = 2
+UNREADABLE: Final = 3
+CERTIFICATES_S: Final = 3600.0
+"""Between two looks at the certificates, in real time."""
 
 
 def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:
@@ -273,12 +276,20 @@ class ControlPlc:
             return
         from coldloop.modbus.tls import certificate_days_left  # noqa: PLC0415 not needed without TLS
 
+        def days_of_those_to_renew() -> list[float]:
+            return [days for tls in files if (days := certificate_days_left(tls)) < tls.warn_days]
+
         while True:
-            days, warn_days = min((certificate_days_left(tls), tls.warn_days) for tls in files)
-            cause = EXPIRED if days < 0 else EXPIRES_SOON
-            self._program.alarms.holds(AlarmKind.CERTIFICATE, condition=days < warn_days, cause=cause)
+            try:
+                days = await asyncio.to_thread(days_of_those_to_renew)  # no scan waits for a disk
+            except ConfigurationError as error:  # somebody is renewing them, perhaps; what was read at the start serves
+                log.warning("certificates unreadable", extra={"reason": str(error)})
+                condition, cause = True, UNREADABLE
+            else:
+                condition, cause = bool(days), EXPIRED if min(days, default=0.0) < 0.0 else EXPIRES_SOON
+            self._program.alarms.holds(AlarmKind.CERTIFICATE, condition=condition, cause=cause)
             self.publication.safety()
-            await asyncio.sleep(3600)
+            await asyncio.sleep(CERTIFICATES_S)
 
     # -- out of step ---------------------------------------------------------------------------------------------------
 

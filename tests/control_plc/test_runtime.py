@@ -7,6 +7,8 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.model_file import read_header
 from coldloop.model_settings import DEFAULT_MODEL_FILE
@@ -25,8 +27,9 @@ from coldloop.registers.declaration import Block
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.seal import sealed
-from control_plc.runtime import ControlPlc
+from control_plc.runtime import EXPIRES_SOON, UNREADABLE, ControlPlc
 from control_plc.settings import ControlSettings
+from rig.certificates import Authority
 from rig.ports import ReservedPorts
 
 WITHIN_S = 20.0
@@ -200,3 +203,25 @@ async def test_a_session_is_gone_on_with_after_several_starts_without_the_rack(t
         await asyncio.sleep(0.1)
         assert not plc.publication.running
         assert plc.bank.get(Operator).mode == OperatorMode.AUTO
+
+
+async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are looked at again and again, and may be about to be renewed."""
+    certificate = tmp_path / "certificate"
+    authority = Authority.new("site", 20)
+    for file, pair in ((tmp_path / "ca", authority.pair), (certificate, authority.issue_client("a", "control"))):
+        file.write_bytes(pair.certificate_pem)
+    monkeypatch.setattr("control_plc.runtime.CERTIFICATES_S", 0.01)
+    tls = {"certificate": certificate, "key": tmp_path / "key", "ca": tmp_path / "ca"}
+    async with running(control_plc={"server": {"tls": tls}}) as plc:
+        watching = asyncio.create_task(plc.watch_certificates())
+        await until(lambda: plc.bank.get(Alarm, AlarmKind.CERTIFICATE).cause == EXPIRES_SOON)
+        content = certificate.read_bytes()
+        certificate.unlink()
+        await until(lambda: plc.bank.get(Alarm, AlarmKind.CERTIFICATE).cause == UNREADABLE)
+        certificate.write_bytes(content)
+        await until(lambda: plc.bank.get(Alarm, AlarmKind.CERTIFICATE).cause == EXPIRES_SOON)
+        assert not watching.done()
+        watching.cancel()
