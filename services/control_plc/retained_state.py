@@ -2,15 +2,16 @@
 
 import base64
 import logging
+import math
 import secrets
 import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from coldloop.registers.control_plc import SEQUENCE_ROWS, Operator, SequenceHeader, SequenceRow
+from coldloop.registers.control_plc import SEQUENCE_ROWS, Operator, OperatorMode, SequenceHeader, SequenceRow
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.retained import RetainedFile, RetainedStateError
 from coldloop.retained_writer import RetainedStateWriter
@@ -49,6 +50,15 @@ class RetainedState(BaseModel):
     """Header and rows (base64 of single precision, high byte first) of the sequence being played."""
     operator: Operator
     alarms: Annotated[list[Alarm], Field(min_length=len(AlarmKind), max_length=len(AlarmKind))]
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if not 0.0 < self.pace.factor < math.inf:
+            raise ValueError(f"no time goes on with a factor of {self.pace.factor}")
+        if not all(map(math.isfinite, self.operator)):
+            raise ValueError("setpoints that are no numbers")
+        OperatorMode(self.operator.mode)
+        return self
 
     @classmethod
     def parsed(cls, content: Mapping[str, object]) -> Self:

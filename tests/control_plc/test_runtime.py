@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -26,7 +27,9 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
+from coldloop.retained import RetainedFile
 from coldloop.seal import sealed
+from control_plc.retained_state import OWNER
 from control_plc.runtime import EXPIRES_SOON, UNREADABLE, ControlPlc
 from control_plc.settings import ControlSettings
 from rig.certificates import Authority
@@ -225,3 +228,19 @@ async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
         await until(lambda: plc.bank.get(Alarm, AlarmKind.CERTIFICATE).cause == EXPIRES_SOON)
         assert not watching.done()
         watching.cancel()
+
+
+@pytest.mark.parametrize(
+    "odd", [{"pace": (1, 0.0)}, {"pace": (1, math.nan)}, {"operator": (77, 1, 1, 1)}, {"operator": (2, math.nan, 1, 1)}]
+)
+async def test_a_retained_state_that_cannot_be_keeps_nobody_from_starting(tmp_path: Path, odd: dict[str, Any]) -> None:
+    file = tmp_path / "state"
+    async with running(SmallRack(4), control_plc={"retain": {"file": file}}) as plc:
+        ask(plc, ControlSession(4, 0, 1.0))
+        await until(lambda: plc.publication.running)
+    kept = RetainedFile(file, OWNER, HEADER.short_digest)
+    state = kept.load()
+    assert state is not None
+    kept.save({**state, **odd})
+    async with running(SmallRack(4), control_plc={"retain": {"file": file}}) as plc:
+        await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IDLE)
