@@ -67,6 +67,8 @@ class Clients:
         self._pace = pace
         self._news = asyncio.Event()
         self._waits = 0
+        self._sessions = 0
+        """Sessions that have begun."""
         self.lease = WriterLease("the optimiser's registers", self._silence_s, self._note_lease)
         self.changed = asyncio.Event()
         self.granted = 0
@@ -104,6 +106,14 @@ class Clients:
                 raise IllegalValueError(f"setpoint of {name} = {value:g} is outside {low:g}..{high:g}")
 
     # -- done ----------------------------------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Show nothing of the session before: a session begins."""
+        self._sessions += 1
+        self._bank.put(sealed(self._bank.get(Update)._replace(session=0)))
+        self._bank.put(sealed(LatchedUpdate()))
+        self._bank.put(sealed(self._program.player.acknowledgement))
+        self._bank.put(self._program.operator)
 
     @property
     def optimizer_waits(self) -> bool:
@@ -217,14 +227,14 @@ class Clients:
         return latched is not None and latched.update >= wanted
 
     async def _wait_for(self, wanted: int) -> None:
-        """Wait for an update; an update of a newer session, which counts from 0 again, will do."""
-        session = self._program.session
+        """Wait for an update; one of a session that has begun since, which counts from 0 again, will do."""
+        sessions = self._sessions
         self._waits += 1
         try:
             async with asyncio.timeout(LONGEST_WAIT_S):
                 while not self._latched(wanted):
                     await self._news.wait()
-                    if self._program.session != session:
+                    if self._sessions != sessions:
                         return
         except TimeoutError:
             return

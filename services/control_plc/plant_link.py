@@ -85,7 +85,7 @@ class PlantLink:
     # -- events --------------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Begin a session: read back first, from a rack of which nothing is known."""
+        """Begin a session: read back first. What the rack applied in the one before does not matter."""
         self.generation = 0
         self._enter(PlantLinkState.JOINING, LinkCause.STARTED)
 

@@ -29,7 +29,7 @@ from coldloop.registers.control_plc import (
     Verdict,
 )
 from coldloop.registers.plant import MAX_LOAD_W, Actuators, Measurement
-from coldloop.registers.safety import AlarmKind
+from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.sequence import InputSequence
 from coldloop.watchdog import Watchdog
 from control_plc.alarms import AlarmPanel
@@ -80,11 +80,28 @@ class ControlProgram:
 
     def restart(self, session: int) -> None:
         """Begin a session at tick 0 with the initial inputs applied."""
-        classical = self._section.driver is ControlStrategy.CLASSICAL
-        self.operator = Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, *self._initial)
+        self.nobody_drives()
         self._begin(session, 0, self._initial, updates=0)
+        classical = self._section.driver is ControlStrategy.CLASSICAL
         mode = Mode.CLASSICAL if classical else Mode.HOLD
         self._ladder = Ladder(self._section.ladder.hold_ticks, mode, Cause.SESSION_STARTED)
+
+    def nobody_drives(self) -> None:
+        """Let those drive whom the configuration names: no operator has said anything."""
+        classical = self._section.driver is ControlStrategy.CLASSICAL
+        self.operator = Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, *self._initial)
+
+    def recall(self, operator: Operator, alarms: Sequence[Alarm], tick: int) -> None:
+        """Take over what operators had said before a restart, and the alarms; the session is resumed later.
+
+        Args:
+            operator: Who drives.
+            alarms: All alarms.
+            tick: The last one.
+        """
+        self.operator = operator
+        self.alarms.begin_at(tick)
+        self.alarms.restore(alarms)
 
     def resume(
         self,
@@ -104,11 +121,13 @@ class ControlProgram:
             applied: What it applies.
             updates: Number of the next update.
             operator: What operators have said.
-            playing: What was being played: its rest is played on.
+            playing: What was being played. Its rest is played on, if what the rack applies is of it: a state that was
+                retained some ticks before the end may hold the sequence before.
         """
         self.operator = operator
         self._begin(session, tick, SequenceRow(*applied), updates=updates)
-        self._player.resume(playing, tick)
+        ours = playing is not None and SequenceRow(*applied) in playing.rows[: max(0, tick - playing.header.first_tick)]
+        self._player.resume(playing if ours else None, tick)
         self._ladder = Ladder(self._section.ladder.hold_ticks, Mode.HOLD, Cause.RESTARTED, tick)
 
     def _begin(self, session: int, tick: int, applied: SequenceRow, *, updates: int) -> None:

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from coldloop.clock import LatenessRecord
 from coldloop.event_text import log_event
@@ -21,13 +21,25 @@ log = logging.getLogger("coldloop.control_plc")
 
 
 class Publication:
-    """Puts the program's state into the registers."""
+    """Puts the program's state into the registers.
 
-    def __init__(self, program: ControlProgram, link: PlantLink, bank: RegisterBank, model_digest: int) -> None:
+    `keep` is called with new events, so that no number of an event is given out twice, and what an operator has said
+    is retained also while no scans are made.
+    """
+
+    def __init__(
+        self,
+        program: ControlProgram,
+        link: PlantLink,
+        bank: RegisterBank,
+        model_digest: int,
+        keep: Callable[[], None] = lambda: None,
+    ) -> None:
         self._program = program
         self._link = link
         self._bank = bank
         self._model_digest = model_digest
+        self._keep = keep
         self.journal = JournalPublication(program.journal, bank)
         self._told_alarms = -1
         self.running = False
@@ -92,8 +104,11 @@ class Publication:
     def safety(self) -> None:
         """Show ladder, watchdog, alarms and events, as far as they have changed, and log the events."""
         program = self._program
-        for event in self.journal.show():
+        events = self.journal.show()
+        for event in events:
             log_event(log, event)
+        if events:
+            self._keep()
         if program.alarms.changes != self._told_alarms:
             self._told_alarms = program.alarms.changes
             for row, alarm in enumerate(program.alarms.rows):

@@ -2,15 +2,16 @@
 
 import base64
 import logging
+import math
 import secrets
 import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from coldloop.registers.control_plc import SEQUENCE_ROWS, Operator, SequenceHeader, SequenceRow
+from coldloop.registers.control_plc import SEQUENCE_ROWS, Operator, OperatorMode, SequenceHeader, SequenceRow
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.retained import RetainedFile, RetainedStateError
 from coldloop.retained_writer import RetainedStateWriter
@@ -23,6 +24,8 @@ log = logging.getLogger("coldloop.control_plc")
 OWNER: Final = "control_plc/2"
 """Who retained states belong to, and the version of what they hold."""
 ROW: Final = struct.Struct(">3f")
+OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing")
+"""What is retained of a session."""
 
 Count = Annotated[int, Field(ge=0, lt=2**32)]
 
@@ -47,6 +50,15 @@ class RetainedState(BaseModel):
     """Header and rows (base64 of single precision, high byte first) of the sequence being played."""
     operator: Operator
     alarms: Annotated[list[Alarm], Field(min_length=len(AlarmKind), max_length=len(AlarmKind))]
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if not 0.0 < self.pace.factor < math.inf:
+            raise ValueError(f"no time goes on with a factor of {self.pace.factor}")
+        if not all(map(math.isfinite, self.operator)):
+            raise ValueError("setpoints that are no numbers")
+        OperatorMode(self.operator.mode)
+        return self
 
     @classmethod
     def parsed(cls, content: Mapping[str, object]) -> Self:
@@ -105,11 +117,14 @@ class Memory:
         """Why the state cannot be written at present."""
         return self._writer.failed if self._writer else None
 
-    def keep(self, program: ControlProgram, pace: Pace) -> None:
-        """Keep the state of now."""
+    def keep(self, program: ControlProgram, pace: Pace, pending: RetainedState | None = None) -> None:
+        """Keep the state of now; of a `pending` session, which is still to be resumed, what was retained of it."""
         if self._writer is None:
             return
-        self._writer.keep(self.content(program, pace))
+        content = self.content(program, pace)
+        if pending is not None:
+            content |= {name: getattr(pending, name) for name in OF_THE_SESSION}
+        self._writer.keep(content)
 
     def content(self, program: ControlProgram, pace: Pace) -> dict[str, Any]:
         """Return the state of a program, as a file holds it; nothing in it changes later."""

@@ -13,7 +13,7 @@ import time
 from typing import Final
 
 from coldloop import __version__
-from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.errors import ConfigurationError, LinkError, PeerUnreachableError
 from coldloop.limits import InputLimits
 from coldloop.logs import dropped
 from coldloop.modbus.client import RegisterClient
@@ -46,9 +46,17 @@ LOOK_PAUSE_S: Final = 0.1
 ANSWER_TICKS: Final = 8
 """In real time an answer that takes longer is of no use: the rack is looked at anew."""
 SHORTEST_PATIENCE_S: Final = 0.1
+LONGEST_SLEEP_S: Final = 0.5
+"""Between two looks for a new session while a scan is not due."""
+ADOPT_AFTER_S: Final = 1.0
+"""An operator who begins a session writes to one PLC after the other: one that the rack has begun is ours by
+`session.autostart` when it has not been asked for here meanwhile."""
 EXPIRES_SOON: Final = 1
 """Causes of the alarm CERTIFICATE."""
 EXPIRED: Final = 2
+UNREADABLE: Final = 3
+CERTIFICATES_S: Final = 3600.0
+"""Between two looks at the certificates, in real time."""
 
 
 def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:
@@ -65,27 +73,38 @@ class ControlPlc:
         section = settings.control_plc
         self._settings = settings
         self._memory = Memory(section.retain.file, header.short_digest)
-        self._kept: RetainedState | None = self._memory.recall()
+        recalled = self._memory.recall()
         self._program = program = make_program(header, section, settings.limits)
-        program.journal.continue_from(self._memory.boot, self._kept.events if self._kept else 0)
-        program.journal.note(0, EventKind.BOOT, int(self._kept is not None))
+        program.journal.continue_from(self._memory.boot, recalled.events if recalled else 0)
+        if recalled is not None:
+            program.recall(recalled.operator, recalled.alarms, recalled.tick)
+        self._kept: RetainedState | None = recalled if recalled is not None and recalled.session else None
+        """The session to be gone on with, until the rack has been found in it, or in another one."""
         self._link = PlantLink(program.alarms, program.journal, self._memory.holder)
         self._cycle = ScanCycle(program, self._link, self._adopt)
         self._plant = RegisterClient.at(PLANT_MAP, section.plant)
-        self._pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
+        configured = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
+        self._pace = self._kept.pace if self._kept else configured
         self._clock = RackClock(self._pace.factor, time.monotonic())
+        if self._kept is not None:
+            self._clock.synchronise(self._kept.tick + PHASE, time.monotonic())
         self.bank = RegisterBank(CONTROL_MAP, section.word_order)
-        self.publication = Publication(program, self._link, self.bank, header.short_digest)
+        self.publication = Publication(program, self._link, self.bank, header.short_digest, self._keep)
         self.clients = Clients(program, settings.limits, self.bank, self.publication, lambda: self._pace)
         self._reached = False
         self._looks = 0
         self._lost_lines = 0
         self._awaiting_since: float | None = None
+        self._other = (0, 0.0)
+        """Another session that the rack was found in while ours ran, and since when (s)."""
+        self.bank.put(program.operator)
+        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None))
         self._publish()
 
     def close(self) -> None:
         """Let go of the rack, and keep what is to be kept."""
         self._plant.close()
+        self._keep()
         self._memory.close()
 
     # -- scan cycle ----------------------------------------------------------------------------------------------------
@@ -130,6 +149,10 @@ class ControlPlc:
         It always yields, however late it is.
         """
         program, due = self._program, self._clock.due(self._program.tick)
+        while due - time.monotonic() > LONGEST_SLEEP_S:  # a tick may last half a minute: a session does not wait for it
+            await asyncio.sleep(LONGEST_SLEEP_S)
+            if self.clients.asked is not None:
+                return False
         await asyncio.sleep(max(0.0, due - time.monotonic()))
         lateness = max(0.0, time.monotonic() - due)
         self.publication.lateness.add(lateness)
@@ -213,7 +236,11 @@ class ControlPlc:
         if publication.is_behind or on_the_second:
             publication.safety()
         publication.identity()
-        self._memory.keep(program, self._pace)
+        self._keep()
+
+    def _keep(self) -> None:
+        """Keep the state of now; of a session that is still to be gone on with, that of before the restart."""
+        self._memory.keep(self._program, self._pace, self._kept)
 
     def _watch_ourselves(self) -> None:
         """Raise the alarms about clock and memory, and note log lines that were lost."""
@@ -249,12 +276,20 @@ class ControlPlc:
             return
         from coldloop.modbus.tls import certificate_days_left  # noqa: PLC0415 not needed without TLS
 
+        def days_of_those_to_renew() -> list[float]:
+            return [days for tls in files if (days := certificate_days_left(tls)) < tls.warn_days]
+
         while True:
-            days, warn_days = min((certificate_days_left(tls), tls.warn_days) for tls in files)
-            cause = EXPIRED if days < 0 else EXPIRES_SOON
-            self._program.alarms.holds(AlarmKind.CERTIFICATE, condition=days < warn_days, cause=cause)
+            try:
+                days = await asyncio.to_thread(days_of_those_to_renew)  # no scan waits for a disk
+            except ConfigurationError as error:  # somebody is renewing them, perhaps; what was read at the start serves
+                log.warning("certificates unreadable", extra={"reason": str(error)})
+                condition, cause = True, UNREADABLE
+            else:
+                condition, cause = bool(days), EXPIRED if min(days, default=0.0) < 0.0 else EXPIRES_SOON
+            self._program.alarms.holds(AlarmKind.CERTIFICATE, condition=condition, cause=cause)
             self.publication.safety()
-            await asyncio.sleep(3600)
+            await asyncio.sleep(CERTIFICATES_S)
 
     # -- out of step ---------------------------------------------------------------------------------------------------
 
@@ -273,6 +308,7 @@ class ControlPlc:
         if not self._link.in_step and self._pace.realtime:
             now = self._clock.tick_at(time.monotonic())
             self._program.alarms.now = max(self._program.tick, now)
+            self._program.alarms.pass_by()
         self._publish()
 
     async def _read_back(self) -> None:
@@ -307,7 +343,7 @@ class ControlPlc:
             # at tick 0 the rack's clock waits for the first outputs
             self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
         elif not self.publication.running and not self._settings.session.autostart:
-            self._kept = None  # the rack has left the session that was retained
+            self._forget_kept()  # the rack has left the session that was retained
             self._link.end()
 
     async def _pause(self) -> None:
@@ -324,30 +360,55 @@ class ControlPlc:
 
     def _adopt(self, reading: Measurement) -> bool:
         """Go over to the session of the rack, where that is ours to do: after a restart, or by `session.autostart`."""
-        kept, self._kept = self._kept, None
-        program = self._program
+        kept, program = self._kept, self._program
         if kept is not None and kept.session == reading.session != 0:
-            program.alarms.restore(kept.alarms)
-            self._pace = kept.pace
+            self._kept = None
             program.resume(
                 reading.session, reading.tick, reading.u,
-                updates=kept.updates, operator=kept.operator, playing=kept.sequence,
+                updates=kept.updates, operator=program.operator, playing=kept.sequence,
             )  # fmt: skip
-        elif not self._settings.session.autostart or not reading.session:
+            self._go_on(reading)
+            return True
+        self._forget_kept()
+        if not self._settings.session.autostart or not self._is_ours_to_adopt(reading.session):
             return False
-        elif reading.tick == 0:
+        if reading.tick == 0:
             program.restart(reading.session)
         else:
             program.resume(
                 reading.session, reading.tick, reading.u, updates=program.player.updates, operator=program.operator
             )
+        self._go_on(reading)
+        return True
+
+    def _go_on(self, reading: Measurement) -> None:
         log.warning("session resumed", extra={"session": reading.session, "tick": reading.tick})
         self._begin()
-        return True
+
+    def _forget_kept(self) -> None:
+        """Do without the session that was retained; what an operator has said since the start stays."""
+        kept, self._kept = self._kept, None
+        if kept is None:
+            return
+        configured = self._settings.session
+        self._pace = Pace(configured.mode is TimeMode.REALTIME, configured.factor)
+        if self._program.operator == kept.operator:
+            self._program.nobody_drives()
+            self.bank.put(self._program.operator)
+
+    def _is_ours_to_adopt(self, session: int) -> bool:
+        """Tell whether a session of the rack has not been asked for by an operator, as far as one can tell by now."""
+        if not session or not self.publication.running:
+            return session > 0
+        now = time.monotonic()
+        if self._other[0] != session:
+            self._other = session, now
+        return now - self._other[1] >= ADOPT_AFTER_S
 
     def _start(self, asked: ControlSession) -> None:
         """Begin the session that an operator has asked for; nothing is written before the rack has been read."""
-        self.clients.asked = self._kept = None
+        self.clients.asked = None
+        self._forget_kept()
         self._program.restart(asked.session)
         self._pace = Pace(bool(asked.realtime), asked.factor)
         self._begin()
@@ -357,10 +418,11 @@ class ControlPlc:
 
     def _begin(self) -> None:
         self._looks = 0
+        self._other = (0, 0.0)
         self._clock = RackClock(self._pace.factor, time.monotonic())
         self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
         self.publication.begin()
-        self.bank.put(self._program.operator)
+        self.clients.begin()
         self.bank.put(ControlSession(self._program.session, int(self._pace.realtime), self._pace.factor))
 
     def _publish(self) -> None:

@@ -122,7 +122,7 @@ class OptimizerProgram:
     def plan(self, update: Update) -> Plan:
         """Take the update latched at t_i and decide the updating period that begins there."""
         elapsed = update.tick - self._last.update.tick if self._last else 0
-        if not 0 <= elapsed <= LONGEST_GAP_TICKS or (not update.playing and self._playing.sequence is not None):
+        if not 0 <= elapsed <= LONGEST_GAP_TICKS or not self._knows_what_is_played(update):
             self._begin_again(update)
         interrupted = self._return_to(update)
         estimate = self._estimator.correct(update)
@@ -138,6 +138,13 @@ class OptimizerProgram:
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
         return Plan(update.update, update.tick + ticks, load_step)
+
+    def _knows_what_is_played(self, update: Update) -> bool:
+        """Tell whether the control PLC plays something of ours, or has not begun to."""
+        if self._playing.sequence is None:
+            return True
+        ours = (delivery.sequence for delivery in (self._playing, self._sent) if delivery is not None)
+        return any(sequence is not None and sequence.header.number == update.playing for sequence in ours)
 
     def _begin_again(self, update: Update) -> None:
         """Forget what was sent: others have moved the inputs since, from which the next profile sets out."""

@@ -33,6 +33,8 @@ HEARTBEAT_S: Final = 1.0
 """Plant time between two signs of life while an answer is computed."""
 SHORTEST_PAUSE_S: Final = 0.001
 """Real time between two such requests, however high the factor: others want to be served too."""
+LONGEST_PAUSE_S: Final = 1.0
+"""The same, however low the factor: a new session does not wait for an answer that nobody wants any more."""
 SHORTEST_WAIT_S: Final = 0.02
 """An answer without a new update that comes sooner, in real time, is followed by a pause: it should have waited."""
 FRESH_UPDATE: Final = AwaitUpdate(session=0, update=0)
@@ -146,7 +148,8 @@ class OptimizerPlc:
                 self._wanted = FRESH_UPDATE  # should the link be lost before this one is planned
                 await self._answer(update, arrived_at)
                 continue
-            if update.session != self._wanted.session:
+            begun_anew = update.update + 1 < self._wanted.update  # under the same number: updates count from 0 again
+            if update.session != self._wanted.session or begun_anew:
                 self._wanted = FRESH_UPDATE
             if arrived_at - asked_at < SHORTEST_WAIT_S:
                 await asyncio.sleep(SHORTEST_WAIT_S)
@@ -210,14 +213,18 @@ class OptimizerPlc:
         self._wanted = FRESH_UPDATE if begin_again else AwaitUpdate(update.session, update.update + 1)
 
     async def _is_computed(self, answer: _Answer) -> bool:
-        """Wait until the PLC would have its answer; tell whether no load step has cut it off before."""
+        """Wait until the PLC would have its answer; tell whether no load step or session has cut it off before."""
         spacing_s = (LOOK_OUT_S if answer.interruptible else HEARTBEAT_S) / self._pace.factor
-        look_s = max(spacing_s, SHORTEST_PAUSE_S)
+        look_s = min(max(spacing_s, SHORTEST_PAUSE_S), LONGEST_PAUSE_S)
         while (remaining := answer.ready - time.monotonic()) > 0.0:
             await asyncio.sleep(min(remaining, look_s))
             # an answer that is ready does not wait for a sign of life
             look = answer.interruptible or remaining > look_s
-            if look and await self._is_superseded(answer.update) and answer.interruptible:
+            if not look:
+                continue
+            newest = await self._control.newest()
+            stepped = answer.interruptible and newest.update > answer.update.update
+            if stepped or newest.session != answer.update.session:
                 return False
         return True
 

@@ -100,6 +100,7 @@ _ALARM_CAUSES: Final[Mapping[int, Words]] = {
     AlarmKind.PLANT_FOREIGN: _causes(LinkCause),
     AlarmKind.PLANT_FROZEN: _causes(LinkCause),
     AlarmKind.OUTPUTS_NOT_TAKEN: _causes(LinkCause),
+    AlarmKind.CERTIFICATE: _listed(("", "expires soon", "has expired", "unreadable")),
 }
 
 

@@ -39,6 +39,19 @@ async def test_when_full_the_connection_that_has_been_idle_longest_makes_room(se
         assert running.server.connections == 3
 
 
+async def test_readers_without_a_role_do_not_take_the_place_of_one_with_a_role(serve: "Serve") -> None:
+    """Where a tick lasts long, a control PLC asks seldom."""
+    access = {"control": ["127.0.0.2"], "operator": [], "optimizer": []}
+    async with serve(connection_limit=2, replaceable_after_s=0, access=access) as running:
+        control = await running.connect("127.0.0.2")
+        await control.ask(READ_MAGIC)
+        for _ in range(4):
+            reader = await running.connect("127.0.0.3")
+            assert len(await reader.ask(READ_MAGIC)) == 6
+        assert len(await control.ask(READ_MAGIC)) == 6
+        assert running.server.counters.connection_evicted == 3
+
+
 async def test_a_crowd_leaves_as_many_connections_as_the_limit_says(serve: "Serve") -> None:
     async with serve(connection_limit=4) as running:
         wires = [await running.connect() for _ in range(20)]

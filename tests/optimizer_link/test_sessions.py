@@ -1,6 +1,7 @@
 """What an operator writes to the optimiser: judged whole, and nothing that is accepted can end the program."""
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
@@ -21,7 +22,7 @@ from optimizer_plc.budget import BudgetSettings, PlcBudget
 from optimizer_plc.publication import Publication
 
 if TYPE_CHECKING:
-    from tests.optimizer_link.conftest import Connect, Link, PlayedControlPlc
+    from tests.optimizer_link.conftest import Connect, Link, PlayedControlPlc, Until
 
 OPERATOR = Caller("panel", frozenset({Role.OPERATOR}))
 BLOCK = OPTIMIZER_MAP.block_of(OptimizerSession)
@@ -139,3 +140,35 @@ async def test_a_session_that_nobody_asked_for_here_runs_as_configured_and_is_no
         assert [event.kind for event in rows] == [EventKind.BOOT, EventKind.CONTROL_LINK, EventKind.SESSION]
         assert (rows[-1].subject, rows[-1].value, from_words(rows[-1].who)) == (0, 1.0, "")
         assert control.headers[0].tau_u != 14
+
+
+async def test_a_session_that_begins_anew_under_its_number_is_joined_at_once(
+    connect: "Connect", control: "PlayedControlPlc", until: "Until"
+) -> None:
+    """Its updates count from 0 again: the one that was awaited would be long in coming."""
+    control.latch()
+    async with connect(control) as link:
+        await link.answers(5)
+        control.latches_on = False
+        await until(lambda: control.awaited[-1].update == control.updates)
+        control.plans.clear()
+        control.updates, control.latches_on = 0, True
+        control.latch()
+        await until(lambda: len(control.plans) > 2)
+        assert [plan.update for plan in control.plans[:3]] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("factor", "period"), [(0.01, 0), (0.01, 8)])
+async def test_a_new_session_does_not_wait_for_the_answer_of_a_slow_one(
+    connect: "Connect", control: "PlayedControlPlc", until: "Until", factor: float, period: int
+) -> None:
+    async with connect(control) as link, panel(link) as client:
+        await client.write(OptimizerSession(1, 1, factor, period))
+        control.latch()
+        await until(lambda: control.plans)
+        control.plans.clear()
+        control.session, control.updates = 2, 0
+        control.latch()
+        before = time.monotonic()
+        await until(lambda: control.plans)
+        assert time.monotonic() - before < 5.0

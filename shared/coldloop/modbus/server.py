@@ -176,13 +176,16 @@ class ModbusServer:
     def _make_room(self, newcomer: Connection) -> bool:
         """Close the connection that has been idle longest, first those that never made a request.
 
-        For a newcomer with a role one that only reads makes room, however busy: readers do not keep a PLC out.
+        For a newcomer with a role one that only reads makes room, however busy, and one with a role never does for a
+        newcomer that only reads: readers neither keep a PLC out nor end its link, also where a scan takes long.
         """
         before = monotonic() - self._settings.replaceable_after_s
         idle = [
             connection
             for connection in self._connections
-            if connection.idle and (not connection.requests or connection.last_request <= before)
+            if connection.idle
+            and (newcomer.has_role or not connection.has_role)
+            and (not connection.requests or connection.last_request <= before)
         ]
         if not idle and newcomer.has_role:
             idle = [connection for connection in self._connections if not connection.has_role]

@@ -1,0 +1,246 @@
+"""The control PLC as a whole, in this process, with a rack that is not there, or one of a few registers."""
+
+import asyncio
+import contextlib
+import math
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
+from coldloop.model_file import read_header
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.registers.audit import EVENT_ROWS, Event
+from coldloop.registers.bank import ANYBODY, Caller, RegisterBank
+from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import (
+    CONTROL_MAP,
+    ControlSession,
+    Operator,
+    OperatorMode,
+    PlantLinkState,
+    PlantLinkStatus,
+)
+from coldloop.registers.declaration import Block
+from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
+from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
+from coldloop.retained import RetainedFile
+from coldloop.seal import sealed
+from control_plc.retained_state import OWNER
+from control_plc.runtime import EXPIRES_SOON, UNREADABLE, ControlPlc
+from control_plc.settings import ControlSettings
+from rig.certificates import Authority
+from rig.ports import ReservedPorts
+
+WITHIN_S = 20.0
+HEADER = read_header(DEFAULT_MODEL_FILE)
+
+
+class SmallRack:
+    """A rack in a session, which takes all outputs and whose clock is the test's."""
+
+    def __init__(self, session: int) -> None:
+        self.bank = RegisterBank(PLANT_MAP)
+        self.bank.put(Identity(map_digest=PLANT_MAP.digest, map_version=PLANT_MAP.version))
+        self.written: list[Actuators] = []
+        self.generation = 0
+        self.begin(session)
+
+    def begin(self, session: int) -> None:
+        """Begin a session."""
+        self.generation += 1
+        self.session = session
+        self._show(0, (43.0, 75.0, 36.0), OutputVerdict.NONE)
+
+    def _show(self, holder: int, u: tuple[float, ...], verdict: OutputVerdict) -> None:
+        self.bank.put(
+            sealed(
+                Measurement(
+                    0, HEADER.w0, tuple(HEADER.y0), tuple(HEADER.x0), self.session, u, holder, self.generation, verdict
+                )
+            )
+        )
+
+    def on_write(self, block: Block, _caller: Caller) -> None:
+        """Take outputs."""
+        if block.record is Actuators:
+            asked = self.bank.get(Actuators)
+            if asked.session == self.session:
+                self.written.append(asked)
+                self._show(asked.holder, asked[1:4], OutputVerdict.TAKEN)
+            else:
+                self._show(0, (43.0, 75.0, 36.0), OutputVerdict.WRONG_SESSION)
+
+
+@contextlib.asynccontextmanager
+async def running(rack: SmallRack | None = None, **sections: Any) -> AsyncIterator[ControlPlc]:  # noqa: ANN401 - settings
+    """Run a control PLC without a server; where no rack is given, nobody listens where it looks for it."""
+    nobody = ReservedPorts(1)
+    port, server = nobody.numbers[0], None
+    if rack is not None:
+        identity = DeviceIdentity(product="test", revision="0")
+        server = ModbusServer(rack.bank, settings=ServerSettings(port=0), on_write=rack.on_write, identity=identity)
+        await server.start()
+        port = server.port
+    section = {**sections.pop("control_plc", {}), "plant": {"port": port}}
+    plc = ControlPlc(ControlSettings.model_validate({"control_plc": section, **sections}))
+    task = asyncio.create_task(plc.run())
+    try:
+        yield plc
+    finally:
+        task.cancel()
+        await asyncio.wait({task})
+        plc.close()
+        if server is not None:
+            await server.close()
+        nobody.release()
+
+
+def ask(plc: ControlPlc, record: tuple[Any, ...]) -> None:
+    """Write a record as an operator does."""
+    plc.bank.put(record)
+    plc.clients.on_write(CONTROL_MAP.block_of(type(record)), ANYBODY)
+
+
+async def until(condition: Callable[[], object], within_s: float = WITHIN_S) -> None:
+    """Wait for a condition."""
+    deadline = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.01)
+
+
+def alarm(plc: ControlPlc, kind: AlarmKind) -> AlarmState:
+    return AlarmState(plc.bank.get(Alarm, kind).state)
+
+
+async def test_an_alarm_with_a_delay_is_raised_also_while_no_scans_are_made() -> None:
+    rules = {"rules": {"plant_lost": {"on_delay_s": 1.0}}}
+    async with running(control_plc={"alarms": rules}) as plc:
+        ask(plc, ControlSession(3, 1, 10.0))
+        await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.SEARCHING)
+        await until(lambda: alarm(plc, AlarmKind.PLANT_LOST) is AlarmState.UNACKNOWLEDGED)
+
+
+async def test_a_new_session_does_not_wait_for_a_tick_that_lasts_long() -> None:
+    rack = SmallRack(1)
+    async with running(rack, session={"autostart": True, "mode": "realtime", "factor": 0.01}) as plc:
+        await until(lambda: rack.written)
+        rack.begin(2)
+        ask(plc, ControlSession(2, 1, 0.01))
+        await until(lambda: rack.written[-1].session == 2, within_s=5.0)
+
+
+async def test_a_new_session_of_an_operator_is_no_loss_of_the_plant() -> None:
+    rack = SmallRack(1)
+    async with running(rack) as plc:
+        for session in (1, 2):
+            rack.begin(session)
+            ask(plc, ControlSession(session, 0, 1.0))
+            plc.clients.granted = 1
+            plc.clients.changed.set()
+            await until(lambda: rack.written and rack.written[-1].session == session)  # noqa: B023 - awaited here
+        assert alarm(plc, AlarmKind.PLANT_LOST) is AlarmState.NORMAL
+
+
+async def test_autostart_leaves_a_session_to_the_operator_who_is_about_to_ask_for_it() -> None:
+    """He writes to the rack first, and then to the control PLC."""
+    rack = SmallRack(1)
+    async with running(rack, session={"autostart": True, "mode": "realtime", "factor": 50.0}) as plc:
+        await until(lambda: rack.written)
+        rack.begin(2)
+        await asyncio.sleep(0.4)
+        assert rack.written[-1].session == 1
+        await until(lambda: rack.written[-1].session == 2)  # nobody has asked
+        assert plc.publication.running
+
+
+async def test_no_number_of_a_start_or_of_an_event_is_given_out_twice(tmp_path: Path) -> None:
+    """Whether scans are made or not: here there is no rack."""
+    given: list[tuple[int, int]] = []
+    for start in (1, 2, 3):
+        async with running(control_plc={"retain": {"file": tmp_path / "state"}}) as plc:
+            await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.SEARCHING)
+            ask(plc, Operator(OperatorMode.CLASSICAL, 43.0, 75.0, 36.0))
+            events = [plc.bank.get(Event, row) for row in range(EVENT_ROWS)]
+            assert {event.boot for event in events if event.number > len(given)} == {start}
+            given += sorted((event.number, event.boot) for event in events if event.number > len(given))
+    assert [number for number, _ in given] == list(range(1, len(given) + 1))
+    assert {boot for _, boot in given} == {1, 2, 3}
+
+
+async def test_what_an_operator_says_before_the_rack_is_found_holds(tmp_path: Path) -> None:
+    settings = {"retain": {"file": tmp_path / "state"}}
+    async with running(SmallRack(4), control_plc=settings) as plc:
+        ask(plc, ControlSession(4, 0, 1.0))
+        await until(lambda: plc.publication.running)
+        ask(plc, AlarmCommand(AlarmKind.CLOCK_SKEW, AlarmAction.SHELVE, 600))
+    for asked in (Operator(OperatorMode.MANUAL, 43.0, 75.0, 36.0), None):
+        async with running(SmallRack(4), control_plc=settings) as plc:
+            if asked is not None:
+                ask(plc, asked)
+                ask(plc, AlarmCommand(AlarmKind.T5_BAND, AlarmAction.SHELVE, 600))
+            await until(lambda: plc.publication.running)
+            assert plc.bank.get(Identity).session == 4
+            assert plc.bank.get(Operator).mode == OperatorMode.MANUAL
+            assert alarm(plc, AlarmKind.T5_BAND) is AlarmState.SHELVED
+            assert alarm(plc, AlarmKind.CLOCK_SKEW) is AlarmState.SHELVED
+
+
+async def test_a_session_is_gone_on_with_after_several_starts_without_the_rack(tmp_path: Path) -> None:
+    settings = {"retain": {"file": tmp_path / "state"}}
+    async with running(SmallRack(4), control_plc=settings) as plc:
+        ask(plc, ControlSession(4, 0, 1.0))
+        await until(lambda: plc.publication.running)
+    for _ in range(2):
+        async with running(control_plc=settings) as plc:
+            ask(plc, Operator(OperatorMode.CLASSICAL, 43.0, 75.0, 36.0))
+    async with running(SmallRack(4), control_plc=settings) as plc:
+        await until(lambda: plc.publication.running)
+        assert plc.bank.get(Operator).mode == OperatorMode.CLASSICAL
+    async with running(SmallRack(5), control_plc=settings) as plc:
+        await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IDLE)
+        await asyncio.sleep(0.1)
+        assert not plc.publication.running
+        assert plc.bank.get(Operator).mode == OperatorMode.AUTO
+
+
+async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are looked at again and again, and may be about to be renewed."""
+    certificate = tmp_path / "certificate"
+    authority = Authority.new("site", 20)
+    for file, pair in ((tmp_path / "ca", authority.pair), (certificate, authority.issue_client("a", "control"))):
+        file.write_bytes(pair.certificate_pem)
+    monkeypatch.setattr("control_plc.runtime.CERTIFICATES_S", 0.01)
+    tls = {"certificate": certificate, "key": tmp_path / "key", "ca": tmp_path / "ca"}
+    async with running(control_plc={"server": {"tls": tls}}) as plc:
+        watching = asyncio.create_task(plc.watch_certificates())
+        await until(lambda: plc.bank.get(Alarm, AlarmKind.CERTIFICATE).cause == EXPIRES_SOON)
+        content = certificate.read_bytes()
+        certificate.unlink()
+        await until(lambda: plc.bank.get(Alarm, AlarmKind.CERTIFICATE).cause == UNREADABLE)
+        certificate.write_bytes(content)
+        await until(lambda: plc.bank.get(Alarm, AlarmKind.CERTIFICATE).cause == EXPIRES_SOON)
+        assert not watching.done()
+        watching.cancel()
+
+
+@pytest.mark.parametrize(
+    "odd", [{"pace": (1, 0.0)}, {"pace": (1, math.nan)}, {"operator": (77, 1, 1, 1)}, {"operator": (2, math.nan, 1, 1)}]
+)
+async def test_a_retained_state_that_cannot_be_keeps_nobody_from_starting(tmp_path: Path, odd: dict[str, Any]) -> None:
+    file = tmp_path / "state"
+    async with running(SmallRack(4), control_plc={"retain": {"file": file}}) as plc:
+        ask(plc, ControlSession(4, 0, 1.0))
+        await until(lambda: plc.publication.running)
+    kept = RetainedFile(file, OWNER, HEADER.short_digest)
+    state = kept.load()
+    assert state is not None
+    kept.save({**state, **odd})
+    async with running(SmallRack(4), control_plc={"retain": {"file": file}}) as plc:
+        await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IDLE)
