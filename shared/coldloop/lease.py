@@ -2,8 +2,9 @@
 
 A lease is granted to a connection with its first write, and refused to all others while it is held. It ends with
 silence, or by hand-over: when the connection of a simple client closes, at once; when that of a holder with a number
-closes, after a moment in which it may come back over another connection. A holder that comes back leaves its former
-connection for good: whoever writes over that one has the same number and is somebody else.
+closes, after a moment in which it may come back over another connection, from the same address and with the same
+certificate: the number is no password, anybody can read it. A holder that comes back leaves its former connection for
+good: whoever writes over that one has the same number and is somebody else.
 """
 
 import time
@@ -69,7 +70,8 @@ class Lease:
         held = self._caller
         if held is None or held.connection == caller.connection or self.state is LeaseState.FREE:
             return
-        if holder is not None and holder == self._holder != SIMPLE_CLIENT and caller.connection not in self._left:
+        known = holder is not None and holder == self._holder != SIMPLE_CLIENT and caller.station == held.station
+        if known and caller.connection not in self._left:
             return
         self.refused += 1
         raise BusyError(f"{held.name} holds the lease of {self._what}")

@@ -25,7 +25,7 @@ class Clock:
 
 
 def caller(connection: int) -> Caller:
-    return Caller(f"10.0.0.{connection}:502", frozenset({Role.CONTROL}), connection)
+    return Caller(f"10.0.0.1:{connection}", frozenset({Role.CONTROL}), connection)
 
 
 A, B, C = caller(1), caller(2), caller(3)

@@ -16,7 +16,7 @@ class Clock:
 
 
 def on(connection: int) -> Caller:
-    return Caller(f"client {connection}", ALL_ROLES, connection)
+    return Caller(f"client:{connection}", ALL_ROLES, connection)
 
 
 @pytest.fixture
@@ -29,6 +29,14 @@ def lease(clock: Clock) -> Lease:
     held = Lease("the outputs", lambda: 10.0, clock)
     held.take(on(1), NUMBER)
     return held
+
+
+def test_a_number_that_was_read_from_registers_opens_nothing_from_another_address() -> None:
+    lease = Lease("the outputs", lambda: 10.0)
+    lease.take(Caller("10.0.0.2:5001 role=control", ALL_ROLES, 1), 7)
+    with pytest.raises(BusyError):
+        lease.check(Caller("10.0.0.9:5001 role=control", ALL_ROLES, 2), 7)
+    lease.check(Caller("10.0.0.2:6001 role=control", ALL_ROLES, 3), 7)
 
 
 def test_a_holder_that_comes_back_over_another_connection_goes_on(lease: Lease) -> None:

@@ -193,7 +193,12 @@ async def test_the_same_optimiser_over_another_connection_keeps_its_lease(
     control.latch()
     async with connect(control) as link:
         await link.answers(1)
-        control.lease.take(ANOTHER, link.status.holder)  # as if its own connection had been another one
+        ours = control.lease._caller  # noqa: SLF001
+        assert ours is not None
+        former = ours._replace(connection=ANOTHER.connection)
+        control.lease.take(former, link.status.holder)  # as if its own connection had been another one, ...
+        control.lease.closed(former)
+        control.lease.closed(ours)  # ... and this one were new
         await link.answers(3)
         assert link.status.breaks == 0
 

@@ -110,7 +110,7 @@ def test_a_control_plc_comes_back_over_another_connection(switch_on: "SwitchOn")
     plc.send(*U)
     plc.closes()
     assert simple.exchange(simple.outputs(*OTHER)) == (6,), "for a moment only the same one may"
-    again = rack.client("control PLC again", 77)
+    again = rack.client("control PLC", 77)
     assert again.send(*U, generation=1).verdict == OutputVerdict.TAKEN
     plc.closes()
     assert again.read(LeaseStatus).state == LeaseState.HELD, "the old connection says nothing any more"

@@ -26,6 +26,12 @@ class Caller(NamedTuple):
     roles: frozenset[Role]
     connection: int = 0
 
+    @property
+    def station(self) -> str:
+        """Name without the port: what stays when the same client connects again."""
+        address, _, rest = self.name.partition(" ")
+        return f"{address.rpartition(':')[0] or address} {rest}"
+
 
 ANYBODY = Caller("program", ALL_ROLES)
 """Who may write everything: the program itself, and tests."""
