@@ -91,15 +91,17 @@ class ControlProgram:
         classical = self._section.driver is ControlStrategy.CLASSICAL
         self.operator = Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, *self._initial)
 
-    def recall(self, operator: Operator, alarms: Sequence[Alarm], tick: int) -> None:
+    def recall(self, operator: Operator, alarms: Sequence[Alarm], watchdog: int, tick: int) -> None:
         """Take over what operators had said before a restart, and the alarms; the session is resumed later.
 
         Args:
             operator: Who drives.
             alarms: All alarms.
+            watchdog: Time-out of the optimiser's watchdog, in ticks.
             tick: The last one.
         """
         self.operator = operator
+        self.watchdog.set(watchdog, tick)
         self.alarms.begin_at(tick)
         self.alarms.restore(alarms)
 

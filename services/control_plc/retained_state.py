@@ -21,7 +21,7 @@ from control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")
 
-OWNER: Final = "control_plc/2"
+OWNER: Final = "control_plc/3"
 """Who retained states belong to, and the version of what they hold."""
 ROW: Final = struct.Struct(">3f")
 OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing")
@@ -49,6 +49,8 @@ class RetainedState(BaseModel):
     playing: tuple[SequenceHeader, Annotated[str, Field(max_length=2 * SEQUENCE_ROWS * ROW.size)]] | None
     """Header and rows (base64 of single precision, high byte first) of the sequence being played."""
     operator: Operator
+    watchdog: Annotated[int, Field(ge=0, lt=2**16)]
+    """Time-out of the optimiser's watchdog, in ticks."""
     alarms: Annotated[list[Alarm], Field(min_length=len(AlarmKind), max_length=len(AlarmKind))]
 
     @model_validator(mode="after")
@@ -132,6 +134,7 @@ class Memory:
             "boot": self.boot, "holder": self.holder, "events": program.journal.count, "session": program.session,
             "tick": program.tick, "pace": pace, "updates": program.player.updates,
             "playing": self._playing(program.player.sequence), "operator": program.operator,
+            "watchdog": program.watchdog.time,
             "alarms": tuple(program.alarms.rows),
         }  # fmt: skip
 

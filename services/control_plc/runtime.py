@@ -24,7 +24,7 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, LinkCause, PlantLinkState
 from coldloop.registers.plant import PLANT_MAP, Measurement
-from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus
+from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus, WatchdogTime
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
 from control_plc.clients import Clients
@@ -77,7 +77,7 @@ class ControlPlc:
         self._program = program = make_program(header, section, settings.limits)
         program.journal.continue_from(self._memory.boot, recalled.events if recalled else 0)
         if recalled is not None:
-            program.recall(recalled.operator, recalled.alarms, recalled.tick)
+            program.recall(recalled.operator, recalled.alarms, recalled.watchdog, recalled.tick)
         self._kept: RetainedState | None = recalled if recalled is not None and recalled.session else None
         """The session to be gone on with, until the rack has been found in it, or in another one."""
         self._link = PlantLink(program.alarms, program.journal, self._memory.holder)
@@ -98,6 +98,7 @@ class ControlPlc:
         self._other = (0, 0.0)
         """Another session that the rack was found in while ours ran, and since when (s)."""
         self.bank.put(program.operator)
+        self.bank.put(WatchdogTime(program.watchdog.time))
         program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None))
         self._publish()
 

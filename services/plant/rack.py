@@ -110,7 +110,7 @@ class Rack:
         cv155, ncr22, cv156 = state.program["u"]
         self._set_up(Session(state.session, state.pace, load, state.seed))
         self._program = program
-        self.watchdog.set(self.watchdog.time, program.tick)
+        self.watchdog.set(state.watchdog, program.tick)
         self.outputs = AppliedOutputs(
             (cv155, ncr22, cv156), holder=state.holder, generation=next_generation(state.generation)
         )
@@ -121,8 +121,8 @@ class Rack:
         session, outputs, journal = self.session, self.outputs, self.journal
         return RetainedState.model_construct(
             boot=journal.boot, events=journal.count, generation=outputs.generation, holder=outputs.holder,
-            session=session.number, pace=session.pace, times=session.load.times, watts=session.load.watts,
-            seed=session.seed, program=self._program.retained(),
+            session=session.number, pace=session.pace, watchdog=self.watchdog.time,
+            times=session.load.times, watts=session.load.watts, seed=session.seed, program=self._program.retained(),
         )  # fmt: skip
 
     # -- outputs -------------------------------------------------------------------------------------------------------

@@ -80,6 +80,7 @@ class RackRegisters:
         self._connect()
         if resumed:
             self._show_session()
+        self.bank.put(WatchdogTime(self.rack.watchdog.time))
         self._show_applied()
         self._finish()
 

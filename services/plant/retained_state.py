@@ -11,7 +11,7 @@ from coldloop.session import Pace
 
 log = logging.getLogger("coldloop.plant")
 
-OWNER = "plant/2"
+OWNER = "plant/3"
 """Who retained states belong to, and the version of what they hold."""
 
 Count = Annotated[int, Field(ge=0, lt=2**32)]
@@ -29,6 +29,8 @@ class RetainedState(BaseModel):
     session: Count
     """0: there has been none, and what follows is the rack as it is configured."""
     pace: Pace
+    watchdog: Annotated[int, Field(ge=0, lt=2**16)]
+    """Its time-out, in ticks."""
     times: tuple[int, ...]
     """Ticks of the load's steps."""
     watts: tuple[float, ...]

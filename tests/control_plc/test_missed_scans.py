@@ -1,5 +1,6 @@
 """Scans that are missed, exchanges that fail, time that leaps: timers go by plant time, sequences by their ticks."""
 
+import json
 import math
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -10,7 +11,9 @@ from coldloop.limits import InputLimits
 from coldloop.process import L1, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow, Verdict
+from coldloop.session import Pace
 from control_plc.guard import OutputGuard
+from control_plc.retained_state import Memory, RetainedState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -187,3 +190,13 @@ def test_after_a_restart_the_rest_of_what_was_played_is_played_on(bench: "Bench"
     assert program.mode is Mode.REST
     assert update is not None
     assert update.update == 7, "the optimiser is asked anew at once"
+
+
+def test_the_time_of_the_watchdog_that_an_operator_set_outlasts_a_restart(bench: "Bench") -> None:
+    program = bench.program
+    program.watchdog.set(240, program.tick)
+    content = Memory(None, 0).content(program, Pace(realtime=False, factor=1.0))
+    kept = RetainedState.parsed(json.loads(json.dumps(content)))
+    program.watchdog.set(60, program.tick)
+    program.recall(kept.operator, kept.alarms, kept.watchdog, kept.tick)
+    assert program.watchdog.registers(program.tick).time == 240
