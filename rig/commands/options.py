@@ -3,12 +3,16 @@
 import argparse
 import re
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from coldloop.config import Configuration, load_configuration
-from coldloop.endpoints import Endpoint
+from coldloop.errors import UsageError
 from coldloop.process import TICK_S
-from rig.settings import Settings
+from rig.commands.choices import LOADS
+
+if TYPE_CHECKING:
+    from coldloop.config import Configuration
+    from rig.settings import Settings
 
 _UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 
@@ -21,6 +25,13 @@ KEYS = {
     "factor": ("session.factor", "--factor"),
 }
 """Options that set one key of the configuration."""
+
+
+class HostPort(NamedTuple):
+    """Address of a server."""
+
+    host: str
+    port: int
 
 
 def duration(text: str) -> int:
@@ -38,27 +49,50 @@ def duration(text: str) -> int:
 
 def updating_period(text: str) -> float:
     """Return an updating period in seconds, 0 for `adaptive`."""
-    if text == "adaptive":
-        return 0.0
+    return 0.0 if text == "adaptive" else _period(text, "neither 'adaptive' nor seconds from 0.5 to 5")
+
+
+def fixed_updating_period(text: str) -> float:
+    """Return an updating period in seconds."""
+    value = _period(text, "not seconds from 0.5 to 5")
+    if value < 2 * TICK_S or value % TICK_S:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s from 0.5 to 5 s")
+    return value
+
+
+def _period(text: str, what: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = -1.0
     if not 0 < value <= 5:
-        raise argparse.ArgumentTypeError(f"'{text}' is neither 'adaptive' nor seconds from 0.5 to 5")
+        raise argparse.ArgumentTypeError(f"'{text}' is {what}")
     return value
 
 
-def endpoint(text: str) -> Endpoint:
-    """Return HOST:PORT as an endpoint."""
+def check_load(name: str | None) -> None:
+    """Refuse a load that is neither a name nor a file, before anything that takes time; the file is read later.
+
+    Raises:
+        UsageError: There is no such load.
+    """
+    if name is not None and name.partition("@")[0] not in LOADS and not (name and Path(name).exists()):
+        raise UsageError(f"load '{name}': neither a file nor one of {', '.join(LOADS)}")
+
+
+def endpoint(text: str) -> HostPort:
+    """Return HOST:PORT as an address."""
     host, separator, port = text.rpartition(":")
     if not separator or not host or not port.isdecimal() or not 0 < int(port) < 0x10000:
         raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT")
-    return Endpoint(host=host.strip("[]"), port=int(port))
+    return HostPort(host.strip("[]"), int(port))
 
 
-def configuration(options: argparse.Namespace) -> Configuration[Settings]:
+def configuration(options: argparse.Namespace) -> "Configuration[Settings]":
     """Return the effective configuration of a command."""
+    from coldloop.config import load_configuration
+    from rig.settings import Settings
+
     given: Mapping[str, Any] = vars(options)
     return load_configuration(
         Settings,

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from distributed import Client, LocalCluster, as_completed
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from coldloop.errors import ColdloopError, ResultsError, StudyError, UsageError
+from rig.progress import make_console
 from rig.results import whole_file
 from rig.studies.request import Outcome, RunRequest, perform, programs_digest
 
@@ -128,6 +128,6 @@ def _bar(title: str, total: int) -> Iterator[Progress]:
         TextColumn("{task.description}"), BarColumn(bar_width=32), MofNCompleteColumn(), TextColumn("runs"),
         TimeElapsedColumn(), TimeRemainingColumn(),
     )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), refresh_per_second=2) as bar:
+    with Progress(*columns, console=make_console(), refresh_per_second=2) as bar:
         bar.add_task(title, total=total)
         yield bar

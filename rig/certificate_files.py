@@ -1,0 +1,70 @@
+"""The files of a test site with Modbus/TCP Security: certificates, keys, and configuration that names them."""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from coldloop.errors import ResultsError, UsageError
+from coldloop.registers.declaration import Role
+from rig.certificates import Authority, Pair
+from rig.results import prepare_folder
+from rig.wiring import SERVICES
+
+CLIENTS = {**{role.value: role.value for role in Role}, "reader": None}
+"""Clients and their roles."""
+CONFIGURATION = "tls.toml"
+LOCAL = ("localhost", "127.0.0.1")
+OWNERS = {
+    "plant.server.tls": "plant",
+    "control_plc.server.tls": "control_plc",
+    "optimizer_plc.server.tls": "optimizer_plc",
+    "control_plc.plant.tls": "control",
+    "optimizer_plc.control_plc.tls": "optimizer",
+    "rig.tls": "operator",
+}
+"""Sections of the configuration, and whose certificate goes there."""
+
+
+def write_site(out: Path, hosts: Sequence[str], days: int) -> tuple[int, Path]:
+    """Write all files, or none where one of them exists; return the number of certificates and the configuration file.
+
+    Raises:
+        UsageError: A file exists, or the folder cannot be written to.
+        ResultsError: A file cannot be written.
+    """
+    authority = Authority.new("Coldloop test CA", days)
+    pairs = {"ca": authority.pair}
+    pairs |= {name: authority.issue_server(name, [*LOCAL, *hosts]) for name in SERVICES}
+    pairs |= {name: authority.issue_client(name, role) for name, role in CLIENTS.items()}
+    present = [name for name in _names(pairs) if (out / name).exists()]
+    if present:
+        raise UsageError(f"{out / present[0]} exists: name another folder with --out, or remove the old files")
+    prepare_folder(out)
+    try:
+        for name, pair in pairs.items():
+            _write(out / f"{name}.crt", pair.certificate_pem, 0o644)
+            _write(out / f"{name}.key", pair.key_pem, 0o600)
+        _write(out / CONFIGURATION, _configuration(out.resolve()).encode(), 0o644)
+    except OSError as error:
+        raise ResultsError(f"{error.filename or out}: {error.strerror}; choose another --out") from None
+    return len(pairs), out / CONFIGURATION
+
+
+def _names(pairs: dict[str, Pair]) -> list[str]:
+    return [*[f"{name}.{kind}" for name in pairs for kind in ("crt", "key")], CONFIGURATION]
+
+
+def _write(file: Path, data: bytes, mode: int) -> None:
+    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)  # a key is private from the start
+    with os.fdopen(descriptor, "wb") as stream:
+        stream.write(data)
+
+
+def _configuration(folder: Path) -> str:
+    lines = ["# Made by `coldloop certificates`: Modbus/TCP Security on all three servers."]
+    for section, owner in OWNERS.items():
+        files = {"certificate": f"{owner}.crt", "key": f"{owner}.key", "ca": "ca.crt"}
+        lines += ["", f"[{section}]"]
+        lines += [f"{key} = {json.dumps(str(folder / name), ensure_ascii=False)}" for key, name in files.items()]
+    return "\n".join(lines) + "\n"
