@@ -18,7 +18,7 @@ from rig.indicators import RunEvaluation, StageCost
 from rig.inputs import FOLDER as INPUTS
 from rig.inputs import copy_inputs
 from rig.manifest import final_manifest, first_manifest
-from rig.recording import LinkStatistics, Recorder, Sink
+from rig.recording import Recorder, Sink
 from rig.results import write_json
 from rig.run_plot import plot_run
 from rig.scenario import Scenario
@@ -87,7 +87,7 @@ class RunFiles:
                 self.folder.rmdir()  # it stays if it has logs
             raise _told(error, self.folder)
         reason = None if error is None else _reason(error)
-        summary = self._summary(reason)
+        summary = summary_of(self._evaluation, self.recorder, realtime=self._realtime, reason=reason)
         manifest = final_manifest(self._manifest, reason, recorded, self._evaluation.trace_sha256)
         try:
             write_json(self.folder / "manifest.json", manifest)
@@ -99,28 +99,32 @@ class RunFiles:
             raise _told(error, self.folder, f"{recorded} of {self.recorder.ticks} ticks are recorded in {self.folder}")
         return summary
 
-    def _summary(self, reason: str | None) -> dict[str, Any]:
-        evaluation, recorder = self._evaluation, self.recorder
-        wall_s = recorder.wall_seconds
-        link = recorder.link if self._realtime else LinkStatistics(recorder.link.deadline_misses)
-        kept = link._asdict() if self._realtime else dict.fromkeys(link._asdict()) | {"deadline_misses": link[0]}
-        figures = {
-            "complete": reason is None,
-            "reason": reason,
-            "ticks": evaluation.ticks,
-            "updates": evaluation.updates,
-            "trace_sha256": evaluation.trace_sha256,
-            **evaluation.indicators._asdict(),
-            **kept,
-            "wall_seconds": round(wall_s, 3),
-            "realtime_factor": round(evaluation.ticks * TICK_S / wall_s, 2) if wall_s else None,
-        }
-        return {name: None if _missing(value) else value for name, value in figures.items()}
-
     def _discard(self) -> None:
         for name in NAMES:
             (self.folder / name).unlink(missing_ok=True)
         shutil.rmtree(self.folder / INPUTS, ignore_errors=True)
+
+
+def summary_of(evaluation: RunEvaluation, recorder: Recorder, *, realtime: bool, reason: str | None) -> dict[str, Any]:
+    """Return the summary of a run; without a reason it is complete. What does not exist is None.
+
+    Nothing is late in lock-step, so that lateness exists in real time only.
+    """
+    wall_s, link = recorder.wall_seconds, recorder.link
+    lateness = link._asdict() if realtime else dict.fromkeys(link._fields)
+    figures = {
+        "complete": reason is None,
+        "reason": reason,
+        "ticks": evaluation.ticks,
+        "updates": evaluation.updates,
+        "trace_sha256": evaluation.trace_sha256,
+        **evaluation.indicators._asdict(),
+        **lateness,
+        "deadline_misses": link.deadline_misses,
+        "wall_seconds": round(wall_s, 3),
+        "realtime_factor": round(evaluation.ticks * TICK_S / wall_s, 2) if wall_s else None,
+    }
+    return {name: None if _missing(value) else value for name, value in figures.items()}
 
 
 def _missing(value: object) -> bool:
