@@ -12,12 +12,10 @@ from matplotlib.figure import Figure
 from coldloop.errors import ResultsError
 from coldloop.process import INPUT_NAMES, INPUT_UNITS
 from rig.plot import (
-    ACCENT,
+    COLOURS,
     DRAWN,
-    INK,
     LONGEST_TAU_U_S,
     STYLE,
-    THIRD,
     Bounds,
     draw_tau_u,
     legend_above,
@@ -27,7 +25,6 @@ from rig.plot import (
 from rig.run_folder import Curves, RunFolder
 from rig.run_plot import save_figure
 
-COLOURS: Final = (INK, ACCENT, THIRD, "#8a6fae", "#b08d2f", "#4d4d4d")
 FIGURES: Final = (
     "complete", "ticks", "updates", "J_BF", "J_open_mean", "J_dev", "J_cst", "c1", "c2", "tau_u_mean",
     "iterations_total", "L1_outside_band_pct", "T5_outside_band_pct", "deadline_misses", "trace_sha256",

@@ -15,6 +15,8 @@ from coldloop.process import INPUT_NAMES, INPUT_UNITS
 Series = NDArray[np.floating]
 
 INK, ACCENT, THIRD, BAND = "#1f3b57", "#c8553d", "#5b8e7d", "#b8c4ce"
+COLOURS: Final = (INK, ACCENT, THIRD, "#8a6fae", "#b08d2f", "#4d4d4d")
+"""Of curves that are drawn over each other."""
 MODE_COLOURS: Final = {"MPC": INK, "REST": "#7f9cb8", "HOLD": "#d9a441", "CLASSICAL": ACCENT, "MANUAL": THIRD}
 STYLE: Final[Any] = {
     "font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False,

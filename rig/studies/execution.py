@@ -5,6 +5,7 @@ runs it had in hand, which others do again; a study that is stopped goes on wher
 """
 
 import contextlib
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +37,7 @@ class Workers:
         Raises:
             UsageError: The scheduler does not answer.
         """
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its import has set it to INFO
         with contextlib.ExitStack() as stack:
             address: str | LocalCluster
             if self.scheduler is None:
