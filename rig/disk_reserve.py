@@ -9,7 +9,7 @@ from typing import BinaryIO, Final
 from coldloop.errors import UsageError
 
 RESERVED_BYTES: Final = 24 * 1024**2
-"""A row group of the trace (5 MB), the index of a file (up to 8 MB), the summary and the figures."""
+"""A row group of the trace (9 MB), the index of 1,000 h (4 MB), the summary and the figures."""
 FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 

@@ -110,8 +110,8 @@ def limit(axes: Axes, values: Series, limits: tuple[float, float], label: str) -
     """Draw a band or bounds; the values decide the scale, and an edge that is far from them stays outside."""
     low, high = view(values)
     span = high - low
-    low = limits[0] - 0.06 * span if low - span < limits[0] else low
-    high = limits[1] + 0.06 * span if high + span > limits[1] else high
+    low = min(low, limits[0] - 0.06 * span) if low - span < limits[0] else low
+    high = max(high, limits[1] + 0.06 * span) if high + span > limits[1] else high
     out_of_view = [edge for edge in limits if not low <= edge <= high]
     note = " (edges outside the view)" if len(out_of_view) == 2 else ""
     axes.axhspan(*limits, color=BAND, alpha=0.3, linewidth=0, label=label + note)
@@ -141,7 +141,7 @@ def _updating_period(axes: Axes, time: Series, series: Mapping[str, Series]) -> 
 
 
 def draw_tau_u(axes: Axes, time: Series, tau_u: Series, time_s: Series, colour: str, label: str) -> None:
-    """Draw the updating period as steps; where it chatters, its mean over a minute before them."""
+    """Draw the updating period at these times as steps; where it chatters, also its mean over a minute."""
     changes = int(np.count_nonzero(np.diff(np.nan_to_num(tau_u))))
     chatters = changes > 100
     axes.plot(time, tau_u, color=colour, linewidth=0.5 if chatters else 1.0, alpha=0.45 if chatters else 1.0,

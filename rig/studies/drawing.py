@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from coldloop.limits import InputLimits
 from coldloop.process import TICK_S
 from rig.plot import COLOURS, INK, LONGEST_TAU_U_S, STYLE, draw_tau_u, legend_above, limit
 from rig.studies.request import Outcome
@@ -59,6 +60,10 @@ PANELS: Final = (
 )  # fmt: skip
 
 
+LIMITED: Final = ("L1", "T5", "CV155", "NCR22_A", "CV156")
+"""Series with a band, or with bounds."""
+
+
 def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[float, float]]) -> Figure:
     """Draw load, cost, constrained outputs, inputs, iterations and updating period of runs under one load.
 
@@ -75,9 +80,11 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
             _updates(place, label, outcome, colour)
         _, first = outcomes[0]
         place["load"].plot(first.series("time_s") / 3600, first.series("load"), color=INK, linewidth=0.9, label="load")
-        for name, band in zip(("L1", "T5"), bands, strict=True):
+        limits = InputLimits()
+        edges = [*bands, *zip(limits.low, limits.high, strict=True)]
+        for name, edge, what in zip(LIMITED, edges, ("band", "band", "bounds", "bounds", "bounds"), strict=True):
             together = np.concatenate([outcome.series(name) for _, outcome in outcomes])
-            limit(place[name], together, band, f"band {band[0]:g} to {band[1]:g}")
+            limit(place[name], together, edge, f"{what} {edge[0]:g} to {edge[1]:g}")
         place["cost"].set_yscale("log")
         place["cost"].set_ylim(bottom=1e-4)
         for (name, label), letter in zip(shown, "abcdefghi", strict=False):
@@ -97,5 +104,7 @@ def _updates(place: Mapping[str, Axes], label: str, outcome: Outcome, colour: st
         start_s / 3600, outcome.column("iterations"), where="post", color=colour, linewidth=0.7, label=label
     )
     if "tau_u" in place and len(start_s) > 1:
-        draw_tau_u(place["tau_u"], start_s / 3600, outcome.column("tau_u") * TICK_S, start_s, colour, label)
+        time_s = np.arange(start_s[0], start_s[-1], TICK_S)
+        held = outcome.column("tau_u")[np.searchsorted(start_s, time_s, side="right") - 1]
+        draw_tau_u(place["tau_u"], time_s / 3600, held * TICK_S, time_s, colour, label)
         place["tau_u"].set_ylim(0, LONGEST_TAU_U_S + 0.3)
