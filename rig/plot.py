@@ -20,7 +20,7 @@ COLOURS: Final = (INK, ACCENT, THIRD, "#8a6fae", "#b08d2f", "#4d4d4d")
 MODE_COLOURS: Final = {"MPC": INK, "REST": "#7f9cb8", "HOLD": "#d9a441", "CLASSICAL": ACCENT, "MANUAL": THIRD}
 STYLE: Final[Any] = {
     "font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False,
-    "legend.frameon": False, "legend.fontsize": 8, "svg.hashsalt": "coldloop",
+    "legend.frameon": False, "legend.fontsize": 8, "svg.hashsalt": "coldloop", "axes.formatter.useoffset": False,
 }  # fmt: skip
 DRAWN: Final = ("load_w", "L1", "T5", *INPUT_NAMES, "tau_u_s", "stage_cost")
 """Columns of the trace that are drawn."""
@@ -83,6 +83,8 @@ def draw_run(curves: RunCurves) -> Figure:
         figure.align_ylabels(axes)
         figure.suptitle(curves.title)
         figure.supxlabel(curves.identity, fontsize=6.5, color="#5a6672")
+        figure.draw_without_rendering()  # computes the layout, once for all formats
+        figure.set_layout_engine("none")
     return figure
 
 
@@ -121,12 +123,12 @@ def limit(axes: Axes, values: Series, limits: tuple[float, float], label: str) -
 
 
 def view(values: Series) -> tuple[float, float]:
-    """Return the scale that shows the values: their range and a margin; not finer than single precision shows."""
+    """Return the scale that shows the values: their range and a margin, of 0.1 % at least."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 0.0, 1.0
     low, high = float(finite.min()), float(finite.max())
-    margin = max(0.08 * (high - low), 1e-4 * max(abs(low), abs(high)), 1e-6)
+    margin = max(0.08 * (high - low), 1e-3 * max(abs(low), abs(high)), 1e-6)
     return low - margin, high + margin
 
 
