@@ -45,7 +45,7 @@ PHYSICAL_COLUMNS: Final = (
         for name, field in zip(INPUT_NAMES, list(fields_of(Actuators).values())[1:4], strict=True)
     ),
     *(
-        Column(name, pa.float32(), unit, f"Output {name}, true value")
+        Column(name, pa.float32(), unit, f"Output {name}: with the noise of its sensor, without a sensor fault")
         for name, unit in zip(OUTPUT_NAMES, OUTPUT_UNITS, strict=True)
     ),
     *(
