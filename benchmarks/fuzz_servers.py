@@ -5,13 +5,17 @@ replaced, cut off, spliced with another, wrong lengths. Then come random bytes, 
 are sent many at a time; where the server closes the connection, as it must after a damaged header, another is opened.
 
     .venv/bin/python benchmarks/fuzz_servers.py --frames 100000 --bytes 10000000 --seed 1
+    .venv/bin/python benchmarks/fuzz_servers.py --tls                                # the same over TLS
+    .venv/bin/python benchmarks/fuzz_servers.py --tls --frames 2000 --bytes 100000   # in short
 
-The frames and the bytes are for each of the three. Ends with 1 when one of them fails.
+Over TLS each connection has the certificate of another client, with and without a role. The frames and the bytes are
+for each of the three. Ends with 1 when one of them fails.
 """
 
 import argparse
 import asyncio
 import random
+import ssl
 import struct
 import sys
 import tempfile
@@ -20,9 +24,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from coldloop.config import load_configuration
+from coldloop.modbus.settings import TlsSettings
+from coldloop.modbus.tls import client_context
 from coldloop.registers.common import STATISTICS_BLOCK
 from coldloop.registers.declaration import RegisterMap
+from rig import cli
 from rig.chaos.resources import resident_mb
+from rig.commands.certificates import CLIENTS
 from rig.local_services import LocalServices
 from rig.register_listing import MAPS
 from rig.settings import Settings
@@ -39,6 +48,10 @@ MAGIC = bytes.fromhex("03 04 42f6e979")
 READ_STATISTICS = struct.pack(">BHH", 3, STATISTICS_BLOCK.address, 5)
 WAITS = "await update"
 """A block whose writing makes the answer wait: written now and then only, or most of the time would be waiting."""
+SENTINEL = 0xABCD
+"""Transaction of the last requests of a batch over TLS, where there is no end of the stream to tell that it is one."""
+SENTINELS = 24
+"""More of them than a frame that was cut off can swallow."""
 
 
 def framed(pdu: bytes, transaction: int = 1) -> bytes:
@@ -46,14 +59,31 @@ def framed(pdu: bytes, transaction: int = 1) -> bytes:
     return struct.pack(">HHHB", transaction, 0, len(pdu) + 1, 1) + pdu
 
 
+@dataclass
+class Door:
+    """Where a server is, and with which certificates to go in; none is plain Modbus/TCP."""
+
+    port: int
+    certificates: list[ssl.SSLContext]
+    opened: int = 0
+
+    async def open(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        """Connect, with the next certificate."""
+        self.opened += 1
+        tls = self.certificates[self.opened % len(self.certificates)] if self.certificates else None
+        return await asyncio.open_connection("127.0.0.1", self.port, ssl=tls)
+
+
 class Requests:
     """Valid requests of one map, and damaged ones."""
 
-    def __init__(self, register_map: RegisterMap, chance: random.Random) -> None:
+    def __init__(self, register_map: RegisterMap, chance: random.Random, *, waits: bool) -> None:
         self._chance = chance
         self._blocks = register_map.blocks
         self._writable = [block for block in register_map.blocks if block.writer is not None and block.name != WAITS]
-        self._all_writable = [block for block in register_map.blocks if block.writer is not None]
+        self._all_writable = [
+            block for block in register_map.blocks if block.writer is not None and (waits or block.name != WAITS)
+        ]
 
     def valid(self) -> bytes:
         """Return the PDU of a request that is right but for its values."""
@@ -132,17 +162,23 @@ class Tally:
     failures: list[str] = field(default_factory=list)
 
 
-async def provoke(port: int, data: bytes, tally: Tally) -> None:
-    """Send bytes and the end of the stream; read what is answered until the server closes."""
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+async def provoke(door: Door, data: bytes, tally: Tally) -> None:
+    """Send bytes; read what is answered until the server closes, or has answered the last request."""
+    reader, writer = await door.open()
     tally.connections += 1
     tally.sent += len(data)
+    end = framed(MAGIC, SENTINEL)
+    tail = b""
     try:
-        writer.write(data)
-        writer.write_eof()
-        while received := await asyncio.wait_for(reader.read(65536), SILENCE_S):
+        if writer.can_write_eof():
+            writer.write(data)
+            writer.write_eof()
+        else:
+            writer.write(data + framed(READ_MAGIC, SENTINEL) * SENTINELS)
+        while not tail.endswith(end) and (received := await asyncio.wait_for(reader.read(65536), SILENCE_S)):
             tally.received += len(received)
-    except ConnectionError:
+            tail = (tail + received)[-len(end) :]
+    except (ConnectionError, ssl.SSLError):
         pass  # closed with bytes unread
     except TimeoutError:
         tally.failures.append(f"silent for {SILENCE_S:g} s")
@@ -150,9 +186,9 @@ async def provoke(port: int, data: bytes, tally: Tally) -> None:
         writer.transport.abort()
 
 
-async def ask(port: int, pdu: bytes) -> bytes:
+async def ask(door: Door, pdu: bytes) -> bytes:
     """Return the answer to a right question, empty when there is none."""
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    reader, writer = await door.open()
     try:
         writer.write(framed(pdu))
         head = await asyncio.wait_for(reader.readexactly(7), SILENCE_S)
@@ -178,29 +214,45 @@ async def up(port: int) -> None:
             return
 
 
+def site(folder: Path) -> Settings:
+    """Make certificates; return the configuration that puts TLS on everything."""
+    if cli.main(["certificates", "--out", str(folder)]):
+        raise SystemExit(1)
+    return load_configuration(Settings, file=folder / "tls.toml", environment={}).settings
+
+
+def certificates(folder: Path) -> list[ssl.SSLContext]:
+    """Return what clients of each kind connect with."""
+    files = [(folder / f"{name}.crt", folder / f"{name}.key") for name in CLIENTS]
+    ca = folder / "ca.crt"
+    return [client_context(TlsSettings(certificate=certificate, key=key, ca=ca), "fuzz") for certificate, key in files]
+
+
 def text_of(log: Path) -> str:
     """Return a log."""
     return log.read_text(encoding="utf-8", errors="replace")
 
 
-async def fuzz(service: str, services: LocalServices, log: Path, options: argparse.Namespace) -> tuple[str, bool]:
+async def fuzz(service: str, services: LocalServices, folder: Path, options: argparse.Namespace) -> tuple[str, bool]:
     """Fuzz one service; return its line of the table, and whether it stood."""
-    port = getattr(services.endpoints, service).port
-    requests = Requests(MAPS[service], random.Random(f"{options.seed} {service}"))  # noqa: S311 - must be repeatable
-    await up(port)
+    chance = random.Random(f"{options.seed} {service}")  # noqa: S311 - must be repeatable
+    requests = Requests(MAPS[service], chance, waits=not options.tls)
+    door = Door(getattr(services.endpoints, service).port, certificates(folder) if options.tls else [])
+    log = services.log(service)
+    await up(door.port)
     tally = Tally()
     before, began = 0.0, time.monotonic()
     try:
         for count, data in requests.batches(options.frames):
             if not before and tally.frames >= min(WARM_UP_FRAMES, options.frames // 2):
                 before = resident_mb(services)[service]
-            await provoke(port, data, tally)
+            await provoke(door, data, tally)
             tally.frames += count
         for data in requests.garbage(options.bytes):
-            await provoke(port, data, tally)
-        if await ask(port, READ_MAGIC) != MAGIC:
+            await provoke(door, data, tally)
+        if await ask(door, READ_MAGIC) != MAGIC:
             tally.failures.append("no right answer to a right question")
-        statistics = await ask(port, READ_STATISTICS)
+        statistics = await ask(door, READ_STATISTICS)
         tally.served = int.from_bytes(statistics[8:12], "big")
     except ConnectionRefusedError:
         tally.failures.append("listens no more")
@@ -228,9 +280,10 @@ async def main(options: argparse.Namespace) -> int:
     print(_row("service", "frames", "served", "sent", "received", "connections", "seconds", "MB then", "MB now"))
     stood = True
     with tempfile.TemporaryDirectory() as folder:
-        async with LocalServices(Settings(), Path(folder)) as services:
+        settings = site(Path(folder)) if options.tls else Settings()
+        async with LocalServices(settings, Path(folder)) as services:
             for service in options.service or SERVICES:
-                line, one_stood = await fuzz(service, services, Path(folder) / f"{service}.log", options)
+                line, one_stood = await fuzz(service, services, Path(folder), options)
                 print(line, flush=True)
                 stood = stood and one_stood
         if not stood:
@@ -244,6 +297,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Sends seeded nonsense to the three services.")
     parser.add_argument("--frames", type=int, default=100_000, help="damaged requests for each (default: 100000)")
     parser.add_argument("--bytes", type=int, default=10_000_000, help="random bytes for each (default: 10000000)")
+    parser.add_argument("--tls", action="store_true", help="over TLS")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--service", action="append", choices=SERVICES, help="only this one; may be repeated")
     parser.add_argument("--log-lines", type=int, default=5, help="lines of each log to show after a failure")

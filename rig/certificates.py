@@ -3,7 +3,7 @@
 For trying Modbus/TCP Security out. A plant has an authority of its own, and keeps its key elsewhere.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from typing import NamedTuple, Self
@@ -51,19 +51,36 @@ class Authority:
         builder = builder.add_extension(_key_usage(signs_certificates=True), critical=True)
         return cls(Pair(_signed(builder, key.public_key(), key), key))
 
-    def issue_server(self, name: str, hosts: Sequence[str]) -> Pair:
+    def issue_server(self, name: str, hosts: Sequence[str], days: float | None = None) -> Pair:
         """Return a server's certificate, with the names and addresses that clients reach it by.
 
         Raises:
             ValueError: One of them is not a host name.
         """
         names = x509.SubjectAlternativeName([_general_name(host) for host in hosts])
-        return self._issue(name, ExtendedKeyUsageOID.SERVER_AUTH, names)
+        return self._issue(name, ExtendedKeyUsageOID.SERVER_AUTH, names, days)
 
     def issue_client(self, name: str, role: str | None, days: float | None = None) -> Pair:
         """Return a client's certificate with a role, or with none."""
-        extension = x509.UnrecognizedExtension(ROLE_EXTENSION, encoded_role(role)) if role is not None else None
+        extension = _role_extension(role) if role is not None else None
         return self._issue(name, ExtendedKeyUsageOID.CLIENT_AUTH, extension, days)
+
+    def revocation_list(self, revoked: Iterable[x509.RevokedCertificate], days: float) -> bytes:
+        """Return the PEM list of revoked certificates, valid from a day ago and for so many days from now."""
+        authority, now = self.pair.certificate, datetime.now(UTC)
+        builder = (
+            x509.CertificateRevocationListBuilder()
+            .issuer_name(authority.subject)
+            .last_update(now - timedelta(days=1))
+            .next_update(now + timedelta(days=days))
+            .add_extension(x509.CRLNumber(int(now.timestamp())), critical=False)
+            .add_extension(
+                x509.AuthorityKeyIdentifier.from_issuer_public_key(self.pair.key.public_key()), critical=False
+            )
+        )
+        for each in revoked:
+            builder = builder.add_revoked_certificate(each)
+        return builder.sign(self.pair.key, hashes.SHA256()).public_bytes(Encoding.PEM)
 
     def _issue(
         self, name: str, usage: x509.ObjectIdentifier, extension: x509.ExtensionType | None, days: float | None = None
@@ -81,6 +98,16 @@ class Authority:
         if extension is not None:
             builder = builder.add_extension(extension, critical=False)
         return Pair(_signed(builder, self.pair.key.public_key(), self.pair.key), key)
+
+
+def revoked_now(certificate: x509.Certificate) -> x509.RevokedCertificate:
+    """Return the entry of a certificate that is revoked now."""
+    builder = x509.RevokedCertificateBuilder().serial_number(certificate.serial_number)
+    return builder.revocation_date(datetime.now(UTC)).build()
+
+
+def _role_extension(role: str) -> x509.UnrecognizedExtension:
+    return x509.UnrecognizedExtension(x509.ObjectIdentifier(ROLE_EXTENSION), encoded_role(role))
 
 
 def _draft(name: str, issuer: str, key: ec.EllipticCurvePrivateKey, end: datetime) -> x509.CertificateBuilder:

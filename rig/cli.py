@@ -25,6 +25,7 @@ COMMANDS: Final = {
     "study": "do the runs of a study and draw its figure",
     "reproduce": "all studies of the paper, one report and a scorecard",
     "budget": "what the reference PLC can compute, and in which time",
+    "events": "the journal of a running service",
     "registers": "the register maps",
     "certificates": "certificates for Modbus/TCP Security on a test site",
     "model": "the prediction model",

@@ -7,11 +7,11 @@ from typing import Any, Final, NamedTuple
 import pyarrow as pa
 
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
+from coldloop.registers.audit import Event
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import Actuators, PlantSample
-from coldloop.registers.safety import Event
 
 FORMAT: Final = 2
 """Version of the files of a run."""
@@ -37,6 +37,7 @@ _TICK: Final = Column("tick", pa.int64(), "1", "Tick since the start of the sess
 _TIME: Final = Column("time_s", pa.float64(), "s", "Plant time since the start of the session")
 _TAU_U: Final = Column("tau_u_s", pa.float64(), "s", "Updating period t_{i+1} - t_i")
 _UPDATE: Final = fields_of(Optimization)
+_EVENT: Final = fields_of(Event)
 
 PHYSICAL_COLUMNS: Final = (
     Column("load_w", pa.float32(), "W", fields_of(PlantSample)["load"].description),
@@ -84,18 +85,23 @@ UPDATES: Final = (
 )  # fmt: skip
 
 EVENTS: Final = (
-    Column("number", pa.int64(), "1", fields_of(Event)["number"].description),
+    Column("number", pa.int64(), "1", _EVENT["number"].description),
+    Column("boot", pa.int32(), "1", _EVENT["boot"].description),
+    Column("utc", pa.string(), "", "UTC, ISO 8601 with milliseconds"),
     _TICK,
     _TIME,
-    Column("kind", pa.string(), "", "What happened"),
-    Column("subject", pa.string(), "", "The new mode, or the alarm"),
+    Column("kind", pa.string(), "", "What happened: mode, alarm raised, setpoint, ..."),
+    Column("subject", pa.string(), "", "The new mode, the alarm, the input, ...: depends on the kind"),
     Column("cause", pa.string(), "", "Why; empty when there is no cause"),
+    Column("value", pa.float32(), "", "A value; null when the kind has none"),
+    Column("unit", pa.string(), "", "Unit of the value; empty when it has none"),
+    Column("who", pa.string(), "", "Whose request it was: address, role, certificate; empty when nobody's"),
 )
 
 FILES: Final = {
     "trace.parquet": ("One row a tick of 0.25 s", TRACE),
     "updates.parquet": ("One row an update whose sequence was played", UPDATES),
-    "events.parquet": ("One row a change of mode or of an alarm, as the control PLC notes them", EVENTS),
+    "events.parquet": ("One row an event of the control PLC's journal: modes, alarms, commands", EVENTS),
 }
 
 

@@ -9,8 +9,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from coldloop.errors import ResultsError
+from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.safety import Event
 from rig.columns import FILES, arrow_schema
 from rig.disk_reserve import DiskReserve, ReservedFile
 from rig.indicators import StageCost

@@ -12,10 +12,11 @@ from typing import Self, TypeVar
 from coldloop.config import PREFIX, to_environment
 from coldloop.errors import LinkError
 from rig.network import NetworkRig
+from rig.ports import ReservedPorts
 from rig.recording import Recorder
 from rig.scenario import Scenario
 from rig.settings import Settings
-from rig.wiring import SERVICES, Detours, endpoints_on, free_ports, wired
+from rig.wiring import SERVICES, Detours, endpoints_on, wired
 
 T = TypeVar("T")
 
@@ -40,7 +41,8 @@ class LocalServices:
         detours: Detours | None = None,
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        self.endpoints = endpoints_on(free_ports(len(SERVICES)), settings)
+        self._ports = ReservedPorts(len(SERVICES))
+        self.endpoints = endpoints_on(self._ports.numbers, settings)
         self._environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
             **to_environment(wired(settings, self.endpoints, detours)),
@@ -69,6 +71,7 @@ class LocalServices:
         for process in processes.values():
             await _ended(process)
         await asyncio.gather(*self._watchers)
+        self._ports.release()
 
     async def start(self, service: str, environment: Mapping[str, str] | None = None, *, may_end: bool = False) -> None:
         """Start one of them, where it was before.

@@ -17,7 +17,7 @@ Series = NDArray[np.floating]
 INK, ACCENT, THIRD, BAND = "#1f3b57", "#c8553d", "#5b8e7d", "#b8c4ce"
 COLOURS: Final = (INK, ACCENT, THIRD, "#8a6fae", "#b08d2f", "#4d4d4d")
 """Of curves that are drawn over each other."""
-MODE_COLOURS: Final = {"MPC": INK, "REST": "#7f9cb8", "HOLD": "#d9a441", "CLASSICAL": ACCENT, "MANUAL": THIRD}
+MODE_COLOURS: Final = {"mpc": INK, "rest": "#7f9cb8", "hold": "#d9a441", "classical": ACCENT, "manual": THIRD}
 STYLE: Final[Any] = {
     "font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False,
     "legend.frameon": False, "legend.fontsize": 8, "svg.hashsalt": "coldloop", "axes.formatter.useoffset": False,
@@ -174,7 +174,7 @@ def _cost(axes: Axes, time: Series, cost: Series) -> None:
 
 def _ribbons(axes: Axes, events: Sequence[Mapping[str, Any]], scale_s: float, end: float) -> None:
     """Draw who drives as a ribbon, and below it when alarms are active."""
-    modes = [(event["time_s"] / scale_s, event["subject"]) for event in events if event["kind"] == "MODE"]
+    modes = [(event["time_s"] / scale_s, event["subject"]) for event in events if event["kind"] == "mode"]
     ends = [time for time, _ in modes[1:]] + [end]
     for (begin, mode), until in zip(modes, ends, strict=False):
         axes.broken_barh([(begin, max(until - begin, 0.0))], (0.55, 0.4), color=MODE_COLOURS.get(mode, BAND))
@@ -195,8 +195,8 @@ def alarm_times(events: Sequence[Mapping[str, Any]], scale_s: float, end: float)
     times = []
     for event in events:
         time = event["time_s"] / scale_s
-        if event["kind"] == "ALARM_RAISED":
+        if event["kind"] == "alarm raised":
             active.setdefault(event["subject"], time)
-        elif event["kind"] == "ALARM_RETURNED" and event["subject"] in active:
+        elif event["kind"] == "alarm returned" and event["subject"] in active:
             times.append((active.pop(event["subject"]), time))
     return times + [(begin, end) for begin in active.values()]

@@ -12,9 +12,9 @@ from itertools import islice
 from typing import Final, Generic, TypeVar
 
 from coldloop.errors import ColdloopError
+from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
-from coldloop.registers.safety import Event
 from rig.recorded import LinkStatistics, Recording, SampleBlock, joined
 
 __all__ = ["LinkStatistics", "MemorySink", "Recorder", "Recording", "SampleBlock", "Sink"]

@@ -22,7 +22,7 @@ from coldloop.config import Configuration, load_configuration
 from coldloop.errors import UsageError
 from coldloop.lti_model import load as load_model
 from coldloop.process import TICK_S
-from coldloop.registers.safety import Event
+from coldloop.registers.audit import Event
 from rig.indicators import RunEvaluation, StageCost
 from rig.one_process import OneProcessRig
 from rig.plot import DRAWN, Bounds, RunCurves, draw_run

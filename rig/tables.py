@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from coldloop.process import OUTPUT_NAMES, TICK_S
-from coldloop.registers.control_plc import Cause, Mode, Verdict
+from coldloop.event_text import describe, utc_text
+from coldloop.process import TICK_S
+from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.safety import AlarmKind, Event, EventKind
 from rig.columns import EVENTS, TRACE, UPDATES, arrow_schema
 from rig.indicators import StageCost
 from rig.recording import SampleBlock
@@ -57,30 +57,18 @@ def updates_table(updates: Sequence[Optimization]) -> pa.Table:
 
 def events_table(events: Sequence[Event]) -> pa.Table:
     """Return the table of events."""
-    rows = [
-        {"number": event.number, "tick": event.tick, "time_s": event.tick * TICK_S, "kind": EventKind(event.kind).name,
-         "subject": _subject(event), "cause": _cause(event)}
-        for event in events
-    ]  # fmt: skip
-    return _table(rows, EVENTS)
+    return _table([_event_row(event) for event in events], EVENTS)
+
+
+def _event_row(event: Event) -> dict[str, Any]:
+    text = describe(event)
+    return {
+        **text._asdict(), "number": event.number, "boot": event.boot, "utc": utc_text(event), "tick": event.tick,
+        "time_s": event.tick * TICK_S, "value": event.value if text.value else None,
+    }  # fmt: skip
 
 
 def _table(rows: Sequence[dict[str, Any]], columns: Any) -> pa.Table:  # noqa: ANN401 a tuple of columns
     return pa.table(
         [pa.array([row[column.name] for row in rows], type=column.kind) for column in columns], arrow_schema(columns)
     )
-
-
-def _subject(event: Event) -> str:
-    return Mode(event.subject).name if event.kind == EventKind.MODE else AlarmKind(event.subject).name
-
-
-def _cause(event: Event) -> str:
-    """Return the cause in words; which list it is from depends on the subject."""
-    if event.kind == EventKind.MODE or event.subject == AlarmKind.MODE:
-        return Cause(event.cause).name
-    if event.subject == AlarmKind.SENSOR_BAD and event.kind == EventKind.ALARM_RAISED:
-        return OUTPUT_NAMES[event.cause]
-    if event.subject == AlarmKind.SEQUENCE_REJECTED:
-        return Verdict(event.cause).name
-    return str(event.cause) if event.cause else ""

@@ -1,7 +1,5 @@
 """Where three services on localhost listen, and where their clients are pointed at."""
 
-import contextlib
-import socket
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -67,12 +65,3 @@ def wired(settings: Settings, endpoints: RigEndpoints, detours: Detours | None =
             ),
         }
     )
-
-
-def free_ports(count: int) -> list[int]:
-    """Return ports that nobody listens on."""
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [int(one.getsockname()[1]) for one in sockets]

@@ -1,15 +1,27 @@
-"""What all tests share: coroutines as tests, no configuration from outside, and the command line."""
+"""What all tests share: how Hypothesis searches, coroutines as tests, no configuration from outside, a free port, and
+the command line.
+"""
 
 import asyncio
 import inspect
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import pytest
+from hypothesis import settings
 
 from coldloop.config import PREFIX
 from rig import cli
+from rig.ports import ReservedPorts
+
+settings.register_profile("quick", deadline=None, print_blob=True)
+settings.register_profile("ci", settings.get_profile("quick"), derandomize=True)
+settings.register_profile("thorough", settings.get_profile("quick"), max_examples=5000)
+settings.load_profile("ci" if "CI" in os.environ else "quick")
+"""Quick looks elsewhere each time, and begins with what failed before; ci tries the same examples always. No example
+has a deadline: this machine may be busy with something else. `--hypothesis-profile=thorough` is for a night, of the
+tests that do not name a number of examples themselves."""
 
 PATIENCE_S = 120.0
 """A coroutine has failed when it takes longer; the first one on a bus may have to compile the kernels."""
@@ -35,6 +47,13 @@ def _no_configuration_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in tuple(os.environ):
         if name.startswith(PREFIX):
             monkeypatch.delenv(name)
+
+
+@pytest.fixture
+def free_port() -> Iterator[int]:
+    """A port on localhost that nobody else gets during the test; connections are refused until a server listens."""
+    with ReservedPorts(1) as reserved:
+        yield reserved.numbers[0]
 
 
 class Outcome(NamedTuple):

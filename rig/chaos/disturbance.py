@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from coldloop.modbus.framing import MalformedFrameError, next_frame
-from rig.chaos.faults import Delay, Direction, Drop, Duplicate, Flip, FrameFault, Reorder, Truncate
+from rig.chaos.faults import Abort, Delay, Direction, Drop, Duplicate, Flip, FrameFault, Reorder, Truncate
 
 
 class Outcome(NamedTuple):
@@ -17,6 +17,8 @@ class Outcome(NamedTuple):
     """How much later."""
     close: bool = False
     """Whether the connection is closed behind it."""
+    reset: bool = False
+    """Whether that is a reset."""
 
 
 class Mangler:
@@ -34,7 +36,7 @@ class Mangler:
         self.hold_s: float | None = None
         """While a frame is held back: how long, unless another one comes."""
 
-    def decide(self, frame: bytes, faults: Iterable[FrameFault]) -> Outcome:
+    def decide(self, frame: bytes, faults: Iterable[FrameFault]) -> Outcome:  # noqa: C901 a branch for each kind
         """Return what becomes of a frame under the faults that are on."""
         pieces, delay_s, overtaken = [frame], 0.0, self.release()
         for fault in faults:
@@ -45,6 +47,9 @@ class Mangler:
             elif isinstance(fault, Truncate):
                 if pieces and self._hit(fault.share):
                     return Outcome(b"".join(pieces[:-1]) + pieces[-1][: len(pieces[-1]) // 2], delay_s, close=True)
+            elif isinstance(fault, Abort):
+                if pieces and self._hit(fault.share):
+                    return Outcome(b"", delay_s, close=True, reset=True)
             elif isinstance(fault, Reorder):
                 if pieces and not overtaken and self._hit(fault.share):
                     self._held, self.hold_s = pieces.pop(), fault.hold_ms / 1000

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.process import L1, T5, TICK_S
+from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
-from coldloop.registers.safety import AlarmKind, Event, EventKind
+from coldloop.registers.safety import AlarmKind
 from rig.chaos.trace import ChaosTrace
 from rig.recording import Recording
 

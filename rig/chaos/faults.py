@@ -144,6 +144,13 @@ class Truncate(FrameFault):
     share: Share = 1.0
 
 
+class Abort(FrameFault):
+    """The connection is reset (RST) in the place of a frame."""
+
+    kind: Literal["abort"]
+    share: Share
+
+
 class Flip(FrameFault):
     """Bits of frames are flipped."""
 
@@ -239,7 +246,7 @@ class WrongModel(Fault):
 
 
 AnyFault = Annotated[
-    Delay | Drop | Duplicate | Reorder | Reset | Freeze | Truncate | Flip
+    Abort | Delay | Drop | Duplicate | Reorder | Reset | Freeze | Truncate | Flip
     | Kill | Pause | Restart | Clock | Sensor | WrongModel,
     Field(discriminator="kind"),
 ]  # fmt: skip

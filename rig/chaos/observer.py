@@ -7,11 +7,12 @@ from typing import Final, NamedTuple, TypeVar
 from coldloop.endpoints import Endpoint
 from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
+from coldloop.registers.audit import EVENT_ROWS, Event
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, Grant, LadderStatus
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, PlantSample, SensorFault
-from coldloop.registers.safety import EVENT_ROWS, Alarm, AlarmKind, Event
+from coldloop.registers.safety import Alarm, AlarmKind
 from rig.chaos.trace import ChaosTrace
 from rig.network import AHEAD, RigEndpoints
 

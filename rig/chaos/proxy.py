@@ -132,6 +132,9 @@ class LinkProxy:
         if outcome.delay_s > 0:
             await asyncio.sleep(outcome.delay_s)
         await self._flowing.wait()
+        if outcome.reset:
+            _reset(writer)
+            return False
         writer.write(outcome.data)
         await writer.drain()
         return not outcome.close

@@ -18,9 +18,10 @@ from rig.chaos.sequencer import FaultSequencer, Progress
 from rig.chaos.trace import ChaosTrace
 from rig.local_services import LocalServices
 from rig.network import NetworkRig
+from rig.ports import ReservedPorts
 from rig.scenario import Scenario
 from rig.settings import Settings
-from rig.wiring import Detours, free_ports
+from rig.wiring import Detours
 
 SLOWEST: Final = 20.0
 """Seconds of plant time in a second that lock-step should reach with proxies and all."""
@@ -36,13 +37,16 @@ async def conduct(
     """
     if any(isinstance(fault, WrongModel) for fault in plan.schedule()):  # not while the clock is running
         await asyncio.to_thread(save_wrong_model, settings.model.file, folder / WRONG_MODEL)
-    detours = Detours(*free_ports(len(Detours._fields)))
-    services = LocalServices(settings, folder / "logs", detours=detours, environment=_retained(folder))
-    proxies = {
-        Link.PLANT: LinkProxy(detours.plant, services.endpoints.plant.port, f"{plan.seed}/plant"),
-        Link.OPTIMIZER: LinkProxy(detours.control_plc, services.endpoints.control_plc.port, f"{plan.seed}/optimizer"),
-    }
     async with AsyncExitStack() as stack:
+        reserved = stack.enter_context(ReservedPorts(len(Detours._fields)))
+        detours = Detours(*reserved.numbers)
+        services = LocalServices(settings, folder / "logs", detours=detours, environment=_retained(folder))
+        proxies = {
+            Link.PLANT: LinkProxy(detours.plant, services.endpoints.plant.port, f"{plan.seed}/plant"),
+            Link.OPTIMIZER: LinkProxy(
+                detours.control_plc, services.endpoints.control_plc.port, f"{plan.seed}/optimizer"
+            ),
+        }
         await stack.enter_async_context(services)
         rig = NetworkRig(services.endpoints, settings)
         stack.callback(rig.close)

@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.plant import PlantSample
-from coldloop.registers.safety import Alarm, Event, EventKind
+from coldloop.registers.safety import Alarm
 from rig.chaos.faults import AnyFault
 from rig.recording import LinkStatistics, Recording
 

@@ -1,4 +1,7 @@
-"""`coldloop certificates`: certificates for Modbus/TCP Security on a test site, and configuration for them."""
+"""`coldloop certificates`: certificates for Modbus/TCP Security on a test site, and configuration for them.
+
+It also revokes certificates that it has made, by the list of revocations that the configuration names.
+"""
 
 import argparse
 import re
@@ -12,6 +15,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", dest="hosts", action="append", default=[], type=_host, metavar="NAME",
                         help="another name or address of the servers, besides localhost; may be repeated")  # fmt: skip
     parser.add_argument("--days", type=_days, default=365, help="days until they expire (default: 365)")
+    parser.add_argument("--revoke", action="append", default=[], metavar="NAME",
+                        help="revoke a certificate in the folder, such as operator; may be repeated")  # fmt: skip
+    parser.add_argument("--renew-list", action="store_true", help="make the list of revoked certificates anew")
     parser.set_defaults(execute=execute)
 
 
@@ -28,9 +34,13 @@ def _days(text: str) -> int:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Write the files."""
-    from rig.certificate_files import write_site
+    """Make certificates, or revoke some that have been made."""
+    from rig.certificate_files import revoke, write_site
 
-    count, configuration = write_site(options.out, options.hosts, options.days)
-    sys.stdout.write(f"{count} certificates and their keys in {options.out}; use them with --config {configuration}\n")
+    if options.revoke or options.renew_list:
+        count, file = revoke(options.out, options.revoke, options.days)
+        sys.stdout.write(f"{count} revoked in {file}; restart the services that use it\n")
+        return 0
+    count, file = write_site(options.out, options.hosts, options.days)
+    sys.stdout.write(f"{count} certificates and their keys in {options.out}; use them with --config {file}\n")
     return 0

@@ -1,142 +1,241 @@
-"""Alarms with the states of ANSI/ISA-18.2, and the sequence of events."""
+"""Alarms with the states of ANSI/ISA-18.2-2016 (clause 5.4, alarm state transition diagram).
 
-from collections import deque
-from collections.abc import Sequence
+    condition ──on-delay, off-delay──> active ──TRANSITIONS──> state ──> registers, journal
 
+A condition is told as it is (`holds`, `raised`, `returned`, `happened`). When it has changed for as long as the delay
+of its alarm, `active` follows, and the state makes a transition. Operators make the others. All times are plant time,
+measured by ticks and not by scans: scans can be missed.
+
+"Suppressed by design" of the standard is not there: no alarm depends on another one.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+from coldloop.journal import Journal
 from coldloop.process import TICK_S
-from coldloop.registers.safety import (
-    ALL_ALARMS,
-    EVENT_ROWS,
-    Alarm,
-    AlarmAction,
-    AlarmCommand,
-    AlarmKind,
-    AlarmState,
-    Event,
-    EventKind,
-)
+from coldloop.registers.audit import EventKind
+from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
+from control_plc.alarm_settings import PASSING, AlarmSettings
 
-PASSING = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED)
-"""Alarms for something that happens at an instant."""
-PASSING_TICKS = round(60 / TICK_S)
-"""They return when it has not happened again for so long."""
+TRANSITIONS: Final[Mapping[AlarmState, Mapping[EventKind, AlarmState]]] = {
+    AlarmState.NORMAL: {
+        EventKind.ALARM_RAISED: AlarmState.UNACKNOWLEDGED,
+        EventKind.ALARM_SHELVED: AlarmState.SHELVED,
+        EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
+    },
+    AlarmState.UNACKNOWLEDGED: {
+        EventKind.ALARM_RAISED: AlarmState.UNACKNOWLEDGED,  # for another cause
+        EventKind.ALARM_RETURNED: AlarmState.RETURNED,
+        EventKind.ALARM_ACKNOWLEDGED: AlarmState.ACKNOWLEDGED,
+        EventKind.ALARM_SHELVED: AlarmState.SHELVED,
+        EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
+    },
+    AlarmState.ACKNOWLEDGED: {
+        EventKind.ALARM_RAISED: AlarmState.UNACKNOWLEDGED,  # for another cause
+        EventKind.ALARM_RETURNED: AlarmState.NORMAL,
+        EventKind.ALARM_SHELVED: AlarmState.SHELVED,
+        EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
+    },
+    AlarmState.RETURNED: {
+        EventKind.ALARM_RAISED: AlarmState.UNACKNOWLEDGED,
+        EventKind.ALARM_ACKNOWLEDGED: AlarmState.NORMAL,
+        EventKind.ALARM_SHELVED: AlarmState.SHELVED,
+        EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
+    },
+    AlarmState.SHELVED: {
+        EventKind.ALARM_RAISED: AlarmState.SHELVED,  # in the journal, and not shown
+        EventKind.ALARM_RETURNED: AlarmState.SHELVED,
+        EventKind.ALARM_SHELVED: AlarmState.SHELVED,  # for another time
+        EventKind.ALARM_UNSHELVED: AlarmState.NORMAL,  # and raised anew when active
+        EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
+    },
+    AlarmState.OUT_OF_SERVICE: {
+        EventKind.ALARM_IN_SERVICE: AlarmState.NORMAL,  # and raised anew when active
+    },
+}
+"""The state after an event. What is not here does not happen: it changes nothing, and nothing is noted."""
+
+COMMANDED: Final[Mapping[int, EventKind]] = {
+    AlarmAction.ACKNOWLEDGE: EventKind.ALARM_ACKNOWLEDGED,
+    AlarmAction.SHELVE: EventKind.ALARM_SHELVED,
+    AlarmAction.UNSHELVE: EventKind.ALARM_UNSHELVED,
+    AlarmAction.OUT_OF_SERVICE: EventKind.ALARM_OUT_OF_SERVICE,
+    AlarmAction.IN_SERVICE: EventKind.ALARM_IN_SERVICE,
+}
+"""The event that an operator's action asks for."""
+
+WITHOUT_DELAY: Final = AlarmSettings(band_delay_s=0.0)
 
 
-class Journal:
-    """Numbers events and keeps the last ones."""
+class _Pending(NamedTuple):
+    """A change of a condition that `active` does not show yet: it waits for its delay."""
 
-    def __init__(self) -> None:
-        self.count = 0
-        self._events: deque[Event] = deque(maxlen=EVENT_ROWS)
-
-    def note(self, tick: int, kind: EventKind, subject: int, cause: int = 0) -> None:
-        """Add an event."""
-        self.count += 1
-        self._events.append(Event(self.count, tick, kind, subject, cause))
-
-    def since(self, number: int) -> list[Event]:
-        """Return the events after event `number`, those that are still kept."""
-        if number == self.count:
-            return []
-        return [event for event in self._events if event.number > number]
+    since: int
+    """Tick."""
+    cause: int
 
 
 class AlarmPanel:
-    """All alarms; `now` is the tick that is noted with what happens."""
+    """All alarms.
 
-    def __init__(self, journal: Journal) -> None:
+    Args:
+        journal: Where each transition is noted.
+        settings: Priorities, delays, shelving.
+    """
+
+    def __init__(self, journal: Journal, settings: AlarmSettings = WITHOUT_DELAY) -> None:
         self._journal = journal
-        self._happened: dict[AlarmKind, int] = {}
-        self.rows = [Alarm()] * len(AlarmKind)
-        self.now = 0
+        self._settings = settings
+        self._rules = [settings.rule(kind) for kind in AlarmKind]
+        self._pending: dict[AlarmKind, _Pending] = {}
+        self._now = 0
+        self.rows = [Alarm(priority=rule.priority) for rule in self._rules]
+        """What the registers show, by number of the alarm."""
         self.changes = 0
         """Rises with every change, so that who shows the alarms knows when to."""
 
-    def raised(self, kind: AlarmKind, cause: int = 0) -> None:
-        """Raise an alarm, or raise it again for another cause."""
-        row = self.rows[kind]
-        if row.active and row.cause == cause:
-            return
-        state = AlarmState.SHELVED if row.state == AlarmState.SHELVED else AlarmState.UNACKNOWLEDGED
-        times = (row.times + 1) & 0xFFFF
-        self._change(kind, row._replace(state=state, active=1, cause=cause, times=times, raised=self.now))
-        self._journal.note(self.now, EventKind.ALARM_RAISED, kind, cause)
+    # -- time ----------------------------------------------------------------------------------------------------------
 
-    def returned(self, kind: AlarmKind) -> None:
-        """Tell that the condition of an alarm has ended."""
-        row = self.rows[kind]
-        if not row.active:
-            return
-        after = {
-            AlarmState.UNACKNOWLEDGED: AlarmState.RETURNED,
-            AlarmState.ACKNOWLEDGED: AlarmState.NORMAL,
-        }  # a shelved alarm stays shelved
-        state = after.get(AlarmState(row.state), AlarmState(row.state))
-        self._change(kind, row._replace(state=state, active=0, returned=self.now))
-        self._journal.note(self.now, EventKind.ALARM_RETURNED, kind, row.cause)
+    @property
+    def now(self) -> int:
+        """Tick of plant time, noted with what happens.
 
-    def holds(self, kind: AlarmKind, *, condition: bool, cause: int = 0) -> None:
-        """Raise or return an alarm, as its condition is."""
-        if condition:
-            self.raised(kind, cause)
-        else:
-            self.returned(kind)
+        When it is set forward, all that time has passed. When it is set back, all timers move back with it: delays keep
+        what has elapsed of them, and shelved alarms what is left.
+        """
+        return self._now
+
+    @now.setter
+    def now(self, tick: int) -> None:
+        back = self._now - tick
+        self._now = tick
+        if back <= 0:
+            return
+        self._pending = {kind: each._replace(since=each.since - back) for kind, each in self._pending.items()}
+        for kind in self._shelved():
+            self._store(kind, shelved_until=max(tick + 1, self.rows[kind].shelved_until - back))
 
     def begin_at(self, tick: int) -> None:
         """Go on at a tick that may lie before the present one."""
         self.now = tick
-        self._happened = {kind: min(happened, tick) for kind, happened in self._happened.items()}
-
-    def restore(self, rows: Sequence[Alarm]) -> None:
-        """Take the alarms of before a restart; what happened at an instant may pass by again."""
-        self.rows = list(rows)
-        self._happened = {kind: self.now for kind in PASSING if self.rows[kind].active}
-        self.changes += 1
-
-    def happened(self, kind: AlarmKind) -> None:
-        """Raise an alarm for something that happens at an instant; `pass_by` returns it."""
-        self._happened[kind] = self.now
-        self.raised(kind)
 
     def pass_by(self) -> None:
-        """Return the alarms of what has not happened again for a while."""
-        for kind, tick in list(self._happened.items()):
-            if self.now - tick > PASSING_TICKS:
-                del self._happened[kind]
-                self.returned(kind)
+        """Let the delays and the shelving that are over by now take effect; call it once a scan."""
+        for kind in list(self._pending):
+            self._settle(kind)
+        for kind in self._shelved():
+            if self.now >= self.rows[kind].shelved_until:
+                self._step(kind, EventKind.ALARM_UNSHELVED)
 
-    def command(self, command: AlarmCommand) -> None:
-        """Do what an operator asks for; what makes no sense changes nothing."""
-        kinds = list(AlarmKind) if command.alarm == ALL_ALARMS else [k for k in AlarmKind if k == command.alarm]
-        for kind in kinds:
-            if command.action == AlarmAction.ACKNOWLEDGE:
-                self._acknowledge(kind)
-            elif command.action == AlarmAction.SHELVE:
-                self._shelve(kind)
-            elif command.action == AlarmAction.UNSHELVE:
-                self._unshelve(kind)
+    # -- conditions ----------------------------------------------------------------------------------------------------
 
-    def _acknowledge(self, kind: AlarmKind) -> None:
+    def holds(self, kind: AlarmKind, *, condition: bool, cause: int = 0) -> None:
+        """Tell whether the condition of an alarm holds, and why; another cause raises the alarm again."""
         row = self.rows[kind]
-        after = {AlarmState.UNACKNOWLEDGED: AlarmState.ACKNOWLEDGED, AlarmState.RETURNED: AlarmState.NORMAL}
-        state = after.get(AlarmState(row.state))
-        if state is not None:
-            self._change(kind, row._replace(state=state))
-            self._journal.note(self.now, EventKind.ALARM_ACKNOWLEDGED, kind, row.cause)
+        if condition != bool(row.active):
+            earlier = self._pending.get(kind)
+            self._pending[kind] = _Pending(self.now if earlier is None else earlier.since, cause)
+            self._settle(kind)
+            return
+        self._pending.pop(kind, None)
+        if condition and cause != row.cause:
+            self._raise(kind, cause)
 
-    def _shelve(self, kind: AlarmKind) -> None:
+    def raised(self, kind: AlarmKind, cause: int = 0) -> None:
+        """Tell that the condition of an alarm holds, and why."""
+        self.holds(kind, condition=True, cause=cause)
+
+    def returned(self, kind: AlarmKind) -> None:
+        """Tell that the condition of an alarm has ended."""
+        self.holds(kind, condition=False)
+
+    def happened(self, kind: AlarmKind, cause: int = 0) -> None:
+        """Tell of something that happens at an instant: the alarm returns an off-delay after the last time.
+
+        An alarm with an on-delay is not raised by it.
+        """
+        self.raised(kind, cause)
+        self.returned(kind)
+
+    def _settle(self, kind: AlarmKind) -> None:
+        """Let a change of a condition take effect if its delay is over."""
+        pending, rule, active = self._pending[kind], self._rules[kind], self.rows[kind].active
+        if self.now - pending.since < (rule.off_ticks if active else rule.on_ticks):
+            return
+        del self._pending[kind]
+        if active:
+            self._return(kind)
+        else:
+            self._raise(kind, pending.cause)
+
+    def _raise(self, kind: AlarmKind, cause: int) -> None:
         row = self.rows[kind]
-        if row.state != AlarmState.SHELVED:
-            self._change(kind, row._replace(state=AlarmState.SHELVED))
-            self._journal.note(self.now, EventKind.ALARM_SHELVED, kind, row.cause)
+        if row.state == AlarmState.OUT_OF_SERVICE:  # it is worked on: followed, and not noted
+            self._store(kind, active=1, cause=cause)
+        else:
+            times = (row.times + 1) & 0xFFFF
+            self._step(kind, EventKind.ALARM_RAISED, active=1, cause=cause, times=times, raised=self.now)
 
-    def _unshelve(self, kind: AlarmKind) -> None:
-        row = self.rows[kind]
-        if row.state == AlarmState.SHELVED:
-            state = AlarmState.UNACKNOWLEDGED if row.active else AlarmState.NORMAL
-            self._change(kind, row._replace(state=state))
-            self._journal.note(self.now, EventKind.ALARM_UNSHELVED, kind, row.cause)
+    def _return(self, kind: AlarmKind) -> None:
+        if self.rows[kind].state == AlarmState.OUT_OF_SERVICE:
+            self._store(kind, active=0, returned=self.now)
+        else:
+            self._step(kind, EventKind.ALARM_RETURNED, active=0, returned=self.now)
 
-    def _change(self, kind: AlarmKind, row: Alarm) -> None:
-        self.rows[kind] = row
+    # -- operators, restarts -------------------------------------------------------------------------------------------
+
+    def command(self, command: AlarmCommand, who: str = "") -> None:
+        """Do what an operator asks for; what makes no sense changes nothing.
+
+        Args:
+            command: Alarm, action, and for shelving the time.
+            who: Whose request it is, for the journal.
+        """
+        event = COMMANDED.get(command.action)
+        if event is None:
+            return
+        for kind in AlarmKind:
+            if command.alarm not in (kind, ALL_ALARMS):
+                continue
+            if event is EventKind.ALARM_SHELVED:
+                self._shelve(kind, command.time, who)
+            else:
+                self._step(kind, event, who=who)
+
+    def _shelve(self, kind: AlarmKind, asked_s: int, who: str) -> None:
+        ticks = self._settings.shelving_ticks(asked_s)
+        until = min(self.now + ticks, 0xFFFFFFFF)
+        if until != self.rows[kind].shelved_until:
+            self._step(kind, EventKind.ALARM_SHELVED, who=who, value=ticks * TICK_S, shelved_until=until)
+
+    def restore(self, rows: Sequence[Alarm]) -> None:
+        """Take the alarms of before a restart; priorities are those of the configuration."""
+        self.rows = [row._replace(priority=rule.priority) for row, rule in zip(rows, self._rules, strict=True)]
+        # Who tells of instants does not tell that they are over.
+        self._pending = {kind: _Pending(self.now, 0) for kind in PASSING if self.rows[kind].active}
         self.changes += 1
+
+    # -- the state machine ---------------------------------------------------------------------------------------------
+
+    def _step(self, kind: AlarmKind, event: EventKind, *, who: str = "", value: float = 0.0, **fields: int) -> None:
+        """Make the transition of an event, if there is one, and note it."""
+        before = AlarmState(self.rows[kind].state)
+        after = TRANSITIONS[before].get(event)
+        if after is None:
+            return
+        if after is not AlarmState.SHELVED:
+            fields["shelved_until"] = 0
+        self._store(kind, state=after, **fields)
+        row = self.rows[kind]
+        self._journal.note(self.now, event, kind, row.cause, value=value, who=who)
+        suppressed = before in (AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)
+        if suppressed and after is AlarmState.NORMAL and row.active:
+            self._raise(kind, row.cause)
+
+    def _store(self, kind: AlarmKind, **fields: int) -> None:
+        self.rows[kind] = self.rows[kind]._replace(**fields)
+        self.changes += 1
+
+    def _shelved(self) -> list[AlarmKind]:
+        return [AlarmKind(i) for i, row in enumerate(self.rows) if row.state == AlarmState.SHELVED]

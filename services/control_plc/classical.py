@@ -67,6 +67,10 @@ class ClassicalSettings(BaseModel):
         return self
 
 
+LONGEST_GAP = 3
+"""Periods; of a longer gap between two executions no more counts for the integral."""
+
+
 class PiController:
     """A discrete PI controller for an input with bounds and a rate limit.
 
@@ -78,7 +82,7 @@ class PiController:
     Args:
         settings: Gain K, integral time T_i.
         setpoint: Wanted output.
-        period_s: Time T between executions, s.
+        period_s: Nominal time T between executions, s.
         low: Lower bound of the input.
         high: Upper bound of the input.
         reach: Largest change of the input in one execution, up or down.
@@ -88,7 +92,8 @@ class PiController:
         self, settings: PiSettings, *, setpoint: float, period_s: float, low: float, high: float, reach: float
     ) -> None:
         self._gain = settings.gain
-        self._share = period_s / settings.integral_time_s
+        self._period_s = period_s
+        self._integral_time_s = settings.integral_time_s
         self._setpoint = setpoint
         self._low, self._high, self._reach = low, high, reach
         self._error: float | None = None
@@ -97,16 +102,20 @@ class PiController:
         """Forget the last error: the next execution continues from the input applied, without proportional kick."""
         self._error = None
 
-    def execute(self, measured: float, applied: float) -> float:
-        """Return the wanted input for a measured output, `applied` being what is applied until now.
+    def execute(self, measured: float, applied: float, elapsed_s: float | None = None) -> float:
+        """Return the wanted input for a measured output.
 
-        An output that is no number leaves the input as it is.
+        Args:
+            measured: The output. One that is no number leaves the input as it is.
+            applied: The input applied until now.
+            elapsed_s: Time since the execution before, s; the nominal time by default.
         """
         if not math.isfinite(measured):
             self.restart()
             return applied
         error = self._setpoint - measured
-        change = self._gain * (error - (error if self._error is None else self._error) + self._share * error)
+        share = (self._period_s if elapsed_s is None else elapsed_s) / self._integral_time_s
+        change = self._gain * (error - (error if self._error is None else self._error) + share * error)
         if not math.isfinite(change):  # beyond all numbers: as good as none
             self.restart()
             return applied
@@ -135,11 +144,14 @@ class ClassicalLoops:
             )
 
         self._period = settings.period_ticks
+        self._seen: int | None = None
+        self._executed: int | None = None
         self._level = loop(settings.level, L1, NCR22)
         self._temperature = loop(settings.temperature, T5, CV156)
 
     def restart(self) -> None:
         """Forget what was measured: the loops take over from whatever is applied next."""
+        self._seen = self._executed = None
         self._level.restart()
         self._temperature.restart()
 
@@ -148,15 +160,25 @@ class ClassicalLoops:
     ) -> SequenceRow:
         """Return the inputs wanted at `tick`, from the newest outputs y (22) and the inputs applied until now.
 
-        A loop whose output is among those to do `without` is left: its input stands.
+        A loop whose output is among those to do `without` is left: its input stays.
 
         Between executions they are the applied ones. Executions are at multiples of the period, so that with 5 s and
-        no sequence before each of them has a rate window of its own and may use it in full.
+        no sequence before each of them has a rate window of its own and may use it in full. Where the scan at such a
+        tick was missed the next one executes, with the time that has passed.
         """
-        if tick % self._period:
+        if not self._is_due(tick):
             return applied
+        elapsed_s = None if self._executed is None else min(tick - self._executed, LONGEST_GAP * self._period) * TICK_S
+        self._executed = tick
         level, temperature = (math.nan if output in without else y[output] for output in (L1, T5))
         return applied._replace(
-            ncr22=self._level.execute(level, applied.ncr22),
-            cv156=self._temperature.execute(temperature, applied.cv156),
+            ncr22=self._level.execute(level, applied.ncr22, elapsed_s),
+            cv156=self._temperature.execute(temperature, applied.cv156, elapsed_s),
         )
+
+    def _is_due(self, tick: int) -> bool:
+        seen, self._seen = self._seen, tick
+        if self._executed is not None and tick <= self._executed:  # this scan was begun before, or time has gone back
+            self._executed = min(self._executed, tick)
+            return False
+        return tick % self._period == 0 or (seen is not None and tick // self._period > seen // self._period)

@@ -1,15 +1,21 @@
 """What optimisers and operators write to the control PLC, and what it makes of it."""
 
 import asyncio
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
+from typing import Final
 
-from coldloop.registers.bank import RegisterBank
+from coldloop.limits import InputLimits
+from coldloop.process import INPUT_NAMES, TICK_S
+from coldloop.registers.audit import EventKind, JournalQuery
+from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
 from coldloop.registers.control_plc import (
     AwaitUpdate,
     ControlSession,
     Grant,
     Heartbeat,
+    LatchedUpdate,
     Operator,
+    OperatorMode,
     Plan,
     SequenceHeader,
     SequenceRow,
@@ -20,27 +26,83 @@ from coldloop.registers.declaration import Block, Role
 from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
 from coldloop.seal import sealed
 from coldloop.sequence import InputSequence
+from coldloop.session import Pace
+from coldloop.writer_lease import LeaseEvent, WriterLease
 from control_plc.program import ControlProgram
 from control_plc.publication import Publication
 
-LONGEST_WAIT_S = 1.0
+LONGEST_WAIT_S: Final = 1.0
 """Longest time that a read of the latch waits for an update; the optimiser then asks again."""
+UNWATCHED_S: Final = 10.0
+"""Silence that ends the lease of the optimiser where its watchdog is off, in real time."""
+SECOND_OPTIMIZER: Final = 1
+"""Cause of the alarm SECOND_WRITER."""
+TRACKED: Final = 1e-4
+"""Setpoints that an operator writes back as they were read have not been changed."""
 
 
 class Clients:
-    """Takes what clients write; `changed` is set with everything that a scan may have waited for."""
+    """Takes what clients write; `changed` is set with everything that a scan may have waited for.
 
-    def __init__(self, program: ControlProgram, bank: RegisterBank, publication: Publication) -> None:
+    Args:
+        program: What is written to.
+        limits: What setpoints may be.
+        bank: The registers.
+        publication: Shows what has changed.
+        pace: Returns the time base of the session.
+    """
+
+    def __init__(
+        self,
+        program: ControlProgram,
+        limits: InputLimits,
+        bank: RegisterBank,
+        publication: Publication,
+        pace: Callable[[], Pace],
+    ) -> None:
         self._program = program
+        self._limits = limits
         self._bank = bank
         self._publication = publication
+        self._pace = pace
         self._news = asyncio.Event()
         self._waits = 0
+        self.lease = WriterLease("the optimiser's registers", self._silence_s, self._note_lease)
         self.changed = asyncio.Event()
         self.granted = 0
         """Lock-step scans every tick before this one."""
         self.asked: ControlSession | None = None
         """A session that is to begin."""
+        publication.lease = self.lease
+        bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader, SequenceRow)
+        bank.judged_by(self._judge_operator, Operator)
+
+    # -- judged before anything is stored ------------------------------------------------------------------------------
+
+    def _silence_s(self) -> float:
+        """Return the silence, in real time, after which another optimiser may write."""
+        pace, watchdog = self._pace(), self._program.watchdog
+        if not watchdog.time:
+            return UNWATCHED_S
+        return watchdog.time * TICK_S / (pace.factor if pace.realtime else 1.0)
+
+    def _judge_optimizer(self, record: tuple[object, ...], _row: int, caller: Caller) -> None:
+        try:
+            self.lease.check(caller, record.holder if isinstance(record, Heartbeat) else None)
+        except BusyError:
+            self._program.alarms.happened(AlarmKind.SECOND_WRITER, SECOND_OPTIMIZER)
+            raise
+        if isinstance(record, Plan) and not record.crc:
+            raise IllegalValueError("a plan without CRC: it decides when inputs change, so it is sealed")
+
+    def _judge_operator(self, record: Operator, _row: int, _caller: Caller) -> None:
+        if record.mode != OperatorMode.MANUAL:
+            return
+        for name, value, low, high in zip(INPUT_NAMES, record[1:], self._limits.low, self._limits.high, strict=True):
+            if not low <= value <= high:
+                raise IllegalValueError(f"setpoint of {name} = {value:g} is outside {low:g}..{high:g}")
+
+    # -- done ----------------------------------------------------------------------------------------------------------
 
     @property
     def optimizer_waits(self) -> bool:
@@ -50,55 +112,84 @@ class Clients:
     def tell(self, update: Update) -> None:
         """Show a new update, and answer who waits for it."""
         self._bank.put(sealed(update))
+        self._bank.put(sealed(LatchedUpdate(update.session, update.update, update.tick)))
         self._news.set()
         self._news = asyncio.Event()
 
-    def on_write(self, block: Block) -> Awaitable[None] | None:
+    def on_write(self, block: Block, caller: Caller) -> Awaitable[None] | None:
         """Take what a client has written; an awaitable lets its answer wait."""
         present = self._program.optimizer_present
-        wait = self._take(block)
+        if block.writer is Role.OPTIMIZER:
+            wait = self._take(block, caller)
+        else:
+            wait = None
+            self._command(block, caller)
         if self._program.optimizer_present is not present:
             self._publication.safety()
         return wait
 
-    def _take(self, block: Block) -> Awaitable[None] | None:
+    def _take(self, block: Block, caller: Caller) -> Awaitable[None] | None:
+        """Take what the optimiser has written."""
         record, program = block.record, self._program
+        beat = self._bank.get(Heartbeat) if record is Heartbeat else None
+        self.lease.take(caller, beat.holder if beat else None)
+        if record is SequenceRow:
+            return None
+        self.changed.set()
         if record is AwaitUpdate:
             return self._await_update(self._bank.get(AwaitUpdate))
         if record is Plan:
             program.accept_plan(self._bank.get(Plan))
         elif record is SequenceHeader:
             self._offer(self._bank.get(SequenceHeader))
-        elif record is Grant:
-            self.granted = self._bank.get(Grant).until_tick
-        elif record is ControlSession:
-            self.asked = self._bank.get(ControlSession)
-            self.granted = 0
-        elif record is Heartbeat:
-            program.heartbeat(self._bank.get(Heartbeat))
-        else:
-            self._command(record)
-        if record is not SequenceRow:
-            self.changed.set()
+        elif beat is not None:
+            program.heartbeat(beat)
         return None
 
-    def _command(self, record: type[object]) -> None:
-        """Do what an operator has written."""
-        program = self._program
-        if record is Operator:
-            program.operate(self._bank.get(Operator))
+    def _command(self, block: Block, caller: Caller) -> None:
+        """Do what an operator has written, and note who it was."""
+        record, program = block.record, self._program
+        if record is Grant:
+            self.granted = self._bank.get(Grant).until_tick
+        elif record is ControlSession:
+            self.asked = asked = self._bank.get(ControlSession)
+            self.granted = 0
+            self._note(EventKind.SESSION, asked.realtime, caller.name, value=asked.factor)
+        elif record is Operator:
+            self._operate(self._bank.get(Operator), caller.name)
         elif record is AlarmCommand:
-            program.alarms.command(self._bank.get(AlarmCommand))
+            program.alarms.command(self._bank.get(AlarmCommand), caller.name)
         elif record is WatchdogTime:
-            program.watchdog.set(self._bank.get(WatchdogTime).time, program.tick)
-        else:
+            time = self._bank.get(WatchdogTime).time
+            self._note(EventKind.WATCHDOG_TIME, time, caller.name, cause=program.watchdog.time)
+            program.watchdog.set(time, program.tick)
+        elif record is JournalQuery:
+            self._publication.journal.answer(self._bank.get(JournalQuery))
             return
-        self._publication.safety()
+        self.changed.set()
+        if record is not Grant:
+            self._publication.safety()
+
+    def _operate(self, operator: Operator, who: str) -> None:
+        before = self._program.operator
+        if operator.mode != before.mode:
+            self._note(EventKind.OPERATOR_MODE, operator.mode, who)
+        for place, (value, last) in enumerate(zip(operator[1:], before[1:], strict=True)):
+            if abs(value - last) > TRACKED:
+                self._note(EventKind.SETPOINT, place, who, value=value)
+        self._program.operate(operator)
+
+    def _note_lease(self, event: LeaseEvent, who: str) -> None:
+        self._note(EventKind.LEASE, event, who)
+
+    def _note(self, kind: EventKind, subject: int, who: str, *, cause: int = 0, value: float = 0.0) -> None:
+        now = max(self._program.tick, self._program.alarms.now)
+        self._program.journal.note(now, kind, subject, cause, value=value, who=who)
 
     def _offer(self, header: SequenceHeader) -> None:
         rows = [self._bank.get(SequenceRow, row) for row in range(header.length)]
         answer = self._program.offer(InputSequence(header, rows))
-        self._bank.put(answer)
+        self._bank.put(sealed(answer))
         if answer.verdict != Verdict.ACCEPTED:
             self._publication.safety()
         self._publication.status()
@@ -116,7 +207,8 @@ class Clients:
                 wanted = latched.update + 1
             else:
                 wanted = latched.update if latched else 0
-            self.changed.set()
+        elif program.awaiting_plan and not self._latched(wanted):
+            program.abandon()  # it has seen this number before our restart, and will not plan it: latch another
         return None if self._latched(wanted) else self._wait_for(wanted)
 
     def _latched(self, wanted: int) -> bool:
@@ -144,6 +236,10 @@ class Clients:
             self._program.optimizer_lost()
             self._publication.safety()
             self.changed.set()
+
+    def on_close(self, caller: Caller) -> None:
+        """Note that a connection has closed."""
+        self.lease.closed(caller)
 
     def on_refusal(self, kind: str) -> None:
         """A server has refused something to somebody."""

@@ -2,12 +2,14 @@
 
 import math
 import struct
+from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple
+from copy import copy
+from typing import NamedTuple, Self
 
 from coldloop.limits import InputLimits
 from coldloop.process import TICKS_PER_SAMPLE
-from coldloop.registers.control_plc import SequenceRow
+from coldloop.registers.control_plc import SequenceRow, Verdict
 
 TOLERANCE = 1e-5
 """Share of an input's range by which a sequence may miss a limit: single precision cannot tell it apart. The guard
@@ -40,7 +42,7 @@ class Window(NamedTuple):
 
 
 class OutputGuard:
-    """Keeps every output inside its bounds and inside its rate window, whatever is asked."""
+    """Keeps every output inside its bounds, its rate window and the slew limit, whatever is asked."""
 
     def __init__(self, limits: InputLimits, applied: SequenceRow) -> None:
         self._limits = limits
@@ -48,21 +50,44 @@ class OutputGuard:
         self.applied = SequenceRow(*map(_inside, applied, limits.low, limits.high))
         self._astray = False
         self._window = Window(self.applied, 0, 1.0, -TICKS_PER_SAMPLE)
+        self._moves: deque[tuple[int, SequenceRow]] = deque(maxlen=limits.slew_ticks)
+        """Tick of each of the last changes, and what was applied before it."""
+
+    def copy(self) -> Self:
+        """Return a guard that goes on from the same state."""
+        twin = copy(self)
+        twin._moves = self._moves.copy()  # noqa: SLF001 - its own class
+        return twin
 
     def begin_at(self, tick: int, applied: SequenceRow) -> None:
         """Go on from what is applied at `tick`, wherever that is; it counts as having moved just then.
 
-        A window that is open stays open: breaks that follow one another would else give a full rate each.
+        A window that is open stays open: breaks that follow one another would else give a full rate each. A value that
+        is not finite is not taken over: the last finite one stays.
         """
+        applied = SequenceRow(
+            *[value if math.isfinite(value) else last for value, last in zip(applied, self.applied, strict=True)]
+        )
         window = self._window
         goes_on = 0 <= tick - window.start < TICKS_PER_SAMPLE and all(
             abs(value - anchor) <= rate * window.share
             for value, anchor, rate in zip(applied, window.anchor, self._limits.rate, strict=True)
         )
+        self._moves = deque(
+            [(min(moved, tick), before) for moved, before in self._moves if self._reaches(before, applied)],
+            maxlen=self._moves.maxlen,
+        )
         self.applied = applied
         self._astray = self.out_of_range([applied])
         if not goes_on:
             self._window = Window(applied, tick, self._limits.rate_share(0), tick)
+
+    def _reaches(self, before: SequenceRow, applied: SequenceRow) -> bool:
+        """Whether what is applied is within the rate of an earlier value: else it limits nothing any more."""
+        return all(
+            abs(value - earlier) <= rate
+            for value, earlier, rate in zip(applied, before, self._limits.rate, strict=True)
+        )
 
     def admit(self, tick: int, wanted: SequenceRow, *, update: bool) -> SequenceRow:
         """Return what may be applied at `tick`, and remember it as applied."""
@@ -70,40 +95,43 @@ class OutputGuard:
         window = self._window = self._window.at(tick, self.applied, limits, update=update)
         if wanted == self.applied and not self._astray:  # it was admitted before, and a new window begins with it
             return wanted
+        recent = [before for moved, before in self._moves if tick - moved < limits.slew_ticks]
         applied = SequenceRow(
             *[
                 _clamped(
                     wanted[i],
-                    window.anchor[i],
                     self.applied[i],
+                    window.anchor[i],
                     limits.rate[i] * window.share,
-                    limits.low[i],
-                    limits.high[i],
+                    [(before[i], limits.rate[i]) for before in recent],
+                    (limits.low[i], limits.high[i]),
                 )
                 for i in range(len(wanted))
             ]
         )
         if applied != self.applied:
             self._window = window._replace(moved=tick)
+            self._moves.append((tick, self.applied))
         self.applied = applied
         self._astray = self._astray and self.out_of_range([applied])
         return applied
 
-    def exceeds(self, rows: Sequence[SequenceRow], first_tick: int, before: SequenceRow) -> bool:
-        """Tell whether a sequence that begins at `first_tick`, after `before`, would break a rate."""
-        limits, window = self._limits, self._window
+    def judge(self, rows: Sequence[SequenceRow], first_tick: int, meanwhile: Sequence[SequenceRow | None]) -> Verdict:
+        """Judge a sequence as it would be played: the guard would let all of it pass, or it is refused.
+
+        Args:
+            rows: One row a tick.
+            first_tick: Tick of the first one.
+            meanwhile: What will be played in the ticks before, where something will be.
+        """
+        twin = self.copy()
+        for tick, row in enumerate(meanwhile, first_tick - len(meanwhile)):
+            twin.admit(tick, twin.applied if row is None else row, update=False)
         for tick, row in enumerate(rows, first_tick):
-            window = window.at(tick, before, limits, update=tick == first_tick)
-            if row == before:
-                continue
-            for value, anchor, last, rate, slack in zip(
-                row, window.anchor, before, limits.rate, self._slack, strict=True
-            ):
-                if max(abs(value - anchor), abs(value - last)) > rate * window.share + slack:
-                    return True
-            window = window._replace(moved=tick)
-            before = row
-        return False
+            admitted = twin.admit(tick, row, update=tick == first_tick)
+            if any(abs(value - asked) > slack for value, asked, slack in zip(admitted, row, self._slack, strict=True)):
+                return Verdict.RATE_EXCEEDED
+        return Verdict.ACCEPTED
 
     def out_of_range(self, rows: Sequence[SequenceRow]) -> bool:
         """Tell whether a row holds a value that is not finite or outside the bounds."""
@@ -114,19 +142,34 @@ class OutputGuard:
         return False
 
 
-def _clamped(wanted: float, anchor: float, applied: float, reach: float, low: float, high: float) -> float:
-    """Return the single-precision value nearest to `wanted` in low..high, within `reach` of `anchor` and of `applied`.
+def _clamped(
+    wanted: float,
+    applied: float,
+    anchor: float,
+    reach: float,
+    recent: Sequence[tuple[float, float]],
+    bounds: tuple[float, float],
+) -> float:
+    """Return the single-precision value nearest to `wanted` inside the bounds and within reach.
 
-    From an anchor outside low..high it goes towards them, as far as `reach` lets it.
+    Args:
+        wanted: Value asked for; one that is not finite asks for the anchor.
+        applied: Value applied now.
+        anchor: Value at the window's beginning.
+        reach: How far the value may be from both.
+        recent: Earlier values that count for the slew limit, and how far it may be from each.
+        bounds: Lowest and highest value. From an anchor outside it goes towards them, as far as it may.
     """
     if not math.isfinite(wanted):
         wanted = anchor
-    down, up = max(anchor, applied) - reach, min(anchor, applied) + reach
+    low, high = bounds
+    references = [(anchor, reach), (applied, reach), *recent]
+    down, up = max(value - far for value, far in references), min(value + far for value, far in references)
     lowest, highest = min(max(low, down), up), max(min(high, up), down)
     inside = low <= anchor <= high
     value = _single(min(max(wanted, lowest), highest))
     for _ in range(ROUNDING_STEPS):
-        reachable = abs(value - anchor) <= reach and abs(value - applied) <= reach
+        reachable = all(abs(value - reference) <= far for reference, far in references)
         if reachable and (low <= value <= high or not inside):
             return value
         value = _neighbour(value, anchor)  # rounding has crossed a limit

@@ -40,6 +40,10 @@ class Ladder:
         self.mode, self.cause, self.since = mode, cause, tick
         return True
 
+    def set_back(self, tick: int) -> None:
+        """Go on at a tick before the present one."""
+        self.since = min(self.since, tick)
+
     def _chosen(self, tick: int, situation: Situation) -> tuple[Mode, Cause]:
         if situation.operator is OperatorMode.MANUAL:
             return Mode.MANUAL, Cause.OPERATOR

@@ -1,12 +1,40 @@
 """The sequence player: updating instants, plans, the sequence contract, and the rows that are played.
 
 Pure. `tick` is the tick of the scan in progress; `earliest` the first tick that can still be changed: the next scan's.
+Scans can be missed and time can leap, so everything here goes by ticks, never by the number of calls.
 """
+
+from enum import IntEnum
 
 from coldloop.process import TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, SequenceRow, Update, Verdict
 from coldloop.sequence import InputSequence, checksum
 from control_plc.guard import OutputGuard
+
+
+class UpdatePhase(IntEnum):
+    """How far the update under way has got.
+
+    NONE      ->  LATCHED                                       at an updating instant (`latch`)
+    LATCHED   ->  PLANNED                                       the optimiser has decided the period
+    PLANNED   ->  ANSWERED or REFUSED                           its sequence was accepted, or not
+    REFUSED   ->  ANSWERED                                      another one was accepted in time
+    any       ->  ABANDONED                                     given up: nobody waits for its answer
+    any       ->  LATCHED                                       the next updating instant, or a load step
+    """
+
+    NONE = 0
+    LATCHED = 1
+    PLANNED = 2
+    ANSWERED = 3
+    REFUSED = 4
+    ABANDONED = 5
+
+
+EXPECTING = (UpdatePhase.LATCHED, UpdatePhase.PLANNED)
+"""A lock-step runtime waits for what is missing."""
+PROMISED = (UpdatePhase.PLANNED, UpdatePhase.REFUSED)
+"""A sequence was to be expected."""
 
 
 class SequencePlayer:
@@ -19,7 +47,8 @@ class SequencePlayer:
         self._playing: InputSequence | None = None
         self._spare: InputSequence | None = None
         self._load_step = 0.0
-        self._planned = self._abandoned = self._refused = False
+        self._missed = -1
+        self.phase = UpdatePhase.NONE
         self.update: Update | None = None
         self.next_update_tick = 0
         self.invited = True
@@ -35,13 +64,13 @@ class SequencePlayer:
     @property
     def awaiting_plan(self) -> bool:
         """The last update has no updating period yet."""
-        return self.invited and self.update is not None and not self._planned and not self._abandoned
+        return self.invited and self.phase is UpdatePhase.LATCHED
 
     def awaiting_sequence(self, tick: int) -> bool:
         """An updating instant has come and its sequence has not; one that a load step may cut off is due at once."""
         due = tick == self.next_update_tick and tick > 0
-        wanted = due or (self._planned and self._load_step > 0)
-        return self.invited and wanted and self._spare is None and not self._abandoned and not self._refused
+        wanted = due or (self.phase is UpdatePhase.PLANNED and self._load_step > 0)
+        return self.invited and wanted and self.phase in EXPECTING
 
     @property
     def has_answer(self) -> bool:
@@ -51,21 +80,30 @@ class SequencePlayer:
     @property
     def answering(self) -> bool:
         """The optimiser has planned the update under way, so its sequence is to be expected."""
-        return self._planned and not self._refused
+        return self.phase in (UpdatePhase.PLANNED, UpdatePhase.ANSWERED)
 
     # -- scan ----------------------------------------------------------------------------------------------------------
 
     def begin(self, tick: int) -> bool:
         """Tell whether a sequence begins at this tick; an updating instant without one is a miss."""
         self.broken_promise = False
-        if self._spare is not None and self._spare.header.first_tick <= tick:
-            self._playing, self._spare, self.late = self._spare, None, False
+        spare = self._spare
+        if spare is not None and spare.header.first_tick <= tick:
+            self._playing, self._spare = spare, None
+            # Scans were missed: what is played so late is the rest of a sequence, not a new one.
+            self.late = tick - spare.header.first_tick >= max(1, spare.header.tau_u)
             return True
-        if self.invited and tick >= self.next_update_tick and tick > 0:
-            self.deadline_misses += self.update is not None
-            self.late = self.update is not None
-            self.broken_promise = self._planned
+        if self.invited and tick >= self.next_update_tick and tick > 0 and self.phase is not UpdatePhase.ANSWERED:
+            self._miss()
         return False
+
+    def _miss(self) -> None:
+        """Count an updating instant without a sequence, once however often its scan is begun."""
+        self.late = self.update is not None or self._playing is not None
+        self.broken_promise = self.phase in PROMISED
+        if self.update is not None and self._missed != self.next_update_tick:
+            self.deadline_misses += 1
+        self._missed = self.next_update_tick
 
     def row(self, tick: int) -> SequenceRow | None:
         """Return the row that is to be played at this tick, if there is one."""
@@ -88,12 +126,12 @@ class SequencePlayer:
         self.update = update._replace(update=self._updates, playing=self.playing)
         self._updates += 1
         self.next_update_tick = update.tick + TICKS_PER_SAMPLE  # until the optimiser has planned another
-        self._planned = self._abandoned = self._refused = False
+        self.phase = UpdatePhase.LATCHED
         return self.update
 
     def _interrupted_by(self, load: float) -> bool:
         """Tell whether the load has left the one that the update under way was latched with."""
-        if self.update is None or not self._planned or not self._load_step:
+        if self.update is None or self.phase not in (*PROMISED, UpdatePhase.ANSWERED) or not self._load_step:
             return False
         return abs(load - self.update.load) > self._load_step
 
@@ -102,7 +140,7 @@ class SequencePlayer:
         if self._playing is None:
             return 0
         header = self._playing.header
-        return max(0, header.first_tick + header.length - tick)
+        return min(header.length, max(0, header.first_tick + header.length - tick))
 
     @property
     def playing(self) -> int:
@@ -110,61 +148,85 @@ class SequencePlayer:
         return self._playing.header.number if self._playing else 0
 
     @property
+    def sequence(self) -> InputSequence | None:
+        """The sequence being played."""
+        return self._playing
+
+    @property
     def updates(self) -> int:
         """Number of the next update."""
         return self._updates
 
-    # -- who else drives -----------------------------------------------------------------------------------------------
+    # -- who else drives, and time that leaps --------------------------------------------------------------------------
 
     def dismiss(self) -> None:
         """Let nothing be played, and nothing be offered, until `invite`."""
-        self.invited = self.late = self._planned = False
+        self.invited = self.late = False
+        self.phase = UpdatePhase.NONE
         self._playing = self._spare = self.update = None
 
     def invite(self, tick: int) -> None:
         """Latch an update at the next scan, so that the optimiser may begin again."""
         self.invited = True
-        self._abandoned = True
+        self.phase = UpdatePhase.ABANDONED
         self.next_update_tick = tick
 
     def drop(self) -> None:
         """Forget the sequence that has been played to its end: somebody else moves the inputs now."""
         self._playing = None
 
+    def resume(self, sequence: InputSequence | None, tick: int) -> None:
+        """Go on after a restart with the rest of what was played, and latch an update at the next scan."""
+        self._playing = sequence
+        self.late = sequence is not None
+        self.invite(tick)
+
+    def set_back(self, tick: int) -> None:
+        """Begin again at a tick long before the present one: what was sent was for a time that is to come again."""
+        self._playing = self._spare = self.update = None
+        self.late = False
+        if self.invited:
+            self.invite(tick)
+
     # -- the optimiser's side ------------------------------------------------------------------------------------------
 
     def accept_plan(self, plan: Plan, earliest: int) -> bool:
         """Take the updating period of the last update; tell whether it was acceptable."""
-        if not self.invited or self.update is None or self._planned or plan.update != self.update.update:
+        update = self.update
+        if not self.invited or update is None or self.phase is not UpdatePhase.LATCHED or plan.update != update.update:
             return False
-        if not earliest <= plan.next_update_tick <= self.update.tick + SEQUENCE_ROWS:
+        if not earliest <= plan.next_update_tick <= update.tick + SEQUENCE_ROWS:
             return False
         self.next_update_tick = plan.next_update_tick
         self._load_step = plan.load_step
-        self._planned = True
+        self.phase = UpdatePhase.PLANNED
         return True
 
     def abandon(self, earliest: int) -> None:
         """Give up the update under way: an optimiser that has lost the thread asks for a new one."""
         if self.update is not None and self._spare is None:
-            self._abandoned = True
+            self.phase = UpdatePhase.ABANDONED
             self.next_update_tick = earliest
 
-    def offer(self, sequence: InputSequence, earliest: int) -> Acknowledgement:
+    def offer(self, sequence: InputSequence, earliest: int, *, plant_lost: bool = False) -> Acknowledgement:
         """Check a committed sequence; accept it for its first tick, or reject it with a reason."""
-        verdict = self._judge(sequence, earliest) if self.invited else Verdict.NOT_INVITED
+        verdict = Verdict.PLANT_LOST if plant_lost else self._judge(sequence, earliest)
         if verdict is Verdict.ACCEPTED:
             self._spare = sequence
+            self.phase = UpdatePhase.ANSWERED
             self.accepted += 1
         else:
             self.rejected += 1
             answers = self.update is not None and sequence.header.update == self.update.update
-            self._refused = self._refused or (answers and self._spare is None)
+            if answers and self.phase is UpdatePhase.PLANNED:
+                self.phase = UpdatePhase.REFUSED
         self.acknowledgement = Acknowledgement(sequence.header.number, verdict)
         return self.acknowledgement
 
     def _judge(self, sequence: InputSequence, earliest: int) -> Verdict:  # noqa: PLR0911 a return for each clause
         header, rows = sequence
+        if not self.invited:
+            return Verdict.NOT_INVITED
         if not 1 <= header.length == len(rows):
             return Verdict.WRONG_LENGTH
         if checksum(header, rows) != header.crc:
@@ -175,19 +237,12 @@ class SequencePlayer:
             return Verdict.REPEATED
         if header.first_tick < earliest:
             return Verdict.LATE
-        if self.update is None or not self._planned or header.update != self.update.update:
+        expected = self.phase in (*PROMISED, UpdatePhase.ANSWERED)
+        if self.update is None or not expected or header.update != self.update.update:
             return Verdict.WRONG_UPDATE
         if header.first_tick != self.next_update_tick or header.first_tick - self.update.tick != header.tau_u:
             return Verdict.WRONG_TICK
         if self._guard.out_of_range(rows):
             return Verdict.OUT_OF_RANGE
-        if self._guard.exceeds(rows, header.first_tick, self._applied_before(header.first_tick, earliest)):
-            return Verdict.RATE_EXCEEDED
-        return Verdict.ACCEPTED
-
-    def _applied_before(self, tick: int, earliest: int) -> SequenceRow:
-        """Return what will have been applied just before a tick to come, if nothing else arrives."""
-        playing = self._playing
-        if playing is None or not self.remaining(earliest):
-            return self._guard.applied
-        return playing.rows[min(tick - 1 - playing.header.first_tick, len(playing.rows) - 1)]
+        meanwhile = [self.row(tick) for tick in range(earliest, header.first_tick)]
+        return self._guard.judge(rows, header.first_tick, meanwhile)

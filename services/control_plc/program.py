@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from coldloop.errors import ConfigurationError
+from coldloop.journal import Journal
 from coldloop.limits import InputLimits
-from coldloop.process import L1, T5, TICK_S
-from coldloop.registers import safety
+from coldloop.process import L1, T5, TICK_S, TICKS_PER_SAMPLE
+from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
     Acknowledgement,
     Cause,
@@ -31,7 +32,7 @@ from coldloop.registers.plant import Actuators, Measurement
 from coldloop.registers.safety import AlarmKind
 from coldloop.sequence import InputSequence
 from coldloop.watchdog import Watchdog
-from control_plc.alarms import AlarmPanel, Journal
+from control_plc.alarms import AlarmPanel
 from control_plc.classical import ClassicalLoops
 from control_plc.guard import OutputGuard
 from control_plc.ladder import Ladder, Situation
@@ -41,6 +42,10 @@ from control_plc.settings import ControlSection, ControlStrategy
 
 HANDSHAKE_PAUSE_S = 30.0
 """After a handshake that came to nothing the classical loops are not held again for so long."""
+SET_BACK_TICKS = TICKS_PER_SAMPLE
+"""Time that goes back by more than this begins anew: what was sent was for a time that is to come again."""
+LOST_TICKS = 4
+"""A rack that has been out of step for longer takes no new sequences: they would be played late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +60,9 @@ class OperatingPoint:
 class ControlProgram:
     """One session of the control PLC. `tick` is the tick of the next scan, or of the one in progress."""
 
-    def __init__(self, *, limits: InputLimits, point: OperatingPoint, section: ControlSection) -> None:
+    def __init__(
+        self, *, limits: InputLimits, point: OperatingPoint, section: ControlSection, journal: Journal | None = None
+    ) -> None:
         self._limits = limits
         self._point = point
         self._section = section
@@ -67,8 +74,8 @@ class ControlProgram:
             )
         self._loops = ClassicalLoops(section.classical, limits, point.outputs)
         self.watchdog = Watchdog(section.ladder.optimizer_ticks)
-        self.journal = Journal()
-        self.alarms = AlarmPanel(self.journal)
+        self.journal = journal or Journal()
+        self.alarms = AlarmPanel(self.journal, section.alarms)
         self.restart(session=0)
 
     def restart(self, session: int) -> None:
@@ -79,11 +86,29 @@ class ControlProgram:
         mode = Mode.CLASSICAL if classical else Mode.HOLD
         self._ladder = Ladder(self._section.ladder.hold_ticks, mode, Cause.SESSION_STARTED)
 
-    def resume(self, session: int, tick: int, applied: Sequence[float], *, updates: int, operator: Operator) -> None:
-        """Go on with a session after a restart: `applied` is what the rack applies at this tick."""
+    def resume(
+        self,
+        session: int,
+        tick: int,
+        applied: Sequence[float],
+        *,
+        updates: int,
+        operator: Operator,
+        playing: InputSequence | None = None,
+    ) -> None:
+        """Go on with a session after a restart.
+
+        Args:
+            session: Its number.
+            tick: Where the rack is.
+            applied: What it applies.
+            updates: Number of the next update.
+            operator: What operators have said.
+            playing: What was being played: its rest is played on.
+        """
         self.operator = operator
         self._begin(session, tick, SequenceRow(*applied), updates=updates)
-        self._player.invite(tick)
+        self._player.resume(playing, tick)
         self._ladder = Ladder(self._section.ladder.hold_ticks, Mode.HOLD, Cause.RESTARTED, tick)
 
     def _begin(self, session: int, tick: int, applied: SequenceRow, *, updates: int) -> None:
@@ -97,7 +122,6 @@ class ControlProgram:
         self._before = self._guard.applied
         self._player = SequencePlayer(self._guard, self._point.model_digest, updates=updates)
         self._sensors = SensorMonitor(self._section.sensors, self._point.outputs)
-        self._outside = {AlarmKind.LEVEL_BAND: 0, AlarmKind.T5_BAND: 0}
         self._failed_handshake = -math.inf
         self._in_scan = False
         self.watchdog.set(self.watchdog.time, tick)
@@ -188,7 +212,7 @@ class ControlProgram:
                 self._loops.restart()
         elif before is Mode.CLASSICAL:
             self._failed_handshake = -math.inf
-        self.journal.note(tick, safety.EventKind.MODE, self._ladder.mode, self._ladder.cause)
+        self.journal.note(tick, EventKind.MODE, self._ladder.mode, self._ladder.cause)
 
     def _wanted(self, tick: int, row: SequenceRow | None) -> SequenceRow:
         """Return what is asked for by whom the ladder has chosen."""
@@ -209,7 +233,7 @@ class ControlProgram:
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
         applied = tuple(self._guard.applied)
-        y = tuple(self._sensors.check(measurement.y))
+        y = tuple(self._sensors.check(self.tick, measurement.y))
         self.process = Process(self.tick, measurement.load, applied, y)
         finite = math.isfinite(measurement.load) and all(map(math.isfinite, measurement.x))
         self._let_play(usable=finite and not self._sensors.unusable)
@@ -234,19 +258,45 @@ class ControlProgram:
         elif not invited and self._player.invited:
             self._player.dismiss()
 
+    def interrupt(self) -> None:
+        """Give up the scan under way: what the rack has done with its outputs is not known."""
+        self._in_scan = False
+
     def rejoin(self, tick: int, applied: Sequence[float]) -> None:
-        """Go on at another tick: the plant was away, or time has leapt; `applied` is what the rack applies."""
-        self.tick = tick
+        """Go on at another tick: the rack was away, or time has leapt.
+
+        Forward, all timers count the time that has passed. Back by a little, they begin at the present tick at the
+        latest; back by more than `SET_BACK_TICKS`, sequences are dropped too, and the optimiser is invited anew.
+
+        Args:
+            tick: Tick of the next scan.
+            applied: What the rack applies, read back from it.
+        """
+        if tick < self.tick:
+            self._set_back(tick)
+        self.tick = self.alarms.now = tick
         self._in_scan = False
         self._guard.begin_at(self.tick, SequenceRow(*applied))
+
+    def _set_back(self, tick: int) -> None:
+        if self.tick - tick > SET_BACK_TICKS:
+            self._player.set_back(tick)
+        self._sensors.set_back(tick)
+        self._ladder.set_back(tick)
+        self.watchdog.set_back(tick)
+        self._failed_handshake = min(self._failed_handshake, tick)
+        self.alarms.begin_at(tick)
 
     # -- alarms --------------------------------------------------------------------------------------------------------
 
     def _watch(self, y: Sequence[float]) -> None:
         """Raise and return the alarms that depend on the process and on the ladder."""
         holds, bands = self.alarms.holds, self._section.alarms
-        self._watch_band(AlarmKind.LEVEL_BAND, y[L1], bands.level_band)
-        self._watch_band(AlarmKind.T5_BAND, y[T5], bands.t5_band)
+        for kind, value, (low, high) in (
+            (AlarmKind.LEVEL_BAND, y[L1], bands.level_band),
+            (AlarmKind.T5_BAND, y[T5], bands.t5_band),
+        ):
+            holds(kind, condition=not low <= value <= high)
         mode, cause = self._ladder.mode, self._ladder.cause
         fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR)
         holds(AlarmKind.MODE, condition=fallen, cause=cause)
@@ -265,16 +315,12 @@ class ControlProgram:
             self.alarms.returned(AlarmKind.SENSOR_BAD)
         self._bad_before = bad
 
-    def _watch_band(self, kind: AlarmKind, value: float, band: tuple[float, float]) -> None:
-        self._outside[kind] = 0 if band[0] <= value <= band[1] else self._outside[kind] + 1
-        self.alarms.holds(kind, condition=self._outside[kind] > self._section.alarms.band_ticks)
-
     # -- the optimiser's side ------------------------------------------------------------------------------------------
 
     def optimizer_seen(self) -> None:
         """Note a sign of life of the optimiser."""
         self.optimizer_present = True
-        self.watchdog.trigger(self.tick)
+        self.watchdog.trigger(max(self.tick, self.alarms.now))
 
     def optimizer_lost(self) -> None:
         """Go on without the optimiser until it shows a sign of life; the alarm is raised by the next scan's end."""
@@ -298,7 +344,8 @@ class ControlProgram:
     def offer(self, sequence: InputSequence) -> Acknowledgement:
         """Check a committed sequence; accept it for its first tick, or reject it with a reason."""
         self.optimizer_seen()
-        answer = self._player.offer(sequence, self._earliest)
+        lost = self.alarms.now - self.tick > LOST_TICKS
+        answer = self._player.offer(sequence, self._earliest, plant_lost=lost)
         accepted = answer.verdict == Verdict.ACCEPTED
         self.alarms.holds(AlarmKind.SEQUENCE_REJECTED, condition=not accepted, cause=answer.verdict)
         if accepted or answer.verdict == Verdict.WRONG_MODEL:

@@ -1,15 +1,21 @@
 """What the control PLC shows: registers, log and telemetry, made from the program's state."""
 
 import logging
+import math
 from collections.abc import Mapping
 
 from coldloop.clock import LatenessRecord
+from coldloop.event_text import log_event
+from coldloop.journal import JournalPublication
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
-from coldloop.registers.control_plc import CONTROL_MAP, Cause, LadderStatus, Mode, Process, Status
-from coldloop.registers.safety import EVENT_ROWS, AlarmKind, AlarmState, Event, EventKind
+from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, PlantLinkStatus, Process, Status
+from coldloop.registers.safety import AlarmKind, AlarmState
+from coldloop.writer_lease import WriterLease
+from control_plc.plant_link import PlantLink
 from control_plc.program import ControlProgram
+from control_plc.rack_clock import Skew
 
 log = logging.getLogger("coldloop.control_plc")
 
@@ -17,18 +23,31 @@ log = logging.getLogger("coldloop.control_plc")
 class Publication:
     """Puts the program's state into the registers."""
 
-    def __init__(self, program: ControlProgram, bank: RegisterBank, model_digest: int) -> None:
+    def __init__(self, program: ControlProgram, link: PlantLink, bank: RegisterBank, model_digest: int) -> None:
         self._program = program
+        self._link = link
         self._bank = bank
         self._model_digest = model_digest
-        self._told_events = 0
+        self.journal = JournalPublication(program.journal, bank)
         self._told_alarms = -1
         self.running = False
         """A session is under way."""
         self.overruns = 0
         """Scans that began too late."""
-        self.lateness: LatenessRecord | None = None
-        """That of all scans; None in lock-step."""
+        self.lateness = LatenessRecord()
+        """That of all scans of this session in real time."""
+        self.skew = Skew(0.0, math.inf)
+        """How much faster the rack's clock is than ours, and its phase error."""
+        self.offset_ms = 0.0
+        self.lease: WriterLease | None = None
+        """That of the optimiser."""
+
+    def begin(self) -> None:
+        """Count anew: a session begins."""
+        self.running = True
+        self.overruns = 0
+        self.lateness = LatenessRecord()
+        self.skew, self.offset_ms = Skew(0.0, math.inf), 0.0
 
     def identity(self) -> None:
         """Show who we are, and the tick."""
@@ -60,24 +79,21 @@ class Publication:
                 rejected=player.rejected,
                 deadline_misses=player.deadline_misses,
                 overruns=self.overruns,
-                lateness_max=lateness.maximum_s * 1000 if lateness else 0.0,
-                lateness_p99=lateness.percentile_s(0.99) * 1000 if lateness else 0.0,
+                lateness_max=lateness.maximum_s * 1000,
+                lateness_p99=lateness.percentile_s(0.99) * 1000,
             )
         )
 
     @property
     def is_behind(self) -> bool:
         """There are events that have not been shown."""
-        return self._program.journal.count != self._told_events
+        return self.journal.is_behind
 
     def safety(self) -> None:
         """Show ladder, watchdog, alarms and events, as far as they have changed, and log the events."""
         program = self._program
-        events = program.journal.since(self._told_events)
-        for event in events:
-            self._bank.put(event, event.number % EVENT_ROWS)
-            self._log(event)
-        self._told_events = program.journal.count
+        for event in self.journal.show():
+            log_event(log, event)
         if program.alarms.changes != self._told_alarms:
             self._told_alarms = program.alarms.changes
             for row, alarm in enumerate(program.alarms.rows):
@@ -93,22 +109,26 @@ class Publication:
             )
         )
         self._bank.put(program.watchdog.registers(program.tick))
+        self._bank.put(self._plant_link())
+        if self.lease is not None:
+            self.lease.note_end()
+            self._bank.put(self.lease.registers())
 
-    @staticmethod
-    def _log(event: Event) -> None:
-        kind = EventKind(event.kind)
-        if kind is EventKind.MODE:
-            log.warning(
-                "mode changed",
-                extra={
-                    "mode": Mode(event.subject).name.lower(), "tick": event.tick,
-                    "cause": Cause(event.cause).name.lower(),
-                },
-            )  # fmt: skip
-            return
-        what = kind.name.lower().replace("_", " ")
-        extra = {"alarm": AlarmKind(event.subject).name.lower(), "tick": event.tick, "cause": event.cause}
-        log.log(logging.WARNING if kind is EventKind.ALARM_RAISED else logging.INFO, what, extra=extra)
+    def _plant_link(self) -> PlantLinkStatus:
+        link = self._link
+        return PlantLinkStatus(
+            state=link.state,
+            cause=link.cause,
+            since=link.since,
+            breaks=link.breaks & 0xFFFFFFFF,
+            holder=link.holder,
+            generation=link.generation,
+            plant_session=link.session,
+            plant_tick=link.tick,
+            offset=self.offset_ms,
+            skew=self.skew.ppm,
+            skew_error=self.skew.error_ppm,
+        )
 
     def snapshot(self) -> Mapping[str, object]:
         """Return what telemetry publishes."""

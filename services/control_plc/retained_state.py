@@ -1,48 +1,55 @@
 """What the control PLC keeps over a restart."""
 
+import base64
 import logging
+import secrets
+import struct
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from coldloop.registers.control_plc import Operator
+from coldloop.registers.control_plc import SEQUENCE_ROWS, Operator, SequenceHeader, SequenceRow
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.retained import RetainedFile, RetainedStateError
+from coldloop.retained_writer import RetainedStateWriter
+from coldloop.sequence import InputSequence, checksum
 from coldloop.session import Pace
 from control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")
 
-OWNER = "control_plc/1"
+OWNER: Final = "control_plc/2"
 """Who retained states belong to, and the version of what they hold."""
+ROW: Final = struct.Struct(">3f")
 
 Count = Annotated[int, Field(ge=0, lt=2**32)]
 
 
 class RetainedState(BaseModel):
-    """The session, how far it has got, what operators have said, and the alarms."""
+    """The session, how far it has got, what is being played, what operators have said, the alarms, and who we are."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    boot: Annotated[int, Field(ge=1, lt=2**16)]
+    """Number of the start that wrote it."""
+    holder: Annotated[int, Field(ge=1, lt=2**32)]
+    """Number by which the rack knows this control PLC."""
+    events: Count
+    """Number of the last event."""
     session: Count
     tick: Count
     pace: Pace
     updates: Count
     """Number of the next update."""
+    playing: tuple[SequenceHeader, Annotated[str, Field(max_length=2 * SEQUENCE_ROWS * ROW.size)]] | None
+    """Header and rows (base64 of single precision, high byte first) of the sequence being played."""
     operator: Operator
     alarms: Annotated[list[Alarm], Field(min_length=len(AlarmKind), max_length=len(AlarmKind))]
 
     @classmethod
-    def of(cls, program: ControlProgram, pace: Pace) -> Self:
-        """Return the state of a program."""
-        return cls.model_construct(
-            session=program.session, tick=program.tick, pace=pace, updates=program.player.updates,
-            operator=program.operator, alarms=program.alarms.rows,
-        )  # fmt: skip
-
-    @classmethod
-    def parsed(cls, content: dict[str, object]) -> Self:
+    def parsed(cls, content: Mapping[str, object]) -> Self:
         """Return the state that a file holds.
 
         Raises:
@@ -53,29 +60,75 @@ class RetainedState(BaseModel):
         except ValidationError as error:
             raise RetainedStateError(f"the retained state is not used: {error.errors()[0]['msg']}") from None
 
+    @property
+    def sequence(self) -> InputSequence | None:
+        """The sequence being played, where it is whole."""
+        if self.playing is None:
+            return None
+        header, text = self.playing
+        try:
+            rows = [SequenceRow(*values) for values in ROW.iter_unpack(base64.b64decode(text))]
+        except (ValueError, struct.error):
+            return None
+        return InputSequence(header, rows) if checksum(header, rows) == header.crc else None
+
 
 class Memory:
-    """Keeps the state in a file, if one is configured; what cannot be trusted or written is told once."""
+    """Keeps the state in a file, if one is configured; what cannot be trusted or written is logged once.
+
+    Writing is done by a thread: a scan never waits for a disk.
+    """
 
     def __init__(self, file: Path | None, model_digest: int) -> None:
         self._file = RetainedFile(file, OWNER, model_digest) if file else None
+        self._writer = RetainedStateWriter(self._file) if self._file else None
+        self._packed: tuple[InputSequence, tuple[SequenceHeader, str]] | None = None
+        self.boot = 1
+        self.holder = secrets.randbelow(2**32 - 1) + 1
 
     def recall(self) -> RetainedState | None:
-        """Return the state of before, if there is one."""
+        """Return the state of before, if there is one; boot and holder go on from it."""
         if self._file is None:
             return None
         try:
             content = self._file.load()
-            return None if content is None else RetainedState.parsed(content)
+            state = None if content is None else RetainedState.parsed(content)
         except RetainedStateError as error:
             log.warning("retained state refused", extra={"reason": str(error)})
             return None
+        if state is not None:
+            self.boot, self.holder = state.boot % 0xFFFF + 1, state.holder
+        return state
+
+    @property
+    def failure(self) -> str | None:
+        """Why the state cannot be written at present."""
+        return self._writer.failed if self._writer else None
 
     def keep(self, program: ControlProgram, pace: Pace) -> None:
         """Keep the state of now."""
-        if self._file is None:
+        if self._writer is None:
             return
-        try:
-            self._file.save(RetainedState.of(program, pace).model_dump())
-        except RetainedStateError as error:
-            log.error("the state is not retained", extra={"reason": str(error)})  # noqa: TRY400 one line
+        self._writer.keep(self.content(program, pace))
+
+    def content(self, program: ControlProgram, pace: Pace) -> dict[str, Any]:
+        """Return the state of a program, as a file holds it; nothing in it changes later."""
+        return {
+            "boot": self.boot, "holder": self.holder, "events": program.journal.count, "session": program.session,
+            "tick": program.tick, "pace": pace, "updates": program.player.updates,
+            "playing": self._playing(program.player.sequence), "operator": program.operator,
+            "alarms": tuple(program.alarms.rows),
+        }  # fmt: skip
+
+    def _playing(self, sequence: InputSequence | None) -> tuple[SequenceHeader, str] | None:
+        if sequence is None:
+            return None
+        if self._packed is None or self._packed[0] is not sequence:
+            rows = b"".join(ROW.pack(*row) for row in sequence.rows)
+            self._packed = sequence, (sequence.header, base64.b64encode(rows).decode())
+        return self._packed[1]
+
+    def close(self) -> None:
+        """Let the last state be written."""
+        if self._writer is not None:
+            self._writer.close()

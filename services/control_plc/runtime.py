@@ -1,48 +1,54 @@
 """The control PLC on the bus: client of the plant's rack, server of the optimiser and of operators.
 
-A scan makes one exchange (FC23) with the rack. In lock-step the next scan waits for what it needs: the operator's
-grant, the optimiser's plan, and at an updating instant its sequence, as long as an optimiser is there. In real time it
-waits for the clock only. A plant that is lost is looked for; a session goes on where the rack has it.
+A scan makes one exchange (FC23) with the rack, and only while the link to it is in step (`plant_link.py`); out of step
+the rack is read until it is. In lock-step the next scan waits for what it needs: the operator's grant, the optimiser's
+plan, and at an updating instant its sequence, as long as an optimiser is there. In real time it waits for the clock
+only, which follows that of the rack (`rack_clock.py`).
 """
 
 import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Final
 
 from coldloop import __version__
-from coldloop.clock import Pacer, Schedule
-from coldloop.errors import LinkError
+from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.limits import InputLimits
+from coldloop.logs import dropped
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import ModelHeader, read_header
 from coldloop.process import TICK_S
+from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import (
-    CONTROL_MAP,
-    ControlSession,
-    Operator,
-)
-from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
+from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, PlantLinkState
+from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.registers.safety import AlarmKind
-from coldloop.seal import is_intact, sealed
 from coldloop.session import Pace, TimeMode
 from coldloop.telemetry import Telemetry
 from control_plc.clients import Clients
+from control_plc.plant_link import PlantLink
 from control_plc.program import ControlProgram, OperatingPoint
 from control_plc.publication import Publication
-from control_plc.retained_state import Memory
+from control_plc.rack_clock import PHASE, RackClock
+from control_plc.retained_state import Memory, RetainedState
+from control_plc.scan_cycle import ScanCycle
 from control_plc.settings import ControlSection, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
 
-TICKS_PER_SECOND = round(1 / TICK_S)
-SEARCH_S = 0.5
-"""How long one attempt to reach a lost plant may take."""
+TICKS_PER_SECOND: Final = round(1 / TICK_S)
+SEARCH_S: Final = 0.5
+"""How long one attempt to reach a lost rack may take."""
+LOOK_PAUSE_S: Final = 0.1
+"""Between two looks at a rack that is not in step; the first one after a break is made at once."""
+ANSWER_TICKS: Final = 8
+"""In real time an answer that takes longer is of no use: the rack is looked at anew."""
+SHORTEST_PATIENCE_S: Final = 0.1
+EXPIRES_SOON: Final = 1
+"""Causes of the alarm CERTIFICATE."""
+EXPIRED: Final = 2
 
 
 def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:
@@ -51,269 +57,288 @@ def make_program(header: ModelHeader, section: ControlSection, limits: InputLimi
     return ControlProgram(limits=limits, point=point, section=section)
 
 
-class _PlantPosition(NamedTuple):
-    """Where the plant is."""
-
-    session: int
-    tick: int
-    applied: Sequence[float]
-    """What it applies; in a session that is not ours, what we applied last."""
-
-
 class ControlPlc:
-    """Connects the program to the registers and to the plant."""
+    """Connects the program to the registers and to the rack."""
 
     def __init__(self, settings: ControlSettings) -> None:
         header = read_header(settings.model.file)
         section = settings.control_plc
         self._settings = settings
-        self._program = make_program(header, section, settings.limits)
-        self._plant = RegisterClient.at(PLANT_MAP, section.plant)
-        self.bank = RegisterBank(CONTROL_MAP, section.word_order)
-        self.publication = Publication(self._program, self.bank, header.short_digest)
-        self.clients = Clients(self._program, self.bank, self.publication)
         self._memory = Memory(section.retain.file, header.short_digest)
+        self._kept: RetainedState | None = self._memory.recall()
+        self._program = program = make_program(header, section, settings.limits)
+        program.journal.continue_from(self._memory.boot, self._kept.events if self._kept else 0)
+        program.journal.note(0, EventKind.BOOT, int(self._kept is not None))
+        self._link = PlantLink(program.alarms, program.journal, self._memory.holder)
+        self._cycle = ScanCycle(program, self._link, self._adopt)
+        self._plant = RegisterClient.at(PLANT_MAP, section.plant)
         self._pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
-        self._pacer = self._new_pacer()
-        self._failures = 0
+        self._clock = RackClock(self._pace.factor, time.monotonic())
+        self.bank = RegisterBank(CONTROL_MAP, section.word_order)
+        self.publication = Publication(program, self._link, self.bank, header.short_digest)
+        self.clients = Clients(program, settings.limits, self.bank, self.publication, lambda: self._pace)
+        self._reached = False
+        self._looks = 0
+        self._lost_lines = 0
         self._awaiting_since: float | None = None
         self._publish()
 
     def close(self) -> None:
-        """Let go of the plant."""
+        """Let go of the rack, and keep what is to be kept."""
         self._plant.close()
+        self._memory.close()
 
     # -- scan cycle ----------------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Scan until cancelled.
-
-        Raises:
-            PeerUnreachableError: The plant has never been there.
-        """
-        await self._plant.connect(self._settings.control_plc.plant.patience_s)
-        await self._begin_at_last()
-        while True:
-            await self._until_due()
-            await self._scan()
-
-    async def _until_due(self) -> None:
-        """Wait until the next scan may begin."""
-        self._awaiting_since = None
+        """Scan until cancelled; a rack that is not there is waited for."""
         while True:
             if self.clients.asked is not None:
                 self._start(self.clients.asked)
-            if self.publication.running and self._pace.realtime:
-                await self._until_clock()
-                if self.clients.asked is None:
-                    return
-            elif self._may_go_on():
-                return
-            else:
-                await self._until_changed()
+            elif not self._has_session:
+                await self._stand_by()
+            elif not self._link.in_step:
+                await self._look()
+            elif await (self._until_clock() if self._pace.realtime else self._until_granted()):
+                await self._scan()
 
-    async def _until_clock(self) -> None:
-        """Wait for the tick; when a whole one or more has been slept through, go on at the present one."""
-        program = self._program
-        if program.tick == 0:
-            self._pacer = self._new_pacer()
-        lateness = await self._pacer.until(program.tick)
+    @property
+    def _has_session(self) -> bool:
+        """There is a session, or the rack may have one that is to be gone on with."""
+        return self.publication.running or self._settings.session.autostart or self._kept is not None
+
+    async def _stand_by(self) -> None:
+        """Wait for a session; until the rack has answered once, look for it."""
+        if self._reached:
+            self.clients.changed.clear()
+            await self.clients.changed.wait()
+            return
+        try:
+            await self._plant.connect(SEARCH_S)
+        except LinkError as error:
+            self._cycle.failed(error)
+            self._say_lost(error)
+            await self._pause()
+        else:
+            self._reached = True
+            self._link.end()
+        self._publish()
+
+    async def _until_clock(self) -> bool:
+        """Wait for the scan's time; tell whether it may begin: after a whole tick slept through, the rack is looked at.
+
+        It always yields, however late it is.
+        """
+        program, due = self._program, self._clock.due(self._program.tick)
+        await asyncio.sleep(max(0.0, due - time.monotonic()))
+        lateness = max(0.0, time.monotonic() - due)
+        self.publication.lateness.add(lateness)
         if lateness * 1000 > self._settings.control_plc.scan_tolerance_ms:
             self.publication.overruns += 1
             program.alarms.happened(AlarmKind.SCAN_OVERRUN)
-        if lateness * self._pace.factor > TICK_S:
-            applied: Sequence[float] = program.applied
-            with contextlib.suppress(LinkError):  # the next exchange will tell
-                applied = (await self._look_at_plant()).applied
-            program.rejoin(self._clock_tick(), applied)
+        if lateness > self._clock.tick_s:
+            self._link.overslept()
+        return self._link.in_step and self.clients.asked is None
 
-    def _clock_tick(self) -> int:
-        """Return the tick that the clock shows; in lock-step, the program's."""
-        if not self._pace.realtime:
-            return self._program.tick
-        elapsed = (time.monotonic() - self._pacer.schedule.start) * self._pace.factor
-        return max(self._program.tick, int(elapsed / TICK_S))
-
-    async def _until_changed(self) -> None:
-        """Wait until somebody writes something; an optimiser that is waited for too long is lost."""
-        self.clients.changed.clear()
+    async def _until_granted(self) -> bool:
+        """Wait until the next scan in lock-step has what it needs; tell whether it may begin."""
         program = self._program
-        granted = self.publication.running and program.tick < self.clients.granted
+        granted = program.tick < self.clients.granted
         awaited = granted and (program.awaiting_plan or program.awaiting_sequence)
-        if not awaited:
+        if granted and not awaited:
+            self._awaiting_since = None
+            return True
+        self.clients.changed.clear()
+        if awaited:
+            await self._until_answered()
+        else:
             self._awaiting_since = None
             await self.clients.changed.wait()
-            return
+        return False
+
+    async def _until_answered(self) -> None:
+        """Wait until somebody writes something; an optimiser that is waited for too long is lost."""
         now = time.monotonic()
         since = self._awaiting_since = self._awaiting_since or now
         try:
             async with asyncio.timeout(since + self._settings.control_plc.ladder.optimizer_patience_s - now):
                 await self.clients.changed.wait()
         except TimeoutError:
-            program.optimizer_lost()
+            self._program.optimizer_lost()
             self._awaiting_since = None
-
-    def _may_go_on(self) -> bool:
-        program = self._program
-        return (
-            self.publication.running
-            and program.tick < self.clients.granted
-            and not program.awaiting_plan
-            and not program.awaiting_sequence
-        )
 
     async def _scan(self) -> None:
         program = self._program
         if self.clients.optimizer_waits:
             program.optimizer_seen()
-        try:
-            measurement = await self._plant.exchange(sealed(program.begin_scan()), Measurement)
-        except LinkError as error:
-            await self._find_plant(str(error))
+        outputs = self._cycle.begin()
+        if outputs is None:
             return
-        elsewhere = measurement.session != program.session
-        if not is_intact(measurement):
-            await self._find_plant("a measurement arrived damaged")
-        elif elsewhere and not self._settings.session.autostart:
-            self._leave(measurement.session, measurement.tick)
-        elif not measurement.crc:
-            await self._find_plant("it has not taken the outputs")
-        elif elsewhere or (measurement.tick != program.tick and not self._pace.realtime):
-            await self._find_plant(f"it is at tick {measurement.tick} of session {measurement.session}")
-        else:
-            self._take(measurement)
+        asked_at = time.monotonic()
+        try:
+            if not self._plant.connected:  # a new connection is a break: the rack is read before it is written to
+                raise PeerUnreachableError(f"{self._plant.peer} has closed the connection")
+            answer = await self._plant.exchange(outputs, Measurement, patience_s=self._patience_s)
+        except LinkError as error:
+            self._cycle.failed(error)
+            self._say_lost(error)
+            return
+        answered_at = time.monotonic()
+        at = (asked_at + answered_at) / 2
+        update = self._cycle.answered(answer, self._in_ticks(at))
+        if not self._link.in_step:
+            self._publish()
+            return
+        if self._pace.realtime and answer.tick:
+            self._clock.observe(answer.tick + answer.age, at, (answered_at - asked_at) / 2)
+        if update is not None:
+            self.clients.tell(update)
+        self._after_scan(latched=update is not None)
 
-    def _take(self, measurement: Measurement) -> None:
-        """End the scan with its measurement, and tell what is new."""
-        program = self._program
-        self._failures = 0
-        program.alarms.returned(AlarmKind.PLANT_LOST)
-        update = program.end_scan(measurement)
+    def _after_scan(self, *, latched: bool) -> None:
+        """Show what is new, and keep what is to be kept."""
+        program, publication = self._program, self.publication
+        on_the_second = program.tick % TICKS_PER_SECOND == 0
         if program.track():
             self.bank.put(program.operator)
+        if on_the_second:
+            self._watch_ourselves()
         program.alarms.pass_by()
         if program.process is not None:
             self.bank.put(program.process)
-        if update is not None or program.tick % TICKS_PER_SECOND == 0:
-            self.publication.status()
-        if self.publication.is_behind or program.tick % TICKS_PER_SECOND == 0:
-            self.publication.safety()
-        if update is not None:
-            self.clients.tell(update)
-        self.publication.identity()
+        if latched or on_the_second:
+            publication.status()
+        if publication.is_behind or on_the_second:
+            publication.safety()
+        publication.identity()
         self._memory.keep(program, self._pace)
+
+    def _watch_ourselves(self) -> None:
+        """Raise the alarms about clock and memory, and note log lines that were lost."""
+        if self._pace.realtime:
+            skew = self.publication.skew = self._clock.skew()
+            self.publication.offset_ms = self._clock.offset * self._clock.tick_s * 1000
+            limit = self._settings.control_plc.skew_alarm_ppm
+            known = skew.error_ppm < limit / 4
+            self._program.alarms.holds(AlarmKind.CLOCK_SKEW, condition=known and abs(skew.ppm) > limit)
+        program, lost = self._program, dropped()
+        program.alarms.holds(AlarmKind.STATE_NOT_RETAINED, condition=self._memory.failure is not None)
+        if lost > self._lost_lines:
+            program.journal.note(program.tick, EventKind.LOST, value=lost - self._lost_lines)
+            self._lost_lines = lost
+
+    @property
+    def _patience_s(self) -> float:
+        """How long an answer of the rack may take."""
+        longest = self._settings.control_plc.plant.timeout_s
+        if not self._pace.realtime:
+            return longest
+        return min(longest, max(SHORTEST_PATIENCE_S, ANSWER_TICKS * self._clock.tick_s))
+
+    def _in_ticks(self, at: float) -> float | None:
+        """Return a moment of real time in ticks; None in lock-step."""
+        return at / self._clock.tick_s if self._pace.realtime else None
+
+    async def watch_certificates(self) -> None:
+        """Raise the alarm while a certificate has expired, or will soon; look again every hour, until cancelled."""
+        section = self._settings.control_plc
+        files = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]
+        if not files:
+            return
+        from coldloop.modbus.tls import certificate_days_left  # noqa: PLC0415 not needed without TLS
+
+        while True:
+            days, warn_days = min((certificate_days_left(tls), tls.warn_days) for tls in files)
+            cause = EXPIRED if days < 0 else EXPIRES_SOON
+            self._program.alarms.holds(AlarmKind.CERTIFICATE, condition=days < warn_days, cause=cause)
+            self.publication.safety()
+            await asyncio.sleep(3600)
+
+    # -- out of step ---------------------------------------------------------------------------------------------------
+
+    async def _look(self) -> None:
+        """Read what the rack applies; in step with it, go on from there."""
+        if self._looks:
+            await self._pause()
+            if self.clients.asked is not None:
+                return
+        self._looks += 1
+        asked_at = time.monotonic()
+        try:
+            if self._link.state is PlantLinkState.SEARCHING:
+                await self._plant.connect(SEARCH_S)
+            asked_at = time.monotonic()
+            reading = await self._plant.read(Measurement)
+        except LinkError as error:
+            self._cycle.failed(error)
+            self._say_lost(error)
+        else:
+            self._reached = True
+            at = (asked_at + time.monotonic()) / 2
+            self._cycle.answered(reading, self._in_ticks(at))
+            if self._link.in_step:
+                self._looks = 0
+                # at tick 0 the rack's clock waits for the first outputs
+                self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
+            elif not self.publication.running and not self._settings.session.autostart:
+                self._kept = None  # the rack has left the session that was retained
+                self._link.end()
+        if not self._link.in_step and self._pace.realtime:
+            now = self._clock.tick_at(time.monotonic())
+            self._program.alarms.now = max(self._program.tick, now)
+        self._publish()
+
+    async def _pause(self) -> None:
+        """Wait before the next look, unless somebody writes something."""
+        self.clients.changed.clear()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(min(LOOK_PAUSE_S, max(0.005, self._clock.tick_s))):
+                await self.clients.changed.wait()
+
+    def _say_lost(self, error: LinkError) -> None:
+        log.warning("plant not in step", extra={"reason": str(error), "tick": self._program.tick})
 
     # -- sessions ------------------------------------------------------------------------------------------------------
 
-    async def _begin_at_last(self) -> None:
-        """Begin, however long it takes until the plant lets us."""
-        while True:
-            try:
-                await self._begin()
-            except LinkError as error:
-                log.warning("plant not ready", extra={"reason": str(error)})
-                await asyncio.sleep(SEARCH_S)
-            else:
-                return
-
-    async def _begin(self) -> None:
-        """Go on with the session of before a restart, or with the plant's, or wait for one."""
-        state = self._memory.recall()
-        plant = await self._look_at_plant()
-        if state is not None and state.session == plant.session != 0:
-            self._program.alarms.restore(state.alarms)
-            self._pace = state.pace
-            await self._join(plant, state.updates, state.operator)
-        elif self._settings.session.autostart:
-            if plant.tick:
-                await self._join(plant, 0, self._program.operator)
-            else:
-                self._start(ControlSession(plant.session or 1, self._pace.realtime, self._pace.factor))
-
-    async def _look_at_plant(self) -> _PlantPosition:
-        """Find out which session and tick the plant is at, and what it applies."""
-        identity, actuators = await self._plant.read(Identity), await self._plant.read(Actuators)
-        ours = actuators.crc and is_intact(actuators) and actuators.session == identity.session
-        return _PlantPosition(identity.session, identity.tick, actuators[1:4] if ours else self._program.applied)
-
-    async def _join(self, plant: _PlantPosition, updates: int, operator: Operator) -> None:
-        """Go on with the plant's session where the plant is."""
-        tick = await self._in_step(plant.tick) if self._pace.realtime else plant.tick
-        self._program.resume(plant.session, tick, plant.applied, updates=updates, operator=operator)
-        self.publication.running = True
-        self.bank.put(operator)
-        self._publish()
-        log.warning("session resumed", extra={"session": plant.session, "tick": tick})
-
-    async def _in_step(self, tick: int) -> int:
-        """Set the pacer by the plant's clock, which ticks half-way between our scans; return the tick to come."""
-        tick_s = TICK_S / self._pace.factor
-        deadline = time.monotonic() + 2 * tick_s
-        present = tick
-        while present == tick and time.monotonic() < deadline:
-            present = (await self._plant.read(Identity)).tick
-        phase = 0.5 * tick_s if present != tick else 0.0
-        self._pacer = self._new_pacer(time.monotonic() + phase - present * tick_s)
-        return present
-
-    def _leave(self, session: int, tick: int) -> None:
-        """The plant was restarted, or is driven by somebody else: wait for a session."""
-        self.publication.running = False
-        self._program.alarms.raised(AlarmKind.PLANT_LOST)
-        log.error(
-            "session ended: the plant has left it",
-            extra={
-                "session": self._program.session,
-                "tick": self._program.tick,
-                "plant_session": session,
-                "plant_tick": tick,
-            },
-        )
-        self._publish()
-
-    async def _find_plant(self, reason: str) -> None:
-        """Look for the plant until it is there, and go on where it is."""
+    def _adopt(self, reading: Measurement) -> bool:
+        """Go over to the session of the rack, where that is ours to do: after a restart, or by `session.autostart`."""
+        kept, self._kept = self._kept, None
         program = self._program
-        log.warning("plant lost", extra={"reason": reason, "tick": program.tick})
-        program.alarms.raised(AlarmKind.PLANT_LOST)
-        if self._failures:  # it is there, and does not do what it is asked
-            await asyncio.sleep(SEARCH_S / 5)
-        self._failures += 1
-        while self.clients.asked is None:
-            self.publication.safety()
-            with contextlib.suppress(LinkError):
-                await self._plant.connect(SEARCH_S)
-                plant = await self._look_at_plant()
-                if plant.session == program.session:
-                    break
-                if self._settings.session.autostart and plant.session:
-                    await self._join(plant, program.player.updates, program.operator)
-                else:
-                    self._leave(plant.session, plant.tick)
-                return
-            await asyncio.sleep(SEARCH_S / 5)
-            program.alarms.now = self._clock_tick()
+        if kept is not None and kept.session == reading.session != 0:
+            program.alarms.restore(kept.alarms)
+            self._pace = kept.pace
+            program.resume(
+                reading.session, reading.tick, reading.u,
+                updates=kept.updates, operator=kept.operator, playing=kept.sequence,
+            )  # fmt: skip
+        elif not self._settings.session.autostart or not reading.session:
+            return False
+        elif reading.tick == 0:
+            program.restart(reading.session)
         else:
-            return
-        program.rejoin(self._clock_tick() if self._pace.realtime else plant.tick, plant.applied)
-        program.alarms.now = program.tick
-        self._publish()
+            program.resume(
+                reading.session, reading.tick, reading.u, updates=program.player.updates, operator=program.operator
+            )
+        log.warning("session resumed", extra={"session": reading.session, "tick": reading.tick})
+        self._begin()
+        return True
 
     def _start(self, asked: ControlSession) -> None:
-        self.clients.asked = None
+        """Begin the session that an operator has asked for; nothing is written before the rack has been read."""
+        self.clients.asked = self._kept = None
         self._program.restart(asked.session)
         self._pace = Pace(bool(asked.realtime), asked.factor)
-        self.publication.overruns = 0
-        self.publication.running = True
-        self._pacer = self._new_pacer()
-        self.bank.put(self._program.operator)
+        self._begin()
+        self._link.begin()
         self._publish()
         log.info("session started", extra={"session": asked.session, "realtime": bool(asked.realtime)})
 
-    def _new_pacer(self, start: float | None = None) -> Pacer:
-        pacer = Pacer(Schedule(time.monotonic() if start is None else start, self._pace.factor))
-        self.publication.lateness = pacer.record if self._pace.realtime else None
-        return pacer
+    def _begin(self) -> None:
+        self._looks = 0
+        self._clock = RackClock(self._pace.factor, time.monotonic())
+        self.publication.begin()
+        self.bank.put(self._program.operator)
+        self.bank.put(ControlSession(self._program.session, int(self._pace.realtime), self._pace.factor))
 
     def _publish(self) -> None:
         self.publication.status()
@@ -327,13 +352,14 @@ async def serve(settings: ControlSettings) -> None:
     identity = DeviceIdentity(product="Coldloop control PLC", revision=__version__)
     server = ModbusServer(
         plc.bank, settings=settings.control_plc.server, on_write=plc.clients.on_write, identity=identity,
-        on_departure=plc.clients.on_departure, on_refusal=plc.clients.on_refusal,
+        on_departure=plc.clients.on_departure, on_refusal=plc.clients.on_refusal, on_close=plc.clients.on_close,
     )  # fmt: skip
     await server.start()
     log.info("serving", extra={"host": settings.control_plc.server.host, "port": server.port})
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(plc.run(), name="scan cycle")
+            tasks.create_task(plc.watch_certificates(), name="certificates")
             telemetry = Telemetry(settings.telemetry, "control_plc", plc.publication.snapshot)
             tasks.create_task(telemetry.run(), name="telemetry")
     finally:

@@ -15,7 +15,7 @@ from coldloop.process import L1, OUTPUT_NAMES, T5, TICK_S
 Range = tuple[FiniteFloat, FiniteFloat]
 CONTROLLED = (L1, T5)
 RECOVERY_TICKS = 8
-"""A sensor is good again after so many good measurements."""
+"""A sensor is good again when its measurements have been good for so long."""
 
 
 class SensorCheckSettings(BaseModel):
@@ -49,7 +49,10 @@ class SensorCheckSettings(BaseModel):
 
 
 class SensorMonitor:
-    """Looks at every measurement; `bad` are the outputs that are substituted now."""
+    """Looks at every measurement. All its times are plant time: scans can be missed.
+
+    `bad` holds the outputs that are substituted now, and since which tick.
+    """
 
     def __init__(self, settings: SensorCheckSettings, initial: Sequence[float]) -> None:
         self._low, self._high = zip(*settings.ranges, strict=True)
@@ -57,14 +60,17 @@ class SensorMonitor:
         self._bridged_ticks = round(settings.bridged_s / TICK_S)
         self._good = list(initial)
         self._before = tuple(initial)
+        self._tick: int | None = None
+        self._now = 0
         self._stands = dict.fromkeys(CONTROLLED, 0)
         self._recovering: dict[int, int] = {}
+        """Output, and since which tick its measurements have been good again."""
         self.bad: dict[int, int] = {}
-        """Output, and the ticks for which it has been bad."""
 
-    def check(self, y: Sequence[float]) -> Sequence[float]:
-        """Return the outputs with bad ones replaced by their last good value."""
-        self._watch_standing(y)
+    def check(self, tick: int, y: Sequence[float]) -> Sequence[float]:
+        """Return the outputs measured at `tick`, with bad ones replaced by their last good value."""
+        self._watch_standing(1 if self._tick is None else max(0, tick - self._tick), y)
+        self._tick = self._now = tick
         frozen = self._frozen()
         if not self.bad and not frozen and all(map(le, self._low, y)) and all(map(le, y, self._high)):
             self._good[:] = y
@@ -75,13 +81,19 @@ class SensorMonitor:
                 self._good[output] = value
         return tuple(self._good)
 
-    def _watch_standing(self, y: Sequence[float]) -> None:
-        """Count for how long each controlled output has stood while most of the others moved."""
+    def set_back(self, tick: int) -> None:
+        """Go on at a tick before the present one: what has lasted until now begins there."""
+        self._tick = None
+        self.bad = {output: min(since, tick) for output, since in self.bad.items()}
+        self._recovering = {output: min(since, tick) for output, since in self._recovering.items()}
+
+    def _watch_standing(self, elapsed: int, y: Sequence[float]) -> None:
+        """Sum up for how long each controlled output has stood while most of the others moved."""
         for output in CONTROLLED:
             if y[output] != self._before[output]:
                 self._stands[output] = 0
             elif 2 * sum(map(ne, y, self._before)) > len(OUTPUT_NAMES):
-                self._stands[output] += 1
+                self._stands[output] += elapsed
         self._before = tuple(y)
 
     def _frozen(self) -> list[int]:
@@ -89,18 +101,21 @@ class SensorMonitor:
 
     def _judge(self, output: int, *, ok: bool) -> None:
         if not ok:
-            self.bad[output] = self.bad.get(output, 0) + 1
+            self.bad.setdefault(output, self._now)
             self._recovering.pop(output, None)
         elif output in self.bad:
-            self.bad[output] += 1  # it is still substituted
-            self._recovering[output] = self._recovering.get(output, 0) + 1
-            if self._recovering[output] >= RECOVERY_TICKS:
+            since = self._recovering.setdefault(output, self._now)
+            if self._now - since + 1 >= RECOVERY_TICKS:
                 del self.bad[output], self._recovering[output]
 
     @property
     def unusable(self) -> list[int]:
         """Controlled outputs that have been bad for longer than they are bridged."""
-        return [output for output in CONTROLLED if self.bad.get(output, 0) > self._bridged_ticks]
+        return [
+            output
+            for output in CONTROLLED
+            if output in self.bad and self._now - self.bad[output] + 1 > self._bridged_ticks
+        ]
 
     @property
     def mask(self) -> int:

@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
 from coldloop.limits import InputLimits
@@ -14,6 +14,7 @@ from coldloop.registers.codec import WordOrder
 from coldloop.retained import RetainSettings
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
+from control_plc.alarm_settings import AlarmSettings
 from control_plc.classical import ClassicalSettings
 from control_plc.sensors import SensorCheckSettings
 
@@ -62,24 +63,6 @@ class LadderSettings(BaseModel):
         return round(self.optimizer_timeout_s / TICK_S)
 
 
-class AlarmSettings(BaseModel):
-    """When the alarms of the process are raised."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    level_band: tuple[FiniteFloat, FiniteFloat] = (59.0, 61.0)
-    """L1, %."""
-    t5_band: tuple[FiniteFloat, FiniteFloat] = (9.0, 16.0)
-    """T5, K."""
-    band_delay_s: Annotated[float, Field(ge=0)] = 5.0
-    """How long an output must be outside."""
-
-    @property
-    def band_ticks(self) -> int:
-        """That delay, in ticks."""
-        return round(self.band_delay_s / TICK_S)
-
-
 class ControlSection(BaseModel):
     """Section `control_plc` of the configuration."""
 
@@ -90,6 +73,8 @@ class ControlSection(BaseModel):
     plant: PlantEndpoint = PlantEndpoint()
     scan_tolerance_ms: Annotated[float, Field(gt=0)] = 5.0
     """Lateness of a scan, in real time, that counts as an overrun."""
+    skew_alarm_ppm: Annotated[float, Field(gt=0)] = 500.0
+    """How much the rack's clock and ours may differ in real time before the alarm is raised."""
     driver: ControlStrategy = ControlStrategy.MPC
     classical: ClassicalSettings = ClassicalSettings()
     ladder: LadderSettings = LadderSettings()

@@ -46,3 +46,7 @@ class PlcBudget:
     def answer_after_s(self, iterations: int) -> float:
         """Return the plant time from an updating instant to the end of its computation, in seconds."""
         return self._settings.preparation_s / self._settings.power + iterations * self._iteration_s
+
+    def is_enough(self, ticks: int) -> bool:
+        """Tell whether an answer of one iteration is there within an updating period of `ticks` ticks."""
+        return self.answer_after_s(1) <= ticks * TICK_S

@@ -77,7 +77,7 @@ class OptimizerProgram:
         self._prediction = PredictionModel(model)
         self._problem = PredictiveProblem(self._prediction, settings.design, limits, self._real)
         self._solver = make_solver(settings)
-        self._budget = PlcBudget(settings.budget, self._solver.tau_1_s)
+        self.budget = PlcBudget(settings.budget, self._solver.tau_1_s)
         self._estimator = self._make_estimator()
         self._prediction = self._prediction.rounded(self._real)
         self._compile_kernels(model)
@@ -107,7 +107,7 @@ class OptimizerProgram:
     def _make_rule(self) -> UpdatingRule:
         adaptive = self.settings.adaptive
         if self._fixed_ticks:
-            return FixedPeriod(self._budget.iterations(self._fixed_ticks))
+            return FixedPeriod(self.budget.iterations(self._fixed_ticks))
         if adaptive.rule is RuleName.CONTRACTION:
             return ContractionRule(**adaptive.contraction.model_dump())
         return Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta)
@@ -132,8 +132,8 @@ class OptimizerProgram:
         here = played.situation._replace(x=estimate.x, w=estimate.w)
         effective = self._cost(self._problem.at(here), played.z)
         wanted, assessment = self._decide(effective, update, interrupted=interrupted)
-        iterations = min(wanted, self._budget.iterations(MAX_PERIOD_TICKS))
-        ticks = self._fixed_ticks or self._budget.period(iterations)
+        iterations = min(wanted, self.budget.iterations(MAX_PERIOD_TICKS))
+        ticks = self._fixed_ticks or self.budget.period(iterations)
         self._last = _Period(update, estimate, iterations, ticks, effective, assessment)
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
@@ -195,7 +195,7 @@ class OptimizerProgram:
 
     def answer_after_s(self) -> float:
         """Return the plant time from the instant of the last `plan` until the PLC has computed its answer."""
-        return self._budget.answer_after_s(self._period.iterations)
+        return self.budget.answer_after_s(self._period.iterations)
 
     @property
     def _period(self) -> _Period:

@@ -83,6 +83,8 @@ class PlantSection(BaseModel):
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     """Seed of the sensors' noise."""
     sensors: SensorSettings = SensorSettings()
+    clock_error_ppm: Annotated[float, Field(ge=-50_000, le=50_000)] = 0.0
+    """How much too fast the rack's clock is in real time, in millionths: for tests of those who follow it."""
     watchdog: WatchdogSettings = WatchdogSettings()
     retain: RetainSettings = RetainSettings()
 

@@ -61,10 +61,12 @@ class Pacer:
         self._now = now
 
     async def until(self, tick: float) -> float:
-        """Sleep until `tick` is due; return by how many seconds that was missed."""
-        delay = self.schedule.due(tick) - self._now()
-        if delay > 0:
-            await asyncio.sleep(delay)
+        """Sleep until `tick` is due; return by how many seconds that was missed.
+
+        The event loop gets its turn also when the tick has been due for long: other tasks are never kept waiting by
+        a clock that cannot follow its schedule.
+        """
+        await asyncio.sleep(max(0.0, self.schedule.due(tick) - self._now()))
         lateness = max(0.0, self._now() - self.schedule.due(tick))
         self.record.add(lateness)
         return lateness

@@ -12,6 +12,7 @@
         ├── PortInUseError
         ├── PeerUnreachableError
         │   └── UntrustedPeerError  its certificate does not hold
+        ├── DamagedAnswerError      the seal of an answer is broken, or missing
         └── RequestRefusedError     the peer answered with a Modbus exception
 
 A message is one line that says what, where, and what to do.
@@ -72,6 +73,10 @@ class PeerUnreachableError(LinkError):
 
 class UntrustedPeerError(PeerUnreachableError):
     """A peer cannot show that it is who it should be; trying again does not help."""
+
+
+class DamagedAnswerError(LinkError):
+    """A record that should be sealed arrived without its seal, or with a broken one."""
 
 
 class RequestRefusedError(LinkError):

@@ -1,11 +1,11 @@
 """What the actuators allow: one setting that the QP, its solvers and the control PLC's guard share."""
 
 from enum import StrEnum
-from typing import Self
+from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process import TICKS_PER_SAMPLE
+from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 
 Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
@@ -29,6 +29,14 @@ class InputLimits(BaseModel):
     rate: Triple = (0.5, 10.0, 0.1)
     """Largest change in one sampling period of 5 s, up or down."""
     rate_reference: RateReference = RateReference.PER_UPDATE
+    slew_s: Annotated[float, Field(ge=TICK_S, le=TICKS_PER_SAMPLE * TICK_S)] = 0.5
+    """Absolute slew limit, however often updates follow one another: within any time shorter than this an input moves
+    by at most `rate`. The default is the shortest updating period that there is: it never binds on our optimiser."""
+
+    @property
+    def slew_ticks(self) -> int:
+        """That time, in ticks."""
+        return max(1, round(self.slew_s / TICK_S))
 
     def rate_share(self, elapsed_ticks: int) -> float:
         """Return the share of `rate` that an update may use, `elapsed_ticks` ticks after the one before."""

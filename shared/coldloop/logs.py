@@ -1,4 +1,7 @@
-"""Structured logs: one JSON object a line on standard error."""
+"""Structured logs: one JSON object a line on standard error, by a thread that never holds up who logs.
+
+When nobody reads them, lines are dropped and counted; the next line that is written says how many in `dropped`.
+"""
 
 import json
 import logging
@@ -7,6 +10,10 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any, TextIO
+
+from coldloop.line_writer import LineWriter, to_stream
+
+log = logging.getLogger("coldloop.logs")
 
 STANDARD_ATTRIBUTES = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
 
@@ -35,6 +42,8 @@ class JsonFormatter(logging.Formatter):
 
 MOST_EVENTS = 1000
 """Different events that are counted at a time."""
+LAST_LINE_S = 0.2
+"""How long the last line is waited for, when those before it have been written."""
 
 
 class FloodFilter(logging.Filter):
@@ -62,10 +71,66 @@ class FloodFilter(logging.Filter):
         return count < self._lines
 
 
+class QueueingHandler(logging.Handler):
+    """Formats records into the queue of a writer."""
+
+    def __init__(self, writer: LineWriter) -> None:
+        super().__init__()
+        self.writer = writer
+        self._told = 0
+        """Of the dropped lines, how many a later line has told."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Let a record be written; called with the handler's lock held."""
+        dropped = self.writer.dropped
+        if dropped > self._told:
+            record.dropped = dropped - self._told
+        if self.writer.put(self._formatted(record)):
+            self._told = dropped
+
+    def _formatted(self, record: logging.LogRecord) -> str:
+        try:
+            return self.format(record)
+        except Exception as error:  # noqa: BLE001 - a scan does not fail because of what it logs
+            about = {"name": record.name, "levelname": record.levelname, "created": record.created}
+            what = {"msg": "a record cannot be formatted", "reason": repr(error), "text": str(record.msg)}
+            return self.format(logging.makeLogRecord({**about, **what}))
+
+    def flush(self) -> None:
+        """Wait until all is written, for a bounded time."""
+        self.writer.flush()
+
+    def close(self) -> None:
+        """Write what waits, for a bounded time, and end the writer."""
+        if self.writer.flush() and self.writer.dropped > self._told:
+            last = {"name": log.name, "levelno": logging.WARNING, "levelname": "WARNING", "msg": "lines dropped"}
+            self.handle(logging.makeLogRecord(last))
+        self.writer.close(LAST_LINE_S)
+        super().close()
+
+
+_handlers: list[QueueingHandler] = []
+"""The handler of this process, when its logs are set up."""
+
+
 def set_up_logs(service: str, level: str, stream: TextIO = sys.stderr) -> None:
     """Send the logs of this process, from `level` up, to `stream`."""
-    handler = logging.StreamHandler(stream)
+    handler = QueueingHandler(LineWriter(to_stream(stream)))
     handler.setFormatter(JsonFormatter(service))
     handler.addFilter(FloodFilter())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # what it would say is raised by our client
+    _handlers[:] = [handler]
+
+
+def dropped() -> int:
+    """Return how many lines of this process were dropped, because nobody read those before them."""
+    return sum(handler.writer.dropped for handler in _handlers)
+
+
+def end_logs(last_line: str | None = None) -> None:
+    """Write a last line of plain text, if there is one, and what waits before it; for a bounded time."""
+    for handler in _handlers:
+        if last_line is not None:
+            handler.writer.put(last_line)
+        handler.close()

@@ -1,10 +1,13 @@
 """State that survives a restart: one small file, replaced whole or not at all.
 
-A draft is written beside it and renamed over it, so a process that is killed at any byte leaves the old state or the
-new one. What cannot be trusted (torn, of another program or model) is refused, and said so.
+A draft is written beside it, synced to the disk and renamed over it, and the folder is synced: a process that is killed
+at any byte, or a power cut, leaves the old state or the new one. What cannot be trusted (torn, of another program or
+model) is refused with a reason. `RetainedStateWriter` of `retained_writer.py` does this off the scan's way.
 """
 
+import contextlib
 import json
+import os
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,6 +33,39 @@ class RetainSettings(BaseModel):
     """None keeps nothing: after a restart the service begins anew."""
 
 
+def encoded(state: Mapping[str, Any], owner: str, digest: int) -> bytes:
+    """Return the bytes of a file: a line that describes the state, and the state as JSON."""
+    content = json.dumps(state, separators=(",", ":")).encode()
+    return _description(content, owner, digest) + content
+
+
+def decoded(data: bytes, owner: str, digest: int) -> dict[str, Any]:
+    """Return the state that these bytes hold.
+
+    Raises:
+        RetainedStateError: They are torn, or not ours.
+    """
+    line, _, content = data.partition(b"\n")
+    if line + b"\n" != _description(content, owner, digest):
+        raise RetainedStateError(f"{_complaint(line, owner, digest)}; it is not used")
+    state: dict[str, Any] = json.loads(content)
+    return state
+
+
+def _description(content: bytes, owner: str, digest: int) -> bytes:
+    fields = f"{MAGIC} {owner} {digest:08x} {len(content)} {zlib.crc32(content):08x}"
+    return f"{fields} {zlib.crc32(fields.encode()):08x}\n".encode()
+
+
+def _complaint(line: bytes, owner: str, digest: int) -> str:
+    words = line.decode(errors="replace").split()
+    if words[:1] != [MAGIC]:
+        return "not a retained state"
+    if words[1:3] != [owner, f"{digest:08x}"]:
+        return "the retained state of another program or model"
+    return "a torn retained state"
+
+
 class RetainedFile:
     """The retained state of one program.
 
@@ -40,31 +76,25 @@ class RetainedFile:
     """
 
     def __init__(self, path: Path, owner: str, digest: int) -> None:
-        self._path = path
-        self._draft = path.with_name(f"{path.name}.draft")
+        self.path = path
         self._owner = owner
         self._digest = digest
 
-    def save(self, state: Mapping[str, Any]) -> None:
+    def save(self, state: Mapping[str, Any], *, synced: bool = True) -> None:
         """Replace the state.
+
+        Args:
+            state: The new one.
+            synced: Wait until the disk has it: milliseconds, or much longer on a slow disk. Without, the state survives
+                the end of the process, but not that of the machine.
 
         Raises:
             RetainedStateError: The file cannot be written.
         """
         try:
-            self._draft.write_bytes(self.encoded(state))
-            self._draft.replace(self._path)
+            _replace(self.path, encoded(state, self._owner, self._digest), synced=synced)
         except OSError as error:
-            raise RetainedStateError(f"{self._path}: {error.strerror}; name another file in retain.file") from None
-
-    def encoded(self, state: Mapping[str, Any]) -> bytes:
-        """Return the bytes of the file: a line that describes the state, and the state as JSON."""
-        content = json.dumps(state, separators=(",", ":")).encode()
-        return self._description(content) + content
-
-    def _description(self, content: bytes) -> bytes:
-        fields = f"{MAGIC} {self._owner} {self._digest:08x} {len(content)} {zlib.crc32(content):08x}"
-        return f"{fields} {zlib.crc32(fields.encode()):08x}\n".encode()
+            raise RetainedStateError(f"{self.path}: {error.strerror}; name another file in retain.file") from None
 
     def load(self) -> dict[str, Any] | None:
         """Return the state; None when there is none yet.
@@ -73,21 +103,40 @@ class RetainedFile:
             RetainedStateError: The file is torn, or not ours.
         """
         try:
-            data = self._path.read_bytes()
+            return decoded(self.path.read_bytes(), self._owner, self._digest)
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise RetainedStateError(f"{self._path}: {error.strerror}") from None
-        line, _, content = data.partition(b"\n")
-        if line + b"\n" != self._description(content):
-            raise RetainedStateError(f"{self._path}: {self._complaint(line)}; it is not used")
-        state: dict[str, Any] = json.loads(content)
-        return state
+            raise RetainedStateError(f"{self.path}: {error.strerror}") from None
+        except RetainedStateError as error:
+            raise RetainedStateError(f"{self.path}: {error}") from None
 
-    def _complaint(self, line: bytes) -> str:
-        words = line.decode(errors="replace").split()
-        if words[:1] != [MAGIC]:
-            return "not a retained state"
-        if words[1:3] != [self._owner, f"{self._digest:08x}"]:
-            return "the retained state of another program or model"
-        return "a torn retained state"
+
+def _replace(path: Path, data: bytes, *, synced: bool) -> None:
+    """Let a file have this content, or the one that it had."""
+    draft = path.with_name(f"{path.name}.draft")
+    try:
+        with draft.open("wb", buffering=0) as file:
+            rest = memoryview(data)
+            while rest:
+                rest = rest[file.write(rest) :]
+            if synced:
+                os.fsync(file.fileno())
+        draft.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):  # half a draft would only fill the disk further
+            draft.unlink(missing_ok=True)
+        raise
+    if synced:
+        _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Let the disk have the names in a folder; only POSIX systems can."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,36 +1,50 @@
 """An end-to-end check of what crosses the links.
 
 TCP's checksum does not see what a gateway, a proxy or a memory does to a value. A sealed record ends with the CRC-32 of
-all before it, as big-endian words whatever the word order of the link; 0 is "not sealed": a simple client's outputs,
-and the rack's answer to outputs that it has not taken.
+all before it, as big-endian words whatever the word order of the link; 0 is "not sealed", as a simple client leaves it.
+A seal is checked on the bytes that arrived: decoding changes some of them (a signalling NaN becomes a quiet one).
 """
 
 import zlib
-from typing import Any, TypeVar
+from enum import Enum
+from functools import cache
+from typing import Any, TypeVar, cast
 
-from coldloop.registers.codec import RecordCodec, codec_of
-from coldloop.registers.control_plc import CONTROL_MAP, Update
-from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
+from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
+from coldloop.registers.declaration import Block
 
-S = TypeVar("S", Actuators, Measurement, Update)
+S = TypeVar("S", bound=tuple[Any, ...])
 
-_CODECS: dict[type[tuple[Any, ...]], RecordCodec] = {
-    Actuators: codec_of(PLANT_MAP.block_of(Actuators)),
-    Measurement: codec_of(PLANT_MAP.block_of(Measurement)),
-    Update: codec_of(CONTROL_MAP.block_of(Update)),
-}
-_CRC_BYTES = 4
+CRC_BYTES = 4
 
 
-def _checksum(record: tuple[Any, ...]) -> int:
-    return zlib.crc32(_CODECS[type(record)].encode(record)[:-_CRC_BYTES]) or 1
+class Seal(Enum):
+    """What the seal of a record says."""
+
+    ABSENT = "absent"
+    INTACT = "intact"
+    BROKEN = "broken"
+
+
+def seal_of(codec: RecordCodec, data: bytes | bytearray | memoryview, offset: int = 0) -> Seal:
+    """Return what the seal says of the record that stands in `data` at `offset`."""
+    raw = codec.canonical(data, offset)
+    crc = int.from_bytes(raw[-CRC_BYTES:], "big")
+    if not crc:
+        return Seal.ABSENT
+    return Seal.INTACT if crc == _checksum(raw) else Seal.BROKEN
 
 
 def sealed(record: S) -> S:
-    """Return the record with its CRC filled in."""
-    return record._replace(crc=_checksum(record))
+    """Return the record with its field `crc`, the last one, filled in."""
+    crc = _checksum(_codec_of_record(type(record)).encode(record))
+    return cast("S", record._replace(crc=crc))  # type: ignore[attr-defined] # a NamedTuple
 
 
-def is_intact(record: Actuators | Measurement | Update) -> bool:
-    """Tell whether a record that arrived is what was sent."""
-    return not record.crc or record.crc == _checksum(record)
+def _checksum(raw: bytes | bytearray | memoryview) -> int:
+    return zlib.crc32(raw[:-CRC_BYTES]) or 1
+
+
+@cache
+def _codec_of_record(record: type[tuple[Any, ...]]) -> RecordCodec:
+    return codec_of(Block("sealed", 0, record, ""), WordOrder.HIGH_FIRST)

@@ -3,6 +3,7 @@
 import argparse
 import asyncio
 import contextlib
+import logging
 import signal
 import sys
 from collections.abc import Awaitable, Callable, Sequence
@@ -14,9 +15,11 @@ from coldloop import __version__
 from coldloop.command_line import add_configuration_options
 from coldloop.config import load_configuration
 from coldloop.errors import ColdloopError
-from coldloop.logs import set_up_logs
+from coldloop.logs import end_logs, set_up_logs
 
 S = TypeVar("S", bound=BaseModel)
+
+log = logging.getLogger("coldloop.service")
 
 SECTIONS = ("limits", "model", "session", "plant", "control_plc", "optimizer_plc", "telemetry", "rig")
 """Sections of a configuration file; each service reads those that concern it."""
@@ -33,14 +36,18 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
     parser.add_argument("--version", action="version", version=__version__)
     options = parser.parse_args(arguments)
     set_up_logs(name, options.log_level)
+    code, last_line = 1, None
     try:
         configuration = load_configuration(
             settings, file=options.config, assignments=options.assignments, others=SECTIONS
         )
-        return run_event_loop(lambda: _until_told(serve(configuration.settings), with_parent=options.with_parent))
+        code = run_event_loop(lambda: _until_told(serve(configuration.settings), with_parent=options.with_parent))
     except ColdloopError as error:
-        sys.stderr.write(f"{name}: {error}\n")
-        return error.exit_code
+        code, last_line = error.exit_code, f"{name}: {error}"
+    except Exception:  # the interpreter would write it past the queue, and wait for whoever reads it
+        log.exception("failed")
+    end_logs(last_line)
+    return code
 
 
 def run_event_loop(start: Callable[[], Any]) -> int:

@@ -12,10 +12,13 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Self
 
-import aiomqtt
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+
+if TYPE_CHECKING:
+    import aiomqtt
 
 log = logging.getLogger("coldloop.telemetry")
 
@@ -33,12 +36,33 @@ class TelemetrySettings(BaseModel):
     broker: str = ""
     """Host of the broker; empty is off."""
     port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    username: str = ""
+    """Name at the broker; empty is a broker that asks for none."""
+    password_file: Path | None = None
+    """File that holds the password for it, on one line. It is read at each connection; without TLS it is sent as it
+    is, so this is for a network of its own."""
     prefix: Annotated[str, Field(pattern=r"^[^#+]+$")] = "coldloop"
     period_s: PositiveFloat = 1.0
     """Real time between snapshots."""
     queue: Annotated[int, Field(ge=1)] = 100
     """Snapshots kept while the broker is away; the oldest go first."""
     timeout_s: PositiveFloat = 5.0
+
+    @model_validator(mode="after")
+    def _password_belongs_to_a_name(self) -> Self:
+        if self.password_file and not self.username:
+            raise ValueError("a password needs a name: set telemetry.username")
+        return self
+
+    def password(self) -> str | None:
+        """Return the password; None is none.
+
+        Raises:
+            OSError: The file cannot be read.
+        """
+        if self.password_file is None:
+            return None
+        return self.password_file.read_text(encoding="utf-8").rstrip("\r\n")
 
 
 class Telemetry:
@@ -74,9 +98,14 @@ class Telemetry:
             await asyncio.sleep(self._settings.timeout_s)
 
     async def _publish(self) -> None:
+        import aiomqtt  # noqa: PLC0415 a tenth of what a service loads at its start, and most have no broker
+
         s = self._settings
         offline = aiomqtt.Will(f"{self._topic}/state", json.dumps({"state": "offline"}), qos=1, retain=True)
-        async with aiomqtt.Client(s.broker, s.port, will=offline, timeout=s.timeout_s) as client:
+        name = s.username or None
+        async with aiomqtt.Client(
+            s.broker, s.port, username=name, password=s.password(), will=offline, timeout=s.timeout_s
+        ) as client:
             await client.publish(f"{self._topic}/state", json.dumps({"state": "online"}), qos=1, retain=True)
             try:
                 await self._forward(client)
@@ -86,7 +115,7 @@ class Telemetry:
                         await client.publish(f"{self._topic}/state", offline.payload, qos=1, retain=True)
                 raise
 
-    async def _forward(self, client: aiomqtt.Client) -> None:
+    async def _forward(self, client: "aiomqtt.Client") -> None:
         while True:
             await self._arrived.wait()
             self._arrived.clear()

@@ -24,6 +24,10 @@ class Watchdog:
         self._triggered = tick
         self.expired = False
 
+    def set_back(self, tick: int) -> None:
+        """Go on at a tick before the present one."""
+        self._triggered = min(self._triggered, tick)
+
     def check(self, tick: int) -> bool:
         """Tell whether it expires at `tick`; once for each time that it does."""
         if not self.time or self.expired or self._remaining(tick) > 0:

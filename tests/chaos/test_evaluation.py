@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from coldloop.process import INPUT_NAMES, L1, OUTPUT_NAMES, STATE_NAMES, T5
+from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode
 from coldloop.registers.plant import PlantSample
-from coldloop.registers.safety import AlarmKind, Event, EventKind
+from coldloop.registers.safety import AlarmKind
 from rig.chaos.evaluation import Evaluation, RaisedAlarm, evaluate
 from rig.chaos.faults import Kill, Reset
 from rig.chaos.report import as_markdown, as_text, table

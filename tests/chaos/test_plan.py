@@ -7,7 +7,7 @@ from rig.chaos.faults import Drop, Kill, Reset
 from rig.chaos.plan import SPREAD_S, Plan, find_plan, parse_plan, shipped_plans
 
 KINDS = {
-    "delay", "drop", "duplicate", "reorder", "reset", "freeze", "truncate", "flip",
+    "delay", "drop", "duplicate", "reorder", "reset", "freeze", "truncate", "abort", "flip",
     "kill", "pause", "restart", "clock", "sensor", "wrong_model",
 }  # fmt: skip
 

@@ -11,7 +11,7 @@ from coldloop.errors import PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.modbus.settings import ServerSettings
-from coldloop.registers.bank import RegisterBank
+from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, Grant
 from coldloop.registers.declaration import Block
@@ -36,7 +36,7 @@ async def line(timeout_s: float = 10.0) -> AsyncIterator[Line]:
     bank.put(Identity(map_digest=CONTROL_MAP.digest, map_version=CONTROL_MAP.version))
     grants: list[int] = []
 
-    def on_write(block: Block) -> None:
+    def on_write(block: Block, _caller: Caller) -> None:
         if block.record is Grant:
             grants.append(bank.get(Grant).until_tick)
 

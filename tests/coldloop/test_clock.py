@@ -24,7 +24,7 @@ class FakeClock:
 
     async def sleep(self, delay: float) -> None:
         self.slept.append(delay)
-        self.now += delay + self._oversleep_s
+        self.now += delay + self._oversleep_s if delay else 0.0
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_a_minute_passes_in_a_second_at_factor_60() -> None:
     assert Schedule(5.0, 1.0).due(0.5) == 5.125
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(values=latenesses, share=st.floats(0.01, 1.0))
 def test_a_percentile_is_numpys_rounded_up_to_its_bin(values: list[float], share: float) -> None:
     record = LatenessRecord()
@@ -97,11 +97,11 @@ def test_a_pacer_sleeps_until_the_tick_and_records_how_late_it_woke(fake: FakeCl
         return [await pacer.until(tick) for tick in (0, 1, 2, 4)]
 
     assert asyncio.run(story()) == [0.0, 0.125, 0.125, 0.125]
-    assert fake.slept == [0.5, 0.375, 0.875], "the schedule does not slip with the one who is late"
+    assert fake.slept == [0.0, 0.5, 0.375, 0.875], "the schedule does not slip with the one who is late"
     assert (pacer.record.count, pacer.record.maximum_s) == (4, 0.125)
 
 
-def test_a_pacer_that_is_late_does_not_sleep_and_does_not_stretch_time(fake: FakeClock) -> None:
+def test_a_pacer_that_is_late_lets_others_run_and_does_not_stretch_time(fake: FakeClock) -> None:
     pacer = Pacer(Schedule(1000.0, 1.0), fake)
     fake.now = 1001.0
 
@@ -109,5 +109,5 @@ def test_a_pacer_that_is_late_does_not_sleep_and_does_not_stretch_time(fake: Fak
         return [await pacer.until(tick) for tick in (1, 2, 4, 5)]
 
     assert asyncio.run(story()) == [0.75, 0.5, 0.0, 0.125]
-    assert fake.slept == [0.25]
+    assert fake.slept == [0.0, 0.0, 0.0, 0.25]
     assert pacer.record.maximum_s == 0.75

@@ -246,7 +246,7 @@ def refusal(assignment: str) -> str:
     return ""
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(text=st.text(max_size=20))
 def test_whatever_stands_behind_the_equals_sign_is_a_value_or_a_refusal_in_one_line(text: str) -> None:
     reason = refusal(f"solver.alpha={text}")
@@ -254,7 +254,7 @@ def test_whatever_stands_behind_the_equals_sign_is_a_value_or_a_refusal_in_one_l
     assert not reason or reason.startswith("--set solver.alpha")
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(key=st.text(st.characters(categories=["L", "N", "P", "S"]), min_size=1, max_size=20))
 def test_whatever_stands_before_the_equals_sign_is_a_key_or_a_refusal_in_one_line(key: str) -> None:
     reason = refusal(f"{key}=3")

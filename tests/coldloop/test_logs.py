@@ -1,7 +1,9 @@
 import io
 import json
 import logging
+import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -9,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from coldloop.logs import JsonFormatter, set_up_logs
+from coldloop.line_writer import CAPACITY
+from coldloop.logs import JsonFormatter, dropped, end_logs, set_up_logs
 
 
 @pytest.fixture
@@ -20,6 +23,8 @@ def stream() -> Iterator[io.StringIO]:
     pymodbus = logging.getLogger("pymodbus").level
     root.handlers = []  # those of pytest must not be closed
     yield io.StringIO()
+    for handler in root.handlers:
+        handler.close()
     root.handlers, root.level = handlers, level
     logging.getLogger("pymodbus").setLevel(pymodbus)
 
@@ -29,6 +34,8 @@ def fail(message: str) -> None:
 
 
 def lines(stream: io.StringIO) -> list[dict[str, Any]]:
+    for handler in logging.getLogger().handlers:
+        handler.flush()
     return [json.loads(line) for line in stream.getvalue().splitlines()]
 
 
@@ -37,8 +44,8 @@ def test_a_record_is_one_json_object_on_one_line(stream: io.StringIO) -> None:
     log = logging.getLogger("coldloop.control_plc")
     log.info("session started", extra={"session": 3, "factor": 60.0})
     log.warning("two\nlines and a %s", "kelvin: µK")
-    assert stream.getvalue().count("\n") == 2
     first, second = lines(stream)
+    assert stream.getvalue().count("\n") == 2
     assert datetime.fromisoformat(first.pop("time")).tzinfo is not None
     assert first == {
         "level": "info",
@@ -83,11 +90,106 @@ def test_the_time_is_that_of_the_record_in_utc() -> None:
     assert json.loads(JsonFormatter("plant").format(record))["time"] == "1970-01-01T00:00:01.500+00:00"
 
 
+class Unspeakable:
+    def __str__(self) -> str:
+        raise ValueError("no words")
+
+
+def test_a_record_that_cannot_be_formatted_is_told_and_does_not_fail_who_logs_it(stream: io.StringIO) -> None:
+    set_up_logs("plant", "info", stream)
+    logging.getLogger("coldloop.plant").warning("applied", extra={"outputs": Unspeakable()})
+    (line,) = lines(stream)
+    assert (line["logger"], line["event"]) == ("coldloop.plant", "a record cannot be formatted")
+    assert (line["text"], line["reason"]) == ("applied", "ValueError('no words')")
+
+
 def test_setting_up_again_replaces_what_was_there(stream: io.StringIO) -> None:
     later = io.StringIO()
     set_up_logs("plant", "info", stream)
     set_up_logs("plant", "info", later)
     logging.getLogger("coldloop").info("once")
-    assert stream.getvalue() == ""
     assert len(lines(later)) == 1
+    assert stream.getvalue() == ""
     assert sys.stderr is not stream
+
+
+class Stalled(io.StringIO):
+    """A stream on which the first write waits until somebody reads."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reached, self.read = threading.Event(), threading.Event()
+
+    def write(self, text: str) -> int:
+        self.reached.set()
+        self.read.wait(20)
+        return super().write(text)
+
+
+@pytest.fixture
+def stalled(stream: io.StringIO) -> Iterator[Stalled]:  # noqa: ARG001 - which restores the loggers
+    """A stream that nobody reads, with the logs of a service sent to it and the first line on its way."""
+    one = Stalled()
+    set_up_logs("plant", "info", one)
+    logging.getLogger("coldloop").info("first")
+    assert one.reached.wait(20)
+    yield one
+    one.read.set()
+
+
+def log_many(count: int) -> None:
+    for number in range(count):
+        logging.getLogger(f"coldloop.{number}").info("event %d", number)
+
+
+def test_while_nobody_reads_the_newest_lines_are_dropped_and_the_next_line_tells_how_many(stalled: Stalled) -> None:
+    log_many(CAPACITY + 25)
+    assert dropped() == 25
+    stalled.read.set()
+    before = lines(stalled)
+    logging.getLogger("coldloop").info("read again")
+    logging.getLogger("coldloop").info("and again")
+    assert [line["event"] for line in before] == ["first", *(f"event {number}" for number in range(CAPACITY))]
+    assert [line.get("dropped") for line in lines(stalled)[-2:]] == [25, None]
+    assert dropped() == 25
+
+
+def test_drops_that_no_line_has_told_are_told_by_the_last_one(stalled: Stalled) -> None:
+    log_many(CAPACITY + 3)
+    stalled.read.set()
+    end_logs()
+    last = json.loads(stalled.getvalue().splitlines()[-1])
+    assert (last["event"], last["dropped"]) == ("lines dropped", 3)
+
+
+def test_the_last_line_is_written_after_all_others(stream: io.StringIO) -> None:
+    set_up_logs("plant", "info", stream)
+    log_many(50)
+    end_logs("plant: cannot listen")
+    assert stream.getvalue().count("\n") == 51
+    assert stream.getvalue().endswith("\nplant: cannot listen\n")
+
+
+PROGRAM = """
+import logging
+from coldloop.logs import dropped, end_logs, set_up_logs
+set_up_logs("plant", "info")
+for number in range(3000):
+    logging.getLogger(f"coldloop.{number}").info("x" * 100)
+assert dropped() > 0
+end_logs("the end")
+"""
+
+
+def test_a_program_whose_lines_nobody_reads_goes_on_and_ends() -> None:
+    with subprocess.Popen([sys.executable, "-c", PROGRAM], stderr=subprocess.PIPE, text=True) as process:
+        assert process.wait(timeout=20) == 0
+        assert process.stderr is not None
+        assert '"event": "xxx' in process.stderr.readline()
+
+
+def test_a_program_whose_reader_has_gone_goes_on_and_ends() -> None:
+    with subprocess.Popen([sys.executable, "-c", PROGRAM], stderr=subprocess.PIPE) as process:
+        assert process.stderr is not None
+        process.stderr.close()
+        assert process.wait(timeout=20) == 0

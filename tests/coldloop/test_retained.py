@@ -1,17 +1,25 @@
 """A state that survives: the old one or the new one, never neither, and never another's."""
 
+import errno
+import os
+import stat
+from collections.abc import Callable
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 
-from coldloop.retained import RetainedFile, RetainedStateError
+from coldloop.retained import RetainedFile, RetainedStateError, encoded
 
 OLD = {"session": 3, "tick": 1000, "applied": [43.0, 75.0, 36.0]}
 NEW = {"session": 3, "tick": 1001, "applied": [43.1, 76.0, 36.0]}
 
 
-def kept(path: Path, owner: str = "control_plc/1", digest: int = 0xC01D) -> RetainedFile:
+OURS = ("control_plc/1", 0xC01D)
+
+
+def kept(path: Path, owner: str = OURS[0], digest: int = OURS[1]) -> RetainedFile:
     return RetainedFile(path, owner, digest)
 
 
@@ -24,44 +32,106 @@ def test_what_is_saved_is_read_back_and_nothing_is_nothing(tmp_path: Path) -> No
     assert [path.name for path in tmp_path.iterdir()] == ["state"]
 
 
-class KilledError(Exception):
+class KilledError(BaseException):
     """The process is killed here."""
 
 
-def test_a_kill_at_each_byte_of_its_writing_leaves_the_old_state_or_the_new(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "state"
-    whole = kept(path).encoded(NEW)
-    write, replace = Path.write_bytes, Path.replace
-    found: list[Any] = []
+class Disk:
+    """Stands between the program and its disk: notes what is done, and kills the process, or fails, on the way.
 
-    for survived in range(len(whole) + 2):
+    Args:
+        killed_after: How many bytes are written, then steps done, before the process is killed.
+        full_after: How many bytes are written before the disk is full.
+    """
 
-        def torn_write(self: Path, data: bytes, *, survived: int = survived) -> int:
-            write(self, data[:survived])
-            if survived <= len(data):
+    def __init__(
+        self, patch: pytest.MonkeyPatch, *, killed_after: int | None = None, full_after: int | None = None
+    ) -> None:
+        self.steps: list[str] = []
+        self._life = killed_after
+        self._room = full_after
+        opened, replace, fsync = Path.open, Path.replace, os.fsync
+
+        def sync(descriptor: int) -> None:
+            is_folder = stat.S_ISDIR(os.fstat(descriptor).st_mode)
+            self._step("sync folder" if is_folder else "sync file", lambda: fsync(descriptor))
+
+        patch.setattr(Path, "open", lambda path, *mode, **how: SlowFile(opened(path, *mode, **how), self))
+        patch.setattr(Path, "replace", lambda path, target: self._step("rename", lambda: replace(path, target)))
+        patch.setattr(os, "fsync", sync)
+
+    def write(self, file: Any, data: memoryview) -> int:  # noqa: ANN401 - a file
+        """Write one byte."""
+        if self._room is not None:
+            if not self._room:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._room -= 1
+        self._step("write", lambda: file.write(data[:1]))
+        return 1
+
+    def _step(self, name: str, do: Callable[[], object]) -> None:
+        if self._life is not None:
+            if not self._life:
                 raise KilledError
-            return len(data)
+            self._life -= 1
+        self.steps.append(name)
+        do()
 
-        def killed_after(self: Path, target: Path) -> Path:
-            replace(self, target)
-            raise KilledError
 
-        kept(path).save(OLD)
-        with monkeypatch.context() as patch:
-            patch.setattr(Path, "write_bytes", torn_write)
-            patch.setattr(Path, "replace", killed_after)
+class SlowFile:
+    """A file that takes a byte at a time."""
+
+    def __init__(self, file: Any, disk: Disk) -> None:  # noqa: ANN401 - a file
+        self._file = file
+        self._disk = disk
+        self.fileno = file.fileno
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def write(self, data: memoryview) -> int:
+        return self._disk.write(self._file, data)
+
+
+def test_a_kill_at_each_byte_and_step_leaves_the_old_state_or_the_new(tmp_path: Path) -> None:
+    file = kept(tmp_path / "state")
+    size = len(encoded(NEW, *OURS))
+    found: list[Any] = []
+    for survived in range(size + 3):
+        file.save(OLD)
+        with pytest.MonkeyPatch.context() as patch:
+            Disk(patch, killed_after=survived)
             with pytest.raises(KilledError):
-                kept(path).save(NEW)
-        found.append(kept(path).load())
-    assert found == [OLD] * (len(whole) + 1) + [NEW]
+                file.save(NEW)
+        found.append(file.load())
+    assert found == [OLD] * (size + 2) + [NEW]
+
+
+def test_the_content_is_on_the_disk_before_its_name_and_the_name_before_the_call_returns(tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        disk = Disk(patch)
+        kept(tmp_path / "state").save(NEW)
+    assert [step for step, _ in groupby(disk.steps)] == ["write", "sync file", "rename", "sync folder"]
+
+
+def test_a_disk_that_fills_leaves_the_old_state_and_no_draft(tmp_path: Path) -> None:
+    file = kept(tmp_path / "state")
+    file.save(OLD)
+    with pytest.MonkeyPatch.context() as patch:
+        Disk(patch, full_after=10)
+        with pytest.raises(RetainedStateError, match="No space left"):
+            file.save(NEW)
+    assert file.load() == OLD
+    assert [path.name for path in tmp_path.iterdir()] == ["state"]
 
 
 @pytest.mark.parametrize("wrong", ["cut", "flipped"])
 def test_a_torn_or_damaged_file_is_refused_wherever_the_damage_is(tmp_path: Path, wrong: str) -> None:
     path = tmp_path / "state"
-    whole = kept(path).encoded(NEW)
+    whole = encoded(NEW, *OURS)
     for position in range(len(whole)):
         damaged = bytearray(whole)
         damaged[position] ^= 0x04

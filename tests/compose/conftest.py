@@ -1,18 +1,20 @@
-"""The composed rig, brought up once for all tests here; they are skipped where no container engine runs."""
+"""Composed rigs, each brought up once for the tests of a file; they are skipped where no container engine runs."""
 
 import json
 import os
 import shutil
-import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from rig import cli
+from rig.ports import ReservedPorts
 
 ROOT = Path(__file__).parents[2]
 SERVICES = ("plant", "control-plc", "optimizer-plc")
@@ -51,22 +53,62 @@ class ComposedRig:
         return described
 
 
+@contextmanager
+def composed(network: str, files: Sequence[str] = ("docker-compose.yml",), **environment: str) -> Iterator[ComposedRig]:
+    """Bring a rig up, on networks whose addresses begin so; take it down with all that it has left."""
+    names = ("COLDLOOP_PLANT_PORT", "COLDLOOP_CONTROL_PLC_PORT", "COLDLOOP_OPTIMIZER_PLC_PORT", "COLDLOOP_MQTT_PORT")
+    with ReservedPorts(len(names)) as reserved:
+        own = {
+            **{name: str(port) for name, port in zip(names, reserved.numbers, strict=True)},
+            "COMPOSE_PROJECT_NAME": f"coldloop-test-{os.getpid()}",
+            "COMPOSE_FILE": os.pathsep.join(files),
+            "COLDLOOP_NETWORK": network,
+        }
+        rig = ComposedRig({**os.environ, **own, **environment}, *reserved.numbers)
+        try:
+            rig.compose("build")
+            _bring_up(rig)
+            yield rig
+        finally:
+            rig.compose("down", "--volumes", "--timeout", "5", check=False)
+
+
 @pytest.fixture(scope="session")
-def rig() -> Iterator[ComposedRig]:
+def _engine() -> Iterator[None]:
+    """A container engine, which keeps the images of this run no longer than it takes."""
     if not _engine_runs():
         if "CONTAINER_ENGINE_REQUIRED" in os.environ:
             pytest.fail("no container engine runs, or it has no `docker compose`", pytrace=False)
         pytest.skip("no container engine runs here")
-    ports = _free_ports(4)
-    names = ("COLDLOOP_PLANT_PORT", "COLDLOOP_CONTROL_PLC_PORT", "COLDLOOP_OPTIMIZER_PLC_PORT", "COLDLOOP_MQTT_PORT")
-    published = {name: str(port) for name, port in zip(names, ports, strict=True)}
-    rig = ComposedRig({**os.environ, **published, "COMPOSE_PROJECT_NAME": f"coldloop-test-{os.getpid()}"}, *ports)
-    try:
-        rig.compose("build")
-        _bring_up(rig)
-        yield rig
-    finally:
-        rig.compose("down", "--volumes", "--rmi", "local", "--timeout", "5", check=False)
+    yield
+    names = [f"coldloop-test-{os.getpid()}-{service}" for service in SERVICES]
+    subprocess.run(["docker", "image", "rm", "--force", *names], check=False, capture_output=True)
+
+
+@pytest.fixture(scope="module")
+def rig(_engine: None) -> Iterator[ComposedRig]:
+    """The rig as it comes."""
+    with composed("172.29") as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Certificates for the rig; the containers' user can read the keys."""
+    folder = tmp_path_factory.mktemp("certificates") / "site"
+    hosts = [f"--host={name}" for name in ("plant.field", "control-plc.control")]
+    assert cli.main(["certificates", "--out", str(folder), *hosts]) == 0
+    for file in folder.glob("*.key"):
+        file.chmod(0o644)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def secured_rig(_engine: None, site: Path) -> Iterator[ComposedRig]:
+    """The rig with TLS."""
+    files = ("docker-compose.yml", "docker-compose.tls.yml")
+    with composed("172.29", files, COLDLOOP_CERTIFICATES=str(site)) as one:
+        yield one
 
 
 def _bring_up(rig: ComposedRig) -> None:
@@ -88,12 +130,6 @@ def _engine_runs() -> bool:
         )
     except (OSError, subprocess.TimeoutExpired):
         return False
-
-
-def _free_ports(count: int) -> list[int]:
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
-        return [one.getsockname()[1] for one in sockets]
 
 
 @pytest.fixture

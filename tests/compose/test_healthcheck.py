@@ -1,52 +1,163 @@
 """What the containers' health check says of servers, right and wrong; needs no container."""
 
+import asyncio
 import os
+import runpy
 import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from coldloop.modbus.server import DeviceIdentity, ModbusServer
+from coldloop.modbus.settings import ServerSettings, TlsSettings
+from coldloop.registers.bank import RegisterBank
+from coldloop.registers.codec import WordOrder
+from coldloop.registers.common import Identity, ServiceState
+from coldloop.registers.control_plc import CONTROL_MAP, ControlSession
+from coldloop.registers.declaration import RegisterMap
+from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
+from coldloop.registers.plant import PLANT_MAP, PlantSession
+from rig.certificates import Authority
+
 PROGRAM = Path(__file__).parents[2] / "docker" / "healthcheck.py"
+MAPS = {"plant": PLANT_MAP, "control_plc": CONTROL_MAP, "optimizer_plc": OPTIMIZER_MAP}
+RUNNING, READY = ServiceState.RUNNING, ServiceState.READY
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
-
-
-def check(port: int) -> "subprocess.CompletedProcess[str]":
-    environment = {**os.environ, "SERVICE": "control_plc", "COLDLOOP__CONTROL_PLC__SERVER__PORT": str(port)}
+def check(
+    port: int, environment: Mapping[str, str], service: str = "control_plc"
+) -> "subprocess.CompletedProcess[str]":
+    own = {"SERVICE": service, f"COLDLOOP__{service.upper()}__SERVER__PORT": str(port)}
     command = [sys.executable, "-I", "-S", str(PROGRAM)]
-    return subprocess.run(command, env=environment, check=False, capture_output=True, text=True, timeout=30)
+    return subprocess.run(
+        command, env={**os.environ, **own, **environment}, check=False, capture_output=True, text=True, timeout=30
+    )
 
 
-@pytest.fixture(params=["high-first", "low-first"])
-def control_plc(request: pytest.FixtureRequest) -> Iterator[int]:
-    port = free_port()
-    settings = [f"server.port={port}", f"word_order={request.param}", "plant.port=1", "plant.patience_s=60"]
-    command = [sys.executable, "-m", "control_plc", *[f"--set=control_plc.{setting}" for setting in settings]]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+class Service:
+    """A server of a service, whose scans a test decides on."""
+
+    def __init__(self, register_map: RegisterMap, order: WordOrder, tls: TlsSettings | None) -> None:
+        self.map = register_map
+        self.bank = RegisterBank(register_map, order)
+        self.server = ModbusServer(
+            self.bank,
+            settings=ServerSettings(port=0, tls=tls),
+            on_write=lambda *_: None,
+            identity=DeviceIdentity(product="test", revision="0"),
+        )
+
+    def show(self, tick: int, state: ServiceState = RUNNING, session: int = 70_000) -> None:
+        self.bank.put(Identity(map_digest=self.map.digest, state=state, session=session, tick=tick))
+
+    async def scan(self) -> None:
+        """Go from tick to tick until cancelled."""
+        for tick in range(0xFFF0, 0x1FFFF):
+            self.show(tick)
+            await asyncio.sleep(0.01)
+
+    async def check(self, environment: Mapping[str, str] | None = None) -> "subprocess.CompletedProcess[str]":
+        how = {"COLDLOOP__SESSION__MODE": "realtime", **(environment or {})}
+        return await asyncio.to_thread(check, self.server.port, how, self.map.service)
+
+
+@asynccontextmanager
+async def served(
+    service: str = "control_plc", order: WordOrder = WordOrder.HIGH_FIRST, tls: TlsSettings | None = None
+) -> AsyncIterator[Service]:
+    one = Service(MAPS[service], order, tls)
+    one.show(7)
+    await one.server.start()
     try:
-        yield port
+        yield one
     finally:
-        process.terminate()
-        process.wait(timeout=20)
+        await one.server.close()
 
 
-def test_a_service_that_answers_is_healthy(control_plc: int) -> None:
-    deadline = time.monotonic() + 20
-    while (done := check(control_plc)).returncode and time.monotonic() < deadline:
-        time.sleep(0.2)
+@asynccontextmanager
+async def scanning(*which: Any, **how: Any) -> AsyncIterator[Service]:  # noqa: ANN401 - those of served
+    async with served(*which, **how) as one:
+        task = asyncio.create_task(one.scan())
+        try:
+            yield one
+        finally:
+            task.cancel()
+
+
+@pytest.mark.parametrize("order", WordOrder)
+@pytest.mark.parametrize("service", ["plant", "control_plc"])
+async def test_a_service_that_goes_from_tick_to_tick_is_healthy(service: str, order: WordOrder) -> None:
+    async with scanning(service, order) as one:
+        done = await one.check()
     assert done.returncode == 0, done.stderr
 
 
-def test_a_port_on_which_nobody_listens_is_not() -> None:
-    done = check(free_port())
+@pytest.mark.parametrize("order", WordOrder)
+@pytest.mark.parametrize("service", ["plant", "control_plc"])
+async def test_one_that_stands_is_not_though_it_answers(service: str, order: WordOrder) -> None:
+    async with served(service, order) as one:
+        done = await one.check()
+    assert done.returncode == 1
+    assert f"{service} on port" in done.stderr
+    assert "stands at tick 7" in done.stderr
+
+
+async def test_in_lock_step_a_service_may_stand_whatever_its_configuration_says() -> None:
+    async with served() as one:
+        one.bank.put(ControlSession(70_000, 0, 1.0))
+        assert (await one.check()).returncode == 0
+        one.bank.put(ControlSession(70_000, 1, 1.0))
+        assert (await one.check({"COLDLOOP__SESSION__MODE": "lockstep"})).returncode == 1
+
+
+@pytest.mark.parametrize("state", ServiceState)
+async def test_an_optimiser_may_have_nothing_to_do(state: ServiceState) -> None:
+    async with served("optimizer_plc") as one:
+        one.show(7, state)
+        assert (await one.check()).returncode == 0
+
+
+@pytest.mark.parametrize("service", ["plant", "control_plc"])
+async def test_without_a_session_nothing_is_scanned(service: str) -> None:
+    async with served(service) as one:
+        one.show(0, READY, session=0)
+        done = await one.check()
+    assert done.returncode == 1
+    assert "runs no session" in done.stderr
+
+
+async def test_it_speaks_tls_and_trusts_no_other_server(tmp_path: Path) -> None:
+    def kept(folder: str) -> tuple[TlsSettings, dict[str, str]]:
+        authority = Authority.new("site", 1)
+        pairs = {
+            "ca": authority.pair,
+            "server": authority.issue_server("server", ["127.0.0.1"]),
+            "reader": authority.issue_client("reader", None),
+        }
+        (tmp_path / folder).mkdir()
+        for name, pair in pairs.items():
+            (tmp_path / folder / f"{name}.crt").write_bytes(pair.certificate_pem)
+            (tmp_path / folder / f"{name}.key").write_bytes(pair.key_pem)
+        paths = {name: tmp_path / folder / name for name in ("server.crt", "server.key", "ca.crt")}
+        tls = TlsSettings(certificate=paths["server.crt"], key=paths["server.key"], ca=paths["ca.crt"])
+        kinds = {"CERTIFICATE": "reader.crt", "KEY": "reader.key", "CA": "ca.crt"}
+        return tls, {f"HEALTHCHECK_TLS_{kind}": str(tmp_path / folder / name) for kind, name in kinds.items()}
+
+    (tls, ours), (_, others) = kept("ours"), kept("others")
+    async with scanning(tls=tls) as one:
+        assert (await one.check(ours)).stderr == ""
+        assert "certificate verify failed" in (await one.check(others)).stderr
+        assert (await one.check()).returncode == 1
+
+
+def test_a_port_on_which_nobody_listens_is_not_healthy(free_port: int) -> None:
+    done = check(free_port, {})
     assert done.returncode == 1
     assert "control_plc on port" in done.stderr
 
@@ -61,7 +172,22 @@ def test_nor_is_a_server_of_something_else() -> None:
 
         thread = threading.Thread(target=answer)
         thread.start()
-        done = check(server.getsockname()[1])
+        done = check(server.getsockname()[1], {})
         thread.join()
     assert done.returncode == 1
     assert "not a register map of ours" in done.stderr
+
+
+def test_the_addresses_it_reads_are_those_of_the_register_maps() -> None:
+    known = runpy.run_path(str(PROGRAM))
+    starters = {"plant": PlantSession, "control_plc": ControlSession}
+    addresses = {
+        service: block.address
+        for service, starter in starters.items()
+        for block in MAPS[service].blocks
+        if block.record is starter
+    }
+    assert known["SESSIONS"] == addresses
+    for register_map in MAPS.values():
+        (identity,) = [block for block in register_map.blocks if block.record is Identity]
+        assert identity.address == 0

@@ -221,7 +221,7 @@ def test_a_setting_that_is_no_driver_is_refused() -> None:
         ControlSection.model_validate({"driver": "nobody"})
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     readings=st.lists(
         st.tuples(st.floats(-80.0, 80.0) | st.just(math.nan), st.floats(-8.0, 100.0) | st.just(math.inf)),

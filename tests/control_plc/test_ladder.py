@@ -9,10 +9,11 @@ import pytest
 
 from coldloop.limits import InputLimits
 from coldloop.process import L1, OUTPUT_NAMES, T5
+from coldloop.registers.audit import EventKind
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Cause, Heartbeat, Mode, Operator, OperatorMode, SequenceRow, Update, Verdict
 from coldloop.registers.plant import Measurement
-from coldloop.registers.safety import AlarmAction, AlarmCommand, AlarmKind, AlarmState, EventKind
+from coldloop.registers.safety import AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from control_plc.program import ControlProgram
 from control_plc.settings import ControlSection
 

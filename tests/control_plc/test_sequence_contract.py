@@ -3,7 +3,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from coldloop.limits import InputLimits, RateReference
@@ -99,7 +99,8 @@ FAULTS = {
 
 
 def test_the_faults_reach_every_verdict_of_a_rejection() -> None:
-    assert set(FAULTS.values()) == set(Verdict) - {Verdict.NONE, Verdict.ACCEPTED, Verdict.NOT_INVITED}
+    others = {Verdict.NONE, Verdict.ACCEPTED, Verdict.NOT_INVITED, Verdict.PLANT_LOST}
+    assert set(FAULTS.values()) == set(Verdict) - others
 
 
 @pytest.mark.parametrize(("fault", "verdict"), FAULTS.items(), ids=FAULTS)
@@ -201,7 +202,7 @@ def test_a_sequence_is_judged_against_what_is_played_just_before_it_begins(bench
 def test_a_sequence_is_judged_against_the_last_row_when_the_one_before_will_have_run_out(
     bench: "Bench", at: At
 ) -> None:
-    bench.play([*[at(0.4)] * 3, at(), *[at(-0.4)] * 3], ticks=4)
+    bench.play([*[at(0.4)] * 3, *[at()] * 2, *[at(-0.4)] * 3], ticks=4)
     bench.scan()
     assert bench.plan(10)
     assert bench.offer(bench.sequence([at(0.2)] * 20)).verdict == Verdict.RATE_EXCEEDED
@@ -225,10 +226,14 @@ def test_with_elapsed_rates_a_missed_deadline_does_not_widen_what_is_accepted(
 
 
 moves = st.tuples(*[st.floats(-1.05, 1.05)] * 3)
+STILL = [(0.0, 0.0, 0.0)]
 updates = st.tuples(st.integers(1, 20), st.lists(moves, min_size=1, max_size=4))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
+@example(
+    reference=RateReference.PER_UPDATE, script=[(15, STILL), (15, STILL), (18, STILL), (18, STILL), (15, STILL * 4)]
+)
 @given(reference=st.sampled_from(RateReference), script=st.lists(updates, max_size=8))
 def test_what_is_accepted_is_what_is_applied(
     new_bench: "Callable[[InputLimits], Bench]",
@@ -238,6 +243,7 @@ def test_what_is_accepted_is_what_is_applied(
     """No accepted sequence is bent by the guard, but for what single precision cannot tell."""
     limits = InputLimits(rate_reference=reference)
     bench = new_bench(limits)
+    bench.steady = True  # outputs that count the ticks leave their sensors' ranges, and MPC is left for that
     now, _ = bench.scan()
     for ticks, wanted in script:
         assert bench.plan(ticks)

@@ -14,10 +14,14 @@ from typing import Any
 
 import pytest
 
+from coldloop.modbus.connection import Connection
+from coldloop.modbus.refusals import RefusalLog
+from coldloop.modbus.requests import RequestHandler
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, OnWrite, ServerSettings
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import client_context
-from coldloop.registers.bank import RegisterBank
+from coldloop.modbus.turns import Turns
+from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap, Role
@@ -101,7 +105,7 @@ async def served(
     bank.put(Identity(map_digest=register_map.digest, map_version=register_map.version))
     written: list[str] = []
 
-    def note(block: Block) -> None:
+    def note(block: Block, _caller: Caller) -> None:
         written.append(block.name)
 
     server = ModbusServer(
@@ -127,6 +131,62 @@ def serve() -> Serve:
     return served
 
 
+class FakeTransport(asyncio.Transport):
+    """Keeps what is written."""
+
+    def __init__(self) -> None:
+        super().__init__({"peername": ("127.0.0.1", 1)})
+        self.written = b""
+        self.closed = False
+
+    def write(self, data: Any) -> None:  # noqa: ANN401 - asyncio's signature
+        self.written += data
+
+    def close(self) -> None:
+        self.closed = True
+
+    abort = close
+
+    def is_closing(self) -> bool:
+        return self.closed
+
+    def pause_reading(self) -> None:
+        """Nothing is read here."""
+
+    resume_reading = pause_reading
+
+
+def plugged(
+    bank: RegisterBank,
+    refusals: RefusalLog,
+    turns: Turns | None = None,
+    on_write: OnWrite = lambda _block, _caller: None,
+    **settings: Any,  # noqa: ANN401 - any field of ServerSettings
+) -> tuple[Connection, FakeTransport]:
+    """Return a connection of which a test is the wire."""
+    identity = DeviceIdentity(product="rig", revision="0.1")
+    connection = Connection(
+        handler_for=lambda caller: RequestHandler(bank, identity, caller),
+        settings=ServerSettings.model_validate({"port": 0, **settings}),
+        on_write=on_write,
+        refusals=refusals,
+        turns=turns or Turns(),
+        opened=lambda _connection: True,
+        lost=lambda _connection: None,
+    )
+    transport = FakeTransport()
+    connection.connection_made(transport)
+    return connection, transport
+
+
+Plug = Callable[..., tuple[Connection, FakeTransport]]
+
+
+@pytest.fixture(scope="session")
+def plug() -> Plug:
+    return plugged
+
+
 class Site:
     """Certificates of a site, as files."""
 
@@ -140,7 +200,7 @@ class Site:
         certificate, key = self.folder / f"{name}.crt", self.folder / f"{name}.key"
         certificate.write_bytes(pair.certificate_pem)
         key.write_bytes(pair.key_pem)
-        return TlsSettings(certificate=certificate, key=key, ca=self.folder / "ca.crt")
+        return TlsSettings(certificate=certificate, key=key, ca=self.folder / "ca.crt", warn_days=0)
 
     def client(self, role: str | None) -> ssl.SSLContext:
         name = f"client-{role}"[:20]

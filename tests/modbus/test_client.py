@@ -16,14 +16,16 @@ from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, Grant
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.plant import PLANT_MAP, Actuators, LoadStep, Measurement, PlantSample, PlantSession
+from coldloop.seal import sealed
 
 if TYPE_CHECKING:
+    from coldloop.registers.bank import Caller
     from coldloop.registers.declaration import Block
     from tests.modbus.conftest import Running, Serve
 
-ACTUATORS = Actuators(tick=7, cv155=50.0, ncr22=100.0, cv156=60.0, session=1)
-MEASUREMENT = as_transmitted(
-    Measurement(7, 40.5, tuple(float(i) for i in range(22)), tuple(i / 3 for i in range(28)), 1)
+ACTUATORS = sealed(Actuators(tick=7, cv155=50.0, ncr22=100.0, cv156=60.0, session=1))
+MEASUREMENT = sealed(
+    as_transmitted(Measurement(7, 40.5, tuple(float(i) for i in range(22)), tuple(i / 3 for i in range(28)), 1))
 )
 
 
@@ -36,12 +38,6 @@ async def client_of(
         yield client
     finally:
         client.close()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.mark.parametrize("order", WordOrder)
@@ -89,22 +85,20 @@ async def test_a_refusal_says_who_refused_what(serve: "Serve") -> None:
         )
         with pytest.raises(RequestRefusedError, match="exception 2"):
             await client.write(MEASUREMENT)
-        assert await client.read(Actuators) == Actuators(0, 0.0, 0.0, 0.0, 0)
+        assert running.bank.get(Actuators) == Actuators(0, 0.0, 0.0, 0.0, 0)
 
 
-async def test_nobody_listens() -> None:
-    port = free_port()
-    async with client_of(port) as client:
-        with pytest.raises(PeerUnreachableError, match=rf"^nobody listens as plant at 127.0.0.1:{port}: start it"):
+async def test_nobody_listens(free_port: int) -> None:
+    async with client_of(free_port) as client:
+        with pytest.raises(PeerUnreachableError, match=rf"^nobody listens as plant at 127.0.0.1:{free_port}: start it"):
             await client.connect(0.0)
 
 
-async def test_patience_outlasts_a_server_that_starts_late(serve: "Serve") -> None:
-    port = free_port()
-    async with client_of(port) as client:
+async def test_patience_outlasts_a_server_that_starts_late(serve: "Serve", free_port: int) -> None:
+    async with client_of(free_port) as client:
         connecting = asyncio.ensure_future(client.connect(15.0))
         await asyncio.sleep(0)
-        async with serve(port=port):
+        async with serve(port=free_port):
             await connecting
             assert (await client.read(Identity)).map_digest == PLANT_MAP.digest
 
@@ -175,7 +169,7 @@ async def test_something_else_answers(answer: bytes | None, message: str) -> Non
 async def test_a_silent_peer_is_noticed_within_the_timeout(serve: "Serve") -> None:
     never = asyncio.Event()
 
-    async def wait(_block: "Block") -> None:
+    async def wait(_block: "Block", _caller: "Caller") -> None:
         await never.wait()
 
     async with serve(on_write=wait) as running, client_of(running.server.port, timeout_s=0.2) as client:
@@ -187,11 +181,12 @@ async def test_a_silent_peer_is_noticed_within_the_timeout(serve: "Serve") -> No
 
 
 async def test_an_exchange_may_be_given_more_patience_than_other_requests(serve: "Serve") -> None:
-    async def wait(_block: "Block") -> None:
+    async def wait(_block: "Block", _caller: "Caller") -> None:
         await asyncio.sleep(0.4)
 
     async with serve(on_write=wait) as running, client_of(running.server.port, timeout_s=0.1) as client:
-        assert (await client.exchange(ACTUATORS, Measurement, patience_s=10.0)).tick == 0
+        running.bank.put(MEASUREMENT)
+        assert (await client.exchange(ACTUATORS, Measurement, patience_s=10.0)) == MEASUREMENT
         with pytest.raises(PeerUnreachableError):
             await client.exchange(ACTUATORS, Measurement)
 
@@ -199,7 +194,7 @@ async def test_an_exchange_may_be_given_more_patience_than_other_requests(serve:
 async def test_a_cancelled_exchange_cancels_the_wait_and_leaves_a_usable_client(serve: "Serve") -> None:
     waiting, cancelled = asyncio.Event(), asyncio.Event()
 
-    async def wait(_block: "Block") -> None:
+    async def wait(_block: "Block", _caller: "Caller") -> None:
         waiting.set()
         try:
             await asyncio.Event().wait()
@@ -217,7 +212,7 @@ async def test_a_cancelled_exchange_cancels_the_wait_and_leaves_a_usable_client(
 async def test_a_server_that_goes_away_is_noticed_at_once_and_found_again(serve: "Serve") -> None:
     waiting = asyncio.Event()
 
-    async def wait(_block: "Block") -> None:
+    async def wait(_block: "Block", _caller: "Caller") -> None:
         waiting.set()
         await asyncio.Event().wait()
 
@@ -231,15 +226,15 @@ async def test_a_server_that_goes_away_is_noticed_at_once_and_found_again(serve:
         with pytest.raises(PeerUnreachableError, match="closed the connection"):
             await exchange
         with pytest.raises(PeerUnreachableError, match="nobody listens"):
-            await client.read(Actuators)
+            await client.read(LoadStep)
         async with serve(port=port):
-            assert await client.read(Actuators) == Actuators(0, 0.0, 0.0, 0.0, 0)
+            assert await client.read(LoadStep) == LoadStep(0, 0.0)
 
 
 async def test_both_ends_send_small_packets_without_delay(serve: "Serve") -> None:
     async with serve() as running, client_of(running.server.port) as client:
         await client.connect(1.0)
-        transport = client._client.ctx.transport  # noqa: SLF001 - pymodbus' own, through our client
+        transport = client._transport._client.ctx.transport  # noqa: SLF001 - pymodbus' own, through our client
         assert transport.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 

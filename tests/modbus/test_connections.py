@@ -10,12 +10,14 @@ import pytest
 from coldloop.errors import PortInUseError
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.registers.bank import RegisterBank
-from coldloop.registers.plant import PLANT_MAP
+from coldloop.registers.plant import PLANT_MAP, PlantSession
 
 if TYPE_CHECKING:
+    from coldloop.registers.bank import Caller
     from coldloop.registers.declaration import Block
     from tests.modbus.conftest import Serve
 
+SESSION = PlantSession(session=1, realtime=0, factor=1.0, seed=2, load_steps=3)
 READ_MAGIC = bytes.fromhex("03 0000 0002")
 READ_MUCH = bytes.fromhex("03 4000 007d")
 
@@ -48,11 +50,12 @@ async def test_a_crowd_leaves_as_many_connections_as_the_limit_says(serve: "Serv
 async def test_a_connection_with_a_request_in_flight_is_not_the_one_that_makes_room(serve: "Serve") -> None:
     waiting, release = asyncio.Event(), asyncio.Event()
 
-    async def wait(_block: "Block") -> None:
+    async def wait(_block: "Block", _caller: "Caller") -> None:
         waiting.set()
         await release.wait()
 
     async with serve(connection_limit=2, replaceable_after_s=0, on_write=wait) as running:
+        running.bank.put(SESSION)
         oldest, idle = await running.connect(), await running.connect()
         await idle.ask(READ_MAGIC)
         oldest.send(framed(bytes.fromhex("06 0192 0001")))
@@ -67,11 +70,12 @@ async def test_a_connection_with_a_request_in_flight_is_not_the_one_that_makes_r
 async def test_when_all_have_a_request_in_flight_the_newcomer_is_refused(serve: "Serve") -> None:
     waiting = asyncio.Event()
 
-    async def wait(_block: "Block") -> None:
+    async def wait(_block: "Block", _caller: "Caller") -> None:
         waiting.set()
         await asyncio.Event().wait()
 
     async with serve(connection_limit=1, on_write=wait) as running:
+        running.bank.put(SESSION)
         first = await running.connect()
         first.send(framed(bytes.fromhex("06 0192 0001")))
         await waiting.wait()
@@ -139,7 +143,7 @@ def plant_server(settings: ServerSettings) -> ModbusServer:
     return ModbusServer(
         RegisterBank(PLANT_MAP),
         settings=settings,
-        on_write=lambda _block: None,
+        on_write=lambda _block, _caller: None,
         identity=DeviceIdentity(product="plant", revision="0.1"),
     )
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 READ_MAGIC = bytes.fromhex("03 0000 0002")
 FUNCTIONS = [1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 43]
-bounded = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+bounded = settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 words = st.sampled_from([0, 1, 2, 8, 100, 102, 104, 121, 125, 126, 200, 400, 0x7FFF, 0xFFFF]).map(
     lambda word: struct.pack(">H", word)

@@ -83,7 +83,7 @@ WRITES = {
     "FC16 with data missing": ("10 0064 0002 04 0000", "90 03"),
     "FC16 with data too many": ("10 0064 0002 04 000000000000", "90 03"),
     "FC16 of read-only registers": ("10 00c8 0002 04 00000000", "90 02"),
-    "FC16 across the end of a block": ("10 006e 0004 08" + "00000001" + floats(1), "90 02"),
+    "FC16 across the end of a block": ("10 0072 0004 08" + "00000000" + floats(1), "90 02"),
     "FC16 across the end of the address space": ("10 ffff 0002 04 00000000", "90 02"),
     "FC16 that begins with half a float": ("10 0067 0003 06 0000" + floats(1), "90 03"),
     "FC16 that ends with half a float": ("10 0066 0003 06" + floats(1) + "0000", "90 03"),

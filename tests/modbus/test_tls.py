@@ -59,8 +59,8 @@ async def test_without_a_role_that_is_known_a_certificate_lets_read_and_no_more(
     async with serve(CONTROL_MAP, tls=site.server, client=site.client(role)) as running:
         wire = await running.connect()
         assert await wire.ask(READ_MAGIC) == MAGIC
-        assert await wire.ask(WRITE_GRANT) == b"\x90\x02"
-        assert await wire.ask(WRITE_ROW) == b"\x90\x02"
+        assert await wire.ask(WRITE_GRANT) == b"\x90\x01"
+        assert await wire.ask(WRITE_ROW) == b"\x90\x01"
         assert running.written == []
 
 
@@ -163,7 +163,7 @@ async def test_our_client_reads_and_writes_by_its_role(serve: "Serve", site: "Si
         await client.connect(1.0)
         await client.write_rows([SequenceRow(float(row), 0.0, 0.0) for row in range(100)])
         assert (await client.exchange(AwaitUpdate(1, 2), Identity)).map_digest == CONTROL_MAP.digest
-        with pytest.raises(RequestRefusedError, match="not for this client to write"):
+        with pytest.raises(RequestRefusedError, match=r"exception 1, .*not for the role of this client"):
             await client.write(Grant(1))
         assert [row.cv155 for row in await client.read_rows(SequenceRow, 0, 100)] == list(range(100))
         client.close()
@@ -208,8 +208,6 @@ def bad_files(site: "Site", case: str) -> TlsSettings:
             pair.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret"))
         )
         return files
-    if case == "expired":
-        return site.keep("bad", site.authority.issue_client("bad", None, days=-1))
     junk = here / "junk.pem"
     junk.write_bytes(b"-----BEGIN CERTIFICATE-----\nnot base64!\n-----END CERTIFICATE-----\n")
     return {
@@ -226,7 +224,6 @@ def bad_files(site: "Site", case: str) -> TlsSettings:
         ("missing", r"certificate .*none.crt: No such file or directory; name a readable file, or make some"),
         ("a folder", r"key .*: Is a directory; name a readable file"),
         ("passphrase", r"key .*: has a passphrase; name a key without one"),
-        ("expired", r"certificate .*: expired on \d{4}-\d\d-\d\d; make a new one"),
         ("junk certificate", r"certificate .*: no PEM certificate in it; name a file that has one"),
         ("junk key", r"key .*: no PEM key in it; name a file that has one"),
         ("junk ca", r"ca .*: no PEM certificate in it; name a file that has one"),

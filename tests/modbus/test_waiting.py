@@ -13,6 +13,7 @@ from coldloop.registers.plant import Actuators, PlantSession
 if TYPE_CHECKING:
     from collections.abc import Awaitable
 
+    from coldloop.registers.bank import Caller
     from tests.modbus.conftest import Serve
 
 STEP = bytes.fromhex("17 000a 0002 0064 0002 04 00000001")  # writes the tick of the actuators, reads that of the plant
@@ -24,7 +25,7 @@ ADJOINING_MAP = RegisterMap(
     (
         IDENTITY_BLOCK,
         Block("actuators", 100, Actuators, "", Role.CONTROL),
-        Block("session", 112, PlantSession, "", Role.OPERATOR),
+        Block("session", 116, PlantSession, "", Role.OPERATOR),
     ),
 )
 
@@ -37,7 +38,7 @@ class Gate:
         self.waiting = asyncio.Event()
         self.cancelled = asyncio.Event()
 
-    def on_write(self, _block: Block) -> "Awaitable[None]":
+    def on_write(self, _block: Block, _caller: "Caller") -> "Awaitable[None]":
         return self._pass()
 
     async def _pass(self) -> None:
@@ -141,15 +142,15 @@ async def test_blocks_are_told_in_the_order_of_their_addresses_each_after_the_wa
 ) -> None:
     story: list[str] = []
 
-    async def take_in(block: Block) -> None:
+    async def take_in(block: Block, _caller: "Caller") -> None:
         story.append(f"{block.name} begins")
         await asyncio.sleep(0)
         story.append(f"{block.name} ends")
 
     async with serve(ADJOINING_MAP, on_write=take_in) as running:
         wire = await running.connect()
-        both = struct.pack(">IfffIIIHfIH", 1, 2.0, 3.0, 4.0, 1, 0, 5, 1, 6.0, 7, 9)
-        assert await wire.ask(bytes.fromhex("10 0064 0014 28") + both) == bytes.fromhex("10 0064 0014")
+        both = struct.pack(">IfffIIIIIHfIH", 1, 2.0, 3.0, 4.0, 1, 0, 0, 0, 5, 1, 6.0, 7, 9)
+        assert await wire.ask(bytes.fromhex("10 0064 0018 30") + both) == bytes.fromhex("10 0064 0018")
         assert running.bank.get(PlantSession) == PlantSession(5, 1, 6.0, 7, 9)
         assert story == ["actuators begins", "actuators ends", "session begins", "session ends"]
 
@@ -159,7 +160,7 @@ async def test_a_program_that_fails_is_answered_with_exception_04(serve: "Serve"
     async def fail_later() -> None:
         raise ValueError("no such tick")
 
-    def fail(_block: Block) -> "Awaitable[None]":
+    def fail(_block: Block, _caller: "Caller") -> "Awaitable[None]":
         if moment == "at once":
             raise ValueError("no such tick")
         return fail_later()

@@ -22,7 +22,7 @@ def matrix(rng: np.random.Generator, rows: int, columns: int, precision: Precisi
 
 
 @each_precision
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(n=sizes, k=sizes, m=sizes, seed=seeds)
 def test_a_product_is_numpys(precision: Precision, tolerance: float, n: int, k: int, m: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -33,7 +33,7 @@ def test_a_product_is_numpys(precision: Precision, tolerance: float, n: int, k: 
 
 
 @each_precision
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(n=sizes, k=sizes, seed=seeds)
 def test_applying_a_transposed_matrix_adds_to_the_result(
     precision: Precision, tolerance: float, n: int, k: int, seed: int
@@ -48,7 +48,7 @@ def test_applying_a_transposed_matrix_adds_to_the_result(
 
 
 @each_precision
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(n=sizes, seed=seeds)
 def test_the_factor_is_numpys_and_solves_its_system(precision: Precision, tolerance: float, n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -63,7 +63,7 @@ def test_the_factor_is_numpys_and_solves_its_system(precision: Precision, tolera
     assert np.abs(residual).max() <= 100 * tolerance * (1 + np.abs(x).max() * np.abs(S).max())
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(n=sizes, seed=seeds)
 def test_only_the_upper_triangle_is_read(n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)

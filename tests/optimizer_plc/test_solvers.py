@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 seeds = st.integers(0, 2**32 - 1)
-repeatable = settings(max_examples=15, deadline=None, derandomize=True)
+repeatable = settings(max_examples=15, derandomize=True)
 
 EVERY = [name.value for name in SolverName]
 EXACT = ["qpoases", "osqp", "daqp"]

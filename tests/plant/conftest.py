@@ -1,15 +1,34 @@
+import struct
 from dataclasses import dataclass
+from functools import partial
+from itertools import count
 from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import pytest
 
 import coldloop
 from coldloop.lti_model import LtiModel, load
+from coldloop.modbus.identification import DeviceIdentity
+from coldloop.modbus.requests import RequestHandler, Written
+from coldloop.model_file import read_header
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
+from coldloop.registers.bank import ALL_ROLES, Caller, RefusedAccessError
+from coldloop.registers.codec import codec_of
+from coldloop.registers.declaration import Role
+from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
+from coldloop.seal import Seal, seal_of, sealed
 from plant.cold_box import REFERENCE, ColdBox, derivative, outputs
 from plant.helium.properties import Helium, load_helium
 from plant.integrator import advance
 from plant.numeric import RealArray
+from plant.registers import RackRegisters
+from plant.runtime import make_program
+from plant.settings import PlantSettings
+
+R = TypeVar("R", bound=tuple[Any, ...])
 
 
 @dataclass(frozen=True)
@@ -57,3 +76,137 @@ def plant(model: LtiModel, helium: Helium) -> Plant:
 def rest(model: LtiModel) -> tuple[RealArray, RealArray, float]:
     """State, inputs and load at the operating point, free to change."""
     return np.array(model.x0), np.array(model.u0), model.w0
+
+
+# -- the rack ----------------------------------------------------------------------------------------------------------
+
+HEADER = read_header(DEFAULT_MODEL_FILE)
+
+
+class Refused(NamedTuple):
+    """The exception code of a request that was refused."""
+
+    code: int
+
+
+class RackClient:
+    """A client of a rack, PDU by PDU."""
+
+    def __init__(self, rack: "RackOnTheBus", caller: Caller, number: int) -> None:
+        self._rack = rack
+        self.caller = caller
+        self.number = number
+        """Its holder number; 0 is a simple client, which neither seals nor says what it has read back."""
+        self._requests = RequestHandler(rack.bank, DeviceIdentity(product="", revision=""), caller)
+
+    def request(self, pdu: bytes) -> bytes | Refused:
+        """Return the answer's data."""
+        try:
+            outcome = self._requests.handle(pdu)
+            if not isinstance(outcome, Written):
+                return outcome[2:]
+            for block in outcome.blocks:
+                self._rack.registers.on_write(block, self.caller)
+            return outcome.answer()[2:]
+        except RefusedAccessError as refusal:
+            return Refused(refusal.exception_code)
+
+    def read(self, record: type[R], row: int = 0) -> R:
+        """Read a record; a sealed one is intact."""
+        block = PLANT_MAP.block_of(record)
+        address = block.address + row * block.row_words
+        data = self.request(struct.pack(">BHH", 3, address, block.row_words))
+        assert isinstance(data, bytes)
+        return self._decoded(record, data)
+
+    @staticmethod
+    def _decoded(record: type[R], data: bytes) -> R:
+        block = PLANT_MAP.block_of(record)
+        codec = codec_of(block)
+        assert not block.sealed or seal_of(codec, data) is Seal.INTACT
+        return cast("R", codec.decode(data))
+
+    def write(self, record: tuple[Any, ...], row: int = 0) -> Refused | None:
+        """Write a record."""
+        block = PLANT_MAP.block_of(type(record))
+        data = codec_of(block).encode(record)
+        head = struct.pack(">BHHB", 16, block.address + row * block.row_words, len(data) // 2, len(data))
+        answer = self.request(head + data)
+        return answer if isinstance(answer, Refused) else None
+
+    def outputs(self, *u: float, **changed: int) -> Actuators:
+        """Return outputs for the present tick, by default with what has been read back."""
+        rack = self._rack.registers.rack
+        outputs = Actuators(rack.tick, *u, rack.session.number, self.number)._replace(**changed)
+        return outputs if not self.number else sealed(outputs)
+
+    def exchange(self, outputs: Actuators) -> Measurement | Refused:
+        """Write outputs and read the measurement in one request; in lock-step the plant moves on after it."""
+        actuators, measurement = PLANT_MAP.block_of(Actuators), PLANT_MAP.block_of(Measurement)
+        data = codec_of(actuators).encode(outputs)
+        head = struct.pack(
+            ">BHHHHB", 23, measurement.address, measurement.row_words, actuators.address, actuators.row_words, len(data)
+        )
+        answer = self.request(head + data)
+        self._rack.registers.move_on()
+        return answer if isinstance(answer, Refused) else self._decoded(Measurement, answer)
+
+    def send(self, *u: float, **changed: int) -> Measurement:
+        """Exchange outputs, which are not refused."""
+        answer = self.exchange(self.outputs(*u, **changed))
+        assert isinstance(answer, Measurement), answer
+        return answer
+
+    def closes(self) -> None:
+        """Close the connection."""
+        self._rack.registers.closed(self.caller)
+
+
+class RackOnTheBus:
+    """A rack whose clocks are the test's."""
+
+    def __init__(self, **configuration: Any) -> None:  # noqa: ANN401 - any part of the configuration
+        session = {"autostart": True} | configuration.pop("session", {})
+        settings = PlantSettings.model_validate({"session": session, "plant": {"load": "a", **configuration}})
+        make_plant = partial(make_program, HEADER, settings.plant.sensors)
+        self.now = 1000.0
+        self.registers = RackRegisters(
+            settings, HEADER, make_plant, age=self._age, now=lambda: self.now, utc=lambda: 1e9 + self.now
+        )
+        self.bank = self.registers.bank
+        self._connections = count(1)
+        self._moved_at = self.now
+        self.operator = self.client("operator", roles=frozenset({Role.OPERATOR}))
+
+    def client(self, name: str, number: int = 0, roles: frozenset[Role] = ALL_ROLES) -> RackClient:
+        """Return a client over a new connection."""
+        return RackClient(self, Caller(name, roles, next(self._connections)), number)
+
+    def _age(self) -> float:
+        rack = self.registers.rack
+        return (self.now - self._moved_at) / 0.25 if rack.session.pace.realtime and rack.moving else 0.0
+
+    @property
+    def tick(self) -> int:
+        return self.registers.rack.tick
+
+    def passes(self, ticks: int) -> None:
+        """Let the plant move by the clock, without the control PLC."""
+        for _ in range(ticks):
+            self.now += 0.25
+            self._moved_at = self.now
+            self.registers.advance()
+
+    def shown(self) -> Measurement:
+        return self.operator.read(Measurement)
+
+    def events(self, kind: EventKind) -> list[Event]:
+        """Return the events of a kind, as the registers show them."""
+        rows = [self.operator.read(Event, row) for row in range(EVENT_ROWS)]
+        return sorted(event for event in rows if event.kind == kind)
+
+
+@pytest.fixture
+def switch_on() -> type[RackOnTheBus]:
+    """Make racks."""
+    return RackOnTheBus

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from plant.cold_box import REFERENCE
@@ -26,13 +26,11 @@ TURBINE = REFERENCE.turbine
 flows = st.floats(0.005, 0.1)
 
 
-@settings(deadline=None)
 @given(opening=st.floats(-50.0, 0.0))
 def test_a_closed_valve_passes_nothing(opening: float) -> None:
     assert valve_mass_flow(VALVE, opening, 150.0, 16e5, 1.2e5) == 0.0
 
 
-@settings(deadline=None)
 @given(opening=st.floats(100.0, 500.0))
 def test_a_valve_opens_no_further_than_fully(opening: float) -> None:
     assert valve_mass_flow(VALVE, opening, 150.0, 16e5, 1.2e5) == valve_mass_flow(VALVE, 100.0, 150.0, 16e5, 1.2e5)
@@ -42,7 +40,6 @@ def test_a_valve_passes_nothing_against_the_pressure() -> None:
     assert valve_mass_flow(VALVE, 50.0, 150.0, 1e5, 2e5) == 0.0
 
 
-@settings(deadline=None)
 @given(opening=st.floats(1.0, 100.0), T=st.floats(10.0, 80.0))
 def test_turbine_valve_and_nozzle_pass_the_same_flow(opening: float, T: float) -> None:
     _, rho = isobar_enthalpy_and_density(T, HELIUM)
@@ -59,7 +56,6 @@ def test_a_shut_turbine_neither_flows_nor_turns() -> None:
     assert (exhaust.h_out, exhaust.speed) == (h, 0.0)
 
 
-@settings(deadline=None)
 @given(P_in=st.floats(3e5, 16e5), T=st.floats(12.0, 80.0))
 def test_a_turbine_takes_its_share_of_the_isentropic_drop(P_in: float, T: float) -> None:
     h, _ = isobar_enthalpy_and_density(T, HELIUM)
@@ -69,7 +65,6 @@ def test_a_turbine_takes_its_share_of_the_isentropic_drop(P_in: float, T: float)
     assert h - exhaust.h_out == pytest.approx(TURBINE.efficiency * drop, rel=1e-9)
 
 
-@settings(deadline=None)
 @given(P_bath=st.floats(1.0e5, 1.9e5), exhaust=st.floats(0.0, 0.1))
 def test_the_pressure_drops_of_the_return_line_add_up(P_bath: float, exhaust: float) -> None:
     line = REFERENCE.return_line
@@ -82,7 +77,6 @@ def test_the_pressure_drops_of_the_return_line_add_up(P_bath: float, exhaust: fl
         assert P_mix >= P_bath
 
 
-@settings(deadline=None)
 @given(m_high=flows, m_low=flows, T_high=st.floats(15.0, 80.0), T_low=st.floats(4.6, 14.0))
 def test_what_an_exchanger_takes_from_one_stream_it_gives_to_the_other(
     m_high: float, m_low: float, T_high: float, T_low: float
@@ -127,7 +121,6 @@ def test_no_cell_is_driven_below_the_stream_that_cools_it() -> None:
     assert driving_difference(9.0, 4.0, 4.5) == -0.5
 
 
-@settings(deadline=None)
 @given(
     P=st.floats(0.95e5, 1.8e5),
     share=st.floats(0.05, 0.95),
@@ -154,7 +147,6 @@ def test_an_empty_bath_gets_no_emptier_and_a_full_one_no_fuller() -> None:
     assert separate(BATH, 1.2e5, 0.0, 0.05, 3000.0, 0.01, 0.0, HELIUM)[1] > 0.0
 
 
-@settings(deadline=None)
 @given(V_l=st.floats(-0.1, 0.3))
 def test_the_level_gauge_reads_0_to_100(V_l: float) -> None:
     assert 0.0 <= level(BATH, V_l) <= 100.0

@@ -1,7 +1,7 @@
 """The shipped tables agree with CoolProp, away from their nodes."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from plant.helium import properties as helium_at
@@ -19,7 +19,6 @@ def coolprop(name: str, first: str, x: float, second: str, y: float) -> float:
     return float(PropsSI(name, first, x, second, y, "Helium"))
 
 
-@settings(deadline=None)
 @given(T=st.floats(4.0, 300.0))
 def test_the_16_bar_isobar_agrees(T: float) -> None:
     h, rho = helium_at.isobar_enthalpy_and_density(T, HELIUM)
@@ -31,7 +30,6 @@ def test_the_16_bar_isobar_agrees(T: float) -> None:
     assert c_wall == pytest.approx(aluminium_heat_capacity(T), rel=1e-5)
 
 
-@settings(deadline=None)
 @given(P=bath_pressures)
 def test_saturation_agrees(P: float) -> None:
     sat = helium_at.saturation(P, HELIUM)
@@ -43,7 +41,6 @@ def test_saturation_agrees(P: float) -> None:
     assert sat.s_v == pytest.approx(coolprop("S", "P", P, "Q", 1.0), abs=1e-3)
 
 
-@settings(deadline=None)
 @given(P=st.floats(0.91e5, 1.89e5))
 def test_saturation_slopes_are_the_derivatives_of_saturation(P: float) -> None:
     above, below = helium_at.saturation(P + 10.0, HELIUM), helium_at.saturation(P - 10.0, HELIUM)
@@ -52,7 +49,6 @@ def test_saturation_slopes_are_the_derivatives_of_saturation(P: float) -> None:
         assert slope == pytest.approx((high - low) / 20.0, rel=1e-4)
 
 
-@settings(deadline=None)
 @given(P=bath_pressures, superheat=superheats)
 def test_vapour_agrees(P: float, superheat: float) -> None:
     sat = helium_at.saturation(P, HELIUM)
@@ -64,7 +60,6 @@ def test_vapour_agrees(P: float, superheat: float) -> None:
     assert helium_at.vapour_temperature(P, h, sat, HELIUM) == pytest.approx(T, abs=2e-5)
 
 
-@settings(deadline=None)
 @given(P=bath_pressures, superheat=superheats)
 def test_the_end_of_an_isentropic_expansion_agrees(P: float, superheat: float) -> None:
     T = helium_at.saturation(P, HELIUM).T + superheat
@@ -72,14 +67,12 @@ def test_the_end_of_an_isentropic_expansion_agrees(P: float, superheat: float) -
     assert helium_at.enthalpy_after_isentropic_expansion(P, s, HELIUM) == pytest.approx(h, abs=2e-3 * cp)
 
 
-@settings(deadline=None)
 @given(P=st.floats(1e5, 16e5), h=st.floats(36e3, 528e3))
 def test_entropy_at_the_turbine_inlet_agrees(P: float, h: float) -> None:
     s = coolprop("S", "P", P, "H", h)
     assert helium_at.entropy_before_expansion(P, h, HELIUM) == pytest.approx(s, abs=5e-3)
 
 
-@settings(deadline=None)
 @given(P=bath_pressures, share=st.floats(0.2, 0.999))
 def test_an_expansion_into_wet_vapour_follows_the_lever_rule(P: float, share: float) -> None:
     s = share * coolprop("S", "P", P, "Q", 1.0) + (1.0 - share) * coolprop("S", "P", P, "Q", 0.0)

@@ -1,184 +1,302 @@
-"""The plant's rack: a watchdog over the control PLC, sensors that fail on purpose, and a session that survives."""
+"""The rack's outputs: taken from one writer that knows what is applied, or not at all; and sensors that fail."""
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import pytest
 
 from coldloop.process import L1, T5
-from coldloop.registers.declaration import Block
+from coldloop.registers.audit import EventKind
 from coldloop.registers.plant import (
-    PLANT_MAP,
     Actuators,
     Measurement,
+    OutputVerdict,
     PlantSample,
+    PlantSession,
     SensorFault,
     SensorFaultKind,
 )
 from coldloop.registers.safety import WatchdogState, WatchdogStatus, WatchdogTime
-from coldloop.seal import is_intact, sealed
-from coldloop.session import Pace
-from plant.runtime import PlantRack
-from plant.settings import PlantSettings
+from coldloop.seal import sealed
 
+if TYPE_CHECKING:
+    from tests.plant.conftest import RackOnTheBus
 
-class Rack:
-    """A rack whose clock is the test."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, **plant: object) -> None:
-        later: list[Any] = []
-        self._later = later
-
-        class Loop:
-            def call_soon(self, what: Any) -> None:  # noqa: ANN401 - as asyncio has it
-                later.append(what)
-
-        monkeypatch.setattr("plant.runtime.asyncio.get_running_loop", Loop)
-        section = {"session": {"autostart": True}, "plant": {"load": "a", **plant}}
-        self.rack = PlantRack(PlantSettings.model_validate(section))
-
-    @property
-    def tick(self) -> int:
-        return self.rack.snapshot()["tick"]  # type: ignore[return-value]
-
-    def write(self, record: Any, row: int = 0) -> None:  # noqa: ANN401 - any record of the map
-        self.rack.bank.put(record, row)
-        block: Block = PLANT_MAP.block_of(type(record))
-        self.rack.on_write(block)
-
-    def exchange(self, *u: float, **changed: int) -> Measurement:
-        self.write(sealed(Actuators(self.tick, *u, 1))._replace(**changed))
-        for what in self._later:
-            what()
-        self._later.clear()
-        return self.rack.bank.get(Measurement)
-
-    def passes(self, ticks: int) -> None:
-        """Let the plant move by the clock, without the control PLC."""
-        for _ in range(ticks):
-            self.rack._moving = True  # noqa: SLF001 - what its clock does
-            self.rack._advance()  # noqa: SLF001
-
-    def outputs(self) -> tuple[float, ...]:
-        return self.rack.snapshot()["inputs"].values()  # type: ignore[attr-defined,no-any-return]
-
+    SwitchOn = type[RackOnTheBus]
 
 U = (43.0, 80.0, 36.0)
+SAFE = (30.0, 50.0, 40.0)
+SAFE_AFTER_5_S = {"timeout_s": 5.0, "action": "safe", "safe_state": SAFE}
+REALTIME = {"mode": "realtime"}
 
 
-@pytest.mark.parametrize(("action", "expected"), [("hold", U), ("safe", (30.0, 50.0, 40.0))])
-def test_outputs_hold_or_go_to_the_safe_state_when_the_control_plc_is_silent(
-    monkeypatch: pytest.MonkeyPatch, action: str, expected: tuple[float, ...]
+# -- what is applied, and by whom --------------------------------------------------------------------------------------
+
+
+def test_a_measurement_shows_what_is_applied_whose_it_is_and_that_it_was_taken(switch_on: "SwitchOn") -> None:
+    rack = switch_on()
+    plc = rack.client("control PLC", 77)
+    begun = rack.shown()
+    assert (begun.tick, begun.session, begun.holder, begun.generation) == (0, 1, 0, 1)
+    assert (begun.verdict, begun.age) == (OutputVerdict.NONE, 0.0)
+    answer = plc.send(*U, generation=1)
+    assert (answer.tick, answer.u, answer.holder, answer.generation) == (0, U, 77, 1)
+    assert answer.verdict == OutputVerdict.TAKEN
+    assert rack.shown() == sealed(plc.read(Measurement))
+    assert (rack.shown().tick, rack.shown().u) == (1, U), "a reader sees the present tick"
+
+
+@pytest.mark.parametrize(
+    ("changed", "verdict"),
+    [
+        ({"tick": 0}, OutputVerdict.UNTIMELY),
+        ({"tick": 7}, OutputVerdict.UNTIMELY),
+        ({"session": 9}, OutputVerdict.WRONG_SESSION),
+        ({"session": 0}, OutputVerdict.WRONG_SESSION),
+        ({"generation": 2}, OutputVerdict.CHANGED),
+    ],
+)
+def test_outputs_that_are_not_for_now_are_not_taken_and_the_answer_says_why(
+    switch_on: "SwitchOn", changed: dict[str, int], verdict: OutputVerdict
 ) -> None:
-    safe_state = {"timeout_s": 5.0, "action": action, "safe_state": (30.0, 50.0, 40.0)}
-    rack = Rack(monkeypatch, watchdog=safe_state)
-    rack.exchange(*U)
+    rack = switch_on()
+    plc = rack.client("control PLC", 77)
+    plc.send(*U)
+    answer = plc.send(44.0, 70.0, 37.0, **changed)
+    assert (answer.verdict, answer.u, answer.generation) == (verdict, U, 1)
+    assert rack.tick == 1
+    applied = plc.read(Actuators)
+    assert applied[1:4] == U, "what is applied is read back, not what was refused"
+    assert plc.send(44.0, 70.0, 37.0).verdict == OutputVerdict.TAKEN
+
+
+def test_damaged_outputs_are_refused_and_a_simple_client_need_not_seal(switch_on: "SwitchOn") -> None:
+    rack = switch_on()
+    plc = rack.client("control PLC", 77)
+    plc.send(*U)
+    assert plc.exchange(plc.outputs(50.0, 80.0, 36.0)._replace(cv155=50.5)) == (3,)
+    shown = rack.shown()
+    assert (shown.u, shown.verdict, shown.tick) == (U, OutputVerdict.TAKEN, 1), "nothing has happened"
+    plc.closes()
+    rack.now += 2.0
+    simple = rack.client("simple client")
+    assert simple.send(44.0, 80.0, 36.0).u == (44.0, 80.0, 36.0)
+
+
+def test_outputs_are_written_whole(switch_on: "SwitchOn") -> None:
+    """Who completes a part of the record with the rest of another's would write in its name."""
+    rack = switch_on(session=REALTIME)
+    rack.client("control PLC", 77).send(*U)
+    meddler = rack.client("meddler")
+    assert meddler.request(bytes.fromhex("10 0066 0002 04 42480000")) == (3,)
+    assert rack.shown().u == U
+
+
+def test_in_real_time_what_a_network_held_up_is_not_applied(switch_on: "SwitchOn") -> None:
+    rack = switch_on(session=REALTIME)
+    plc = rack.client("control PLC", 77)
+    plc.send(*U)
+    rack.passes(40)
+    for tick, verdict in ((31, "UNTIMELY"), (49, "UNTIMELY"), (32, "TAKEN"), (48, "TAKEN")):
+        assert plc.send(*U, tick=tick).verdict == OutputVerdict[verdict], tick
+
+
+# -- breaks ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_control_plc_that_slept_through_the_safe_state_makes_no_step(switch_on: "SwitchOn") -> None:
+    rack = switch_on(session=REALTIME, watchdog=SAFE_AFTER_5_S)
+    plc = rack.client("control PLC", 77)
+    plc.send(*U, generation=1)
+    rack.passes(20)
+    assert rack.shown().u == SAFE
+    woken = plc.send(43.1, 80.0, 36.0, generation=1)
+    assert woken.verdict == OutputVerdict.CHANGED
+    assert (woken.u, woken.holder, woken.generation) == (SAFE, 0, 2)
+    assert plc.send(30.1, 50.0, 40.0, generation=2).u == pytest.approx((30.1, 50.0, 40.0))
+
+
+def test_what_a_simple_client_has_moved_is_read_back_before_the_control_plc_moves_on(switch_on: "SwitchOn") -> None:
+    rack = switch_on()
+    restarted = rack.client("control PLC", 77)
+    restarted.send(*U, generation=1)
+    restarted.closes()
+    rack.now += 2.0
+    simple = rack.client("simple client")
+    moved = simple.send(25.0, 80.0, 36.0)
+    assert (moved.u[0], moved.holder, moved.generation) == (25.0, 0, 2)
+    simple.closes()
+    again = rack.client("control PLC", 78)
+    first = again.send(*U, generation=1)
+    assert (first.verdict, first.u[0], first.generation) == (OutputVerdict.CHANGED, 25.0, 3)
+    assert again.send(25.5, 80.0, 36.0, generation=3).verdict == OutputVerdict.TAKEN
+
+
+def test_a_session_that_begins_again_at_tick_0_is_a_break(switch_on: "SwitchOn") -> None:
+    rack = switch_on(session=REALTIME)
+    plc = rack.client("control PLC", 77)
+    rack.operator.write(SensorFault(SensorFaultKind.VALUE, 1.0), T5)
+    assert rack.operator.write(PlantSession(3, 1, 1.0, 1, 1)) is None, "the load table is one of 0 W"
+    plc.send(*U)
+    rack.passes(3)
+    assert rack.operator.write(PlantSession(3, 1, 1.0, 1, 1)) is None, "the same number again"
+    begun = rack.shown()
+    assert (begun.tick, begun.session, begun.generation, begun.verdict) == (0, 3, 3, OutputVerdict.NONE)
+    assert (begun.holder, begun.age) == (0, 0.0), "it waits for the first outputs"
+    assert begun.y[T5] != 1.0
+    assert rack.operator.read(SensorFault, T5).kind == SensorFaultKind.NONE
+    assert plc.send(*U, generation=2).verdict == OutputVerdict.CHANGED
+    assert plc.send(*U, generation=3).verdict == OutputVerdict.TAKEN
+    assert [event.value for event in rack.events(EventKind.SESSION)] == [1.0, 1.0]
+
+
+def test_without_a_session_no_outputs_are_taken(switch_on: "SwitchOn") -> None:
+    rack = switch_on(session={"autostart": False})
+    assert rack.client("simple client").send(*U).verdict == OutputVerdict.WRONG_SESSION
+    assert rack.tick == 0
+
+
+def test_an_answer_that_was_lost_can_be_read_again(switch_on: "SwitchOn") -> None:
+    rack = switch_on(session=REALTIME)
+    plc = rack.client("control PLC", 77)
+    plc.send(*U)
+    plc.exchange(plc.outputs(44.0, 80.0, 36.0, generation=1))  # nobody gets the answer
+    shown = plc.read(Measurement)
+    assert (shown.u[0], shown.holder, shown.verdict) == (44.0, 77, OutputVerdict.TAKEN)
+
+
+# -- time --------------------------------------------------------------------------------------------------------------
+
+
+def test_age_grows_between_ticks_and_is_fresh_at_each_read(switch_on: "SwitchOn") -> None:
+    rack = switch_on(session=REALTIME)
+    rack.client("control PLC", 77).send(*U)
+    rack.passes(1)
+    ages = []
+    for _ in range(3):
+        ages.append(rack.shown().age)
+        rack.now += 0.05
+    assert ages == pytest.approx([0.0, 0.2, 0.4])
+    rack.passes(1)
+    assert (rack.shown().age, rack.shown().tick) == (0.0, 2)
+
+
+@pytest.mark.parametrize(("action", "expected"), [("hold", U), ("safe", SAFE)])
+def test_outputs_hold_or_go_to_the_safe_state_when_the_control_plc_is_silent(
+    switch_on: "SwitchOn", action: str, expected: tuple[float, ...]
+) -> None:
+    rack = switch_on(session=REALTIME, watchdog={**SAFE_AFTER_5_S, "action": action})
+    plc = rack.client("control PLC", 77)
+    plc.send(*U)
     rack.passes(18)
-    assert tuple(rack.outputs()) == U
-    assert rack.rack.bank.get(WatchdogStatus).state == WatchdogState.RUNNING
+    assert rack.shown().u == U
+    assert plc.read(WatchdogStatus).state == WatchdogState.RUNNING
     rack.passes(2)
-    assert tuple(rack.outputs()) == expected
-    shown = rack.rack.bank.get(WatchdogStatus)
-    assert (shown.time, shown.state, shown.trips) == (20, WatchdogState.EXPIRED, 1)
-    assert rack.rack.bank.get(Actuators)[1:4] == expected, "the control PLC reads back what is applied"
-    rack.exchange(*U)
-    assert tuple(rack.outputs()) == U
-    assert rack.rack.bank.get(WatchdogStatus).state == WatchdogState.RUNNING
+    shown = rack.shown()
+    assert (shown.u, shown.generation) == (expected, 1 + (expected == SAFE))
+    status = plc.read(WatchdogStatus)
+    assert (status.time, status.state, status.trips) == (20, WatchdogState.EXPIRED, 1)
+    assert plc.read(Actuators)[1:4] == expected
+    assert [event.tick for event in rack.events(EventKind.WATCHDOG_EXPIRED)] == [20]
+    assert plc.send(*U).u == U
+    assert plc.read(WatchdogStatus).state == WatchdogState.RUNNING
 
 
-def test_the_watchdog_is_set_by_register(monkeypatch: pytest.MonkeyPatch) -> None:
-    rack = Rack(monkeypatch)
-    rack.exchange(*U)
-    rack.write(WatchdogTime(4))
+def test_the_watchdog_is_set_by_the_writer_of_outputs_and_it_is_known_who_did(switch_on: "SwitchOn") -> None:
+    rack = switch_on(session=REALTIME)
+    plc = rack.client("control PLC", 77)
+    plc.send(*U)
+    assert plc.write(WatchdogTime(4)) is None
     rack.passes(4)
-    assert rack.rack.bank.get(WatchdogStatus).trips == 1
-    rack.write(WatchdogTime(0))
+    assert plc.read(WatchdogStatus).trips == 1
+    assert plc.write(WatchdogTime(0)) is None
     rack.passes(100)
-    assert rack.rack.bank.get(WatchdogStatus).trips == 1
-    assert rack.rack.bank.get(WatchdogStatus).state == WatchdogState.OFF
+    assert plc.read(WatchdogStatus)[1:] == (WatchdogState.OFF, 0, 0, 1)
+    changes = [(event.subject, event.cause) for event in rack.events(EventKind.WATCHDOG_TIME)]
+    assert changes == [(4, 40), (0, 4)]
 
 
-def test_outputs_that_arrive_damaged_are_not_applied(monkeypatch: pytest.MonkeyPatch) -> None:
-    rack = Rack(monkeypatch)
-    rack.exchange(*U)
-    rack.write(sealed(Actuators(rack.tick, 50.0, 80.0, 36.0, 1))._replace(cv155=50.5))
-    assert tuple(rack.outputs()) == U
-    rack.write(Actuators(rack.tick, 44.0, 80.0, 36.0, 1))
-    assert tuple(rack.outputs()) == (44.0, 80.0, 36.0), "a simple client need not seal"
+# -- sensors -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_measurement_is_sealed(monkeypatch: pytest.MonkeyPatch) -> None:
-    measured = Rack(monkeypatch).exchange(*U)
-    assert measured.crc
-    assert is_intact(measured)
-    assert not is_intact(measured._replace(load=measured.load + 1.0))
-
-
-def test_sensors_fail_on_purpose_and_the_history_keeps_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
-    rack = Rack(monkeypatch)
-    rack.exchange(*U)
-    rack.write(SensorFault(SensorFaultKind.NOT_A_NUMBER, 0.0), L1)
-    rack.write(SensorFault(SensorFaultKind.FROZEN, 0.0), T5)
-    rack.write(SensorFault(SensorFaultKind.VALUE, 12.5), 4)
-    shown = rack.exchange(*U).y
+def test_sensors_fail_on_purpose_and_the_history_keeps_the_truth(switch_on: "SwitchOn") -> None:
+    rack = switch_on()
+    plc, operator = rack.client("control PLC", 77), rack.operator
+    plc.send(*U)
+    operator.write(SensorFault(SensorFaultKind.NOT_A_NUMBER, 0.0), L1)
+    operator.write(SensorFault(SensorFaultKind.FROZEN, 0.0), T5)
+    operator.write(SensorFault(SensorFaultKind.VALUE, 12.5), 4)
+    shown = plc.send(*U).y
     for _ in range(8):
-        y = rack.exchange(*U).y
+        y = plc.send(*U).y
     assert math.isnan(y[L1])
     assert (y[T5], y[4]) == (shown[T5], 12.5)
-    true = rack.rack.bank.get(PlantSample, rack.tick - 1).y
+    true = operator.read(PlantSample, rack.tick - 1).y
     assert true[T5] != shown[T5]
     assert math.isfinite(true[L1])
     for output in (L1, T5, 4):
-        rack.write(SensorFault(SensorFaultKind.NONE, 0.0), output)
-    assert all(map(math.isfinite, rack.exchange(*U).y))
+        operator.write(SensorFault(SensorFaultKind.NONE, 0.0), output)
+    assert all(map(math.isfinite, plc.send(*U).y))
+    faults = [(event.subject, event.cause, event.value) for event in rack.events(EventKind.SENSOR_FAULT)]
+    assert faults == [(L1, 1, 0.0), (T5, 2, 0.0), (4, 3, 12.5), (L1, 0, 0.0), (T5, 0, 0.0), (4, 0, 0.0)]
 
 
-def test_a_killed_rack_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    plant = {"retain": {"file": str(tmp_path / "plant")}, "sensors": {"level": 0.1}}
-    undisturbed, killed = Rack(monkeypatch, sensors={"level": 0.1}), Rack(monkeypatch, **plant)
+# -- restarts ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_killed_rack_goes_on_where_it_was_and_its_outputs_are_read_back_first(
+    switch_on: "SwitchOn", tmp_path: Path
+) -> None:
+    retained = {"retain": {"file": str(tmp_path / "plant")}, "sensors": {"level": 0.1}}
+    racks = switch_on(sensors={"level": 0.1}), switch_on(**retained)
+    undisturbed, plc = (rack.client("control PLC", 77) for rack in racks)
     for _ in range(30):
-        undisturbed.exchange(*U)
-        killed.exchange(*U)
-    again = Rack(monkeypatch, **plant)
-    assert again.tick == 30
-    assert tuple(again.outputs()) == U
+        undisturbed.send(*U)
+        plc.send(*U)
+    again = switch_on(**retained)
+    shown = again.shown()
+    assert (shown.tick, shown.u, shown.holder, shown.generation) == (30, U, 77, 2)
+    plc = again.client("control PLC", 77)
+    assert plc.send(44.0, 75.0, 36.0, generation=1).verdict == OutputVerdict.CHANGED
     for _ in range(30):
-        expected = undisturbed.exchange(44.0, 75.0, 36.0)
-        found = again.exchange(44.0, 75.0, 36.0)
-    assert found == expected, "to the bit, the sensors' noise included"
+        expected = undisturbed.send(44.0, 75.0, 36.0)
+        found = plc.send(44.0, 75.0, 36.0, generation=2)
+    assert found._replace(generation=1, crc=expected.crc) == expected, "to the bit, the sensors' noise included"
 
 
-@pytest.mark.parametrize("content", [b"", b"coldloop-retained plant/1", b"\x00" * 100])
+def test_boots_and_events_are_numbered_over_restarts(switch_on: "SwitchOn", tmp_path: Path) -> None:
+    configuration = {"retain": {"file": str(tmp_path / "plant")}, "session": {"autostart": False}}
+    for boot in (1, 2, 3):
+        rack = switch_on(**configuration)
+        (event,) = rack.events(EventKind.BOOT)
+        assert (event.number, event.boot, event.subject) == (boot, boot, 0)
+    rack.operator.write(PlantSession(1, 0, 1.0, 1, 1))
+    rack.client("control PLC", 77).send(*U)
+    (event,) = switch_on(**configuration).events(EventKind.BOOT)
+    assert (event.number, event.boot, event.subject) == (3 + 3 + 1, 4, 1), "session, load and lease came between"
+
+
+def test_no_generation_comes_twice_when_the_rack_is_killed_behind_an_answer(
+    switch_on: "SwitchOn", tmp_path: Path
+) -> None:
+    retained = {"retain": {"file": str(tmp_path / "plant")}, "session": REALTIME}
+    rack = switch_on(**retained)
+    rack.client("control PLC", 77).send(*U)
+    rack.passes(2)
+    given_out = rack.client("simple client").exchange(rack.client("").outputs(*U))
+    assert given_out == (6,)
+    rack.now += 60.0
+    generation = rack.client("another control PLC", 78).send(44.0, 80.0, 36.0, generation=1).generation
+    assert generation == 2
+    assert switch_on(**retained).shown().generation > generation
+
+
+@pytest.mark.parametrize("content", [b"", b"coldloop-retained plant/2", b"\x00" * 100])
 def test_a_state_that_cannot_be_trusted_is_refused_and_said_so(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture, content: bytes
+    switch_on: "SwitchOn", tmp_path: Path, caplog: pytest.LogCaptureFixture, content: bytes
 ) -> None:
     (tmp_path / "plant").write_bytes(content)
-    rack = Rack(monkeypatch, retain={"file": str(tmp_path / "plant")})
+    rack = switch_on(retain={"file": str(tmp_path / "plant")})
     assert rack.tick == 0
     assert "retained state refused" in caplog.text
-
-
-def test_outputs_of_another_tick_are_not_applied_and_the_answer_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    rack = Rack(monkeypatch)
-    rack.exchange(*U)
-    for changed in ({"tick": 0}, {"tick": 7}, {"session": 9}, {"cv155": 50}):
-        answer = rack.exchange(44.0, 70.0, 37.0, **changed)
-        assert answer.crc == 0, "not taken"
-        assert (rack.tick, tuple(rack.outputs())) == (1, U)
-        shown = rack.rack.bank.get(Actuators)
-        assert shown[1:4] == U
-        assert is_intact(shown), "what is applied is read back, not what was refused"
-    assert rack.exchange(44.0, 70.0, 37.0).crc
-
-
-def test_in_real_time_what_a_network_held_up_is_not_applied(monkeypatch: pytest.MonkeyPatch) -> None:
-    rack = Rack(monkeypatch)
-    monkeypatch.setattr(PlantRack, "_start_clock", lambda _self: None)
-    rack.rack._pace = Pace(realtime=True, factor=1.0)  # noqa: SLF001
-    rack.write(sealed(Actuators(0, *U, 1)))
-    rack.passes(40)
-    rack.write(sealed(Actuators(10, 30.0, 10.0, 30.0, 1)))
-    assert tuple(rack.outputs()) == U
-    rack.write(sealed(Actuators(39, 43.5, 80.0, 36.0, 1)))
-    assert tuple(rack.outputs()) == (43.5, 80.0, 36.0)

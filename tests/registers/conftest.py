@@ -8,6 +8,7 @@ import pytest
 from hypothesis import strategies as st
 
 from coldloop.registers.declaration import Block, Field, Kind, fields_of
+from coldloop.seal import sealed
 
 Records = Callable[[Block], st.SearchStrategy[tuple[Any, ...]]]
 
@@ -19,7 +20,7 @@ def values_of(field: Field) -> st.SearchStrategy[Any]:
         low, high = (None if bound is None else single(bound) for bound in (field.low, field.high))
         number = st.floats(low, high, width=32, allow_nan=False, allow_infinity=False)
     else:
-        number = st.integers(0, int(field.high or 2 ** (16 * field.kind.words) - 1))
+        number = st.integers(int(field.low or 0), int(field.high or 2 ** (16 * field.kind.words) - 1))
     return st.tuples(*[number] * len(field.elements)) if field.elements else number
 
 
@@ -30,6 +31,7 @@ def single(value: float) -> float:
 @pytest.fixture(scope="session")
 def records() -> Records:
     def records_of(block: Block) -> st.SearchStrategy[tuple[Any, ...]]:
-        return st.tuples(*map(values_of, fields_of(block.record).values())).map(lambda row: block.record(*row))
+        rows = st.tuples(*map(values_of, fields_of(block.record).values())).map(lambda row: block.record(*row))
+        return rows.map(sealed) if block.sealed else rows
 
     return records_of

@@ -26,7 +26,7 @@ each_order = pytest.mark.parametrize("order", WordOrder)
 
 @each_block
 @each_order
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_every_record_survives_the_bus(records: "Records", block: Block, order: WordOrder, data: st.DataObject) -> None:
     record = data.draw(records(block))
@@ -41,7 +41,7 @@ def test_every_record_survives_the_bus(records: "Records", block: Block, order: 
 
 
 @each_block
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_the_word_orders_differ_in_the_halves_of_32_bit_values_only(
     records: "Records", block: Block, data: st.DataObject

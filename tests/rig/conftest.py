@@ -3,10 +3,9 @@
 import asyncio
 import contextlib
 import os
-import socket
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -28,6 +27,7 @@ from plant.program import LoadProfile
 from plant.settings import PlantSettings
 from rig.network import NetworkRig, RigEndpoints
 from rig.one_process import OneProcessRig
+from rig.ports import ReservedPorts
 from rig.recording import Recorder, Recording
 from rig.scenario import Scenario
 from rig.settings import Settings
@@ -82,15 +82,11 @@ def simulate() -> Simulate:
 # -- rigs on the bus ---------------------------------------------------------------------------------------------------
 
 
-def free_ports(count: int) -> list[int]:
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
-        return [one.getsockname()[1] for one in sockets]
-
-
-def wired(settings: Settings, order: WordOrder = WordOrder.HIGH_FIRST) -> tuple[Settings, RigEndpoints]:
-    """Return the settings with each server on a free port and each client pointed at it; and where they are."""
-    ends = RigEndpoints(*(Endpoint(port=port, word_order=order, patience_s=PATIENCE_S) for port in free_ports(3)))
+def wired(
+    settings: Settings, ports: Sequence[int], order: WordOrder = WordOrder.HIGH_FIRST
+) -> tuple[Settings, RigEndpoints]:
+    """Return the settings with each server on its port and each client pointed at it; and where they are."""
+    ends = RigEndpoints(*(Endpoint(port=port, word_order=order, patience_s=PATIENCE_S) for port in ports))
     sections: dict[str, BaseModel] = {}
     for name, end in zip(SERVICES, ends, strict=True):
         section = getattr(settings, name)
@@ -143,7 +139,8 @@ async def services_in_this_loop(
     services: tuple[str, ...] = SERVICES,
 ) -> AsyncIterator[Bus]:
     """Serve on free ports; a service that ends by an error fails the test."""
-    settings, endpoints = wired(settings or Settings(), order)
+    reserved = ReservedPorts(len(SERVICES))
+    settings, endpoints = wired(settings or Settings(), reserved.numbers, order)
     serving: dict[str, Callable[[], Awaitable[None]]] = {
         "plant": lambda: plant.runtime.serve(part(PlantSettings, settings)),
         "control_plc": lambda: control_plc.runtime.serve(part(ControlSettings, settings)),
@@ -156,6 +153,7 @@ async def services_in_this_loop(
         for task in tasks:
             task.cancel()
         ends = await asyncio.gather(*tasks, return_exceptions=True)
+        reserved.release()
     for end in ends:
         if end is not None and not isinstance(end, asyncio.CancelledError):
             raise end
@@ -202,8 +200,8 @@ def start_service() -> Iterator[Start]:
 @pytest.fixture(scope="session")
 def three_processes() -> Iterator[Bus]:
     """One rig of three processes for all tests; each test runs sessions of its own on it."""
-    settings, endpoints = wired(Settings())
-    with processes() as start:
+    with ReservedPorts(len(SERVICES)) as reserved, processes() as start:
+        settings, endpoints = wired(Settings(), reserved.numbers)
         for service in SERVICES:
             start(service, settings)
         yield Bus(endpoints, settings)

@@ -253,11 +253,9 @@ def web_server() -> Iterator[int]:
 
 
 @pytest.mark.usefixtures("impatient")
-def test_a_rig_that_is_not_there_is_told(coldloop: "Coldloop", results: Path) -> None:
-    with socket.socket() as bound_but_deaf:
-        bound_but_deaf.bind(("127.0.0.1", 0))
-        nobody = f"127.0.0.1:{bound_but_deaf.getsockname()[1]}"
-        outcome = coldloop("run", "--duration", "2s", "--attach", nobody, nobody, nobody, "--out", results)
+def test_a_rig_that_is_not_there_is_told(coldloop: "Coldloop", results: Path, free_port: int) -> None:
+    nobody = f"127.0.0.1:{free_port}"
+    outcome = coldloop("run", "--duration", "2s", "--attach", nobody, nobody, nobody, "--out", results)
     assert outcome.code == FAILURE
     assert outcome.complaints[-1] == f"coldloop: nobody listens as plant at {nobody}: start it, or check host and port"
     assert_no_results(results)

@@ -61,7 +61,40 @@ def test_the_configuration_that_comes_with_them_is_whole_and_its_files_can_be_us
     assert tomllib.loads((out / "tls.toml").read_text())["rig"]["tls"]["key"] == str(out / "operator.key")
 
 
-@pytest.mark.parametrize("present", ["ca.key", "plant.crt", "tls.toml"])
+def test_what_is_revoked_is_in_the_list_that_the_configuration_names_and_stays_in_it(
+    coldloop: "Coldloop", tmp_path: Path
+) -> None:
+    out = tmp_path / "site"
+    coldloop("certificates", "--out", out)
+    for name, number in (("operator", 1), ("reader", 2), ("operator", 2)):
+        outcome = coldloop("certificates", "--out", out, "--revoke", name, "--days", "9")
+        assert outcome.code == 0
+        assert outcome.out.startswith(f"{number} revoked in {out / 'ca.crl'}; restart the services")
+    assert coldloop("certificates", "--out", out, "--renew-list", "--days", "99").code == 0
+    revoked = x509.load_pem_x509_crl((out / "ca.crl").read_bytes())
+    assert {each.serial_number for each in revoked} == {
+        certificate(out / f"{name}.crt").serial_number for name in ("operator", "reader")
+    }
+    settings = load_configuration(Settings, file=out / "tls.toml", environment={}).settings
+    assert settings.plant.server.tls is not None
+    assert settings.plant.server.tls.crl == out / "ca.crl"
+    server_context(settings.plant.server.tls, "server")
+    assert not (out / "ca.crl.new").exists()
+
+
+@pytest.mark.parametrize(("missing", "message"), [("ca.key", "is needed to revoke"), ("operator.crt", "has made")])
+def test_revoking_needs_the_authority_and_the_certificate(
+    coldloop: "Coldloop", tmp_path: Path, missing: str, message: str
+) -> None:
+    coldloop("certificates", "--out", tmp_path)
+    (tmp_path / missing).unlink()
+    outcome = coldloop("certificates", "--out", tmp_path, "--revoke", "operator")
+    assert outcome.code == USAGE
+    (complaint,) = outcome.complaints
+    assert message in complaint
+
+
+@pytest.mark.parametrize("present", ["ca.key", "plant.crt", "ca.crl", "tls.toml"])
 def test_nothing_is_written_where_one_of_the_files_exists(coldloop: "Coldloop", tmp_path: Path, present: str) -> None:
     (tmp_path / present).write_text("precious")
     outcome = coldloop("certificates", "--out", tmp_path)

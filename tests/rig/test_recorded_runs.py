@@ -75,7 +75,7 @@ def test_an_hdf5_file_has_groups_whose_datasets_know_their_units(coldloop: "Cold
             assert file["trace/L1"][:].tolist() == trace(run)["L1"]
             assert file["trace/L1"].attrs["unit"] == "%"
     with h5py.File(mpc / "run.h5") as file:
-        assert file["events/subject"].asstr()[0] == "MPC"
+        assert file["events/subject"].asstr()[0] == "mpc"
     with h5py.File(mpc.parent / "classical" / "run.h5") as file:
         assert np.isnan(file["trace/tau_u_s"][:]).all(), "the classical loops have no updating period"
 
@@ -137,7 +137,7 @@ def test_the_page_of_a_run_needs_no_other_host_and_shows_alarms_and_settings(col
     own = page[: page.index("<script>")] + page[page.index("</script>") :]
     assert not re.search(r"<(script|link|img|iframe)[^>]*(src|href)=", page[: page.index("<script>")])
     assert "http" not in re.sub(r"<script.*?</script>", "", own, flags=re.DOTALL)
-    for part in ("SEQUENCE_BEGAN", "plant.sensors.level", RunFolder(mpc).summary["trace_sha256"], "my_load.csv"):
+    for part in ("sequence began", "plant.sensors.level", RunFolder(mpc).summary["trace_sha256"], "my_load.csv"):
         assert part in page
     assert "Plotly.newPlot" in page
     assert coldloop("report", mpc).code == 2, "it exists"

@@ -145,7 +145,7 @@ def test_the_updates_are_the_history_of_the_optimiser_in_seconds(folder: Path, m
 
 def test_the_events_say_when_mpc_took_over(folder: Path) -> None:
     first, *_ = pq.read_table(folder / "events.parquet").to_pylist()
-    assert (first["kind"], first["subject"], first["cause"]) == ("MODE", "MPC", "SEQUENCE_BEGAN")
+    assert (first["kind"], first["subject"], first["cause"]) == ("mode", "mpc", "sequence began")
 
 
 def test_duckdb_and_pandas_read_the_trace(folder: Path, minute: Recording) -> None:

@@ -5,7 +5,6 @@ import contextlib
 import json
 import os
 import shutil
-import socket
 import struct
 import subprocess
 import sys
@@ -18,13 +17,7 @@ import aiomqtt
 import pytest
 
 from coldloop.config import PREFIX
-
-
-@pytest.fixture
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as one:
-        return int(one.getsockname()[1])
-
+from rig.ports import ReservedPorts
 
 # -- processes ---------------------------------------------------------------------------------------------------------
 
@@ -33,15 +26,24 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Start a service with `--set` assignments; what is still running at the end of the test is killed."""
-    started: list[subprocess.Popen[str]] = []
+    """Start a service with `--set` assignments; what is still running at the end of the test is killed.
 
-    def one(service: str, *assignments: str, level: str = "error") -> subprocess.Popen[str]:
+    It listens on any free port, and looks for its peer where nobody listens, unless the assignments say otherwise.
+    """
+    started: list[subprocess.Popen[str]] = []
+    nobody = ReservedPorts(1)
+
+    def one(
+        service: str, *assignments: str, level: str = "error", stderr: int = subprocess.PIPE
+    ) -> subprocess.Popen[str]:
+        ports = {"plant": [], "control_plc": ["plant"], "optimizer_plc": ["control_plc"]}[service]
+        peers = [f"{service}.{peer}.port={nobody.numbers[0]}" for peer in ports]
+        chosen = [f"--set={text}" for text in (f"{service}.server.port=0", *peers, *assignments)]
         started.append(
             subprocess.Popen(
-                [sys.executable, "-m", service, "--log-level", level, *[f"--set={text}" for text in assignments]],
+                [sys.executable, "-m", service, "--log-level", level, *chosen],
                 env={name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
-                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stderr, text=True,
             )
         )  # fmt: skip
         return started[-1]
@@ -50,6 +52,25 @@ def start() -> Iterator[Start]:
     for process in started:
         process.kill()
         process.communicate()
+    nobody.release()
+
+
+ServingPort = Callable[["subprocess.Popen[str]"], int]
+
+
+@pytest.fixture
+def serving_port() -> ServingPort:
+    """Wait until a service that was started with `level="info"` serves; return the port that it got."""
+
+    def read(process: "subprocess.Popen[str]") -> int:
+        assert process.stderr is not None
+        for line in process.stderr:
+            said = json.loads(line)
+            if said["event"] == "serving":
+                return int(said["port"])
+        raise AssertionError(f"ended with {process.wait()} before it served")
+
+    return read
 
 
 # -- brokers -----------------------------------------------------------------------------------------------------------
@@ -77,6 +98,8 @@ class SmallBroker:
 
     def __init__(self) -> None:
         self._kept: dict[str, bytes] = {}
+        self.password = b""
+        """Whoever connects has to know it, if there is one."""
         self.frozen = False
         """It takes what comes, and answers nothing."""
         self._connections: dict[asyncio.StreamWriter, asyncio.Task[object] | None] = {}
@@ -98,7 +121,10 @@ class SmallBroker:
                 if self.frozen:
                     continue
                 if kind >> 4 == 1:
-                    will = self._will(body)
+                    will, password = self._connect(body)
+                    if password != self.password:
+                        writer.write(b"\x20\x02\0\x05")
+                        break
                     writer.write(b"\x20\x02\0\0")
                 elif kind >> 4 == 3:
                     self._publish(kind, body, writer)
@@ -129,15 +155,20 @@ class SmallBroker:
         if kind & 0x01:
             self._kept[topic.decode()] = rest
 
-    def _will(self, body: bytes) -> tuple[str, bytes] | None:
+    def _connect(self, body: bytes) -> tuple[tuple[str, bytes] | None, bytes]:
+        """Return the last will and the password."""
         _, rest = self._text(body)
         flags = rest[1]
         _, rest = self._text(rest[4:])
-        if not flags & 0x04:
-            return None
-        assert flags & 0x20, "a last will that is not retained tells nobody who comes later"
-        topic, rest = self._text(rest)
-        return topic.decode(), self._text(rest)[0]
+        will = None
+        if flags & 0x04:
+            assert flags & 0x20, "a last will that is not retained tells nobody who comes later"
+            topic, rest = self._text(rest)
+            message, rest = self._text(rest)
+            will = topic.decode(), message
+        for flag in (0x80, 0x40):  # name, password
+            field, rest = self._text(rest) if flags & flag else (b"", rest)
+        return will, field
 
     @staticmethod
     def _text(data: bytes) -> tuple[bytes, bytes]:

@@ -12,7 +12,7 @@ from coldloop.model_file import read_document, write_document
 from coldloop.model_settings import DEFAULT_MODEL_FILE
 
 if TYPE_CHECKING:
-    from tests.services.conftest import Start
+    from tests.services.conftest import ServingPort, Start
 
 USAGE, FAILURE = 2, 1
 SERVICES = ("plant", "control_plc", "optimizer_plc")
@@ -42,29 +42,29 @@ def test_a_port_in_use_is_named_with_what_to_do(start: "Start") -> None:
 
 
 def test_a_control_plc_without_a_plant_gives_up_after_its_patience(start: "Start", free_port: int) -> None:
-    process = start(
-        "control_plc", "control_plc.server.port=0", f"control_plc.plant.port={free_port}",
-        "control_plc.plant.patience_s=0.2",
-    )  # fmt: skip
+    process = start("control_plc", f"control_plc.plant.port={free_port}", "control_plc.plant.patience_s=0.2")
     assert_ended(process, FAILURE, f"plant at 127.0.0.1:{free_port}", "start it")
 
 
-def test_an_optimiser_refuses_a_control_plc_with_another_model(start: "Start", free_port: int, tmp_path: Path) -> None:
+def test_an_optimiser_refuses_a_control_plc_with_another_model(
+    start: "Start", serving_port: "ServingPort", tmp_path: Path
+) -> None:
     document = read_document(DEFAULT_MODEL_FILE)
     document["B"][0][0] *= 1.001
     other = tmp_path / "model.json"
     write_document(other, document)
-    start("control_plc", f"control_plc.server.port={free_port}", f"model.file={other}")
-    process = start("optimizer_plc", "optimizer_plc.server.port=0", f"optimizer_plc.control_plc.port={free_port}")
+    port = serving_port(start("control_plc", f"model.file={other}", level="info"))
+    process = start("optimizer_plc", f"optimizer_plc.control_plc.port={port}")
     digests = [f"{read_document(file)['digest'][:8]}" for file in (DEFAULT_MODEL_FILE, other)]
     assert_ended(process, FAILURE, "same model.file", *digests)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_service_that_is_told_to_stop_ends_in_good_order(number: signal.Signals, start: "Start") -> None:
-    process = start("control_plc", "control_plc.server.port=0", level="info")
-    assert process.stderr is not None
-    assert '"event": "serving"' in process.stderr.readline()
+def test_a_service_that_is_told_to_stop_ends_in_good_order(
+    number: signal.Signals, start: "Start", serving_port: "ServingPort"
+) -> None:
+    process = start("control_plc", level="info")
+    serving_port(process)
     process.send_signal(number)
     _, complaint = process.communicate(timeout=20)
     assert process.returncode == 0
@@ -77,5 +77,5 @@ def test_tls_files_that_cannot_be_used_end_a_service_with_one_line(start: "Start
     server = [f"plant.server.tls.{name}{file}" for name, file in zip(files, missing, strict=True)]
     client = [f"control_plc.plant.tls.{name}{file}" for name, file in zip(files, missing, strict=True)]
     expected = (f"{tmp_path}/certificate.pem", "No such file", "coldloop certificates")
-    assert_ended(start("plant", "plant.server.port=0", *server), USAGE, "plant.server.tls", *expected)
-    assert_ended(start("control_plc", "control_plc.server.port=0", *client), USAGE, "client of plant", *expected)
+    assert_ended(start("plant", *server), USAGE, "plant.server.tls", *expected)
+    assert_ended(start("control_plc", *client), USAGE, "client of plant", *expected)

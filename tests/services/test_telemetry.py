@@ -5,7 +5,10 @@ import contextlib
 import math
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import pytest
 
 from coldloop.telemetry import Telemetry, TelemetrySettings
 
@@ -58,7 +61,7 @@ async def test_a_service_is_online_shows_itself_and_goes_offline_in_good_order(b
 async def test_a_service_that_is_killed_leaves_its_last_will(broker: "Serve", free_port: int, start: "Start") -> None:
     async with broker(free_port) as known:
         service = start(
-            "control_plc", "control_plc.server.port=0", "telemetry.broker=127.0.0.1", f"telemetry.port={free_port}",
+            "control_plc", "telemetry.broker=127.0.0.1", f"telemetry.port={free_port}",
             "telemetry.prefix=hall-3",
         )  # fmt: skip
         await keeps(known, "hall-3/control_plc/state", ONLINE)
@@ -109,3 +112,31 @@ async def test_a_service_can_be_stopped_while_its_broker_is_frozen(
 async def test_what_is_published_is_json_whatever_the_numbers(broker: "Serve", free_port: int) -> None:
     async with broker(free_port) as known, publishing(free_port, lambda: {"gamma": math.inf}):
         await until(lambda: known.retained("coldloop/plant/telemetry"), lambda now: now is not None)
+
+
+async def test_the_password_is_read_at_each_connection_and_is_not_in_the_configuration(
+    frozen_broker: "ServeFrozen", free_port: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "password"
+    login = {"username": "plant", "password_file": file}
+    async with frozen_broker(free_port) as known:
+        known.password = "schlüssel".encode()
+        async with publishing(free_port, lambda: {"tick": 1}, **login):
+            await until(lost(caplog), lambda reasons: any("No such file" in reason for reason in reasons))
+            file.write_text("wrong", encoding="utf-8")
+            await until(lost(caplog), lambda reasons: any("authori" in reason for reason in reasons))
+            file.write_text("schlüssel\n", encoding="utf-8")
+            await keeps(known, "coldloop/plant/state", ONLINE)
+    assert "schlüssel" not in caplog.text + TelemetrySettings(**login).model_dump_json()
+
+
+def lost(caplog: pytest.LogCaptureFixture) -> Callable[[], Awaitable[list[str]]]:
+    async def reasons() -> list[str]:
+        return [str(getattr(record, "reason", "")) for record in caplog.records]
+
+    return reasons
+
+
+def test_a_password_without_a_name_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"telemetry\.username"):
+        TelemetrySettings(password_file=Path("password"))

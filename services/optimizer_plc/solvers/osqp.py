@@ -8,18 +8,19 @@ The matrices are scaled and factorised once, with a fixed rho; from problem to p
   J is not monotonic (Definition 1 of the paper): see `docs/solvers.md`.
 """
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from osqp import OSQP
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
-from scipy import sparse
 
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.solution import Solution, judge
 from optimizer_plc.solvers.interface import PENALTY_WEIGHT
+
+if TYPE_CHECKING:
+    from osqp import OSQP
 
 Array = NDArray[np.float64]
 
@@ -71,7 +72,10 @@ class OsqpSolver:
             self._osqp.update(q=problem.phi, l=lower, u=upper)
         self._osqp.warm_start(x=self._z)
 
-    def _set_up(self, problem: QuadraticProblem, lower: Array, upper: Array) -> OSQP:
+    def _set_up(self, problem: QuadraticProblem, lower: Array, upper: Array) -> "OSQP":
+        from osqp import OSQP  # noqa: PLC0415 with scipy.sparse, a fifth of what the optimiser loads at its start
+        from scipy import sparse  # noqa: PLC0415
+
         solver = OSQP()
         P = sparse.csc_matrix(np.triu(2.0 * problem.Phi))
         A = sparse.csc_matrix(np.vstack([np.eye(len(problem.phi)), problem.Gamma]))

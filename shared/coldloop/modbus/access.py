@@ -6,26 +6,17 @@ A certificate says its role in the X.509v3 extension of the Modbus/TCP Security 
 
 import json
 from ipaddress import IPv4Address, IPv6Address, ip_address
-from typing import Final, NamedTuple
-
-from cryptography import x509
+from typing import Final
 
 from coldloop.modbus.settings import AccessSettings, Networks
+from coldloop.registers.bank import Caller
 from coldloop.registers.declaration import Role
 
-ROLE_EXTENSION: Final = x509.ObjectIdentifier("1.3.6.1.4.1.50316.802.1")
-ODD_CERTIFICATE: Final = (x509.DuplicateExtension, x509.UnsupportedGeneralNameType, x509.InvalidVersion)
+ROLE_EXTENSION: Final = "1.3.6.1.4.1.50316.802.1"
 UTF8_STRING: Final = 0x0C
 """Tag of a UTF8String in DER."""
 MAX_LENGTH: Final = 127
 """Longest role, in bytes: what DER says the length of in one byte."""
-
-
-class Caller(NamedTuple):
-    """A client as the server knows it: its name in messages, and its roles."""
-
-    name: str
-    roles: frozenset[Role]
 
 
 def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:
@@ -58,12 +49,15 @@ def _within(address: IPv4Address | IPv6Address, networks: Networks) -> bool:
 
 def _subject_and_role(der: bytes) -> tuple[str, str]:
     """Return both as they stand in a certificate; empty where it is too odd to be read, though OpenSSL took it."""
+    from cryptography import x509  # noqa: PLC0415 a service without TLS starts without it
+
+    odd = (x509.DuplicateExtension, x509.UnsupportedGeneralNameType, x509.InvalidVersion)
     subject = ""
     try:
         certificate = x509.load_der_x509_certificate(der)
         subject = certificate.subject.rfc4514_string()
-        extension = certificate.extensions.get_extension_for_oid(ROLE_EXTENSION).value
-    except (x509.ExtensionNotFound, ValueError, *ODD_CERTIFICATE):
+        extension = certificate.extensions.get_extension_for_oid(x509.ObjectIdentifier(ROLE_EXTENSION)).value
+    except (x509.ExtensionNotFound, ValueError, *odd):
         return subject, ""
     return subject, decoded_role(extension.public_bytes())
 

@@ -1,20 +1,15 @@
 """A typed client of one server: records in, records out."""
 
 import asyncio
-import logging
 import ssl
 import struct
 from collections.abc import Sequence
-from functools import cached_property, partial
 from typing import Any, Final, Self, TypeVar, cast
 
-from pymodbus.client import AsyncModbusTcpClient
-from pymodbus.exceptions import ConnectionException, ModbusException
-
 from coldloop.endpoints import Endpoint
-from coldloop.errors import PeerUnreachableError, RequestRefusedError, UntrustedPeerError
+from coldloop.errors import DamagedAnswerError, PeerUnreachableError, RequestRefusedError, UntrustedPeerError
 from coldloop.modbus.peer_check import check_peer
-from coldloop.modbus.raw_pdu import RawDecoder, RawPdu
+from coldloop.modbus.raw_pdu import RawPdu
 from coldloop.modbus.requests import (
     MAX_READ_WORDS,
     MAX_WRITE_WORDS,
@@ -23,30 +18,27 @@ from coldloop.modbus.requests import (
     WRITE_MULTIPLE_REGISTERS,
 )
 from coldloop.modbus.settings import TlsSettings
-from coldloop.modbus.tls import client_context
+from coldloop.modbus.transport import NoAnswerError, Transport
 from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
+from coldloop.seal import Seal, seal_of, sealed
 
 R = TypeVar("R", bound=tuple[Any, ...])
+S = TypeVar("S", bound=tuple[Any, ...])
 
 CONNECT_PAUSE_S: Final = 0.1
-BUFFER_BYTES: Final = 4096
-"""pymodbus throws away what is received when more than two frames' length of it has come, stale answers included."""
-
 _READ: Final = struct.Struct(">HH")
 _WRITE: Final = struct.Struct(">HHB")
 _READ_WRITE: Final = struct.Struct(">HHHHB")
 _EXCEPTIONS: Final = {
-    1: "illegal function",
-    2: "no such register, or not for this client to write",
+    1: "no such function, or not for the role of this client",
+    2: "no such register, or read-only",
     3: "illegal value",
     4: "failure in the server",
+    6: "somebody else holds the lease of this role",
     11: "no such unit id",
 }
-
-# pymodbus logs each failure besides reporting it; here every one becomes an error of Coldloop's that says more.
-logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 
 class RegisterClient:
@@ -62,8 +54,10 @@ class RegisterClient:
 
     Requests of several tasks are sent one after the other. After a lost connection the next request connects again.
 
-    All requests raise `PeerUnreachableError` when there is no answer in time and `RequestRefusedError` when the
-    answer is a Modbus exception.
+    Records of sealed blocks are sealed when they are written, and their seals are checked when they are read.
+
+    All requests raise `PeerUnreachableError` when there is no answer in time, `RequestRefusedError` when the answer is
+    a Modbus exception, and `DamagedAnswerError` when a record that should be sealed is not, or its seal is broken.
     """
 
     def __init__(
@@ -78,10 +72,10 @@ class RegisterClient:
     ) -> None:
         self._map = register_map
         self._order = order
-        self._host = host
-        self._port = port
         self._timeout_s = timeout_s
-        self._tls = client_context(tls, f"tls of the client of {self.peer}") if tls else None
+        context = _secured(tls, f"tls of the client of {register_map.service} at {host}:{port}") if tls else None
+        self._secure = context is not None
+        self._transport = Transport(register_map.service, host, port, timeout_s, context)
         self._turn = asyncio.Lock()
         self._places: dict[type[tuple[Any, ...]], tuple[Block, RecordCodec]] = {
             block.record: (block, codec_of(block, order)) for block in register_map.blocks
@@ -106,7 +100,12 @@ class RegisterClient:
     @property
     def peer(self) -> str:
         """The server, as messages name it."""
-        return f"{self._map.service} at {self._host}:{self._port}"
+        return self._transport.peer
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection; without one the next request makes one."""
+        return self._transport.connected
 
     async def connect(self, patience_s: float) -> None:
         """Connect, and make sure that the peer speaks this register map in this word order.
@@ -150,6 +149,8 @@ class RegisterClient:
         for first in range(start, start + count, rows_at_once):
             here = min(rows_at_once, start + count - first)
             raw = await self._read_words(block, block.address + first * row_words, here * row_words)
+            for row in range(here if block.sealed else 0):
+                self._check_seal(block, codec, raw, row * codec.size)
             rows += [cast("R", codec.decode(raw, row * codec.size)) for row in range(here)]
         return rows
 
@@ -165,7 +166,7 @@ class RegisterClient:
         row_words = codec.size // 2
         rows_at_once = MAX_WRITE_WORDS // row_words
         for first in range(0, len(records), rows_at_once):
-            data = b"".join([codec.encode(record) for record in records[first : first + rows_at_once]])
+            data = b"".join([_encoded(block, codec, record) for record in records[first : first + rows_at_once]])
             head = _WRITE.pack(block.address + (start + first) * row_words, len(data) // 2, len(data))
             answer = await self._transact(RawPdu(WRITE_MULTIPLE_REGISTERS, head + data), block)
             if answer != head[: _READ.size]:
@@ -189,14 +190,32 @@ class RegisterClient:
         """
         block, codec = self._places[type(record)]
         answer_block, answer_codec = self._places[answer]
-        data = codec.encode(record) + b"".join([self._places[type(row)][1].encode(row) for row in rows])
+        data = _encoded(block, codec, record) + b"".join([self._places[type(row)][1].encode(row) for row in rows])
         head = _READ_WRITE.pack(answer_block.address, answer_codec.size // 2, block.address, len(data) // 2, len(data))
         raw = await self._transact(RawPdu(READ_WRITE_REGISTERS, head + data), block, patience_s)
-        return cast("R", answer_codec.decode(self._checked(raw, answer_codec.size, answer_block), 1))
+        words = self._checked(raw, answer_codec.size, answer_block)
+        if answer_block.sealed:
+            self._check_seal(answer_block, answer_codec, words, 1)
+        return cast("R", answer_codec.decode(words, 1))
+
+    async def query(self, record: tuple[Any, ...], answer: type[R], rows: type[S], count: int) -> tuple[R, list[S]]:
+        """Write `record`, then read `answer` and the first `count` rows of the block that adjoins it, in one request.
+
+        One request, so that no other client's query comes between. The blocks that are read are not sealed.
+        """
+        written, own_codec = self._places[type(record)]
+        block, codec = self._places[answer]
+        row_codec = self._places[rows][1]
+        size = codec.size + count * row_codec.size
+        data = _encoded(written, own_codec, record)
+        head = _READ_WRITE.pack(block.address, size // 2, written.address, len(data) // 2, len(data))
+        raw = self._checked(await self._transact(RawPdu(READ_WRITE_REGISTERS, head + data), written), size, block)
+        places = range(1 + codec.size, 1 + size, row_codec.size)
+        return cast("R", codec.decode(raw, 1)), [cast("S", row_codec.decode(raw, place)) for place in places]
 
     def close(self) -> None:
         """Close the connection."""
-        self._client.close()
+        self._transport.close()
 
     async def _read_words(self, block: Block, address: int, count: int) -> bytes:
         raw = await self._transact(RawPdu(READ_HOLDING_REGISTERS, _READ.pack(address, count)), block)
@@ -207,78 +226,30 @@ class RegisterClient:
             raise self._nonsense(block)
         return raw
 
+    def _check_seal(self, block: Block, codec: RecordCodec, raw: bytes, offset: int) -> None:
+        if seal_of(codec, raw, offset) is not Seal.INTACT:
+            raise DamagedAnswerError(f"{self.peer}: block '{block.name}' arrived damaged, or is not sealed there")
+
     async def _transact(self, request: RawPdu, block: Block, patience_s: float | None = None) -> bytes:
         """Send a request, connecting first where needed; return the bytes behind the answer's function code."""
         async with self._turn:
-            client = self._client
-            if not client.connected:
-                await self._open()
-            client.ctx.comm_params.timeout_connect = patience_s or self._timeout_s
+            if not self._transport.connected:
+                await self._transport.open()
             try:
-                response = await client.execute(False, request)  # noqa: FBT003 - pymodbus takes it by position only
-            except (ModbusException, RuntimeError) as error:  # uvloop's, when the transport has just been closed
-                client.close()  # a late answer must not meet a later request
-                raise self._silent(block, error) from error
-            except asyncio.CancelledError:
-                client.close()
-                raise
-        _raise_lost_cancellation()
+                response = await self._transport.transact(request, patience_s or self._timeout_s)
+            except NoAnswerError as error:
+                raise self._silent(block, closed=error.closed) from error
         if not isinstance(response, RawPdu) or response.function_code & 0x7F != request.function_code:
             raise self._nonsense(block)
         if response.function_code != request.function_code:
             raise self._refused(request.function_code, block, response.payload)
         return response.payload
 
-    async def _open(self) -> None:
-        self._client.ctx.comm_params.timeout_connect = self._timeout_s
-        connected = await self._client.connect()
-        _raise_lost_cancellation()
-        if not connected:
-            raise PeerUnreachableError(f"nobody listens as {self.peer}: start it, or check host and port")
-
-    @cached_property
-    def _client(self) -> AsyncModbusTcpClient:
-        # Neither retries nor reconnection in the background: a request fails within its time, and the next one
-        # connects again. pymodbus only notices a lost connection by the time-out, so it is told here.
-        client = AsyncModbusTcpClient(
-            self._host,
-            port=self._port,
-            name=self._map.service,
-            timeout=self._timeout_s,
-            retries=0,
-            reconnect_delay=0,
-            trace_connect=self._connection_changed,
-        )
-        client.ctx.framer.decoder = RawDecoder(is_server=False)
-        client.ctx.max_buffer_size = BUFFER_BYTES
-        if self._tls is not None:
-            # pymodbus' own TLS client takes each TLS record for a whole answer, and does not say why it failed.
-            client.ctx.call_create = partial(self._create_secured, client, self._tls)
-        return client
-
-    async def _create_secured(self, client: AsyncModbusTcpClient, tls: ssl.SSLContext) -> Any:  # noqa: ANN401 - pymodbus' signature
-        try:
-            return await asyncio.get_running_loop().create_connection(
-                client.ctx.handle_new_connection, self._host, self._port, ssl=tls
-            )
-        except ssl.SSLCertVerificationError as error:
-            raise UntrustedPeerError(
-                f"{self.peer} cannot be trusted: {error.verify_message}: check the host name, and tls.ca here"
-            ) from None
-        except (ssl.SSLError, ConnectionResetError, ConnectionAbortedError):
-            raise PeerUnreachableError(f"{self.peer} does not speak TLS 1.3: check server.tls there") from None
-
-    def _connection_changed(self, connected: bool) -> None:  # noqa: FBT001 - pymodbus' signature
-        answer = self._client.ctx.response_future
-        if not connected and not answer.done():
-            answer.set_exception(ConnectionException("closed by the peer"))
-
-    def _silent(self, block: Block, error: Exception) -> PeerUnreachableError:
-        lost = isinstance(error, ConnectionException | RuntimeError)
-        what = "closed the connection" if lost else "did not answer in time"
+    def _silent(self, block: Block, *, closed: bool) -> PeerUnreachableError:
+        what = "closed the connection" if closed else "did not answer in time"
         return PeerUnreachableError(
             f"{self.peer} {what} at a request for block '{block.name}': check that it runs and is what listens there"
-            f"{', and that it accepts our certificate' if self._tls else ''}"
+            f"{', and that it accepts our certificate' if self._secure else ''}"
         )
 
     def _refused(self, function: int, block: Block, payload: bytes) -> RequestRefusedError:
@@ -294,8 +265,11 @@ class RegisterClient:
         )
 
 
-def _raise_lost_cancellation() -> None:
-    """Raise the cancellation that `asyncio.wait_for` loses before Python 3.12 when it meets what is waited for."""
-    task = asyncio.current_task()
-    if task is not None and task.cancelling():
-        raise asyncio.CancelledError
+def _secured(tls: TlsSettings, name: str) -> ssl.SSLContext:
+    from coldloop.modbus.tls import client_context  # noqa: PLC0415 a service without TLS starts without cryptography
+
+    return client_context(tls, name)
+
+
+def _encoded(block: Block, codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
+    return codec.encode(sealed(record) if block.sealed else record)

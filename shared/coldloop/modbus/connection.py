@@ -1,22 +1,25 @@
 """One connection of a server: who it is, frames in, answers out, and the wait that a write may ask for.
 
 Everything runs in the callbacks of the event loop. A request costs no task and no await unless `on_write` asks for a
-wait; then requests that arrive behind it stay in the buffer until its answer is written.
+wait; then requests that arrive behind it stay in the buffer until its answer is written. A request that comes alone is
+answered at once; many are answered a few at a time (`turns`).
 """
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator
 from functools import partial
+from itertools import count
 from time import monotonic
 from typing import Final, cast
 
-from coldloop.modbus.access import Caller, caller_at, caller_with
+from coldloop.modbus.access import caller_at, caller_with
 from coldloop.modbus.framing import Frame, MalformedFrameError, framed, next_frame
-from coldloop.modbus.rate_limit import RateLimit
+from coldloop.modbus.rate_limit import RateLimit, rate_limit_of
 from coldloop.modbus.refusals import RefusalLog
 from coldloop.modbus.requests import NO_SUCH_UNIT, SERVER_FAILURE, RequestHandler, Written, exception_answer
 from coldloop.modbus.settings import ServerSettings
-from coldloop.registers.bank import ForbiddenWriteError, RefusedAccessError
+from coldloop.modbus.turns import REQUESTS_AT_ONCE, Turns
+from coldloop.registers.bank import ANYBODY, Caller, ForbiddenWriteError, RefusedAccessError
 from coldloop.registers.declaration import Block, Role
 
 INPUT_LIMIT: Final = 64 * 1024
@@ -25,9 +28,10 @@ INPUT_LIMIT: Final = 64 * 1024
 OUTPUT_CHUNK: Final = 16 * 1024
 """Bytes of answers that are written at once; a client that does not take them is not served further."""
 
-OnWrite = Callable[[Block], Awaitable[None] | None]
+OnWrite = Callable[[Block, Caller], Awaitable[None] | None]
 
-_KINDS: Final = {1: "illegal_function", 2: "illegal_address", 3: "illegal_value"}
+_KINDS: Final = {1: "illegal_function", 2: "illegal_address", 3: "illegal_value", 6: "second_writer"}
+_numbers = count(1)
 
 
 class Connection(asyncio.Protocol):
@@ -41,10 +45,11 @@ class Connection(asyncio.Protocol):
     def __init__(
         self,
         *,
-        handler_for: Callable[[frozenset[Role]], RequestHandler],
+        handler_for: Callable[[Caller], RequestHandler],
         settings: ServerSettings,
         on_write: OnWrite,
         refusals: RefusalLog,
+        turns: Turns,
         opened: Callable[["Connection"], bool],
         lost: Callable[["Connection"], None],
     ) -> None:
@@ -52,6 +57,7 @@ class Connection(asyncio.Protocol):
         self._settings = settings
         self._on_write = on_write
         self._refusals = refusals
+        self._turns = turns
         self._opened = opened
         self._lost = lost
         self._loop = asyncio.get_running_loop()
@@ -59,19 +65,21 @@ class Connection(asyncio.Protocol):
         self._wait: asyncio.Future[None] | None = None
         self._output_blocked = False
         self._reading_paused = False
-        self._rate = RateLimit(settings.request_rate, settings.request_burst) if settings.request_rate else None
+        self._queued = False
+        self._rate: RateLimit | None = None
         self._held: asyncio.TimerHandle | None = None
         self.requests = 0
         self.written_as: set[Role | None] = set()
         self.last_request = monotonic()  # not the loop's time, which uvloop rounds to milliseconds
         self.peer = "?"
+        self.caller = ANYBODY._replace(roles=frozenset())
         self.has_role = False
         """Whether it may write anything."""
 
     @property
     def idle(self) -> bool:
         """Whether no request is waiting for its answer."""
-        return self._wait is None and self._held is None
+        return self._wait is None and self._held is None and not self._queued
 
     def close(self) -> None:
         """Close when what was answered has been sent."""
@@ -101,9 +109,11 @@ class Connection(asyncio.Protocol):
             self._refusals.note("access_refused", self.peer, "this address has no role and may not read")
             self.close()
             return
+        self.caller = caller = caller._replace(connection=next(_numbers))
         self.peer = caller.name
         self.has_role = bool(caller.roles)
-        self._handle = self._handler_for(caller.roles).handle
+        self._rate = rate_limit_of(self._settings, has_role=self.has_role)
+        self._handle = self._handler_for(caller).handle
         self._opened(self)
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - why it was lost changes nothing
@@ -132,14 +142,29 @@ class Connection(asyncio.Protocol):
         self.last_request = monotonic()
         self._serve()
 
+    @property
+    def _ready(self) -> bool:
+        blocked = self._output_blocked or self._wait is not None or self._held is not None
+        return not blocked and not self._transport.is_closing()
+
     def _serve(self) -> None:
-        while self._wait is None and self._held is None and not self._output_blocked:
-            answers = self._answers()
-            if not answers:
-                break
-            self.last_request = monotonic()
-            self._transport.write(answers)
+        """Serve what this turn of the event loop has time for; the rest waits for later ones."""
+        if self._queued:
+            return
+        until = self._turns.until()
+        if self.serve_some(until) if until else self._wait_for_a_turn():
+            self._turns.queue(self)
+
+    def _wait_for_a_turn(self) -> bool:
+        self._queued = self._ready and bool(self._buffer)
         self._regulate_reading()
+        return self._queued
+
+    def serve_some(self, until: float) -> bool:
+        """Answer a few requests, none after `until` (monotonic time, s); return whether there are more for now."""
+        self._queued = self._ready and self._answer_some(until) and self._ready
+        self._regulate_reading()
+        return self._queued
 
     def _regulate_reading(self) -> None:
         pause = self._output_blocked or self._held is not None or len(self._buffer) > INPUT_LIMIT
@@ -151,31 +176,38 @@ class Connection(asyncio.Protocol):
         else:
             self._transport.resume_reading()
 
-    def _answers(self) -> bytes:
-        """Take the next whole requests out of the buffer and return their answers, to be written at once."""
+    def _answer_some(self, until: float) -> bool:
+        """Take whole requests out of the buffer and write their answers at once; return whether there may be more."""
         answers = b""
         position = 0
+        last = self.requests + REQUESTS_AT_ONCE
+        more = False
         try:
-            while len(answers) < OUTPUT_CHUNK and self._wait is None:
+            while self._wait is None and not more:
                 frame = next_frame(self._buffer, position)
                 if frame is None or (self._rate is not None and self._too_fast(self._rate)):
                     break
                 position = frame.end
                 answers += self._answer(frame)
+                self.last_request = monotonic()
+                more = self.requests >= last or len(answers) >= OUTPUT_CHUNK or self.last_request >= until
         except MalformedFrameError as error:
-            if not answers:  # otherwise they are sent first, and the next call comes here again
+            if answers:  # they are sent first, and the next call comes here again
+                more = True
+            else:
                 self._refusals.note("malformed_frame", self.peer, str(error))
                 position = len(self._buffer)
                 self._transport.close()
         del self._buffer[:position]
-        return answers
+        if answers:
+            self._transport.write(answers)
+        return more and bool(self._buffer)
 
     def _too_fast(self, limit: RateLimit) -> bool:
         """Tell whether the next request comes too early; then it is served, and the client read from, later."""
         wait_s = limit.take()
         if wait_s:
-            rate = self._settings.request_rate
-            self._refusals.note("rate_limited", self.peer, f"more than {rate:g} requests/s: read from later")
+            self._refusals.note("rate_limited", self.peer, f"more than {limit.rate:g} requests/s: read from later")
             self._held = self._loop.call_later(wait_s, self._release)
         return wait_s > 0.0
 
@@ -208,7 +240,7 @@ class Connection(asyncio.Protocol):
         """Tell the program about the blocks; return the answer, or nothing when the program makes it wait."""
         try:
             for block in blocks:
-                waiting = self._on_write(block)
+                waiting = self._on_write(block, self.caller)
                 if waiting is not None:
                     self._wait = asyncio.ensure_future(waiting)
                     self._wait.add_done_callback(partial(self._go_on, frame, written, blocks))

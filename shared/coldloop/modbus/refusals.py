@@ -27,6 +27,7 @@ class ErrorCounters:
     access_refused: int = 0
     tls_refused: int = 0
     rate_limited: int = 0
+    second_writer: int = 0
 
 
 class RefusalLog:

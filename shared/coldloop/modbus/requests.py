@@ -12,13 +12,14 @@ from typing import Final, NamedTuple
 
 from coldloop.modbus.identification import ENCAPSULATED_INTERFACE, DeviceIdentity, identification_answer
 from coldloop.registers.bank import (
-    ALL_ROLES,
+    ANYBODY,
+    Caller,
     IllegalAddressError,
     IllegalValueError,
     RefusedAccessError,
     RegisterBank,
 )
-from coldloop.registers.declaration import Block, Role
+from coldloop.registers.declaration import Block
 
 READ_COILS: Final = 1
 READ_DISCRETE_INPUTS: Final = 2
@@ -61,14 +62,14 @@ def exception_answer(function: int, exception_code: int) -> bytes:
 
 
 class RequestHandler:
-    """Carries requests of clients with the same roles out on one bank.
+    """Carries requests of one client out on one bank.
 
     Nothing is stored unless the whole request is right.
     """
 
-    def __init__(self, bank: RegisterBank, identity: DeviceIdentity, roles: frozenset[Role] = ALL_ROLES) -> None:
+    def __init__(self, bank: RegisterBank, identity: DeviceIdentity, caller: Caller = ANYBODY) -> None:
         self._bank = bank
-        self._roles = roles
+        self._caller = caller
         self._functions: Final[dict[int, Callable[[bytes], bytes | Written]]] = {
             READ_COILS: _read_bits,
             READ_DISCRETE_INPUTS: _read_bits,
@@ -103,7 +104,7 @@ class RequestHandler:
         return bytes((function, 2 * count)) + self._bank.read(address, count)
 
     def _write(self, address: int, data: bytes) -> list[Block]:
-        return self._bank.write(address, data, self._roles)
+        return self._bank.write(address, data, self._caller)
 
     def _write_single(self, pdu: bytes) -> Written:
         address, _ = _unpacked(_PAIR, pdu)
@@ -128,7 +129,7 @@ class RequestHandler:
         _check_quantity(read_count, MAX_READ_WORDS)
         _check_quantity(count, MAX_READ_WRITE_WORDS)
         _check_byte_count(byte_count, 2 * count, data)
-        self._bank.read(read_address, read_count)  # refuses before anything is stored
+        self._bank.check_readable(read_address, read_count)  # before anything is stored
         blocks = self._write(address, data)
         return Written(blocks, partial(self._registers, READ_WRITE_REGISTERS, read_address, read_count))
 

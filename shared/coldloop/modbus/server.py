@@ -5,7 +5,7 @@ import contextlib
 import errno
 from collections.abc import Callable
 from dataclasses import asdict
-from functools import cache
+from functools import partial
 from time import monotonic
 from typing import Final
 
@@ -15,9 +15,9 @@ from coldloop.modbus.identification import DeviceIdentity
 from coldloop.modbus.refusals import ErrorCounters, RefusalLog
 from coldloop.modbus.requests import RequestHandler
 from coldloop.modbus.settings import ServerSettings
-from coldloop.modbus.tls import server_context
 from coldloop.modbus.tls_listener import TlsListener
-from coldloop.registers.bank import RegisterBank
+from coldloop.modbus.turns import Turns
+from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import ServerStatistics
 from coldloop.registers.declaration import Role
 
@@ -39,13 +39,14 @@ class ModbusServer:
     Args:
         bank: What is served; it also decides the word order.
         settings: Where to listen, whom to answer and how many.
-        on_write: Called with each block that a request has written, in the order of their addresses, after everything
-            is stored. When it returns an awaitable, the answer (the read half of an FC23 too) is made after it is
-            done; other connections are served meanwhile. It is cancelled when its client goes away, so it must not be
-            shared. When `on_write` or its awaitable raises, the client gets exception 04.
+        on_write: Called with each block that a request has written, in the order of their addresses, and with who
+            wrote it, after everything is stored. When it returns an awaitable, the answer (the read half of an FC23
+            too) is made after it is done; other connections are served meanwhile. It is cancelled when its client goes
+            away, so it must not be shared. When `on_write` or its awaitable raises, the client gets exception 04.
         identity: Answer to the device identification, function 43 / 14.
         on_departure: Called with a role when the last open connection that has written a block of that role closes,
             unless the server itself is being closed.
+        on_close: Called with the caller of each connection that closes.
         on_refusal: Called with the kind, a field of `ErrorCounters`, of everything that is refused.
 
     The block of `ServerStatistics`, where the map has one, is kept up to date.
@@ -59,14 +60,17 @@ class ModbusServer:
         on_write: OnWrite,
         identity: DeviceIdentity,
         on_departure: Callable[[Role], None] | None = None,
+        on_close: Callable[[Caller], None] | None = None,
         on_refusal: Callable[[str], None] | None = None,
     ) -> None:
         self._settings = settings
         self._on_write = on_write
         self._service = bank.map.service
         self._on_departure = on_departure
-        self._handler_for = cache(lambda roles: RequestHandler(bank, identity, roles))
+        self._on_close = on_close
+        self._handler_for = partial(RequestHandler, bank, identity)
         self._refusals = RefusalLog(bank.map.service, on_refusal)
+        self._turns = Turns()
         self._closing = False
         self._accepted = self._past_requests = 0
         self._connections: dict[Connection, None] = {}  # in the order of their arrival
@@ -122,6 +126,8 @@ class ModbusServer:
         tls = self._settings.tls
         if tls is None:
             return await asyncio.get_running_loop().create_server(self._new_connection, host, port)
+        from coldloop.modbus.tls import server_context  # noqa: PLC0415 without TLS, nothing needs cryptography
+
         return await TlsListener.at(
             host,
             port,
@@ -151,6 +157,7 @@ class ModbusServer:
             settings=self._settings,
             on_write=self._on_write,
             refusals=self._refusals,
+            turns=self._turns,
             opened=self._admit,
             lost=self._forget,
         )
@@ -192,6 +199,8 @@ class ModbusServer:
         self._past_requests += connection.requests
         if not self._connections:
             self._none_connected.set()
+        if self._on_close is not None:
+            self._on_close(connection.caller)
         if self._on_departure is None or self._closing:
             return
         present = {role for other in self._connections for role in other.written_as}

@@ -40,6 +40,9 @@ class TlsSettings(BaseModel):
         certificate: Our certificate, and the intermediate ones that lead to the peer's CA.
         key: Its key, without a passphrase.
         ca: Certificates of the authorities whose peers we accept.
+        crl: Revocation lists of these authorities: peers whose certificates are listed are refused. All peers are,
+            when the list has expired.
+        warn_days: How long before one of these files expires there is a warning, days.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -47,6 +50,8 @@ class TlsSettings(BaseModel):
     certificate: Path
     key: Path
     ca: Path
+    crl: Path | None = None
+    warn_days: float = Field(default=30.0, ge=0)
 
 
 class ServerSettings(BaseModel):
@@ -63,7 +68,8 @@ class ServerSettings(BaseModel):
         replaceable_after_s: A connection is idle, and may be replaced, when its last request is this long ago.
         idle_timeout_s: A connection without a whole request for this long is closed.
         request_rate: Requests a second that a connection may keep up; beyond, it is read from later. 0 is no limit.
-        request_burst: Requests that it may make at once.
+        reader_request_rate: The same for a client without a role, which has the lower of both; 0 is `request_rate`.
+        request_burst: Requests that a connection with a limit may make at once.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -78,4 +84,5 @@ class ServerSettings(BaseModel):
     replaceable_after_s: float = Field(default=10.0, ge=0)
     idle_timeout_s: float = Field(default=300.0, gt=0)
     request_rate: float = Field(default=0.0, ge=0)
+    reader_request_rate: float = Field(default=200.0, ge=0)
     request_burst: int = Field(default=100, ge=1)

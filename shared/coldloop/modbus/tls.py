@@ -1,8 +1,11 @@
 """Modbus/TCP Security: TLS 1.3 with certificates on both sides."""
 
+import logging
 import ssl
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Final, NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric.types import PublicKeyTypes
@@ -10,6 +13,11 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat,
 
 from coldloop.errors import ConfigurationError
 from coldloop.modbus.settings import TlsSettings
+
+CRL_BEGIN: Final = b"-----BEGIN X509 CRL-----"
+DAY_S: Final = 86400.0
+
+_logger = logging.getLogger("coldloop.modbus")
 
 
 def server_context(settings: TlsSettings, name: str) -> ssl.SSLContext:
@@ -37,29 +45,111 @@ def client_context(settings: TlsSettings, name: str) -> ssl.SSLContext:
     return _context(ssl.PROTOCOL_TLS_CLIENT, settings, name)
 
 
+class Expiry(NamedTuple):
+    """The file that expires first, and when."""
+
+    what: str
+    end: datetime
+
+    def days_left(self, now: datetime | None = None) -> float:
+        """Return the days from now on, negative when it has expired."""
+        return (self.end - (now or datetime.now(UTC))).total_seconds() / DAY_S
+
+
+def first_expiry(settings: TlsSettings, name: str = "tls") -> Expiry:
+    """Return which of our certificate, the authorities and the revocation lists expires first.
+
+    Reads the files: not for a control program to do in a scan.
+
+    Raises:
+        ConfigurationError: A file cannot be used.
+    """
+    certificate = _certificates(settings.certificate, f"{name}: certificate")[0]
+    authorities = _certificates(settings.ca, f"{name}: ca")
+    ends = [Expiry(f"certificate {settings.certificate}", certificate.not_valid_after_utc)]
+    ends += [Expiry(f"ca {settings.ca}", authority.not_valid_after_utc) for authority in authorities]
+    lists = _revocation_lists(settings.crl, authorities, f"{name}: crl") if settings.crl else []
+    ends += [Expiry(f"crl {settings.crl}", each.next_update_utc) for each in lists if each.next_update_utc]
+    return min(ends, key=lambda expiry: expiry.end)
+
+
+def certificate_days_left(settings: TlsSettings, now: datetime | None = None) -> float:
+    """Return the days until the first of the files expires, negative when one has.
+
+    Raises:
+        ConfigurationError: A file cannot be used.
+    """
+    return first_expiry(settings).days_left(now)
+
+
 def _context(protocol: int, settings: TlsSettings, name: str) -> ssl.SSLContext:
-    _check_files(settings, name)
+    authorities = _check_files(settings, name)
+    _warn_of_time(settings, name)
     context = ssl.SSLContext(protocol)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     try:
         context.load_cert_chain(settings.certificate, settings.key)
         context.load_verify_locations(settings.ca)
+        if settings.crl is not None:
+            context.load_verify_locations(settings.crl)
     except ssl.SSLError as error:
         raise ConfigurationError(f"{name}: {settings.certificate} cannot be used for TLS: {error.reason}") from None
+    if settings.crl is not None:
+        issuers = {each.issuer for each in _revocation_lists(settings.crl, authorities, f"{name}: crl")}
+        whole = issuers >= {authority.subject for authority in authorities}
+        context.verify_flags |= ssl.VERIFY_CRL_CHECK_CHAIN if whole else ssl.VERIFY_CRL_CHECK_LEAF
     return context
 
 
-def _check_files(settings: TlsSettings, name: str) -> None:
-    """Say what OpenSSL would only hint at."""
+def _check_files(settings: TlsSettings, name: str) -> list[x509.Certificate]:
+    """Say what OpenSSL would only hint at; return the authorities."""
     certificate = _certificates(settings.certificate, f"{name}: certificate")[0]
     key = _public_key_of(settings.key, f"{name}: key")
     if _comparable(key) != _comparable(certificate.public_key()):
         raise ConfigurationError(
             f"{name}: key {settings.key} does not belong to certificate {settings.certificate}: name a pair"
         )
-    for authority in _certificates(settings.ca, f"{name}: ca"):
-        _check_time(authority, f"{name}: ca {settings.ca}")
-    _check_time(certificate, f"{name}: certificate {settings.certificate}")
+    return _certificates(settings.ca, f"{name}: ca")
+
+
+def _warn_of_time(settings: TlsSettings, name: str) -> None:
+    """Log what has expired, expires soon or is not valid yet: peers refuse it, but the service starts."""
+    expiry = first_expiry(settings, name)
+    days = expiry.days_left()
+    if days < settings.warn_days:
+        when = f"{'expired' if days < 0 else 'expires'} on {expiry.end:%Y-%m-%d}"
+        _logger.warning("%s: %s %s; make a new one", name, expiry.what, when)
+    start = _certificates(settings.certificate, f"{name}: certificate")[0].not_valid_before_utc
+    if datetime.now(UTC) < start:
+        _logger.warning(
+            "%s: certificate %s is not valid before %s UTC; check this clock",
+            name, settings.certificate, f"{start:%Y-%m-%d %H:%M}",
+        )  # fmt: skip
+
+
+def _revocation_lists(
+    file: Path, authorities: Sequence[x509.Certificate], what: str
+) -> list[x509.CertificateRevocationList]:
+    _, *blocks = _contents(file, what).split(CRL_BEGIN)
+    try:
+        lists = [x509.load_pem_x509_crl(CRL_BEGIN + block) for block in blocks]
+    except ValueError:
+        lists = []
+    if not lists:
+        raise ConfigurationError(f"{what} {file}: no PEM revocation list in it; name a file that has one")
+    for each in lists:
+        if not any(_is_by(each, authority) for authority in authorities):
+            raise ConfigurationError(f"{what} {file}: is not by an authority in ca; name the list of one of them")
+    return lists
+
+
+def _is_by(revocations: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:
+    if revocations.issuer != authority.subject:
+        return False
+    try:
+        return revocations.is_signature_valid(authority.public_key())  # type: ignore[arg-type] # others raise
+    except TypeError:
+        return False
 
 
 def _certificates(file: Path, what: str) -> list[x509.Certificate]:
@@ -89,13 +179,3 @@ def _contents(file: Path, what: str) -> bytes:
 
 def _comparable(key: PublicKeyTypes) -> bytes:
     return key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
-
-
-def _check_time(certificate: x509.Certificate, what: str) -> None:
-    now = datetime.now(UTC)
-    if now > certificate.not_valid_after_utc:
-        raise ConfigurationError(f"{what}: expired on {certificate.not_valid_after_utc:%Y-%m-%d}; make a new one")
-    if now < certificate.not_valid_before_utc:
-        raise ConfigurationError(
-            f"{what}: not valid before {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC; check this clock"
-        )

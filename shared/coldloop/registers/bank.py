@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 from coldloop.registers.codec import RecordCodec, ValueCodec, WordOrder, codec_of
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, Role, fields_of
+from coldloop.seal import Seal, seal_of, sealed
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -16,6 +17,18 @@ FIRST_HALF, SECOND_HALF = 1, 2
 ALL_ROLES = frozenset(Role)
 MAX_SPANS = 512
 """Ranges that clients write to are remembered up to this number."""
+
+
+class Caller(NamedTuple):
+    """Who makes a request: its name in messages, its roles, and which connection of the server it is."""
+
+    name: str
+    roles: frozenset[Role]
+    connection: int = 0
+
+
+ANYBODY = Caller("program", ALL_ROLES)
+"""Who may write everything: the program itself, and tests."""
 
 
 class RefusedAccessError(Exception):
@@ -33,8 +46,18 @@ class IllegalAddressError(RefusedAccessError):
         super().__init__(2, reason)
 
 
-class ForbiddenWriteError(IllegalAddressError):
-    """Exception 02: a register that somebody else writes."""
+class ForbiddenWriteError(RefusedAccessError):
+    """Exception 01: a register that another role writes, as Modbus/TCP Security asks for where a role is refused."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(1, reason)
+
+
+class BusyError(RefusedAccessError):
+    """Exception 06: somebody else holds the lease of this role."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(6, reason)
 
 
 class IllegalValueError(RefusedAccessError):
@@ -44,11 +67,18 @@ class IllegalValueError(RefusedAccessError):
         super().__init__(3, reason)
 
 
+Judge = Callable[[Any, int, Caller], None]
+"""Takes a record that a write would result in, its row and who writes; raises `RefusedAccessError` to refuse it."""
+
+
 class RegisterBank:
     """Memory of one register map.
 
     The program behind the server reads and writes whole records (`get`, `put`); the server reads and writes words
     (`read`, `write`). Both are atomic: nothing here awaits.
+
+    A write is judged as the whole records that it would result in, also when it changes a part of them: by the declared
+    ranges, by their seals, and by the judges of the program. Nothing is stored unless all of it may be.
     """
 
     def __init__(self, register_map: RegisterMap, order: WordOrder = WordOrder.HIGH_FIRST) -> None:
@@ -61,7 +91,8 @@ class RegisterBank:
         self._places: dict[type[tuple[Any, ...]], tuple[Block, RecordCodec]] = {}
         self._checks: list[tuple[int, Kind, Field, str]] = []
         self._spans: dict[tuple[int, int], _Span] = {}
-        self._live: tuple[int, int, Callable[[], tuple[Any, ...]]] = (0x10000, 0, tuple)
+        self._judges: dict[type[tuple[Any, ...]], Judge] = {}
+        self._live: list[tuple[int, int, Callable[[], tuple[Any, ...] | None]]] = []
         for block in register_map.blocks:
             self._declare(block)
         self._check_addresses = [address for address, *_ in self._checks]
@@ -72,6 +103,8 @@ class RegisterBank:
         self._places[block.record] = block, codec_of(block, self.order)
         if block.writer is not None:
             self._writable[block.address : block.end] = b"\1" * size
+        if block.sealed:  # also what nobody has written yet: no seal is damage to those who read
+            self.put(sealed(codec_of(block, self.order).decode(bytes(2 * size))))
         fields = {name: _with_stored_bounds(field) for name, field in fields_of(block.record).items()}
         for row in range(block.rows):
             for register in block.registers(row):
@@ -93,13 +126,19 @@ class RegisterBank:
         start = 2 * block.address + row * codec.size
         self._memory[start : start + codec.size] = codec.encode(record)
 
-    def keep_fresh(self, record: type[tuple[Any, ...]], present: Callable[[], tuple[Any, ...]]) -> None:
-        """Store `present()` whenever a client reads from the block that holds `record`; one block may have this."""
-        block, _ = self._places[record]
-        self._live = block.address, block.end, present
+    def judged_by(self, judge: Judge, *records: type[tuple[Any, ...]]) -> None:
+        """Let `judge` have a say in what clients write to the blocks of these records."""
+        for record in records:
+            self._judges[record] = judge
+        self._spans.clear()
 
-    def read(self, address: int, count: int) -> bytes:
-        """Return `count` words from `address` on.
+    def keep_fresh(self, record: type[tuple[Any, ...]], present: Callable[[], tuple[Any, ...] | None]) -> None:
+        """Store `present()` whenever a client reads from the block that holds `record`; None leaves it as it is."""
+        block, _ = self._places[record]
+        self._live.append((block.address, block.end, present))
+
+    def check_readable(self, address: int, count: int) -> None:
+        """Check that `count` words from `address` on may be read.
 
         Raises:
             IllegalAddressError: One of them is not declared.
@@ -107,42 +146,66 @@ class RegisterBank:
         end = address + count
         if end > 0x10000 or self._declared.find(0, address, end) >= 0:
             raise IllegalAddressError(f"no register at some of {address}..{end - 1}")
-        start, behind, present = self._live
-        if address < behind and start < end:
-            self.put(present())
+
+    def read(self, address: int, count: int) -> bytes:
+        """Return `count` words from `address` on.
+
+        Raises:
+            IllegalAddressError: One of them is not declared.
+        """
+        self.check_readable(address, count)
+        end = address + count
+        for start, behind, present in self._live:
+            if address < behind and start < end:
+                record = present()
+                if record is not None:
+                    self.put(record)
         return bytes(self._memory[2 * address : 2 * end])
 
-    def write(self, address: int, data: bytes, roles: frozenset[Role] = ALL_ROLES) -> list[Block]:
-        """Check and store words from `address` on; return the blocks that they fall in.
+    def write(self, address: int, data: bytes, caller: Caller = ANYBODY) -> list[Block]:
+        """Judge and store words from `address` on; return the blocks that they fall in.
 
         Args:
             address: Of the first word.
             data: The words, high byte first.
-            roles: Of whom it is that writes.
+            caller: Who writes.
 
         Raises:
             IllegalAddressError: A register does not exist or is read-only.
-            ForbiddenWriteError: A register is not for these roles to write.
-            IllegalValueError: A value is out of range, or half of a 32-bit value.
+            ForbiddenWriteError: A register is not for the roles of the caller to write.
+            IllegalValueError: A value is out of range, half of a 32-bit value, or does not fit the rest of its record.
+            BusyError: Somebody else holds the lease of the role.
         """
-        span = self._checked(address, data, roles)
-        self._memory[2 * address : 2 * address + len(data)] = data
+        span = self._span(address, len(data) // 2, caller)
+        image = data
+        if span.first != address or span.end != address + len(data) // 2:  # a part of a record: the rest stays
+            offset = 2 * (address - span.first)
+            image = bytes(self._memory[2 * span.first : 2 * address]) + data
+            image += self._memory[2 * span.first + offset + len(data) : 2 * span.end]
+        self._check(span, image)
+        for judge, codec, offset, row in span.judged:
+            judge(codec.decode(image, offset), row, caller)
+        self._memory[2 * span.first : 2 * span.end] = image
         return span.blocks
 
-    def _checked(self, address: int, data: bytes, roles: frozenset[Role]) -> "_Span":
-        words = len(data) // 2
-        span = self._spans.get((address, words))
-        if span is None:
-            span = self._make_span(address, words, roles)
-            if len(self._spans) >= MAX_SPANS:
-                self._spans.clear()
-            self._spans[address, words] = span
-        elif not span.writers <= roles:
-            raise _forbidden(span.blocks, roles)
-        values = span.codec.unpack(data)
+    def _check(self, span: "_Span", image: bytes) -> None:
+        values = span.codec.unpack(image)
         if not span.plain or not math.isfinite(sum(values)):
             for value, (field, name) in zip(values, span.fields, strict=True):
                 _check_value(value, field, name)
+        for codec, offset, name in span.sealed:
+            if seal_of(codec, image, offset) is Seal.BROKEN:
+                raise IllegalValueError(f"the CRC of block '{name}' is not that of its registers: write all of them")
+
+    def _span(self, address: int, words: int, caller: Caller) -> "_Span":
+        span = self._spans.get((address, words))
+        if span is None:
+            span = self._make_span(address, words, caller.roles)
+            if len(self._spans) >= MAX_SPANS:
+                self._spans.clear()
+            self._spans[address, words] = span
+        elif not span.writers <= caller.roles:
+            raise _forbidden(span.blocks, caller.roles)
         return span
 
     def _make_span(self, address: int, words: int, roles: frozenset[Role]) -> "_Span":
@@ -157,25 +220,58 @@ class RegisterBank:
             raise IllegalValueError(
                 f"a 32-bit register is written whole or not at all, {address}..{end - 1} halves one"
             )
-        checks = self._checks[bisect_left(self._check_addresses, address) : bisect_left(self._check_addresses, end)]
+        rows = [(block, row) for block in blocks for row in _touched_rows(block, address, end)]
+        first = rows[0][0].address + rows[0][1] * rows[0][0].row_words
+        end = rows[-1][0].address + (rows[-1][1] + 1) * rows[-1][0].row_words
+        checks = self._checks[bisect_left(self._check_addresses, first) : bisect_left(self._check_addresses, end)]
         return _Span(
+            first=first,
+            end=end,
             codec=ValueCodec("".join(kind.letter for _, kind, _, _ in checks), self.order),
             fields=[(field, name) for *_, field, name in checks],
             plain=all(field.low is None and field.high is None for *_, field, _ in checks),
             blocks=blocks,
             writers=writers,
+            sealed=[
+                (self._places[block.record][1], self._offset(block, row, first), block.name)
+                for block, row in rows
+                if block.sealed
+            ],
+            judged=[
+                (self._judges[block.record], self._places[block.record][1], self._offset(block, row, first), row)
+                for block, row in rows
+                if block.record in self._judges
+            ],
         )
+
+    @staticmethod
+    def _offset(block: Block, row: int, first: int) -> int:
+        return 2 * (block.address + row * block.row_words - first)
 
 
 class _Span(NamedTuple):
     """What is known of a writable range of words, whatever is written to it."""
 
+    first: int
+    """Address of the first record that it falls in."""
+    end: int
+    """Behind the last one."""
     codec: ValueCodec
     fields: list[tuple[Field, str]]
     plain: bool
     """No value has a range of its own: it is enough that all are finite."""
     blocks: list[Block]
     writers: frozenset[Role]
+    sealed: list[tuple[RecordCodec, int, str]]
+    """Codec, offset in bytes, and block of each record that has a seal."""
+    judged: list[tuple[Judge, RecordCodec, int, int]]
+    """Judge, codec, offset in bytes, and row of each record that is judged."""
+
+
+def _touched_rows(block: Block, address: int, end: int) -> range:
+    first = max(0, address - block.address) // block.row_words
+    last = (min(end, block.end) - 1 - block.address) // block.row_words
+    return range(first, last + 1)
 
 
 def _forbidden(blocks: list[Block], roles: frozenset[Role]) -> ForbiddenWriteError:

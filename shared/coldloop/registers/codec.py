@@ -42,6 +42,10 @@ class ValueCodec:
             data, offset = self._reordered(data[offset : offset + self.size]), 0
         return self._struct.unpack_from(data, offset)
 
+    def canonical(self, raw: bytes | bytearray | memoryview) -> bytes | bytearray | memoryview:
+        """Return the same values with the high words first, bit for bit."""
+        return raw if self._swaps is None else self._reordered(raw)
+
     def _reordered(self, raw: bytes | bytearray | memoryview) -> bytes:
         words = self._words.unpack(raw)
         return self._words.pack(*[words[source] for source in self._swaps or ()])
@@ -69,6 +73,10 @@ class RecordCodec:
         """Return the record that stands in `data` at `offset` (bytes)."""
         values = self._values.unpack(data, offset)
         return self._record(*(values if self._flat else self._nested(values)))
+
+    def canonical(self, data: bytes | bytearray | memoryview, offset: int = 0) -> bytes | bytearray | memoryview:
+        """Return the row's bytes that stand in `data` at `offset`, with the high words first, bit for bit."""
+        return self._values.canonical(data[offset : offset + self.size])
 
     def _flattened(self, record: tuple[Any, ...]) -> list[Any]:
         flat: list[Any] = []

@@ -46,6 +46,7 @@ class ServerStatistics(NamedTuple):
     access_refused: Annotated[int, u32("Writes and connections refused: not for this client")] = 0
     tls_refused: Annotated[int, u32("Connections refused: no TLS 1.3, or no certificate that holds")] = 0
     rate_limited: Annotated[int, u32("Times that a connection was made to wait for its rate")] = 0
+    second_writer: Annotated[int, u32("Writes refused: somebody else holds the lease of the role")] = 0
 
 
 IDENTITY_BLOCK: Final = Block("identity", 0, Identity, "Who answers, and whether it is alive")

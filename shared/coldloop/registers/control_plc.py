@@ -4,9 +4,10 @@ from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
+from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
-from coldloop.registers.safety import EVENT_ROWS, Alarm, AlarmCommand, AlarmKind, Event, WatchdogStatus, WatchdogTime
+from coldloop.registers.safety import Alarm, AlarmCommand, AlarmKind, LeaseStatus, WatchdogStatus, WatchdogTime
 
 SEQUENCE_ROWS: Final = 240
 
@@ -65,6 +66,53 @@ class Verdict(IntEnum):
     REPEATED = 10
     NOT_INVITED = 11
     """No sequence is played now: an operator drives, or a sensor that MPC needs is bad."""
+    PLANT_LOST = 12
+    """The rack has not been in step for a while."""
+
+
+class PlantLinkState(IntEnum):
+    """State of the control PLC's link to the rack."""
+
+    IDLE = 0
+    """No session."""
+    SEARCHING = 1
+    """The rack does not answer."""
+    JOINING = 2
+    """It answers; what it applies is being read back, nothing is written."""
+    IN_STEP = 3
+    """Outputs are written in every scan, and taken."""
+    NOT_TAKEN = 4
+    """It answers, and does not take the outputs."""
+    FOREIGN = 5
+    """It is in another session, or somebody else drives it."""
+    FROZEN = 6
+    """It answers, and its clock does not move."""
+
+
+class LinkCause(IntEnum):
+    """Why the link to the rack is in its state."""
+
+    NONE = 0
+    NO_ANSWER = 1
+    DAMAGED = 2
+    """An answer whose seal is broken or absent."""
+    NOT_FINITE = 3
+    """What it says that it applies is no number."""
+    WRONG_SESSION = 4
+    UNTIMELY = 5
+    CHANGED = 6
+    """What it applies was changed by somebody else, or by its watchdog."""
+    SECOND_MASTER = 7
+    """Another control PLC holds the lease of the rack."""
+    REFUSED = 8
+    """It refused a request with an exception."""
+    OVERSLEPT = 9
+    """This program stood still for a tick or more."""
+    LEAPT = 10
+    """The tick of the rack leapt, or went back."""
+    STANDS = 11
+    """The tick of the rack does not move."""
+    STARTED = 12
 
 
 class Process(NamedTuple):
@@ -131,6 +179,7 @@ class AwaitUpdate(NamedTuple):
 
     session: Annotated[int, u32("Session of the update before the awaited one")]
     update: Annotated[int, u32("Number of the awaited update")]
+    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
 class Plan(NamedTuple):
@@ -142,6 +191,7 @@ class Plan(NamedTuple):
         float,
         f32("An update is latched at once when the load has moved by more than this; 0 is never", unit="W", low=0),
     ] = 0.0
+    crc: Annotated[int, u32("CRC-32 of the registers before; none, or a wrong one, is refused")] = 0
 
 
 class Acknowledgement(NamedTuple):
@@ -152,9 +202,10 @@ class Acknowledgement(NamedTuple):
         int,
         u16(
             "0 none, 1 accepted, 2 late, 3 wrong update, 4 wrong tick, 5 wrong length, 6 wrong model, 7 bad CRC, "
-            "8 out of range, 9 rate exceeded, 10 repeated, 11 not invited"
+            "8 out of range, 9 rate exceeded, 10 repeated, 11 not invited, 12 plant lost"
         ),
     ]
+    crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
 class Heartbeat(NamedTuple):
@@ -162,6 +213,17 @@ class Heartbeat(NamedTuple):
 
     beat: Annotated[int, u16("Any number; writing it is what counts")]
     model_digest: Annotated[int, u32("First 32 bits of the digest of the optimiser's prediction model")]
+    holder: Annotated[int, u32("Number that the optimiser has given itself; 0 is a simple client")] = 0
+    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
+
+
+class LatchedUpdate(NamedTuple):
+    """Which update is the newest: what an optimiser that computes looks at."""
+
+    session: Annotated[int, u32("Session")] = 0
+    update: Annotated[int, u32("Number of the newest update")] = 0
+    tick: Annotated[int, u32("Tick of its updating instant")] = 0
+    crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
 class Operator(NamedTuple):
@@ -196,10 +258,34 @@ class SequenceRow(NamedTuple):
     cv156: Annotated[float, f32("Opening of the turbine valve", unit="%")]
 
 
+class PlantLinkStatus(NamedTuple):
+    """The link to the rack: whether outputs are written, and how far the clocks agree."""
+
+    state: Annotated[
+        int, u16("0 idle, 1 searching, 2 joining, 3 in step, 4 outputs not taken, 5 foreign, 6 frozen", high=6)
+    ] = PlantLinkState.IDLE
+    cause: Annotated[
+        int,
+        u16(
+            "0 none, 1 no answer, 2 damaged, 3 not finite, 4 wrong session, 5 untimely, 6 changed, 7 second master, "
+            "8 refused, 9 overslept, 10 leapt, 11 stands, 12 started"
+        ),
+    ] = LinkCause.NONE
+    since: Annotated[int, u32("Tick at which this state began")] = 0
+    breaks: Annotated[int, u32("Times that the link has left the state in step")] = 0
+    holder: Annotated[int, u32("Number that this control PLC has given itself")] = 0
+    generation: Annotated[int, u32("Generation of the rack's outputs that was read back")] = 0
+    plant_session: Annotated[int, u32("Session of the rack when it last answered")] = 0
+    plant_tick: Annotated[int, u32("Tick of the rack when it last answered")] = 0
+    offset: Annotated[float, f32("Phase of the rack's clock against ours, less what it should be", unit="ms")] = 0.0
+    skew: Annotated[float, f32("How much faster the rack's clock is than ours", unit="ppm")] = 0.0
+    skew_error: Annotated[float, f32("Standard error of that", unit="ppm")] = 0.0
+
+
 class ControlSession(NamedTuple):
     """Starts a session when written."""
 
-    session: Annotated[int, u32("Number of the session; a new number starts anew from tick 0")]
+    session: Annotated[int, u32("Number of the session; the control PLC starts anew from tick 0", low=1)]
     realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
 
@@ -212,27 +298,35 @@ class Grant(NamedTuple):
 
 CONTROL_MAP: Final = RegisterMap(
     service="control_plc",
-    version=2,
+    version=3,
     blocks=(
         IDENTITY_BLOCK,
         Block("status", 30, Status, "Sequence player and scan cycle"),
         Block("ladder", 50, LadderStatus, "The fail-safe ladder"),
         STATISTICS_BLOCK,
         Block("process", 100, Process, "The process at the last scan"),
-        Block("update", 200, Update, "Latched at the last updating instant"),
-        Block("await update", 400, AwaitUpdate, "Lets a read of the latch wait for a new update", Role.OPTIMIZER),
-        Block("plan", 410, Plan, "Decided updating period", Role.OPTIMIZER),
-        Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence"),
-        Block("heartbeat", 430, Heartbeat, "Sign of life of the optimiser", Role.OPTIMIZER),
-        Block("watchdog", 436, WatchdogStatus, "Watches the optimiser"),
-        Block("watchdog time", 444, WatchdogTime, "Sets that watchdog", Role.OPERATOR),
+        Block("update", 200, Update, "Latched at the last updating instant", sealed=True),
+        Block("plant link", 330, PlantLinkStatus, "Link to the rack, and the clocks of both"),
+        Block("optimiser lease", 360, LeaseStatus, "Who may write as the optimiser"),
+        Block(
+            "await update", 400, AwaitUpdate, "Lets a read of the latch wait for an update", Role.OPTIMIZER, sealed=True
+        ),
+        Block("plan", 410, Plan, "Decided updating period", Role.OPTIMIZER, sealed=True),
+        Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence", sealed=True),
+        Block("heartbeat", 430, Heartbeat, "Sign of life of the optimiser", Role.OPTIMIZER, sealed=True),
+        Block("watchdog", 440, WatchdogStatus, "Watches the optimiser"),
+        Block("watchdog time", 446, WatchdogTime, "Sets that watchdog", Role.OPERATOR),
         Block("session", 450, ControlSession, "Start of a session", Role.OPERATOR),
         Block("grant", 460, Grant, "How far to go in lock-step", Role.OPERATOR),
+        Block("latched update", 462, LatchedUpdate, "The newest update, in short", sealed=True),
         Block("operator", 470, Operator, "Who drives, and manual setpoints", Role.OPERATOR),
-        Block("alarm command", 480, AlarmCommand, "Acknowledges or shelves an alarm", Role.OPERATOR),
+        Block("alarm command", 480, AlarmCommand, "What is to be done with an alarm", Role.OPERATOR),
         Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
         Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
         Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(AlarmKind)),
-        Block("events", 3000, Event, "The last events", rows=EVENT_ROWS),
+        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
+        Block("journal page", 45010, JournalPage, "State of the journal"),
+        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
+        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
     ),
 )

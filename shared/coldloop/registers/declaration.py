@@ -58,14 +58,19 @@ class Field:
         return self.kind.words * max(1, len(self.elements))
 
 
-def u16(description: str, *, unit: str = "", high: int = 0xFFFF) -> Field:
+def u16(description: str, *, unit: str = "", low: int = 0, high: int = 0xFFFF) -> Field:
     """Declare an unsigned 16-bit register."""
-    return Field(Kind.U16, description, unit, 0, high)
+    return Field(Kind.U16, description, unit, low, high)
 
 
-def u32(description: str, *, unit: str = "") -> Field:
+def u32(description: str, *, unit: str = "", low: int | None = None) -> Field:
     """Declare an unsigned 32-bit register pair."""
-    return Field(Kind.U32, description, unit)
+    return Field(Kind.U32, description, unit, low)
+
+
+def text(description: str, words: int) -> Field:
+    """Declare a text of two ASCII characters a word, padded with zeros; `registers.text` converts it."""
+    return Field(Kind.U16, description, elements=tuple(f"{word}" for word in range(words)))
 
 
 def f32(description: str, *, unit: str = "", low: float | None = None, high: float | None = None) -> Field:
@@ -114,6 +119,8 @@ class Block:
     description: str
     writer: Role | None = None
     rows: int = 1
+    sealed: bool = False
+    """Each row ends with the CRC-32 of the words before it (`coldloop.seal`)."""
 
     @cached_property
     def row_words(self) -> int:

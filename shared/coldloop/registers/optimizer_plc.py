@@ -1,7 +1,9 @@
 """Register map of the optimiser PLC: what it did with each update, and the settings of a session."""
 
+from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
+from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, u16, u32
 
@@ -11,10 +13,41 @@ HISTORY_ROWS: Final = 256
 class OptimizerSession(NamedTuple):
     """Settings of a session, taken when its first update arrives."""
 
-    session: Annotated[int, u32("Number of the session")]
+    session: Annotated[int, u32("Number of the session", low=1)]
     realtime: Annotated[int, u16("0 lock-step, 1 real time: answers then arrive when the PLC would have them", high=1)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
-    updating_period: Annotated[int, u16("Fixed updating period; 0 is adaptive", unit="0.25 s")]
+    updating_period: Annotated[int, u16("Fixed updating period, 2 or more; 0 is adaptive", unit="0.25 s", high=20)]
+
+
+class ControlLinkState(IntEnum):
+    """State of the optimiser's link to the control PLC."""
+
+    SEARCHING = 0
+    """The control PLC does not answer."""
+    INTRODUCING = 1
+    """It answers: who it is and which model it runs is being found out."""
+    WAITING = 2
+    """For the next update."""
+    COMPUTING = 3
+    DELIVERING = 4
+    FOREIGN = 5
+    """Another optimiser holds the lease."""
+    WRONG_MODEL = 6
+    """The control PLC runs another model."""
+
+
+class ControlLinkStatus(NamedTuple):
+    """The optimiser's link to the control PLC."""
+
+    state: Annotated[
+        int,
+        u16("0 searching, 1 introducing, 2 waiting, 3 computing, 4 delivering, 5 foreign, 6 wrong model", high=6),
+    ] = ControlLinkState.SEARCHING
+    holder: Annotated[int, u32("Number that this optimiser has given itself")] = 0
+    breaks: Annotated[int, u32("Times that the link was lost")] = 0
+    damaged: Annotated[int, u32("Answers whose seal was broken")] = 0
+    rejected: Annotated[int, u32("Sequences that the control PLC has rejected")] = 0
+    interrupted: Annotated[int, u32("Computations given up for a newer update")] = 0
 
 
 class Optimization(NamedTuple):
@@ -40,11 +73,16 @@ class Optimization(NamedTuple):
 
 OPTIMIZER_MAP: Final = RegisterMap(
     service="optimizer_plc",
-    version=2,
+    version=3,
     blocks=(
         IDENTITY_BLOCK,
         Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
+        Block("control link", 40, ControlLinkStatus, "Link to the control PLC"),
         STATISTICS_BLOCK,
         Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
+        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
+        Block("journal page", 45010, JournalPage, "State of the journal"),
+        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
+        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
     ),
 )

@@ -4,36 +4,63 @@ from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
+from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
-from coldloop.registers.safety import WatchdogStatus, WatchdogTime
+from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 
 HISTORY_ROWS: Final = 256
 LOAD_ROWS: Final = 2048
 MAX_LOAD_W: Final = 10_000.0
 
 
+class OutputVerdict(IntEnum):
+    """What the rack did with the outputs that it was sent last."""
+
+    NONE = 0
+    """None have been sent, or they were not for this rack to judge: they were refused with an exception."""
+    TAKEN = 1
+    WRONG_SESSION = 2
+    UNTIMELY = 3
+    """For another tick than the present one; in real time, too old."""
+    CHANGED = 4
+    """What is applied has changed since it was read back: read it back, and begin from there."""
+
+
 class Actuators(NamedTuple):
-    """Outputs of the control PLC for one tick. Those of another session than the plant's are answered, not applied."""
+    """Outputs for one tick, of the one control PLC that holds the lease of the rack.
+
+    The rack judges them whole; its next measurement tells whether it has taken them.
+    """
 
     tick: Annotated[int, u32("Tick of these outputs; in lock-step writing the present one moves the plant on")]
     cv155: Annotated[float, f32("Opening of the Joule-Thomson valve", unit="%", low=0, high=100)]
     ncr22: Annotated[float, f32("Actuator part of the bath heater's power", unit="W", low=0, high=1000)]
     cv156: Annotated[float, f32("Opening of the turbine valve", unit="%", low=0, high=100)]
     session: Annotated[int, u32("Session that these outputs belong to")]
-    crc: Annotated[
-        int, u32("CRC-32 of the registers before; 0 is none, a wrong one leaves the outputs as they are")
-    ] = 0
+    holder: Annotated[int, u32("Number that the writer has given itself; 0 is a simple client")] = 0
+    generation: Annotated[int, u32("Generation that was read back; 0 does not compare")] = 0
+    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
 class Measurement(NamedTuple):
-    """What the rack reads at one tick."""
+    """What the rack reads at one tick, what it applies, and who decided that."""
 
     tick: Annotated[int, u32("Tick at which these values were read")]
     load: Annotated[float, f32("Heat load NCR22_HL (the same heater, so it is known)", unit="W")]
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
     x: Annotated[tuple[float, ...], f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS)]
     session: Annotated[int, u32("Session")]
+    u: Annotated[tuple[float, ...], f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS)] = (0.0, 0.0, 0.0)
+    holder: Annotated[int, u32("Whose outputs they are; 0 is a simple client's, the safe state or the beginning")] = 0
+    generation: Annotated[
+        int, u32("Rises when outputs change in another way than by their writer: safe state, session, new writer")
+    ] = 0
+    verdict: Annotated[
+        int, u16("Outputs sent last: 0 none, 1 taken, 2 wrong session, 3 untimely, 4 changed since they were read back")
+    ] = OutputVerdict.NONE
+    refused: Annotated[int, u16("Writes of others that were refused so far; wraps")] = 0
+    age: Annotated[float, f32("Time since this tick began, by the rack's clock, in ticks; 0 in lock-step")] = 0.0
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
@@ -56,11 +83,11 @@ class SensorFault(NamedTuple):
 class PlantSession(NamedTuple):
     """Starts a simulation session when written."""
 
-    session: Annotated[int, u32("Number of the session; a new number starts anew from tick 0")]
+    session: Annotated[int, u32("Number of the session; the simulation starts anew from tick 0", low=1)]
     realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
     seed: Annotated[int, u32("Seed of the sensor noise")]
-    load_steps: Annotated[int, u16("Rows of the load table that are in use", high=LOAD_ROWS)]
+    load_steps: Annotated[int, u16("Rows of the load table that are in use", low=1, high=LOAD_ROWS)]
 
 
 class LoadStep(NamedTuple):
@@ -82,19 +109,22 @@ class PlantSample(NamedTuple):
 
 PLANT_MAP: Final = RegisterMap(
     service="plant",
-    version=2,
+    version=3,
     blocks=(
         IDENTITY_BLOCK,
         STATISTICS_BLOCK,
-        Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL),
-        Block("measurement", 200, Measurement, "Inputs of the control PLC"),
-        Block(
-            "watchdog", 310, WatchdogStatus, "Watches the control PLC; outputs go to their safe state when it expires"
-        ),
-        Block("watchdog time", 320, WatchdogTime, "Sets that watchdog", Role.CONTROL),
-        Block("sensor faults", 330, SensorFault, "Faults put into the outputs", Role.OPERATOR, len(OUTPUT_NAMES)),
+        Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL, sealed=True),
+        Block("measurement", 200, Measurement, "Inputs of the control PLC", sealed=True),
+        Block("watchdog", 330, WatchdogStatus, "Watches the control PLC; outputs are made safe when it expires"),
+        Block("watchdog time", 340, WatchdogTime, "Sets that watchdog", Role.CONTROL),
+        Block("lease", 350, LeaseStatus, "Who may write outputs"),
         Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
+        Block("sensor faults", 500, SensorFault, "Faults put into the outputs", Role.OPERATOR, len(OUTPUT_NAMES)),
         Block("load table", 1000, LoadStep, "Heat load over the session", Role.OPERATOR, LOAD_ROWS),
         Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
+        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
+        Block("journal page", 45010, JournalPage, "State of the journal"),
+        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
+        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
     ),
 )

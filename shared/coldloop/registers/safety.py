@@ -1,11 +1,10 @@
-"""Records that the fail-safe side of both PLCs and the rack shares: watchdog, alarms, events."""
+"""Records that the fail-safe side of both PLCs and the rack shares: watchdog, lease, alarms."""
 
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.registers.declaration import u16, u32
-
-EVENT_ROWS: Final = 256
+from coldloop.registers.audit import NOBODY, WHO_WORDS
+from coldloop.registers.declaration import text, u16, u32
 
 
 class WatchdogState(IntEnum):
@@ -32,6 +31,24 @@ class WatchdogTime(NamedTuple):
     time: Annotated[int, u16("Time-out; 0 switches the watchdog off, a new value starts it anew", unit="0.25 s")]
 
 
+class LeaseState(IntEnum):
+    """Whether somebody is the one writer of a role."""
+
+    FREE = 0
+    HELD = 1
+    LINGERING = 2
+    """Its connection has closed: for a moment only the same holder may take it."""
+
+
+class LeaseStatus(NamedTuple):
+    """The lease of a role: only one connection at a time writes in it."""
+
+    state: Annotated[int, u16("0 free, 1 held, 2 lingering: its connection has closed")] = LeaseState.FREE
+    holder: Annotated[int, u32("Number that the holder has given itself; 0 is a simple client")] = 0
+    refused: Annotated[int, u32("Writes of others that were refused with exception 06")] = 0
+    who: Annotated[tuple[int, ...], text("Address, role and certificate of the holder", WHO_WORDS)] = NOBODY
+
+
 class AlarmKind(IntEnum):
     """The alarms of the control PLC; the number is the row in their block."""
 
@@ -47,6 +64,18 @@ class AlarmKind(IntEnum):
     MODEL_MISMATCH = 9
     SCAN_OVERRUN = 10
     ACCESS_REFUSED = 11
+    PLANT_FOREIGN = 12
+    """The rack is driven by somebody else, or is in another session."""
+    PLANT_FROZEN = 13
+    """The rack answers, and its clock does not move."""
+    OUTPUTS_NOT_TAKEN = 14
+    CLOCK_SKEW = 15
+    """The rack's clock and ours differ by too much."""
+    SECOND_WRITER = 16
+    """A second writer was refused: cause 1 an optimiser here, 2 a control PLC at the rack."""
+    CERTIFICATE = 17
+    """Our certificate has expired, or will soon."""
+    STATE_NOT_RETAINED = 18
 
 
 class AlarmState(IntEnum):
@@ -57,6 +86,16 @@ class AlarmState(IntEnum):
     ACKNOWLEDGED = 2
     RETURNED = 3
     SHELVED = 4
+    OUT_OF_SERVICE = 5
+
+
+class AlarmPriority(IntEnum):
+    """How soon an operator has to act."""
+
+    LOW = 1
+    MEDIUM = 2
+    HIGH = 3
+    CRITICAL = 4
 
 
 class AlarmAction(IntEnum):
@@ -65,12 +104,19 @@ class AlarmAction(IntEnum):
     ACKNOWLEDGE = 1
     SHELVE = 2
     UNSHELVE = 3
+    OUT_OF_SERVICE = 4
+    IN_SERVICE = 5
 
 
 class Alarm(NamedTuple):
     """One alarm."""
 
-    state: Annotated[int, u16("0 normal, 1 unacknowledged, 2 acknowledged, 3 returned unacknowledged, 4 shelved")] = 0
+    state: Annotated[
+        int,
+        u16(
+            "0 normal, 1 unacknowledged, 2 acknowledged, 3 returned unacknowledged, 4 shelved, 5 out of service", high=5
+        ),
+    ] = 0
     active: Annotated[int, u16("1 while the condition holds, whatever the state", high=1)] = 0
     cause: Annotated[
         int, u16("Cause: of a mode its ladder cause, of a sensor its output, of a sequence its verdict")
@@ -78,37 +124,18 @@ class Alarm(NamedTuple):
     times: Annotated[int, u16("Times that it was raised")] = 0
     raised: Annotated[int, u32("Tick at which it was last raised")] = 0
     returned: Annotated[int, u32("Tick at which the condition last ended")] = 0
+    priority: Annotated[int, u16("1 low, 2 medium, 3 high, 4 critical", high=4)] = AlarmPriority.LOW
+    shelved_until: Annotated[int, u32("Tick at which shelving ends; 0 is not shelved")] = 0
 
 
 class AlarmCommand(NamedTuple):
     """What an operator wants done with an alarm; done when written."""
 
     alarm: Annotated[int, u16("Number of the alarm; 65535 is all")]
-    action: Annotated[int, u16("1 acknowledge, 2 shelve, 3 unshelve", high=3)]
+    action: Annotated[
+        int, u16("1 acknowledge, 2 shelve, 3 unshelve, 4 out of service, 5 in service again", low=1, high=5)
+    ]
+    time: Annotated[int, u16("How long to shelve it; 0 is the time of the configuration", unit="s")] = 0
 
 
 ALL_ALARMS: Final = 0xFFFF
-
-
-class EventKind(IntEnum):
-    """What an event tells of."""
-
-    NONE = 0
-    MODE = 1
-    """The mode changed: `subject` is the new mode, `cause` why."""
-    ALARM_RAISED = 2
-    """`subject` is the alarm, `cause` its cause."""
-    ALARM_RETURNED = 3
-    ALARM_ACKNOWLEDGED = 4
-    ALARM_SHELVED = 5
-    ALARM_UNSHELVED = 6
-
-
-class Event(NamedTuple):
-    """One line of the sequence of events. The row of event n is n modulo the number of rows; the first is number 1."""
-
-    number: Annotated[int, u32("Number of the event; 0 is none yet")] = 0
-    tick: Annotated[int, u32("Tick of the event")] = 0
-    kind: Annotated[int, u16("1 mode, 2 alarm raised, 3 returned, 4 acknowledged, 5 shelved, 6 unshelved")] = 0
-    subject: Annotated[int, u16("The mode, or the alarm")] = 0
-    cause: Annotated[int, u16("Why")] = 0

@@ -1,0 +1,144 @@
+"""When alarms are raised, how urgent they are, and how long they may be shelved."""
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Annotated, Final, Literal, NamedTuple, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+
+from coldloop.process import TICK_S
+from coldloop.registers.safety import AlarmKind, AlarmPriority
+
+PASSING: Final = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED, AlarmKind.SECOND_WRITER)
+"""Alarms for something that happens at an instant: their off-delay is how long ago the last time must be."""
+BANDS: Final = (AlarmKind.LEVEL_BAND, AlarmKind.T5_BAND)
+
+LOW, MEDIUM, HIGH, CRITICAL = AlarmPriority
+
+
+class AlarmRule(NamedTuple):
+    """How one alarm is treated. Delays are seconds of plant time."""
+
+    priority: AlarmPriority
+    on_delay_s: float = 0.0
+    """How long the condition must hold before the alarm is raised."""
+    off_delay_s: float = 0.0
+    """How long the condition must have ended before the alarm returns."""
+
+    @property
+    def on_ticks(self) -> int:
+        """The on-delay, in ticks."""
+        return _ticks(self.on_delay_s)
+
+    @property
+    def off_ticks(self) -> int:
+        """The off-delay, in ticks."""
+        return _ticks(self.off_delay_s)
+
+
+DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
+    # Nobody controls the process, or somebody else does: act at once.
+    AlarmKind.PLANT_LOST: AlarmRule(CRITICAL),  # only the rack's watchdog protects the plant
+    AlarmKind.PLANT_FOREIGN: AlarmRule(CRITICAL),  # another master decides the outputs
+    AlarmKind.OUTPUTS_NOT_TAKEN: AlarmRule(CRITICAL),  # what is computed is not applied
+    # The process leaves its limits, or is about to without anybody seeing it: act within minutes.
+    AlarmKind.LEVEL_BAND: AlarmRule(HIGH),  # the bath may run dry or flood; on-delay: `band_delay_s`
+    AlarmKind.T5_BAND: AlarmRule(HIGH),  # the turbines leave their range; on-delay: `band_delay_s`
+    AlarmKind.PLANT_FROZEN: AlarmRule(HIGH),  # measurements are old
+    # Control goes on with less quality, or a protection is gone: act within the shift.
+    AlarmKind.MODE: AlarmRule(MEDIUM),  # the ladder has left MPC
+    AlarmKind.SEQUENCE_EXHAUSTED: AlarmRule(MEDIUM),  # outputs are held, then the classical loops control
+    AlarmKind.OPTIMIZER_LOST: AlarmRule(MEDIUM),  # no new sequence will come by itself
+    AlarmKind.SENSOR_BAD: AlarmRule(MEDIUM),  # substituted; the ladder reacts to those that matter
+    AlarmKind.MODEL_MISMATCH: AlarmRule(MEDIUM),  # no sequence is accepted until somebody changes a configuration
+    AlarmKind.SECOND_WRITER: AlarmRule(MEDIUM, off_delay_s=60.0),  # refused, but wired or configured wrongly
+    AlarmKind.CERTIFICATE: AlarmRule(MEDIUM),  # clients will not connect once it has expired
+    AlarmKind.STATE_NOT_RETAINED: AlarmRule(MEDIUM),  # a restart would not continue from here
+    # Nothing is to be done at once: a hint for maintenance.
+    AlarmKind.SEQUENCE_REJECTED: AlarmRule(LOW),  # the rest of the last sequence is played meanwhile
+    AlarmKind.SEQUENCE_LATE: AlarmRule(LOW),  # likewise
+    AlarmKind.SCAN_OVERRUN: AlarmRule(LOW, off_delay_s=60.0),  # outputs came some milliseconds late
+    AlarmKind.ACCESS_REFUSED: AlarmRule(LOW, off_delay_s=60.0),  # nothing has happened
+    AlarmKind.CLOCK_SKEW: AlarmRule(LOW),  # the scan follows the rack's clock
+})  # fmt: skip
+"""Priorities by how soon an operator has to act (ANSI/ISA-18.2-2016, clause 8), and delays."""
+
+
+def _known_name(name: str) -> str:
+    if name.upper() not in AlarmKind.__members__:
+        known = ", ".join(kind.name.lower() for kind in AlarmKind)
+        raise ValueError(f"no alarm is called '{name}'; there are {known}")
+    return name.lower()
+
+
+Delay = Annotated[FiniteFloat, Field(ge=0, le=86_400)]
+
+
+class RuleSettings(BaseModel):
+    """What differs from the default rule of an alarm; what is not given stays."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    priority: Literal["low", "medium", "high", "critical"] | None = None
+    on_delay_s: Delay | None = None
+    """How long the condition must hold before the alarm is raised, plant time."""
+    off_delay_s: Delay | None = None
+    """How long the condition must have ended before the alarm returns, plant time."""
+
+    def changed(self, rule: AlarmRule) -> AlarmRule:
+        """Return a rule with what is given here."""
+        return AlarmRule(
+            rule.priority if self.priority is None else AlarmPriority[self.priority.upper()],
+            rule.on_delay_s if self.on_delay_s is None else self.on_delay_s,
+            rule.off_delay_s if self.off_delay_s is None else self.off_delay_s,
+        )
+
+
+class AlarmSettings(BaseModel):
+    """When the alarms are raised, how urgent they are, and how long they may be shelved."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    level_band: tuple[FiniteFloat, FiniteFloat] = (59.0, 61.0)
+    """L1, %."""
+    t5_band: tuple[FiniteFloat, FiniteFloat] = (9.0, 16.0)
+    """T5, K."""
+    band_delay_s: Delay = 5.0
+    """On-delay of the two band alarms: how long an output must be outside, plant time."""
+    rules: dict[Annotated[str, AfterValidator(_known_name)], RuleSettings] = {}
+    """By name of the alarm, such as `sensor_bad`."""
+    shelving_s: Annotated[FiniteFloat, Field(ge=1, le=65_535)] = 900.0
+    """How long an alarm is shelved by a command that gives no time, plant time."""
+    longest_shelving_s: Annotated[FiniteFloat, Field(ge=1, le=65_535)] = 28_800.0
+    """Longest time of one command, plant time. A shift: the next one decides again."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.shelving_s > self.longest_shelving_s:
+            raise ValueError("shelving_s is above longest_shelving_s; shorten it, or allow more")
+        delayed = [kind.name.lower() for kind in PASSING if self.rule(kind).on_delay_s]
+        if delayed:
+            raise ValueError(f"{delayed[0]} happens at an instant and would never be raised; leave out its on_delay_s")
+        return self
+
+    @property
+    def band_ticks(self) -> int:
+        """The on-delay of the band alarms, in ticks."""
+        return _ticks(self.band_delay_s)
+
+    def rule(self, kind: AlarmKind) -> AlarmRule:
+        """Return how an alarm is treated."""
+        default = DEFAULT_RULES[kind]
+        if kind in BANDS:
+            default = default._replace(on_delay_s=self.band_delay_s)
+        return self.rules.get(kind.name.lower(), RuleSettings()).changed(default)
+
+    def shelving_ticks(self, asked_s: int) -> int:
+        """Return how long an alarm is shelved when so many seconds are asked for; 0 asks for the default."""
+        return _ticks(min(asked_s or self.shelving_s, self.longest_shelving_s))
+
+
+def _ticks(seconds: float) -> int:
+    """Return a time in ticks, not shorter than it; what is smaller than the error of a float does not count."""
+    return math.ceil(seconds / TICK_S - 1e-9)

@@ -1,0 +1,91 @@
+"""A scan with the rack: what is sent, and what becomes of the program with what comes back.
+
+Pure: the runtime sends what `begin` returns (outputs, or a mere reading) and tells what happened, and so does a test
+that has a rack of its own. Time is the rack's: after a break the program goes on at the tick that the rack shows.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
+from coldloop.registers.control_plc import LinkCause, PlantLinkState, Update
+from coldloop.registers.plant import Actuators, Measurement
+from control_plc.plant_link import PlantLink
+from control_plc.program import ControlProgram
+from control_plc.rack_clock import PHASE
+
+BUSY: Final = 6
+"""Modbus exception of a rack whose lease somebody else holds."""
+
+Adopt = Callable[[Measurement], bool]
+"""Takes a reading of a rack in another session; tells whether the program has gone over to that session."""
+
+
+def cause_of(error: LinkError) -> LinkCause:
+    """Return why a request came to nothing."""
+    if isinstance(error, DamagedAnswerError):
+        return LinkCause.DAMAGED
+    if isinstance(error, RequestRefusedError):
+        return LinkCause.SECOND_MASTER if error.exception_code == BUSY else LinkCause.REFUSED
+    return LinkCause.NO_ANSWER
+
+
+class ScanCycle:
+    """Program and link to the rack, put together.
+
+    Args:
+        program: Decides the outputs.
+        link: Decides whether they may be written.
+        adopt: Called with a reading of another session.
+    """
+
+    def __init__(self, program: ControlProgram, link: PlantLink, adopt: Adopt) -> None:
+        self._program = program
+        self._link = link
+        self._adopt = adopt
+        self._sent: Actuators | None = None
+
+    def begin(self) -> Actuators | None:
+        """Return the outputs to be written now, or None: the rack is to be read, and nothing written."""
+        self._sent = None
+        if self._link.in_step:
+            outputs = self._program.begin_scan()
+            self._sent = outputs._replace(holder=self._link.holder, generation=self._link.generation)
+        return self._sent
+
+    def failed(self, error: LinkError) -> None:
+        """Note that the request came to nothing."""
+        self._sent = None
+        self._program.interrupt()
+        self._link.unanswered(cause_of(error))
+
+    def answered(self, answer: Measurement, now: float | None) -> Update | None:
+        """Go on with the rack's answer; return the update if one was latched.
+
+        Args:
+            answer: The measurement, its seal intact.
+            now: Real time, in ticks from any beginning; None in lock-step.
+        """
+        sent, self._sent = self._sent, None
+        if sent is None:
+            self._read_back(answer, now)
+            return None
+        if self._link.exchanged(sent, answer, now):
+            self._link.settled()
+            return self._program.end_scan(answer)
+        self._program.interrupt()
+        return None
+
+    def _read_back(self, reading: Measurement, now: float | None) -> None:
+        program, link = self._program, self._link
+        if reading.session != program.session and self._adopt(reading):
+            link.begin()
+        if not link.read_back(reading, program.session, now):
+            return
+        program.rejoin(reading.tick + (reading.age >= PHASE), reading.u)
+        link.joined()
+
+    @property
+    def is_foreign(self) -> bool:
+        """Whether somebody else has the rack: looking again soon changes nothing."""
+        return self._link.state is PlantLinkState.FOREIGN

@@ -1,0 +1,109 @@
+"""What the optimiser PLC shows in its registers, and what operators write there."""
+
+from collections.abc import Mapping
+from typing import Final
+
+from coldloop.journal import Journal, JournalPublication
+from coldloop.process import TICK_S
+from coldloop.registers.audit import EventKind, JournalQuery
+from coldloop.registers.bank import Caller, IllegalValueError, RegisterBank
+from coldloop.registers.codec import WordOrder
+from coldloop.registers.common import Identity, ServiceState
+from coldloop.registers.declaration import Block
+from coldloop.registers.optimizer_plc import HISTORY_ROWS, OPTIMIZER_MAP, Optimization, OptimizerSession
+from optimizer_plc.budget import PlcBudget
+from optimizer_plc.control_link import ControlLink
+
+SHORTEST_PERIOD_TICKS: Final = 2
+
+
+class Publication:
+    """Registers and journal of the optimiser PLC.
+
+    Args:
+        order: Word order of the registers.
+        budget: Decides which updating periods can be asked for in real time.
+        model_digest: Of our model.
+        holder: Number that this optimiser gives itself.
+    """
+
+    def __init__(self, order: WordOrder, budget: PlcBudget, model_digest: int, holder: int) -> None:
+        self.bank = RegisterBank(OPTIMIZER_MAP, order)
+        self.bank.judged_by(self._judge, OptimizerSession)
+        self._budget = budget
+        self._model_digest = model_digest
+        self._journal = Journal()
+        self._shown = JournalPublication(self._journal, self.bank)
+        self._asked_by = ""
+        self._last: Optimization | None = None
+        self._session = 0
+        self.link = ControlLink(holder, self._journal, self._show_link)
+        self._journal.note(0, EventKind.BOOT)
+        self._show_link()
+        self._show_identity(0)
+
+    # -- what operators write ------------------------------------------------------------------------------------------
+
+    def _judge(self, asked: OptimizerSession, _row: int, _caller: Caller) -> None:
+        """Refuse an updating period that there is not, or whose answers would never be there in time."""
+        ticks = asked.updating_period
+        if 0 < ticks < SHORTEST_PERIOD_TICKS:
+            raise IllegalValueError(
+                f"session.updating_period = {ticks}: give {SHORTEST_PERIOD_TICKS} or more, or 0 (adaptive)"
+            )
+        if ticks and asked.realtime and not self._budget.is_enough(ticks):
+            raise IllegalValueError(
+                f"session.updating_period = {ticks}: in real time no answer is there within {ticks * TICK_S:g} s, one "
+                f"iteration takes {self._budget.answer_after_s(1):g} s with its preparation: give more, or 0 (adaptive)"
+            )
+
+    def on_write(self, block: Block, caller: Caller) -> None:
+        """Answer a query of the journal; the settings of a session are taken when it begins."""
+        if block.record is JournalQuery:
+            self._shown.answer(self.bank.get(JournalQuery))
+        elif block.record is OptimizerSession:
+            self._asked_by = caller.name
+
+    def asked_for(self, session: int) -> OptimizerSession | None:
+        """Return the settings that an operator has written for a session."""
+        asked = self.bank.get(OptimizerSession)
+        return asked if asked.session == session else None
+
+    # -- what is shown -------------------------------------------------------------------------------------------------
+
+    def session_started(self, session: int, *, realtime: bool, factor: float) -> None:
+        """Show that a session has begun."""
+        who = self._asked_by if self.asked_for(session) is not None else ""
+        self._session, self._last = session, None
+        self._journal.note(self.link.tick, EventKind.SESSION, int(realtime), value=factor, who=who)
+        self._shown.show()
+        self._show_identity(0)
+
+    def optimised(self, tick: int, done: Optimization) -> None:
+        """Show what was done with the update latched at `tick`."""
+        self._last = done
+        self.bank.put(done, done.update % HISTORY_ROWS)
+        self._show_identity(tick)
+
+    def _show_link(self) -> None:
+        self.bank.put(self.link.registers())
+        if self._shown.is_behind:
+            self._shown.show()
+
+    def _show_identity(self, tick: int) -> None:
+        self.bank.put(
+            Identity(
+                map_digest=OPTIMIZER_MAP.digest,
+                map_version=OPTIMIZER_MAP.version,
+                state=ServiceState.RUNNING if self._session else ServiceState.READY,
+                model_digest=self._model_digest,
+                session=self._session,
+                tick=tick,
+                heartbeat=(self._last.update + 1 if self._last else 0) & 0xFFFF,
+            )
+        )
+
+    def snapshot(self) -> Mapping[str, object]:
+        """Return what telemetry publishes."""
+        shown = {"session": self._session, "link": self.link.state.name.lower()}
+        return {**shown, **(self._last._asdict() if self._last else {})}

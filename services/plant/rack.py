@@ -1,0 +1,196 @@
+"""The plant's rack: outputs in, measurements out, one tick at a time. No registers, no sockets, no clock.
+
+In lock-step, outputs that are taken make the plant due for one tick. In real time it moves from the first outputs on,
+whatever the control PLC does.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, NamedTuple
+
+from coldloop.journal import Journal
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.registers.audit import EventKind
+from coldloop.registers.bank import Caller
+from coldloop.registers.plant import Actuators, Measurement, OutputVerdict, PlantSample, SensorFault
+from coldloop.session import Pace
+from coldloop.watchdog import Watchdog
+from plant.faults import SensorFaults
+from plant.outputs import AppliedOutputs, Inputs, next_generation
+from plant.program import LoadProfile, PlantProgram
+from plant.retained_state import RetainedState
+from plant.settings import SafeAction, WatchdogSettings
+
+MakePlant = Callable[[LoadProfile, int], PlantProgram]
+"""Returns the plant at tick 0, for a load and a seed of the sensors' noise."""
+
+UNWATCHED_SILENCE_S: Final = 10.0
+"""Real time after which a silent client loses its lease when the watchdog is off."""
+
+
+class Session(NamedTuple):
+    """A run of the simulation from tick 0 on."""
+
+    number: int
+    """0 is none: the plant waits for an operator."""
+    pace: Pace
+    load: LoadProfile
+    seed: int
+
+
+class Rack:
+    """The simulation, what it applies, and what watches over who writes that.
+
+    Args:
+        watchdog: Its configuration.
+        u0: Inputs at the beginning of a session.
+        make_plant: Makes the simulation of a session.
+        session: The one to begin with.
+        journal: Takes the events.
+        generation: Number of the first generation of outputs.
+    """
+
+    def __init__(
+        self,
+        watchdog: WatchdogSettings,
+        u0: Inputs,
+        make_plant: MakePlant,
+        session: Session,
+        *,
+        journal: Journal,
+        generation: int = 1,
+    ) -> None:
+        self._safety = watchdog
+        self._u0 = u0
+        self._make_plant = make_plant
+        self.journal = journal
+        self.watchdog = Watchdog(watchdog.ticks)
+        self.outputs = AppliedOutputs(u0, generation=generation)
+        self._set_up(session)
+
+    def _set_up(self, session: Session) -> None:
+        self._program = self._make_plant(session.load, session.seed)
+        self.session = session
+        self.faults = SensorFaults()
+        self.watchdog.set(self.watchdog.time, 0)
+        self.moving = False
+        """The plant is due to move: in lock-step by one tick, in real time by the clock from now on."""
+
+    @property
+    def tick(self) -> int:
+        """The present tick."""
+        return self._program.tick
+
+    @property
+    def silence_s(self) -> float:
+        """Real time (s) after which the client that writes outputs counts as silent."""
+        pace = self.session.pace
+        if not self.watchdog.time:
+            return UNWATCHED_SILENCE_S
+        return self.watchdog.time * TICK_S / (pace.factor if pace.realtime else 1.0)
+
+    # -- sessions ------------------------------------------------------------------------------------------------------
+
+    def start(self, session: Session, who: str) -> None:
+        """Begin a session at tick 0."""
+        self._set_up(session)
+        self.outputs.replace(self._u0)
+        pace = session.pace
+        self.journal.note(0, EventKind.SESSION, int(pace.realtime), value=pace.factor, who=who)
+        self.journal.note(0, EventKind.LOAD, value=session.load.value(0), who=who)
+
+    def resume(self, state: RetainedState) -> None:
+        """Go on where a session was when the rack was ended; a new generation of outputs begins.
+
+        Raises:
+            KeyError, TypeError, ValueError: It is not the state of such a plant; nothing has changed.
+        """
+        load = LoadProfile(state.times, state.watts)
+        program = self._make_plant(load, state.seed)
+        program.resume(**state.program)
+        cv155, ncr22, cv156 = state.program["u"]
+        self._set_up(Session(state.session, state.pace, load, state.seed))
+        self._program = program
+        self.watchdog.set(self.watchdog.time, program.tick)
+        self.outputs = AppliedOutputs(
+            (cv155, ncr22, cv156), holder=state.holder, generation=next_generation(state.generation)
+        )
+        self.moving = state.pace.realtime and program.tick > 0
+
+    def retained(self) -> RetainedState:
+        """Return what `resume` needs."""
+        session, outputs, journal = self.session, self.outputs, self.journal
+        return RetainedState.model_construct(
+            boot=journal.boot, events=journal.count, generation=outputs.generation, holder=outputs.holder,
+            session=session.number, pace=session.pace, times=session.load.times, watts=session.load.watts,
+            seed=session.seed, program=self._program.retained(),
+        )  # fmt: skip
+
+    # -- outputs -------------------------------------------------------------------------------------------------------
+
+    def offer(self, asked: Actuators, caller: Caller) -> OutputVerdict:
+        """Judge outputs, and apply them from the present tick on if they are taken."""
+        verdict = self.outputs.offer(
+            asked, caller, session=self.session.number, tick=self.tick, realtime=self.session.pace.realtime
+        )
+        if verdict is OutputVerdict.TAKEN:
+            self._program.apply(self.outputs.u)
+            self.watchdog.trigger(self.tick)
+            self.moving = True
+        return verdict
+
+    def advance(self) -> PlantSample:
+        """Go one tick forward; return the record of the tick that ends."""
+        program = self._program
+        sample = PlantSample(program.tick, program.load, self.outputs.u, program.measure(), program.state)
+        self.moving = self.session.pace.realtime
+        program.advance()
+        if self.watchdog.check(program.tick):
+            self._watchdog_expired()
+        return sample
+
+    def _watchdog_expired(self) -> None:
+        """Bring the outputs into their safe state, where the configuration asks for that."""
+        safe = self._safety.action is SafeAction.SAFE
+        if safe:
+            self.outputs.replace(self._safety.safe_state)
+            self._program.apply(self.outputs.u)
+        self.journal.note(self.tick, EventKind.WATCHDOG_EXPIRED, int(safe))
+
+    # -- what operators change -----------------------------------------------------------------------------------------
+
+    def set_watchdog(self, time: int, who: str) -> None:
+        """Change the time-out of the watchdog (ticks, 0 is off), and start it anew."""
+        self.journal.note(self.tick, EventKind.WATCHDOG_TIME, time, self.watchdog.time, who=who)
+        self.watchdog.set(time, self.tick)
+
+    def set_faults(self, faults: Sequence[SensorFault], who: str) -> None:
+        """Take the faults of all sensors."""
+        for output, fault in self.faults.take(faults, self.faults.on(self._program.measure())):
+            self.journal.note(self.tick, EventKind.SENSOR_FAULT, output, fault.kind, value=fault.value, who=who)
+
+    # -- what others see -----------------------------------------------------------------------------------------------
+
+    def measurement(self, age: float, refused: int = 0) -> Measurement:
+        """Return what the sensors show, and what is applied.
+
+        Args:
+            age: Time since the tick began, in ticks.
+            refused: Writes of others that the lease has refused so far.
+        """
+        program, outputs = self._program, self.outputs
+        y = self.faults.on(program.measure())
+        return Measurement(
+            program.tick, program.load, y, program.state, self.session.number, outputs.u, outputs.holder,
+            outputs.generation, outputs.verdict, refused & 0xFFFF, age,
+        )  # fmt: skip
+
+    def snapshot(self) -> Mapping[str, object]:
+        """Return what telemetry publishes."""
+        program = self._program
+        return {
+            "session": self.session.number,
+            "tick": program.tick,
+            "load_w": program.load,
+            "inputs": dict(zip(INPUT_NAMES, self.outputs.u, strict=True)),
+            "outputs": dict(zip(OUTPUT_NAMES, program.measure(), strict=True)),
+        }

@@ -1,0 +1,102 @@
+"""One writer at a time: the lease of a role.
+
+A lease is granted to a connection with its first write, and refused to all others while it is held. It ends with
+silence, or by hand-over: when the connection of a simple client closes, at once; when that of a holder with a number
+closes, after a moment in which it may come back over another connection.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from coldloop.registers.audit import WHO_WORDS
+from coldloop.registers.bank import BusyError, Caller
+from coldloop.registers.safety import LeaseState, LeaseStatus
+from coldloop.registers.text import to_words
+
+LINGER_S: Final = 1.0
+"""For how long, in real time, a holder whose connection has closed keeps its lease."""
+
+SIMPLE_CLIENT: Final = 0
+"""Number of a holder that has given itself none."""
+
+
+class Lease:
+    """Who may write in a role.
+
+    Args:
+        what: What the lease is of, for messages.
+        silence_s: Returns how long, in real time, a holder may be silent; 0 is for ever.
+        now: A clock, s.
+    """
+
+    def __init__(self, what: str, silence_s: Callable[[], float], now: Callable[[], float] = time.monotonic) -> None:
+        self._what = what
+        self._silence_s = silence_s
+        self._now = now
+        self._caller: Caller | None = None
+        self._holder = SIMPLE_CLIENT
+        self._heard_at = 0.0
+        self._closed_at: float | None = None
+        self.refused = 0
+
+    @property
+    def holder(self) -> int:
+        """Number of the holder; 0 is a simple client, or none."""
+        return SIMPLE_CLIENT if self.state is LeaseState.FREE else self._holder
+
+    @property
+    def state(self) -> LeaseState:
+        """Whether somebody holds it now."""
+        if self._caller is None:
+            return LeaseState.FREE
+        silence_s, now = self._silence_s(), self._now()
+        if silence_s and now - self._heard_at > silence_s:
+            return LeaseState.FREE
+        if self._closed_at is None:
+            return LeaseState.HELD
+        return LeaseState.LINGERING if now - self._closed_at <= LINGER_S else LeaseState.FREE
+
+    def check(self, caller: Caller, holder: int | None = None) -> None:
+        """Check that a caller may write; `holder` is the number that it says it has, None where it does not say.
+
+        Raises:
+            BusyError: Somebody else holds the lease.
+        """
+        held = self._caller
+        if held is None or held.connection == caller.connection or self.state is LeaseState.FREE:
+            return
+        if holder is not None and holder == self._holder != SIMPLE_CLIENT:
+            return
+        self.refused += 1
+        raise BusyError(f"{held.name} holds the lease of {self._what}")
+
+    def take(self, caller: Caller, holder: int | None = None) -> bool:
+        """Note a write that `check` has let pass; tell whether the lease has a new holder with it."""
+        held, state = self._caller, self.state
+        same = held is not None and held.connection == caller.connection
+        number = self._holder if holder is None and same else holder or SIMPLE_CLIENT
+        new = held is None or state is LeaseState.FREE or not (same or number == self._holder != SIMPLE_CLIENT)
+        new = new or number != self._holder
+        self._caller, self._holder = caller, number
+        self._heard_at, self._closed_at = self._now(), None
+        return new
+
+    def closed(self, caller: Caller) -> bool:
+        """Note that a connection has closed; tell whether it held the lease."""
+        gone = self._caller is None or self._caller.connection != caller.connection
+        if gone or self._closed_at is not None:
+            return False
+        self._closed_at = self._now()
+        if self._holder == SIMPLE_CLIENT:
+            self._caller = None
+        return True
+
+    def registers(self) -> LeaseStatus:
+        """Return what its registers show."""
+        state = self.state
+        free = state is LeaseState.FREE or self._caller is None
+        who = "" if free or self._caller is None else self._caller.name
+        return LeaseStatus(
+            state, SIMPLE_CLIENT if free else self._holder, self.refused & 0xFFFFFFFF, to_words(who, WHO_WORDS)
+        )

@@ -1,0 +1,97 @@
+"""Records of the journal: what happened, when, and who did it. Every service has one."""
+
+from enum import IntEnum
+from typing import Annotated, Final, NamedTuple
+
+from coldloop.registers.declaration import f32, text, u16, u32
+
+EVENT_ROWS: Final = 256
+QUERY_ROWS: Final = 3
+"""Events in one answer to a query: what one request can read."""
+WHO_WORDS: Final = 24
+NOBODY: Final = (0,) * WHO_WORDS
+
+
+class EventKind(IntEnum):
+    """What an event tells of: `subject`, `cause` and `value` depend on it."""
+
+    NONE = 0
+    MODE = 1
+    """The mode of the ladder changed: subject the new mode, cause why."""
+    ALARM_RAISED = 2
+    """Subject is the alarm, cause its cause; so for all alarm events."""
+    ALARM_RETURNED = 3
+    ALARM_ACKNOWLEDGED = 4
+    ALARM_SHELVED = 5
+    """Value is the time, s."""
+    ALARM_UNSHELVED = 6
+    ALARM_OUT_OF_SERVICE = 7
+    ALARM_IN_SERVICE = 8
+    BOOT = 9
+    """The service started: subject 1 when it goes on with a retained state."""
+    SESSION = 10
+    """A session was started: subject 0 lock-step, 1 real time; value the factor."""
+    OPERATOR_MODE = 11
+    """Subject is the operator's mode."""
+    SETPOINT = 12
+    """Subject is the input, value the setpoint."""
+    WATCHDOG_TIME = 13
+    """Subject is the new time-out in ticks, 0 off; cause the old one."""
+    WATCHDOG_EXPIRED = 14
+    PLANT_LINK = 15
+    """Subject is the new state of the plant link, cause why."""
+    LEASE = 16
+    """Subject 0 ended, 1 granted, 2 a second writer was refused."""
+    SENSOR_FAULT = 17
+    """A fault was put into a sensor: subject the output, cause the kind."""
+    LOAD = 18
+    """The load was written: subject the row of the table, value in W."""
+    CERTIFICATE = 19
+    """Subject 1 expires soon, 2 expired; value days left."""
+    LOST = 20
+    """Events or log lines were lost: value how many."""
+    CONTROL_LINK = 21
+    """Subject is the new state of the optimiser's link to the control PLC; 2 is up."""
+
+
+class Event(NamedTuple):
+    """One line of the journal. The row of event n is n modulo the number of rows; the first is number 1."""
+
+    number: Annotated[int, u32("Number of the event, rising over restarts; 0 is none yet")] = 0
+    boot: Annotated[int, u16("Number of the start of the service in which it happened")] = 0
+    tick: Annotated[int, u32("Tick of plant time")] = 0
+    utc: Annotated[int, u32("UTC, seconds since 1970", unit="s")] = 0
+    milliseconds: Annotated[int, u16("Milliseconds of that time", unit="ms", high=999)] = 0
+    kind: Annotated[
+        int,
+        u16(
+            "1 mode, 2 alarm raised, 3 returned, 4 acknowledged, 5 shelved, 6 unshelved, 7 out of service, 8 in "
+            "service, 9 boot, 10 session, 11 operator mode, 12 setpoint, 13 watchdog time, 14 watchdog expired, "
+            "15 plant link, 16 lease, 17 sensor fault, 18 load, 19 certificate, 20 lost, 21 control link"
+        ),
+    ] = 0
+    subject: Annotated[int, u16("The mode, the alarm, ...: depends on the kind")] = 0
+    cause: Annotated[int, u16("Why: depends on the kind")] = 0
+    value: Annotated[float, f32("A value: depends on the kind")] = 0.0
+    who: Annotated[tuple[int, ...], text("Whose request it was: address, role, certificate", WHO_WORDS)] = NOBODY
+
+
+class JournalQuery(NamedTuple):
+    """Selects events when written; the answer is in the block behind it."""
+
+    first: Annotated[int, u32("Number of the first event looked at")]
+    kind: Annotated[int, u16("Only events of this kind; 0 is any")]
+    subject: Annotated[int, u16("Only events with this subject; 65535 is any")]
+
+
+class JournalPage(NamedTuple):
+    """State of the journal, and where to go on after the last query."""
+
+    oldest: Annotated[int, u32("Number of the oldest event kept")] = 0
+    newest: Annotated[int, u32("Number of the newest event")] = 0
+    found: Annotated[int, u16("Events in the answer")] = 0
+    next_first: Annotated[int, u32("First number for the next query; 0 when there is nothing more")] = 0
+
+
+class JournalAnswer(Event):
+    """An event that a query has found."""

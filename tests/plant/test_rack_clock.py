@@ -1,0 +1,80 @@
+"""The rack's clock: how fast it is, and what becomes of a rack whose plant cannot move."""
+
+import asyncio
+import time
+
+import pytest
+
+from coldloop.errors import ColdloopError
+from coldloop.registers.bank import ANYBODY
+from coldloop.registers.plant import PLANT_MAP, Actuators, PlantSession
+from plant.registers import RackRegisters
+from plant.runtime import PlantRuntime
+from plant.settings import PlantSettings
+
+OUTPUTS = Actuators(0, 43.0, 75.0, 36.0, session=1)
+
+
+def runtime(mode: str, **plant: object) -> PlantRuntime:
+    session = {"autostart": True, "mode": mode, "factor": 200.0}
+    return PlantRuntime(PlantSettings.model_validate({"session": session, "plant": {"load": "a", **plant}}))
+
+
+def send(plant: PlantRuntime) -> None:
+    plant.registers.bank.put(OUTPUTS)
+    plant.on_write(PLANT_MAP.block_of(Actuators), ANYBODY)
+
+
+@pytest.mark.parametrize("clock_error_ppm", [-50_000.0, 0.0, 50_000.0])
+async def test_the_clock_is_as_fast_as_is_configured(clock_error_ppm: float) -> None:
+    plant = runtime("realtime", clock_error_ppm=clock_error_ppm)
+
+    def position() -> tuple[float, float]:
+        return time.monotonic(), plant.registers.rack.tick + plant._age()  # noqa: SLF001 - unrounded
+
+    running = asyncio.create_task(plant.run())
+    send(plant)
+    (begun, first) = position()
+    while plant.registers.rack.tick < 400:  # noqa: ASYNC110 - the rack has no event for that
+        await asyncio.sleep(0)
+    (ended, last) = position()
+    running.cancel()
+    await asyncio.wait({running})
+    assert first == pytest.approx(0.5, abs=0.4), "the first tick begins in its middle"
+    assert (last - first) / (ended - begun) == pytest.approx(800.0 * (1.0 + clock_error_ppm * 1e-6), rel=0.005)
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+async def test_a_plant_that_cannot_move_ends_the_service_with_one_line(
+    monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    def fails(_registers: RackRegisters) -> None:
+        raise FloatingPointError("no such state")
+
+    monkeypatch.setattr(RackRegisters, "advance", fails)
+    plant = runtime(mode)
+    running = asyncio.create_task(plant.run())
+    await asyncio.sleep(0)
+    send(plant)
+    with pytest.raises(
+        ColdloopError, match=r"^the plant has stopped at tick 0: FloatingPointError\('no such state'\)$"
+    ):
+        await running
+
+
+async def test_a_session_in_lock_step_stops_the_clock_of_the_one_before() -> None:
+    plant = runtime("realtime")
+    running = asyncio.create_task(plant.run())
+    send(plant)
+    while plant.registers.rack.tick < 3:  # noqa: ASYNC110 - the rack has no event for that
+        await asyncio.sleep(0)
+    plant.registers.bank.put(PlantSession(1, 0, 1.0, 1, 1))
+    plant.on_write(PLANT_MAP.block_of(PlantSession), ANYBODY)
+    for _ in range(100):
+        await asyncio.sleep(0)
+    assert plant.registers.rack.tick == 0
+    send(plant)
+    await asyncio.sleep(0)
+    assert plant.registers.rack.tick == 1, "one tick for each exchange"
+    running.cancel()
+    await asyncio.wait({running})

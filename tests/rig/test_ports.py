@@ -1,0 +1,40 @@
+"""Ports that are kept for services which start later, end and start again."""
+
+import asyncio
+import socket
+import sys
+
+import pytest
+import uvloop
+
+from rig.ports import HOST, ReservedPorts
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="two sockets share a port in this way on Linux alone")
+
+
+def test_connections_are_refused_until_a_server_listens_and_after_it_has_ended() -> None:
+    with ReservedPorts(1) as reserved:
+        (port,) = reserved.numbers
+        for _ in range(2):
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection((HOST, port)).close()
+            with socket.create_server((HOST, port)):
+                socket.create_connection((HOST, port)).close()
+
+
+@pytest.mark.parametrize("new_loop", [asyncio.new_event_loop, uvloop.new_event_loop])
+def test_the_server_of_an_event_loop_may_listen_there(new_loop: type[asyncio.AbstractEventLoop]) -> None:
+    async def serve(port: int) -> None:
+        server = await asyncio.get_running_loop().create_server(asyncio.Protocol, HOST, port)
+        _, writer = await asyncio.open_connection(HOST, port)
+        writer.close()
+        server.close()
+        await server.wait_closed()
+
+    with ReservedPorts(1) as reserved, asyncio.Runner(loop_factory=new_loop) as runner:
+        runner.run(serve(reserved.numbers[0]))
+
+
+def test_nobody_else_gets_them() -> None:
+    with ReservedPorts(50) as reserved, ReservedPorts(400) as others:
+        assert len({*reserved.numbers, *others.numbers}) == 450
