@@ -12,6 +12,7 @@ from coldloop.registers.control_plc import Verdict
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import Actuators, PlantSample
+from rig.driving import SHOWN
 
 FORMAT: Final = 2
 """Version of the files of a run."""
@@ -64,10 +65,26 @@ HELD_COLUMNS: Final = (
 )
 """What the optimiser was doing."""
 
+DRIVING_COLUMNS: Final = (
+    Column("mode", pa.string(), "", "Mode of the fail-safe ladder: mpc, rest, hold, classical, manual"),
+    Column("cause", pa.string(), "", "Why the control PLC is in this mode"),
+    Column("driver", pa.string(), "", "Whose inputs are applied: optimizer, loops, operator, or nobody: they are held"),
+    Column("bad_sensors", pa.string(), "", "Outputs whose measurement the control PLC substitutes; empty when none"),
+)
+"""What the control PLC was doing, by its events."""
+
+MEASURED_COLUMNS: Final = tuple(
+    Column(f"{OUTPUT_NAMES[output]}_measured", pa.float32(), OUTPUT_UNITS[output],
+           f"What the sensor of {OUTPUT_NAMES[output]} showed, with its faults; null when it was no number")
+    for output in SHOWN
+)  # fmt: skip
+
 TRACE: Final = (
     _TICK,
     _TIME,
     *PHYSICAL_COLUMNS,
+    *MEASURED_COLUMNS,
+    *DRIVING_COLUMNS,
     Column("stage_cost", pa.float64(), "1", "Stage cost of what was reached: deviations and violations of the bands"),
     *HELD_COLUMNS,
 )
@@ -85,6 +102,7 @@ UPDATES: Final = (
 )  # fmt: skip
 
 EVENTS: Final = (
+    Column("service", pa.string(), "", "Whose journal: control_plc or plant"),
     Column("number", pa.int64(), "1", _EVENT["number"].description),
     Column("boot", pa.int32(), "1", _EVENT["boot"].description),
     Column("utc", pa.string(), "", "UTC, ISO 8601 with milliseconds"),
@@ -101,7 +119,7 @@ EVENTS: Final = (
 FILES: Final = {
     "trace.parquet": ("One row a tick of 0.25 s", TRACE),
     "updates.parquet": ("One row an update whose sequence was played", UPDATES),
-    "events.parquet": ("One row an event of the control PLC's journal: modes, alarms, commands", EVENTS),
+    "events.parquet": ("One row an event of the journals: modes, alarms, commands", EVENTS),
 }
 
 

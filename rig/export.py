@@ -83,7 +83,7 @@ def _mat(run: RunFolder) -> Writers:
 
 def _for_matlab(column: pa.ChunkedArray) -> Any:  # noqa: ANN401 an array of numbers or of texts
     if pa.types.is_string(column.type):
-        return np.array(column.to_pylist(), dtype=object)
+        return np.array(column.fill_null("").to_pylist(), dtype=object)
     return column.to_numpy()  # null becomes NaN
 
 
@@ -114,7 +114,8 @@ def _fill(h5py: Any, group: Any, file: pq.ParquetFile) -> None:  # noqa: ANN401 
     first = 0
     for batch in file.iter_batches():
         for field in schema:
-            column = batch[field.name].to_numpy(zero_copy_only=False)
+            values = batch[field.name]
+            column = (values.fill_null("") if pa.types.is_string(field.type) else values).to_numpy(zero_copy_only=False)
             group[field.name][first : first + len(column)] = column
         first += batch.num_rows
 

@@ -13,6 +13,7 @@ from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from rig.columns import FILES, arrow_schema
 from rig.disk_reserve import DiskReserve, ReservedFile
+from rig.driving import DrivingHistory
 from rig.indicators import StageCost
 from rig.recorded import joined
 from rig.recording import SampleBlock, Sink
@@ -75,11 +76,16 @@ class TraceSink(Sink):
         self._file = ParquetFile(folder / "trace.parquet", reserve)
         self._cost = cost
         self._blocks: list[SampleBlock] = []
+        self._driving = DrivingHistory()
         self._updates: deque[Optimization] = deque()
 
     def update(self, update: Optimization) -> None:
         """Take an update, which the ticks from its own on refer to."""
         self._updates.append(update)
+
+    def event(self, service: str, event: Event) -> None:
+        """Take an event, which the ticks from its own on refer to."""
+        self._driving.event(service, event)
 
     def block(self, block: SampleBlock) -> None:
         """Take ticks; write them when they are many."""
@@ -91,10 +97,11 @@ class TraceSink(Sink):
             self._file.check()
 
     def _write(self, block: SampleBlock) -> None:
-        table = trace_table(block, self._updates, self._cost)
+        table = trace_table(block, self._updates, self._cost, self._driving)
         end = block.first + len(block.load)
         while len(self._updates) > 1 and self._updates[1].tick <= end:
             self._updates.popleft()
+        self._driving.forget(end)
         self._file.write(table)
 
     def close(self) -> None:
@@ -155,9 +162,9 @@ class EventsSink(Sink):
     def __init__(self, folder: Path, reserve: DiskReserve) -> None:
         self._rows = _RowFile(folder / "events.parquet", reserve, events_table)
 
-    def event(self, event: Event) -> None:
+    def event(self, service: str, event: Event) -> None:
         """Write an event."""
-        self._rows.add(event)
+        self._rows.add((service, event))
 
     def close(self) -> None:
         """Write the rest."""

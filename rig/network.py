@@ -1,6 +1,7 @@
 """A rig of three services on the bus: started here, or already up; driven and recorded over Modbus alone."""
 
 import asyncio
+import contextlib
 import time
 from typing import NamedTuple
 
@@ -16,12 +17,15 @@ from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, LoadStep, PlantSam
 from plant.runtime import own_header
 from rig.recording import LinkStatistics, Recorder
 from rig.scenario import Scenario
+from rig.session_events import SessionEvents
 from rig.settings import Settings
 
 AHEAD = HISTORY_ROWS - 32
 """Ticks that the control PLC may be ahead of the recording, so that the history still has them."""
 QUIET_S = 20.0
 """A rig on which nothing happens for this long is given up."""
+LAST_LOOK_S = 2.0
+"""How long the events of a run that has ended are waited for."""
 BATCH = 64
 """Ticks to wait for before reading, in lock-step."""
 
@@ -71,14 +75,24 @@ class NetworkRig:
         Raises:
             LinkError: The rig stopped moving, or went faster than it could be recorded.
         """
+        events = await SessionEvents.after_now(self._control, self._plant, recorder)
         session = await self.start(scenario)
         recorder.begin()
+        try:
+            await self._follow(scenario, recorder, session, events)
+        finally:
+            with contextlib.suppress(LinkError, TimeoutError):  # what ended the run is what is reported
+                async with asyncio.timeout(LAST_LOOK_S):
+                    await events.look(now=True)
+
+    async def _follow(self, scenario: Scenario, recorder: Recorder, session: int, events: SessionEvents) -> None:
         updates = _UpdateReader(self._optimizer, recorder, session)
         quiet_since = time.monotonic()
         pause_s = 20 * TICK_S / scenario.factor if scenario.realtime else 0.001
         while len(recorder.samples) < scenario.ticks:
             arrived = await self._read_samples(session, scenario, recorder)
             await updates.read()
+            await events.look()
             now = time.monotonic()
             if arrived:
                 quiet_since = now

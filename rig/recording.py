@@ -15,6 +15,7 @@ from coldloop.errors import ColdloopError
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
+from rig.driving import CONTROL
 from rig.recorded import LinkStatistics, Recording, SampleBlock, joined
 
 __all__ = ["LinkStatistics", "MemorySink", "Recorder", "Recording", "SampleBlock", "Sink"]
@@ -67,8 +68,8 @@ class Sink:
     def update(self, update: Optimization) -> None:
         """Take an update whose sequence was played, before the block that its period ends in is much older."""
 
-    def event(self, event: Event) -> None:
-        """Take an event of the control PLC."""
+    def event(self, service: str, event: Event) -> None:
+        """Take an event of the journal of a service, `control_plc` or `plant`."""
 
     def close(self) -> None:
         """Nothing more comes; raises what kept the sink from its work."""
@@ -80,7 +81,7 @@ class MemorySink(Sink):
     def __init__(self) -> None:
         self._blocks: list[SampleBlock] = []
         self._updates: list[Optimization] = []
-        self.events: list[Event] = []
+        self.events: list[tuple[str, Event]] = []
 
     def block(self, block: SampleBlock) -> None:
         """Keep a block."""
@@ -90,9 +91,9 @@ class MemorySink(Sink):
         """Keep an update."""
         self._updates.append(update)
 
-    def event(self, event: Event) -> None:
+    def event(self, service: str, event: Event) -> None:
         """Keep an event."""
-        self.events.append(event)
+        self.events.append((service, event))
 
     def recording(self, link: LinkStatistics) -> Recording:
         """Return what was kept."""
@@ -167,10 +168,10 @@ class Recorder:
         if len(self._unsettled) > BLOCK_TICKS:
             self._settle()
 
-    def event(self, event: Event) -> None:
-        """Take an event of the control PLC."""
+    def event(self, event: Event, service: str = CONTROL) -> None:
+        """Take an event of the journal of a service; before the ticks after it are older than `SETTLED_TICKS`."""
         for sink in self._sinks:
-            sink.event(event)
+            sink.event(service, event)
 
     def close(self) -> None:
         """Pass on what is left, and close all sinks, each of them even if another one fails.

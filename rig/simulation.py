@@ -23,6 +23,7 @@ from coldloop.errors import UsageError
 from coldloop.lti_model import load as load_model
 from coldloop.process import TICK_S
 from coldloop.registers.audit import Event
+from rig.driving import DrivingHistory
 from rig.indicators import RunEvaluation, StageCost
 from rig.one_process import OneProcessRig
 from rig.plot import DRAWN, Bounds, RunCurves, draw_run
@@ -69,12 +70,15 @@ class Simulation:
     configuration: dict[str, Any]
     """The effective configuration by dotted key."""
     _cost: StageCost
-    _events: tuple[Event, ...]
+    _events: tuple[tuple[str, Event], ...]
 
     @cached_property
     def trace(self) -> Table:
         """One row a tick."""
-        return Table(trace_table(self.recording.block, self.recording.updates, self._cost))
+        history = DrivingHistory()
+        for service, event in self._events:
+            history.event(service, event)
+        return Table(trace_table(self.recording.block, self.recording.updates, self._cost, history))
 
     @cached_property
     def updates(self) -> Table:

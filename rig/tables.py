@@ -11,20 +11,27 @@ from coldloop.process import TICK_S
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from rig.columns import EVENTS, TRACE, UPDATES, arrow_schema
+from rig.driving import DrivingHistory
 from rig.indicators import StageCost
 from rig.recording import SampleBlock
 
 
-def trace_table(block: SampleBlock, updates: Sequence[Optimization], cost: StageCost) -> pa.Table:
+def trace_table(
+    block: SampleBlock, updates: Sequence[Optimization], cost: StageCost, driving: DrivingHistory
+) -> pa.Table:
     """Return the trace of a block.
 
     Args:
         block: Ticks in a row.
         updates: Those whose sequence was played, from the last one before the block on, in their order.
         cost: Computes the stage cost.
+        driving: Has the events of these ticks.
     """
     ticks = block.first + np.arange(len(block.load))
-    columns = [ticks, ticks * TICK_S, *block.rows.T, cost.of(block), *_held(ticks, updates)]
+    columns = [
+        ticks, ticks * TICK_S, *block.rows.T, *driving.measured(ticks, block.y), *driving.columns(ticks),
+        cost.of(block), *_held(ticks, updates),
+    ]  # fmt: skip
     schema = arrow_schema(TRACE)
     return pa.table([pa.array(data, type=field.type) for field, data in zip(schema, columns, strict=True)], schema)
 
@@ -55,15 +62,16 @@ def updates_table(updates: Sequence[Optimization]) -> pa.Table:
     return _table(rows, UPDATES)
 
 
-def events_table(events: Sequence[Event]) -> pa.Table:
+def events_table(events: Sequence[tuple[str, Event]]) -> pa.Table:
     """Return the table of events."""
-    return _table([_event_row(event) for event in events], EVENTS)
+    return _table([_event_row(service, event) for service, event in events], EVENTS)
 
 
-def _event_row(event: Event) -> dict[str, Any]:
+def _event_row(service: str, event: Event) -> dict[str, Any]:
     text = describe(event)
     return {
-        **text._asdict(), "number": event.number, "boot": event.boot, "utc": utc_text(event), "tick": event.tick,
+        **text._asdict(), "service": service, "number": event.number, "boot": event.boot, "utc": utc_text(event),
+        "tick": event.tick,
         "time_s": event.tick * TICK_S, "value": event.value if text.value else None,
     }  # fmt: skip
 

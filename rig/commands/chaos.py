@@ -69,7 +69,7 @@ def execute(options: argparse.Namespace) -> int:
     claim_folder(out, force=options.force)
     with ChaosProgress(plan.ticks) as progress:
         experiment = perform(plan, effective.settings, out, progress)
-    _report(out, plan, experiment)
+    _report(out, plan, experiment, effective.settings)
     if experiment.failure is not None:
         raise LinkError(experiment.failure)
     return 0
@@ -90,11 +90,11 @@ def _refuse_what_the_plan_has(effective: "Configuration[Settings]") -> None:
             raise UsageError(f"{source}: the plan has its own value of {key}; change it with {option}")
 
 
-def _report(out: Path, plan: "Plan", experiment: "Experiment") -> None:
+def _report(out: Path, plan: "Plan", experiment: "Experiment", settings: "Settings") -> None:
     from rig.chaos.report import as_text, summary_lines, table
 
     try:
-        _write(out, plan, experiment)
+        _write(out, plan, experiment, settings)
     except OSError as error:
         raise ResultsError(f"{out}: {error.strerror}; no report was written, choose another --out") from None
     sys.stdout.write(as_text(table(experiment.evaluation.rows)))
@@ -113,9 +113,12 @@ def _changes(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
 
 
-def _write(out: Path, plan: "Plan", experiment: "Experiment") -> None:
+def _write(out: Path, plan: "Plan", experiment: "Experiment", settings: "Settings") -> None:
+    from coldloop.lti_model import load as load_model
     from rig.chaos.figure import plot_chaos
     from rig.chaos.report import write_report
+    from rig.chaos.tables import write_tables
+    from rig.indicators import StageCost
 
     trace, undisturbed = experiment.trace, experiment.undisturbed
     hashes = {
@@ -123,4 +126,6 @@ def _write(out: Path, plan: "Plan", experiment: "Experiment") -> None:
         "undisturbed_trace_sha256": undisturbed.trace_sha256,
     }
     write_report(out, plan, trace, experiment.evaluation, hashes, experiment.failure)
+    cost = StageCost(load_model(settings.model.file), settings.optimizer_plc.program.design)
+    write_tables(out, trace, cost)
     plot_chaos(out / "chaos.png", trace, undisturbed, f"{plan.name}: {plan.description}")

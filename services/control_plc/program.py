@@ -85,6 +85,8 @@ class ControlProgram:
         self._begin(session, 0, self._initial, updates=0)
         mode = Mode.CLASSICAL if classical else Mode.HOLD
         self._ladder = Ladder(self._section.ladder.hold_ticks, mode, Cause.SESSION_STARTED)
+        if session:
+            self._note_mode(0)
 
     def resume(
         self,
@@ -110,6 +112,7 @@ class ControlProgram:
         self._begin(session, tick, SequenceRow(*applied), updates=updates)
         self._player.resume(playing, tick)
         self._ladder = Ladder(self._section.ladder.hold_ticks, Mode.HOLD, Cause.RESTARTED, tick)
+        self._note_mode(tick)
 
     def _begin(self, session: int, tick: int, applied: SequenceRow, *, updates: int) -> None:
         self.session = session
@@ -212,6 +215,9 @@ class ControlProgram:
                 self._loops.restart()
         elif before is Mode.CLASSICAL:
             self._failed_handshake = -math.inf
+        self._note_mode(tick)
+
+    def _note_mode(self, tick: int) -> None:
         self.journal.note(tick, EventKind.MODE, self._ladder.mode, self._ladder.cause)
 
     def _wanted(self, tick: int, row: SequenceRow | None) -> SequenceRow:
@@ -307,8 +313,10 @@ class ControlProgram:
         self._watch_sensors()
 
     def _watch_sensors(self) -> None:
-        """Raise the alarm for each sensor that has become bad; the cause is the newest one's output."""
+        """Note each sensor that became bad or good, and raise the alarm; its cause is the newest one's output."""
         bad = frozenset(self._sensors.bad)
+        for output in sorted(bad ^ self._bad_before):
+            self.journal.note(self.tick, EventKind.SENSOR, output, int(output in bad))
         for output in sorted(bad - self._bad_before):
             self.alarms.raised(AlarmKind.SENSOR_BAD, output)
         if not bad:

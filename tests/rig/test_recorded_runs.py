@@ -75,7 +75,7 @@ def test_an_hdf5_file_has_groups_whose_datasets_know_their_units(coldloop: "Cold
             assert file["trace/L1"][:].tolist() == trace(run)["L1"]
             assert file["trace/L1"].attrs["unit"] == "%"
     with h5py.File(mpc / "run.h5") as file:
-        assert file["events/subject"].asstr()[0] == "mpc"
+        assert file["events/subject"].asstr()[0] == "hold"
     with h5py.File(mpc.parent / "classical" / "run.h5") as file:
         assert np.isnan(file["trace/tau_u_s"][:]).all(), "the classical loops have no updating period"
 

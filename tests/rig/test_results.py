@@ -121,6 +121,7 @@ def test_the_units_of_the_trace_are_those_of_the_process(folder: Path) -> None:
         "tick": "1", "time_s": "s", "load_w": "W", **dict(zip(INPUT_NAMES, INPUT_UNITS, strict=True)),
         **dict(zip(OUTPUT_NAMES, OUTPUT_UNITS, strict=True)),
         **{f"x_{name}": unit for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)},
+        "L1_measured": "%", "T5_measured": "K", **dict.fromkeys(("mode", "cause", "driver", "bad_sensors"), ""),
         "stage_cost": "1", "update": "1", "tau_u_s": "s", "iterations": "1", "J": "1",
     }  # fmt: skip
 
@@ -144,8 +145,11 @@ def test_the_updates_are_the_history_of_the_optimiser_in_seconds(folder: Path, m
 
 
 def test_the_events_say_when_mpc_took_over(folder: Path) -> None:
-    first, *_ = pq.read_table(folder / "events.parquet").to_pylist()
-    assert (first["kind"], first["subject"], first["cause"]) == ("mode", "mpc", "sequence began")
+    events = pq.read_table(folder / "events.parquet").to_pylist()
+    assert [(event["kind"], event["subject"], event["cause"]) for event in events] == [
+        ("mode", "hold", "session started"),
+        ("mode", "mpc", "sequence began"),
+    ]
 
 
 def test_duckdb_and_pandas_read_the_trace(folder: Path, minute: Recording) -> None:
