@@ -36,7 +36,7 @@ ALARMS: Final = {
 }
 SECOND_MASTER: Final = 2
 """Cause of the alarm SECOND_WRITER."""
-HARMLESS: Final = (LinkCause.STARTED, LinkCause.OVERSLEPT, LinkCause.LEAPT)
+HARMLESS: Final = (LinkCause.STARTED, LinkCause.OVERSLEPT, LinkCause.LEAPT, LinkCause.PACE)
 """Causes of JOINING that raise no alarm: what is read back is expected to be what we applied."""
 REFUSED_OUTPUTS: Final = {
     OutputVerdict.NONE: (PlantLinkState.NOT_TAKEN, LinkCause.REFUSED),
@@ -66,7 +66,7 @@ class PlantLink:
         self.session = 0
         """That of the rack when it last answered; so the tick."""
         self.tick = 0
-        self._moved_at = 0.0
+        self._moved_at: float | None = None
         self._refused = 0
 
     @property
@@ -99,6 +99,12 @@ class PlantLink:
         """Note that this program stood still: what the rack has done meanwhile is not known."""
         if self.in_step:
             self._enter(PlantLinkState.JOINING, LinkCause.OVERSLEPT)
+
+    def repaced(self) -> None:
+        """Note that the time base was changed: where the rack is, and how fast it moves, is found out anew."""
+        self._moved_at = None
+        if self.in_step:
+            self._enter(PlantLinkState.JOINING, LinkCause.PACE)
 
     def read_back(self, reading: Measurement, session: int, now: float | None) -> bool:
         """Judge a reading that was asked for without writing; tell whether outputs may be written from it on.
@@ -166,8 +172,8 @@ class PlantLink:
         """Note where the rack is; tell whether its clock stands. At tick 0 it waits for the first outputs."""
         moved = (reading.session, reading.tick) != (self.session, self.tick)
         self.session, self.tick = reading.session, reading.tick
-        if now is None or moved or reading.tick == 0:
-            self._moved_at = now or 0.0
+        if now is None or moved or reading.tick == 0 or self._moved_at is None:
+            self._moved_at = now
             return False
         return now - self._moved_at >= FROZEN_TICKS
 
