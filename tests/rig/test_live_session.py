@@ -22,6 +22,7 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import PLANT_MAP, LiveLoad, LoadAhead, LoadStatus, LoadStep, PlantSession
+from coldloop.registers.safety import AlarmKind
 from coldloop.seal import sealed
 from rig.journal_reader import JournalReader
 from rig.local_services import LocalServices
@@ -29,6 +30,9 @@ from rig.settings import Settings
 
 FACTOR = 20.0
 PATIENCE_S = 20.0
+OF_THE_RACK = {
+    AlarmKind.PLANT_LOST, AlarmKind.PLANT_FOREIGN, AlarmKind.PLANT_FROZEN, AlarmKind.OUTPUTS_NOT_TAKEN,
+}  # fmt: skip
 
 
 class Rig:
@@ -80,8 +84,9 @@ class Rig:
         return await JournalReader(client, kinds=kinds).read_on()
 
     async def alarms(self) -> list[Event]:
-        """Those since the session began: a control PLC that starts before its rack has looked for it."""
-        return [event for event in await self.events(self.control, EventKind.ALARM_RAISED) if event.tick]
+        """Those of the link to the rack since the session began."""
+        raised = await self.events(self.control, EventKind.ALARM_RAISED)
+        return [event for event in raised if event.tick and event.subject in OF_THE_RACK]
 
 
 @asynccontextmanager
