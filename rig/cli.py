@@ -16,6 +16,10 @@ from rig.interruption import INTERRUPTION
 
 COMMANDS: Final = {
     "run": "run the loop and record it",
+    "up": "keep the rig up, in real time, on fixed ports",
+    "down": "end a rig that is up",
+    "status": "what a rig that is up is doing",
+    "set": "load, mode, setpoint, factor, pause, resume, acknowledge: commands to a rig that is up",
     "rerun": "repeat a recorded run and compare the traces",
     "plot": "draw a recorded run again, as PNG, PDF or SVG",
     "report": "one HTML page of a recorded run, with interactive plots",

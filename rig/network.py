@@ -13,8 +13,9 @@ from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, Mode, Status
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, Optimization, OptimizerSession
-from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, LoadStep, PlantSample, PlantSession
+from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, PlantSample, PlantSession
 from plant.runtime import own_header
+from rig.load_stream import LoadStream, write_table
 from rig.recording import LinkStatistics, Recorder
 from rig.scenario import Scenario
 from rig.session_events import SessionEvents
@@ -26,6 +27,7 @@ QUIET_S = 20.0
 """A rig on which nothing happens for this long is given up."""
 LAST_LOOK_S = 2.0
 """How long the events of a run that has ended are waited for."""
+LAST_TICK = 2**32 - 1
 BATCH = 64
 """Ticks to wait for before reading, in lock-step."""
 
@@ -46,6 +48,8 @@ class NetworkRig:
         self._plant = RegisterClient.at(PLANT_MAP, endpoints.plant)
         self._control = RegisterClient.at(CONTROL_MAP, endpoints.control_plc)
         self._optimizer = RegisterClient.at(OPTIMIZER_MAP, endpoints.optimizer_plc)
+        self.load: LoadStream | None = None
+        """The load of the session that was started last."""
 
     async def connect(self, patience_s: float) -> None:
         """Connect to all three, and make sure that all run the model of our configuration.
@@ -85,6 +89,23 @@ class NetworkRig:
                 async with asyncio.timeout(LAST_LOOK_S):
                     await events.look(now=True)
 
+    async def hold(self, session: int, look_s: float) -> None:
+        """Keep a session in real time supplied with its load until cancelled, or until another one begins.
+
+        Raises:
+            LinkError: The plant does not answer.
+        """
+        while True:
+            identity = await self._plant.read(Identity)
+            if identity.session != session:
+                self.load = None
+            elif self.load is not None and not self.load.done:
+                if await self.load.was_replaced():
+                    self.load = None
+                else:
+                    await self.load.feed(identity.tick)
+            await asyncio.sleep(look_s)
+
     async def _follow(self, scenario: Scenario, recorder: Recorder, session: int, events: SessionEvents) -> None:
         updates = _UpdateReader(self._optimizer, recorder, session)
         quiet_since = time.monotonic()
@@ -115,22 +136,29 @@ class NetworkRig:
         session = 1
         for client in (self._plant, self._control, self._optimizer):
             session = max(session, (await client.read(Identity)).session + 1)
-        load = scenario.load
-        steps = [LoadStep(tick, watts) for tick, watts in zip(load.times, load.watts, strict=True)]
         realtime = int(scenario.realtime)
         await self._optimizer.write(
             OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / TICK_S))
         )
-        await self._plant.write_rows(steps)
-        await self._plant.write(PlantSession(session, realtime, scenario.factor, scenario.seed, len(steps)))
+        rows = await write_table(self._plant, scenario.load)
+        await self._plant.write(PlantSession(session, realtime, scenario.factor, scenario.seed, rows))
+        self.load = LoadStream(self._plant, session, scenario.load, sent=rows)
         await self._control.write(ControlSession(session, realtime, scenario.factor))
         return session
+
+    @property
+    def _load_known_until(self) -> int:
+        """Lock-step goes no further than the load is known."""
+        known = None if self.load is None else self.load.known_until
+        return LAST_TICK if known is None else known
 
     async def _read_samples(self, session: int, scenario: Scenario, recorder: Recorder) -> int:
         """Read the ticks that have gone by since the last call; return their number."""
         first = len(recorder.samples)
+        if self.load is not None:
+            await self.load.feed(first)
         if not scenario.realtime:
-            await self._control.write(Grant(min(scenario.ticks, first + AHEAD)))
+            await self._control.write(Grant(min(scenario.ticks, first + AHEAD, self._load_known_until)))
         identity = await self._plant.read(Identity)
         if identity.session != session:
             raise LinkError(f"{self._plant.peer} was taken over by session {identity.session}: one run at a time")

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from coldloop.config import Configuration
 from coldloop.endpoints import Endpoint
-from coldloop.errors import RunInterruptedError
+from coldloop.errors import RunInterruptedError, UsageError
 from coldloop.lti_model import load as load_model
 from coldloop.service import run_event_loop
 from coldloop.session import TimeMode
@@ -58,6 +58,23 @@ def make_scenario(settings: Settings, ticks: int | None = None) -> Scenario:
         realtime=settings.session.mode is TimeMode.REALTIME,
         factor=settings.session.factor,
     )
+
+
+def check_certificates(settings: Settings) -> None:
+    """Refuse a rig in which a client could not show its server a certificate.
+
+    Raises:
+        UsageError: One has none.
+    """
+    clients = [
+        ("rig", settings.rig.tls, ("plant", "control_plc", "optimizer_plc")),
+        ("control_plc.plant", settings.control_plc.plant.tls, ("plant",)),
+        ("optimizer_plc.control_plc", settings.optimizer_plc.control_plc.tls, ("control_plc",)),
+    ]
+    for client, tls, servers in clients:
+        for server in servers:
+            if tls is None and getattr(settings, server).server.tls is not None:
+                raise UsageError(f"{client}.tls is not set, and {server}.server.tls is: name a client certificate")
 
 
 class _StopRequest:

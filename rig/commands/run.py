@@ -70,7 +70,7 @@ def execute(options: argparse.Namespace) -> int:
 def _job(options: argparse.Namespace) -> "Job":
     """Return the run that the options and the configuration ask for."""
     from coldloop.endpoints import Endpoint
-    from rig.running import Job, Way, make_scenario
+    from rig.running import Job, Way, check_certificates, make_scenario
 
     effective = configuration(options)
     settings = effective.settings
@@ -87,7 +87,7 @@ def _job(options: argparse.Namespace) -> "Job":
         return Job(effective, scenario, Way.ATTACHED, tuple(ends))
     if options.in_process:
         return Job(effective, scenario, Way.IN_PROCESS)
-    _check_certificates(settings)
+    check_certificates(settings)
     return Job(effective, scenario, Way.LOCALHOST)
 
 
@@ -96,19 +96,6 @@ def _refuse_what_a_rig_has(effective: "Configuration[Settings]") -> None:
     for key, source in effective.sources.items():
         if source.startswith("--") and not key.startswith(OF_SESSION):
             raise UsageError(f"{source}: a rig that is up has its own {key}, which --attach does not change; drop it")
-
-
-def _check_certificates(settings: "Settings") -> None:
-    """Refuse a rig in which a client could not show its server a certificate."""
-    clients = [
-        ("rig", settings.rig.tls, ("plant", "control_plc", "optimizer_plc")),
-        ("control_plc.plant", settings.control_plc.plant.tls, ("plant",)),
-        ("optimizer_plc.control_plc", settings.optimizer_plc.control_plc.tls, ("control_plc",)),
-    ]
-    for client, tls, servers in clients:
-        for server in servers:
-            if tls is None and getattr(settings, server).server.tls is not None:
-                raise UsageError(f"{client}.tls is not set, and {server}.server.tls is: name a client certificate")
 
 
 def _tell(out: Path, summary: dict[str, Any]) -> None:
