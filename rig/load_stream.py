@@ -1,13 +1,15 @@
 """A load of any length, written to the plant ahead of its clock."""
 
 from bisect import bisect_right
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import LinkError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.plant import AHEAD_STEPS, LOAD_ROWS, LoadAhead, LoadStatus, LoadStep
 from coldloop.seal import sealed
-from plant.program import LoadProfile
+
+if TYPE_CHECKING:  # the simulation behind it takes a second
+    from plant.program import LoadProfile
 
 KEPT_AHEAD: Final = LOAD_ROWS
 """Steps that the plant is to know in advance; it keeps twice as many."""
@@ -24,16 +26,25 @@ class LoadStream:
         load: All of it.
         sent: Steps that the plant has already.
         begin: Tick of the session at which the load begins.
+        ahead: Steps that the plant is to know in advance.
     """
 
     def __init__(
-        self, plant: RegisterClient, session: int, load: LoadProfile, *, sent: int = 0, begin: int = 0
+        self,
+        plant: RegisterClient,
+        session: int,
+        load: "LoadProfile",
+        *,
+        sent: int = 0,
+        begin: int = 0,
+        ahead: int = KEPT_AHEAD,
     ) -> None:
         self._plant = plant
         self._session = session
         self._times = [begin + tick for tick in load.times]
         self._watts = load.watts
         self._sent = sent
+        self._ahead = ahead
 
     @property
     def steps(self) -> int:
@@ -56,7 +67,7 @@ class LoadStream:
         Raises:
             LinkError: The plant does not answer, or the steps have come too late.
         """
-        while not self.done and self._sent - bisect_right(self._times, tick) < KEPT_AHEAD:
+        while not self.done and self._sent - bisect_right(self._times, tick) < self._ahead:
             record = self._next()
             try:
                 await self._plant.write(sealed(record))
@@ -86,7 +97,7 @@ class LoadStream:
         return status.last_tick != last
 
 
-async def write_table(plant: RegisterClient, load: LoadProfile) -> int:
+async def write_table(plant: RegisterClient, load: "LoadProfile") -> int:
     """Write the load table of a session that is to begin; return the steps that are in it.
 
     Raises:

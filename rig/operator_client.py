@@ -1,9 +1,9 @@
 """An operator's client of a rig that is up: what it asks for is read back."""
 
 import asyncio
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
 from types import TracebackType
-from typing import Final, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from coldloop.errors import LinkError, RequestRefusedError, UsageError
 from coldloop.event_text import word
@@ -13,12 +13,14 @@ from coldloop.process import INPUT_NAMES, INPUT_UNITS, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import CONTROL_MAP, Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import MAX_LOAD_W, PLANT_MAP, LiveLoad, LoadStatus
+from coldloop.registers.plant import AHEAD_STEPS, MAX_LOAD_W, PLANT_MAP, LiveLoad, LoadStatus
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.seal import sealed
-from plant.program import LoadProfile
 from rig.load_stream import LoadStream
-from rig.network import RigEndpoints
+from rig.rig_endpoints import RigEndpoints
+
+if TYPE_CHECKING:
+    from plant.program import LoadProfile
 
 T = TypeVar("T")
 
@@ -87,17 +89,22 @@ class OperatorClient:
             return f"load {status.next_watts:g} W from {status.next_tick * TICK_S:g} s on"
         return f"load {status.watts:g} W now"
 
-    async def stream_load(self, load: LoadProfile, at_s: float | None) -> str:
+    async def stream_load(self, load: "LoadProfile", at_s: float | None, say: Callable[[str], None]) -> str:
         """Write a load of any length, as fast as the plant has room for it; return what came back."""
         identity = await self.plant.read(Identity)
         if not identity.session:
             raise UsageError(f"{self.plant.peer} has no session")
         begin = identity.tick + LEAD_TICKS if at_s is None else round(at_s / TICK_S)
-        stream = LoadStream(self.plant, identity.session, load, begin=begin)
+        free = (await self.plant.read(LoadStatus)).free
+        stream = LoadStream(self.plant, identity.session, load, begin=begin, ahead=max(0, free - AHEAD_STEPS))
+        told = False
         while True:
             await stream.feed((await self.plant.read(Identity)).tick)
             if stream.done:
                 break
+            if not told:
+                told = True
+                say(f"the plant keeps {free} steps of {stream.steps}: this goes on until it has all of them")
             await asyncio.sleep(LOOK_S)
         status = await self.plant.read(LoadStatus)
         times = f"{begin * TICK_S:g} s to {status.last_tick * TICK_S:g} s"

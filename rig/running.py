@@ -2,7 +2,7 @@
 
 import asyncio
 import signal
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -15,11 +15,13 @@ from coldloop.lti_model import load as load_model
 from coldloop.service import run_event_loop
 from coldloop.session import TimeMode
 from plant.load import find_load
+from rig.handing_back import give_back, look_around
 from rig.interruption import INTERRUPTION
 from rig.local_services import run_on_localhost
-from rig.network import NetworkRig, RigEndpoints
+from rig.network import NetworkRig
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder, Sink
+from rig.rig_endpoints import RigEndpoints
 from rig.run_files import RunFiles
 from rig.scenario import Scenario, natural_ticks
 from rig.settings import Settings
@@ -146,6 +148,20 @@ async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scena
     rig = NetworkRig(endpoints, settings)
     try:
         await rig.connect(ATTACH_PATIENCE_S)
-        await rig.run(scenario, recorder)
+        found = await look_around(rig)
+        try:
+            await rig.run(scenario, recorder)
+        finally:
+            await _to_its_end(give_back(rig, found, rig.session))
     finally:
         rig.close()
+
+
+async def _to_its_end(work: Coroutine[Any, Any, None]) -> None:
+    """Do all of it, also when this task is cancelled meanwhile."""
+    task = asyncio.ensure_future(work)
+    try:
+        await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await task
+        raise

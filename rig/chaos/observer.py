@@ -14,7 +14,8 @@ from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, PlantSample, Senso
 from coldloop.registers.safety import Alarm, AlarmKind
 from rig.chaos.trace import ChaosTrace
 from rig.journal_reader import JournalReader
-from rig.network import AHEAD, RigEndpoints
+from rig.network import AHEAD
+from rig.rig_endpoints import RigEndpoints
 
 T = TypeVar("T")
 

@@ -17,7 +17,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """End it, and wait until it has ended."""
-    from rig.up import ports_from, take_down
+    from rig.started_rigs import ports_from, take_down
 
     pid = take_down(ports_from(options.port_base)[0], PATIENCE_S)
     sys.stdout.write(f"the rig is down (process {pid})\n")

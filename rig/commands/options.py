@@ -13,7 +13,7 @@ from rig.commands.choices import LOADS
 
 if TYPE_CHECKING:
     from coldloop.config import Configuration
-    from rig.network import RigEndpoints
+    from rig.rig_endpoints import RigEndpoints
     from rig.settings import Settings
 
 _UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
@@ -114,8 +114,8 @@ def rig_endpoints(options: argparse.Namespace, settings: "Settings") -> "RigEndp
     """
     from coldloop.endpoints import Endpoint
     from coldloop.modbus.settings import TlsSettings
-    from rig.network import RigEndpoints
-    from rig.up import ports_from, running_rig
+    from rig.rig_endpoints import RigEndpoints
+    from rig.started_rigs import ports_from, running_rig
     from rig.wiring import SERVICES
 
     if options.rig and options.port_base:

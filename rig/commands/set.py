@@ -84,5 +84,10 @@ def _load(client: "OperatorClient", options: argparse.Namespace) -> Done:
             raise UsageError(f"load '{options.new_load}': neither watts nor a file") from None
         from plant.load import read_load_file
 
-        return client.stream_load(read_load_file(Path(options.new_load)), options.at)
+        return client.stream_load(read_load_file(Path(options.new_load)), options.at, _say)
     return client.set_load(watts, options.at)
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()

@@ -34,7 +34,7 @@ def execute(options: argparse.Namespace) -> int:
     check_load(options.load)
     from rig.commands.options import configuration
     from rig.running import check_certificates
-    from rig.up import UpRig, check_ports, detached, ports_from
+    from rig.started_rigs import check_ports, detached, ports_from
 
     effective = configuration(options)
     check_certificates(effective.settings)
@@ -43,6 +43,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.detach:
         return detached(ports)
     from rig.until_interrupted import run_until_interrupted
+    from rig.up import UpRig
 
     rig = UpRig(effective.settings, ports, options.tls)
     run_until_interrupted(lambda: rig.run(announce=not options.quiet))
