@@ -1,5 +1,7 @@
-"""Indicators of a finished run (paper, section V)."""
+"""Indicators of a run (paper, section V), summed while it goes on or from a recording."""
 
+import hashlib
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -7,13 +9,17 @@ from numpy.typing import NDArray
 
 from coldloop.lti_model import LtiModel
 from coldloop.process import L1, T5, TICK_S, TICKS_PER_SAMPLE
+from coldloop.registers.optimizer_plc import Optimization
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.prediction import state_weights
-from rig.recording import Recording
+from rig.recording import BLOCK_TICKS, Recording, SampleBlock, Sink
 
 
 class Indicators(NamedTuple):
-    """Costs are in the units of the predictive problem's J; sums run over the problems solved, as in the paper."""
+    """Costs are in the units of the predictive problem's J; sums run over the problems solved, as in the paper.
+
+    What does not exist is NaN: without updates all that is predicted, without ticks all that is measured.
+    """
 
     J_dev: float
     """Sum over the problems of the predicted deviation cost."""
@@ -35,45 +41,101 @@ class Indicators(NamedTuple):
     T5_outside_band_pct: float
 
 
+class StageCost:
+    """The stage cost of what was really reached: deviations from the operating point, and violations of the bands."""
+
+    def __init__(self, model: LtiModel, design: ControlDesign) -> None:
+        self._x0, self._u0 = model.x0, model.u0
+        self._state_weights = state_weights(model, design)
+        self._design = design
+
+    def of(self, block: SampleBlock) -> NDArray[np.float64]:
+        """Return the cost of each tick, shape (N,)."""
+        design = self._design
+        x = block.x.astype(float) - self._x0
+        u = block.u.astype(float) - self._u0
+        constrained = block.y[:, [L1, T5]].astype(float)
+        violation = np.maximum(constrained - design.output_high, 0) + np.maximum(design.output_low - constrained, 0)
+        cost: NDArray[np.float64] = (
+            (x**2 * self._state_weights).sum(axis=1)
+            + (u**2 * design.input_weight).sum(axis=1)
+            + (violation**2 * design.violation_weight).sum(axis=1)
+        )
+        return cost
+
+
+class RunEvaluation(Sink):
+    """Sums the indicators of a run, and its digest, in constant memory."""
+
+    def __init__(self, model: LtiModel, design: ControlDesign) -> None:
+        self._cost = StageCost(model, design)
+        self._design = design
+        self._digest = hashlib.sha256()
+        self._outside = np.zeros(2, dtype=int)
+        self._stage_costs = 0.0
+        self._j_dev = self._j_cst = self._weighted = self._violations = self._largest = 0.0
+        self._taus = self._delivered = 0
+        self.ticks = self.updates = self.iterations = 0
+
+    def block(self, block: SampleBlock) -> None:
+        """Take ticks."""
+        constrained = block.y[:, [L1, T5]]
+        outside = (constrained < self._design.output_low) | (constrained > self._design.output_high)
+        self._outside += outside.sum(axis=0)
+        self._stage_costs += float(self._cost.of(block).sum())
+        self._digest.update(block.rows.tobytes())
+        self.ticks += len(block.load)
+
+    def update(self, update: Optimization) -> None:
+        """Take an update."""
+        delivered = update.tick + update.tau_u
+        self._j_dev += update.j_dev
+        self._j_cst += update.j_cst
+        self._weighted += (update.j_dev + update.j_cst) * (delivered - self._delivered)
+        self._delivered = delivered
+        self._violations += update.violation
+        self._largest = max(self._largest, update.violation)
+        self._taus += update.tau_u
+        self.iterations += update.iterations
+        self.updates += 1
+
+    @property
+    def trace_sha256(self) -> str:
+        """SHA-256 over load, inputs, outputs and states of all ticks, as little-endian single precision."""
+        return self._digest.hexdigest()
+
+    @property
+    def indicators(self) -> Indicators:
+        """The indicators of what was taken so far."""
+        count, ticks = self.updates or math.nan, self.ticks or math.nan
+        exists = 1.0 if self.updates else math.nan
+        level, temperature = 100.0 * self._outside / ticks
+        return Indicators(
+            J_dev=self._j_dev * exists,
+            J_cst=self._j_cst * exists,
+            J_open_mean=self._weighted / (self._delivered or math.nan),
+            J_BF=self._stage_costs / TICKS_PER_SAMPLE if self.ticks else math.nan,
+            c1=self._largest * exists,
+            c2=self._violations / count,
+            tau_u_mean=self._taus * TICK_S / count,
+            iterations_total=self.iterations,
+            L1_outside_band_pct=float(level),
+            T5_outside_band_pct=float(temperature),
+        )
+
+
 def instantaneous_cost(recording: Recording, model: LtiModel, design: ControlDesign) -> NDArray[np.float64]:
     """Return the stage cost of each tick, shape (N,): deviations and violations of what was really reached."""
-    x = recording.x.astype(float) - model.x0
-    u = recording.u.astype(float) - model.u0
-    constrained = recording.y[:, [L1, T5]].astype(float)
-    violation = np.maximum(constrained - design.output_high, 0) + np.maximum(design.output_low - constrained, 0)
-    cost: NDArray[np.float64] = (
-        (x**2 * state_weights(model, design)).sum(axis=1)
-        + (u**2 * design.input_weight).sum(axis=1)
-        + (violation**2 * design.violation_weight).sum(axis=1)
-    )
-    return cost
+    return StageCost(model, design).of(recording.block)
 
 
 def evaluate(recording: Recording, model: LtiModel, design: ControlDesign) -> Indicators:
-    """Compute all indicators."""
-    updates = recording.updates
-    open_loop = np.array([[update.j_dev, update.j_cst] for update in updates], dtype=float).reshape(-1, 2)
-    violations = np.array([update.violation for update in updates], dtype=float)
-    tau = np.array([update.tau_u for update in updates], dtype=float)
-    delivered = np.array([update.tick + update.tau_u for update in updates], dtype=float)
-    since = np.diff(delivered, prepend=0.0)
-    outside = _outside_pct(recording, design)
-    return Indicators(
-        J_dev=float(open_loop[:, 0].sum()),
-        J_cst=float(open_loop[:, 1].sum()),
-        J_open_mean=float(np.average(open_loop.sum(axis=1), weights=since)) if updates else 0.0,
-        J_BF=float(instantaneous_cost(recording, model, design).sum() / TICKS_PER_SAMPLE),
-        c1=float(violations.max(initial=0.0)),
-        c2=float(violations.mean()) if updates else 0.0,
-        tau_u_mean=float(tau.mean() * TICK_S) if updates else 0.0,
-        iterations_total=sum(update.iterations for update in updates),
-        L1_outside_band_pct=outside[0],
-        T5_outside_band_pct=outside[1],
-    )
-
-
-def _outside_pct(recording: Recording, design: ControlDesign) -> tuple[float, float]:
-    constrained = recording.y[:, [L1, T5]]
-    outside = (constrained < design.output_low) | (constrained > design.output_high)
-    level, temperature = 100.0 * outside.mean(axis=0)
-    return float(level), float(temperature)
+    """Return the indicators of a recording, as `RunEvaluation` would have summed them."""
+    evaluation = RunEvaluation(model, design)
+    rest = recording.block
+    while len(rest.load):
+        block, rest = rest.split(BLOCK_TICKS)
+        evaluation.block(block)
+    for update in recording.updates:
+        evaluation.update(update)
+    return evaluation.indicators

@@ -28,6 +28,8 @@ class JournalReader:
         self._kinds = frozenset(kinds)
         self._next = first
         self._newest = 0
+        self._read: list[Event] = []
+        """Read before a request that failed."""
         self.limited = False
         """Queries are refused: only the last events can be read."""
         self.missed = 0
@@ -39,9 +41,8 @@ class JournalReader:
         """Return the events up to the newest one that have not been returned yet.
 
         Raises:
-            LinkError: The service does not answer, or refuses.
+            LinkError: The service does not answer, or refuses; the next call returns what was read so far.
         """
-        events: list[Event] = []
         while True:
             page, found = await self._page()
             if page.newest < self._newest:
@@ -49,10 +50,11 @@ class JournalReader:
                 continue
             if 1 < self._next < page.oldest:
                 self.missed += page.oldest - self._next
-            events += [event for event in found if not self._kinds or event.kind in self._kinds]
+            self._read += [event for event in found if not self._kinds or event.kind in self._kinds]
             self._newest = page.newest
             if page.next_first <= self._next:
                 self._next = max(self._next, page.newest + 1)
+                events, self._read = self._read, []
                 return events
             self._next = page.next_first
 

@@ -5,7 +5,7 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Awaitable, Mapping
+from collections.abc import Awaitable, Mapping, Sequence
 from pathlib import Path
 from typing import Self, TypeVar
 
@@ -31,6 +31,7 @@ class LocalServices:
         log_folder: Their logs go to `<folder>/<service>.log`.
         detours: Where something stands between clients and servers.
         environment: Further variables for all of them.
+        ports: Where they listen; by default on ports that nobody else uses.
     """
 
     def __init__(
@@ -40,9 +41,10 @@ class LocalServices:
         *,
         detours: Detours | None = None,
         environment: Mapping[str, str] | None = None,
+        ports: Sequence[int] | None = None,
     ) -> None:
-        self._ports = ReservedPorts(len(SERVICES))
-        self.endpoints = endpoints_on(self._ports.numbers, settings)
+        self._ports = ReservedPorts(len(SERVICES) if ports is None else 0)
+        self.endpoints = endpoints_on(ports or self._ports.numbers, settings)
         self._environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
             **to_environment(wired(settings, self.endpoints, detours)),

@@ -30,6 +30,7 @@ class OneProcessRig:
         load_table = LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
         plant = make_program(self._header, self._settings.plant.sensors, load_table, scenario.seed)
         self.optimizer.restart(scenario.updating_period_s)
+        told = self.control.journal.count
         self.control.restart(session=1)
         recorder.begin()
         for _ in range(scenario.ticks):
@@ -38,6 +39,9 @@ class OneProcessRig:
             update = self._scan(plant, recorder)
             if update is not None:
                 self.control.accept_plan(as_transmitted(self.optimizer.plan(as_transmitted(update))))
+            for event in self.control.journal.since(told):
+                recorder.event(event)
+                told = event.number
 
     def _deliver(self, recorder: Recorder) -> None:
         sequence = self.optimizer.solve()

@@ -1,15 +1,29 @@
 """What is seen while a run goes on: simulated time, speed, and the state of the loop in one line."""
 
+import os
 import time
-from typing import Self
+from typing import Final, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
 from coldloop.process import L1, T5, TICK_S
-from rig.recording import Recorder
+from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.plant import PlantSample
+from rig.recording import Sink
 
-REFRESH_S = 0.1
+REFRESH_S: Final = 0.1
+NARROW: Final = 72
+"""Columns that the bar with speed and remaining time needs."""
+WIDE: Final = 120
+"""Columns that the live line needs besides."""
 
 
 class PlantTimeBar:
@@ -32,51 +46,57 @@ def clock(seconds: float) -> str:
     return f"{hours}:{rest // 60:02}:{rest % 60:02}"
 
 
-class RunProgress(PlantTimeBar):
-    """A progress bar on standard error, with the loop's live line on a terminal."""
+def make_console() -> Console:
+    """Return a console on standard error; without a terminal, or with NO_COLOR, it writes no control sequences."""
+    plain = bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
+    return Console(stderr=True, force_terminal=False if plain else None)
+
+
+class RunProgress(PlantTimeBar, Sink):
+    """A progress bar on standard error, with the loop's live line on a wide terminal."""
 
     def __init__(self, ticks: int) -> None:
-        console = Console(stderr=True)
-        live = [TextColumn("[dim]{task.fields[line]}")] if console.is_terminal else []
-        self._bar = Progress(
-            TextColumn("{task.fields[clock]}"),
-            BarColumn(bar_width=24),
-            TaskProgressColumn(),
-            TextColumn("{task.fields[speed]}"),
-            TimeRemainingColumn(),
-            *live,
-            console=console,
-            auto_refresh=False,
-        )
+        console = make_console()
+        columns: list[ProgressColumn] = [TextColumn("{task.fields[clock]}"), TaskProgressColumn()]
+        if console.width >= NARROW:
+            columns.insert(1, BarColumn(bar_width=24))
+            columns += [TextColumn("{task.fields[speed]}"), TimeRemainingColumn()]
+        if console.is_terminal and console.width >= WIDE:
+            columns.append(TextColumn("[dim]{task.fields[line]}"))
+        self._bar = Progress(*columns, console=console, auto_refresh=False)
         self._task = self._bar.add_task("", total=ticks, clock="0:00:00", speed="", line="")
-        self._shown = time.monotonic()
+        self._ticks = ticks
+        self._done = 0
+        self._updating = ""
+        self._began = self._shown = time.monotonic()
 
-    def __call__(self, recorder: Recorder) -> None:
+    def begin(self) -> None:
+        """Begin to count the speed."""
+        self._began = time.monotonic()
+
+    def reported(self, update: Optimization) -> None:
+        """Remember what the optimiser does."""
+        self._updating = f"  tau_u {update.tau_u * TICK_S:.2f} s  J {update.j_effective:.3g}"
+
+    def sample(self, sample: PlantSample) -> None:
         """Show where the run is, a few times a second."""
-        done = len(recorder.samples)
-        if done % 8 and done != recorder.ticks:
+        self._done += 1
+        last = self._done == self._ticks
+        if self._done % 8 and not last:
             return
         now = time.monotonic()
-        if now - self._shown < REFRESH_S and done != recorder.ticks:
-            return
-        self._shown = now
+        if now - self._shown >= REFRESH_S or last:
+            self._shown = now
+            self._show(sample, now - self._began)
+
+    def _show(self, sample: PlantSample, elapsed_s: float) -> None:
         self._bar.start()  # not before there is something to show: an error then stands alone
-        seconds = done * TICK_S
-        speed = seconds / max(recorder.wall_seconds, 1e-9)
+        seconds = self._done * TICK_S
         self._bar.update(
             self._task,
-            completed=done,
+            completed=self._done,
             clock=clock(seconds),
-            speed=f"{speed:,.0f} x real time",
-            line=_line(recorder),
+            speed=f"{seconds / max(elapsed_s, 1e-9):,.0f} x real time",
+            line=f"L1 {sample.y[L1]:.2f} %  T5 {sample.y[T5]:.2f} K{self._updating}",
         )
         self._bar.refresh()
-
-
-def _line(recorder: Recorder) -> str:
-    y = recorder.samples[-1].y
-    line = f"L1 {y[L1]:.2f} %  T5 {y[T5]:.2f} K"
-    if recorder.updates:
-        update = recorder.updates[-1]
-        line += f"  tau_u {update.tau_u * TICK_S:.2f} s  J {update.j_effective:.3g}"
-    return line

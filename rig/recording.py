@@ -1,93 +1,230 @@
-"""What a run leaves behind: the physical trace, tick by tick, and what the optimiser did, update by update."""
+"""What a run reports while it goes on, and to whom.
 
-import hashlib
+A rig calls the `Recorder`; the recorder passes samples on in blocks, and updates when their sequence was played, to
+its sinks. Sinks write files, evaluate, show a line, or keep all in memory.
+"""
+
 import time
-from collections.abc import Callable
-from typing import NamedTuple
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import islice
+from typing import Final, Generic, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from coldloop.errors import ColdloopError
+from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
+from rig.driving import CONTROL
+from rig.recorded import LinkStatistics, Recording, SampleBlock, joined
 
-FloatArray = NDArray[np.float32]
+__all__ = ["LinkStatistics", "MemorySink", "Recorder", "Recording", "SampleBlock", "Sink"]
+
+BLOCK_TICKS: Final = 512
+"""Samples that are passed on together."""
+SETTLED_TICKS: Final = 512
+"""An update that nothing has followed for so long after its period was not cut off. In a networked run samples are
+read up to 256 ticks before the updates that go with them."""
+
+T = TypeVar("T")
 
 
-class LinkStatistics(NamedTuple):
-    """How well a run kept time, as the control PLC counts it."""
+class Tail(Generic[T]):
+    """The number of items so far, and the last one: `len(tail)`, `tail[-1]`."""
 
-    deadline_misses: int = 0
-    overruns: int = 0
-    lateness_max_ms: float = 0.0
-    lateness_p99_ms: float = 0.0
+    def __init__(self) -> None:
+        self._count = 0
+        self._last: T | None = None
+
+    def append(self, item: T) -> None:
+        """Take the next item."""
+        self._count += 1
+        self._last = item
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: int) -> T:
+        if index != -1 or self._last is None:
+            raise IndexError(index)
+        return self._last
+
+
+class Sink:
+    """Takes what a run yields. The methods do nothing; a sink overrides those that concern it."""
+
+    def begin(self) -> None:
+        """Real time begins to count: the first tick is about to be done."""
+
+    def sample(self, sample: PlantSample) -> None:
+        """Take a tick as it is done."""
+
+    def block(self, block: SampleBlock) -> None:
+        """Take up to `BLOCK_TICKS` ticks."""
+
+    def reported(self, update: Optimization) -> None:
+        """Take an update as it is reported, before it is known whether its sequence is played."""
+
+    def update(self, update: Optimization) -> None:
+        """Take an update whose sequence was played, before the block that its period ends in is much older."""
+
+    def event(self, service: str, event: Event) -> None:
+        """Take an event of the journal of a service, `control_plc` or `plant`."""
+
+    def close(self) -> None:
+        """Nothing more comes; raises what kept the sink from its work."""
+
+
+class MemorySink(Sink):
+    """Keeps the whole run: about 220 bytes a tick."""
+
+    def __init__(self) -> None:
+        self._blocks: list[SampleBlock] = []
+        self._updates: list[Optimization] = []
+        self.events: list[tuple[str, Event]] = []
+
+    def block(self, block: SampleBlock) -> None:
+        """Keep a block."""
+        self._blocks.append(block)
+
+    def update(self, update: Optimization) -> None:
+        """Keep an update."""
+        self._updates.append(update)
+
+    def event(self, service: str, event: Event) -> None:
+        """Keep an event."""
+        self.events.append((service, event))
+
+    def recording(self, link: LinkStatistics) -> Recording:
+        """Return what was kept."""
+        block = joined(self._blocks)
+        return Recording(block.load, block.u, block.y, block.x, self._updates, link)
 
 
 class Recorder:
-    """Collects samples and updates while a run goes on; `progress` is called after each sample."""
+    """Passes what a run yields to its sinks.
 
-    def __init__(self, ticks: int, progress: Callable[["Recorder"], None] | None = None) -> None:
+    Args:
+        ticks: Length of the run.
+        sinks: Who takes it; by default a sink in memory, whose content `recording` returns.
+    """
+
+    def __init__(self, ticks: int, sinks: Sequence[Sink] | None = None) -> None:
         self.ticks = ticks
-        self.samples: list[PlantSample] = []
-        self.updates: list[Optimization] = []
+        self.samples: Tail[PlantSample] = Tail()
+        self.updates: Tail[Optimization] = Tail()
+        """All updates, those that a load step has cut off included."""
         self.link = LinkStatistics()
-        self._progress = progress
+        self._memory = MemorySink()
+        self._sinks = (self._memory,) if sinks is None else tuple(sinks)
+        self._pending: list[PlantSample] = []
+        self._unsettled: deque[Optimization] = deque()
+        self._stop: ColdloopError | None = None
+        self._closed = False
         self._began = self._last = time.monotonic()
 
     def begin(self) -> None:
         """Begin to count real time: the first tick is about to be done."""
         self._began = self._last = time.monotonic()
+        for sink in self._sinks:
+            sink.begin()
 
     @property
     def wall_seconds(self) -> float:
         """Real time from the beginning to the last sample."""
         return self._last - self._began
 
+    @property
+    def complete(self) -> bool:
+        """Whether all ticks were recorded."""
+        return len(self.samples) == self.ticks
+
+    def stop(self, reason: ColdloopError) -> None:
+        """Let the next sample raise `reason`: a signal handler calls this."""
+        self._stop = reason
+
     def sample(self, sample: PlantSample) -> None:
-        """Take the next tick."""
+        """Take the next tick.
+
+        Raises:
+            ColdloopError: The run is to stop; the tick is recorded.
+        """
         self.samples.append(sample)
+        self._pending.append(sample)
         self._last = time.monotonic()
-        if self._progress is not None:
-            self._progress(self)
+        for sink in self._sinks:
+            sink.sample(sample)
+        if len(self._pending) >= BLOCK_TICKS:
+            self._pass_on()
+        if self._stop is not None:
+            raise self._stop
 
     def update(self, update: Optimization) -> None:
         """Take the next update."""
         self.updates.append(update)
+        self._unsettled.append(update)
+        for sink in self._sinks:
+            sink.reported(update)
+        if len(self._unsettled) > BLOCK_TICKS:
+            self._settle()
 
-    def recording(self) -> "Recording":
-        """Return what was recorded, with the updates whose sequence was played within the run.
+    def event(self, event: Event, service: str = CONTROL) -> None:
+        """Take an event of the journal of a service; before the ticks after it are older than `SETTLED_TICKS`."""
+        for sink in self._sinks:
+            sink.event(service, event)
+
+    def close(self) -> None:
+        """Pass on what is left, and close all sinks, each of them even if another one fails.
+
+        Raises:
+            OSError: A sink could not write.
+            ColdloopError: The disk is full.
+        """
+        if not self._closed:
+            self._closed = True
+            _all(self._pass_on, *(sink.close for sink in self._sinks))
+
+    def recording(self) -> Recording:
+        """Return what was recorded in memory, with the updates whose sequence was played within the run.
 
         An update that a load step has cut off is not among them.
         """
-        load, u, y, x = (
-            np.array([getattr(sample, name) for sample in self.samples], dtype=np.float32)
-            for name in ("load", "u", "y", "x")
-        )
-        ends = [later.tick for later in self.updates[1:]] + [self.ticks]
-        played = [
-            update
-            for update, end in zip(self.updates, ends, strict=False)
-            if update.tick + update.tau_u <= end and update.tick + update.tau_u < self.ticks
-        ]
-        return Recording(load, u, y, x, played, self.link)
+        self.close()
+        return self._memory.recording(self.link)
+
+    def _pass_on(self) -> None:
+        self._settle()
+        if self._pending:
+            block = SampleBlock.of(self._pending)
+            self._pending = []
+            _all(*(partial(sink.block, block) for sink in self._sinks))
+
+    def _settle(self) -> None:
+        """Pass on the updates of which it is known that their sequence was played."""
+        for update in self._settled():
+            _all(*(partial(sink.update, update) for sink in self._sinks))
+
+    def _settled(self) -> Iterator[Optimization]:
+        done = len(self.samples)
+        while self._unsettled:
+            update, *following = tuple(islice(self._unsettled, 2))
+            end = update.tick + update.tau_u
+            cut_off = bool(following) and following[0].tick < end
+            played = end < done and (bool(following) or self._closed or done >= end + SETTLED_TICKS)
+            if not cut_off and not played:
+                return
+            self._unsettled.popleft()
+            if not cut_off:
+                yield update
 
 
-class Recording(NamedTuple):
-    """A finished run of N ticks."""
-
-    load: FloatArray
-    """W, shape (N,)."""
-    u: FloatArray
-    """Inputs applied, shape (N, 3)."""
-    y: FloatArray
-    """Measured outputs, shape (N, 22)."""
-    x: FloatArray
-    """Simulated states, shape (N, 28)."""
-    updates: list[Optimization]
-    link: LinkStatistics
-
-    @property
-    def trace_sha256(self) -> str:
-        """SHA-256 over load, inputs, outputs and states of all ticks, as little-endian single precision."""
-        rows = np.hstack([self.load[:, None], self.u, self.y, self.x])
-        return hashlib.sha256(np.ascontiguousarray(rows, dtype="<f4").tobytes()).hexdigest()
+def _all(*calls: Callable[[], None]) -> None:
+    """Make all calls, then raise the first error: what one sink cannot do does not concern the others."""
+    errors = []
+    for call in calls:
+        try:
+            call()
+        except (OSError, ColdloopError) as error:
+            errors.append(error)
+    if errors:
+        raise errors[0]

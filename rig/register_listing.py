@@ -28,7 +28,10 @@ def modicon(address: int) -> str:
     return f"{40001 + address}" if address < 9999 else f"{400001 + address}"
 
 
-def _entries(maps: Sequence[RegisterMap]) -> Iterator[dict[str, str]]:
+Entry = dict[str, str | int | float | None]
+
+
+def _entries(maps: Sequence[RegisterMap]) -> Iterator[Entry]:
     """Yield one entry a register, the first row of each block."""
     for register_map in maps:
         for block in register_map.blocks:
@@ -36,21 +39,23 @@ def _entries(maps: Sequence[RegisterMap]) -> Iterator[dict[str, str]]:
                 yield _entry(register_map.service, block, register)
 
 
-def _entry(service: str, block: Block, register: Register) -> dict[str, str]:
+def _entry(service: str, block: Block, register: Register) -> Entry:
     values = (
-        service, block.name, register.name, str(register.address), modicon(register.address), str(block.rows),
-        str(block.row_words), register.kind.label, register.unit, _bound(register.low), _bound(register.high),
+        service, block.name, register.name, register.address, modicon(register.address), block.rows,
+        block.row_words, register.kind.label, register.unit, register.low, register.high,
         register.writer.value if register.writer else "read-only", register.description,
     )  # fmt: skip
     return dict(zip(COLUMNS, values, strict=True))
 
 
-def _bound(value: float | None) -> str:
-    return "" if value is None else f"{value:g}"
+def _text(value: str | float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def as_json(maps: Sequence[RegisterMap]) -> str:
-    """Return an array of objects."""
+    """Return an array of objects; a bound that does not exist is null."""
     return json.dumps(list(_entries(maps)), indent=1, ensure_ascii=False) + "\n"
 
 
@@ -59,14 +64,14 @@ def as_csv(maps: Sequence[RegisterMap]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(_entries(maps))
+    writer.writerows({name: _text(value) for name, value in entry.items()} for entry in _entries(maps))
     return text.getvalue()
 
 
 def as_table(maps: Sequence[RegisterMap]) -> str:
     """Return aligned columns for a terminal."""
     shown = ("service", "block", "name", "address", "modicon", "type", "unit", "writer")
-    rows = [shown, *[tuple(entry[column] for column in shown) for entry in _entries(maps)]]
+    rows = [shown, *[tuple(_text(entry[column]) for column in shown) for entry in _entries(maps)]]
     widths = [max(len(row[i]) for row in rows) for i in range(len(shown))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     return "\n".join(lines) + "\n"
@@ -94,7 +99,7 @@ def _block_markdown(service: str, block: Block) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for r in block.registers():
-        bounds = f"{_bound(r.low)}..{_bound(r.high)}" if r.low is not None or r.high is not None else ""
+        bounds = f"{_text(r.low)}..{_text(r.high)}" if r.low is not None or r.high is not None else ""
         lines.append(
             f"| {r.address} | {modicon(r.address)} | {r.name} | {r.kind.label} | {r.unit} | {bounds} "
             f"| {r.description} |"

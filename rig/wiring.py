@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from coldloop.endpoints import Endpoint
-from rig.network import RigEndpoints
+from rig.rig_endpoints import RigEndpoints
 from rig.settings import Settings
 
 SERVICES: Final = ("plant", "control_plc", "optimizer_plc")

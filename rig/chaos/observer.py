@@ -7,14 +7,15 @@ from typing import Final, NamedTuple, TypeVar
 from coldloop.endpoints import Endpoint
 from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
-from coldloop.registers.audit import EVENT_ROWS, Event
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, Grant, LadderStatus
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, PlantSample, SensorFault
 from coldloop.registers.safety import Alarm, AlarmKind
 from rig.chaos.trace import ChaosTrace
-from rig.network import AHEAD, RigEndpoints
+from rig.journal_reader import JournalReader
+from rig.network import AHEAD
+from rig.rig_endpoints import RigEndpoints
 
 T = TypeVar("T")
 
@@ -43,7 +44,8 @@ class Observer:
         self._trace = trace
         self._session = session
         self._recorded = 0
-        self._last_event = 0
+        self._journal = JournalReader(self._control)
+        self._noted = -1
         self._standing_since = time.monotonic()
         self._tick = -1
 
@@ -87,10 +89,6 @@ class Observer:
         alarms = await self._attempt(self._control.read_rows(Alarm, 0, len(AlarmKind)))
         self._trace.alarms = alarms or self._trace.alarms
 
-    def expect_new_events(self) -> None:
-        """The control PLC has been restarted: its events are counted from 1 again."""
-        self._last_event = 0
-
     async def _read_plant(self) -> int:
         identity = await self._plant.read(Identity)
         if identity.session != self._session:
@@ -109,16 +107,10 @@ class Observer:
         return identity.tick
 
     async def _read_control(self) -> LadderStatus:
-        ladder = await self._control.read(LadderStatus)
-        if ladder.events < self._last_event:
-            self.expect_new_events()
-        first = max(self._last_event + 1, ladder.events - EVENT_ROWS + 1)
-        for number in range(first, ladder.events + 1):
-            (event,) = await self._control.read_rows(Event, number % EVENT_ROWS, 1)
-            if event.number == number:
-                self._trace.events.append(event)
-            self._last_event = number
-        self._trace.ladder = ladder
+        ladder = self._trace.ladder = await self._control.read(LadderStatus)
+        if ladder.events != self._noted:
+            self._trace.events += await self._journal.read_on()
+            self._noted = ladder.events
         return ladder
 
     async def _attempt(self, request: Awaitable[T]) -> T | None:

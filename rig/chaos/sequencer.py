@@ -143,15 +143,11 @@ class FaultSequencer:
             await self._until_up(started, moment.fault)
         if not self._plan.realtime and not self._timeline.on:
             await self._until_optimizer_is_known()
-        sight = await self._look()
-        if started == "control_plc" and sight.ladder is not None:
-            self._trace.sight_mode(self.tick, sight.ladder)
+        await self._look()
         mark.end = self.tick
 
     async def _until_up(self, service: str, fault: AnyFault) -> None:
         """Wait until a service that was started again answers."""
-        if service == "control_plc":
-            self._observer.expect_new_events()
         since = time.monotonic()
         while not await self._observer.answers(service):
             if time.monotonic() - since > RESTART_PATIENCE_S:

@@ -46,7 +46,7 @@ class ChaosTrace:
 
     ticks: int
     events: list[Event] = field(default_factory=list)
-    """As they came; one with the number 0 was not told, but seen."""
+    """As they came."""
     alarms: list[Alarm] = field(default_factory=list)
     ladder: LadderStatus | None = None
     marks: list[Mark] = field(default_factory=list)
@@ -65,10 +65,6 @@ class ChaosTrace:
         """Take a tick; a tick that is done again replaces what was there."""
         for rows, values in zip(self._rows, ((sample.load,), sample.u, sample.y, sample.x), strict=True):
             rows[sample.tick] = np.array(values)
-
-    def sight_mode(self, tick: int, ladder: LadderStatus) -> None:
-        """Take the mode of a control PLC that was started again: it makes no event of it."""
-        self.events.append(Event(tick=tick, kind=EventKind.MODE, subject=ladder.mode, cause=ladder.cause))
 
     def modes(self, first: int = 0, last: int | None = None) -> list[Event]:
         """Return the changes of mode among the events from one index to before another."""

@@ -4,31 +4,40 @@ import argparse
 import sys
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
+from coldloop.command_line import add_configuration_options
 from coldloop.errors import LinkError, ResultsError, UsageError
 from coldloop.process import TICK_S
-from coldloop.service import add_configuration_options
-from coldloop.session import TimeMode
-from rig.chaos.experiment import Experiment, perform
-from rig.chaos.figure import plot_chaos
-from rig.chaos.plan import Plan, find_plan, shipped_plans
-from rig.chaos.progress import ChaosProgress
-from rig.chaos.report import as_text, summary_lines, table, write_report
-from rig.commands.options import configuration, duration
-from rig.results import prepare_folder
+from rig.commands.choices import MODES, plans
+from rig.commands.options import check_load, configuration, duration
+
+if TYPE_CHECKING:
+    from coldloop.config import Configuration
+    from rig.chaos.experiment import Experiment
+    from rig.chaos.plan import Plan
+    from rig.settings import Settings
+
+OF_PLAN: Final = {
+    "plant.load": "--load", "plant.seed": "--seed", "session.mode": "--mode", "session.factor": "--factor",
+    "optimizer_plc.program.updating_period_s": "updating_period_s of the plan",
+}  # fmt: skip
+"""Keys whose values a plan has, and what changes them there."""
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument("plan", nargs="?", metavar="PLAN", help="a shipped plan (see --list) or a TOML file")
+    plan = parser.add_argument("plan", nargs="?", metavar="PLAN", help="a shipped plan (see --list) or a TOML file")
+    plan.completer = lambda **_: plans()  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--list", action="store_true", help="name the plans that are shipped")
     parser.add_argument("--out", type=Path, help="folder for the results (default: chaos/<plan>-<time>)")
+    parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     parser.add_argument("--seed", type=_seed, dest="plan_seed", help="instead of the plan's")
     parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s, instead of the plan's")
-    parser.add_argument("--load", dest="plan_load", help="a named load or a CSV file, instead of the plan's")
-    parser.add_argument("--mode", choices=[mode.value for mode in TimeMode], dest="plan_mode",
+    parser.add_argument("--load", dest="plan_load",
+                        help="a named load or a CSV file, instead of the plan's")  # fmt: skip
+    parser.add_argument("--mode", choices=MODES, dest="plan_mode",
                         help="instead of the plan's")  # fmt: skip
     parser.add_argument("--factor", type=float, dest="plan_factor", help="instead of the plan's")
     parser.set_defaults(execute=execute)
@@ -43,27 +52,54 @@ def _seed(text: str) -> int:
 def execute(options: argparse.Namespace) -> int:
     """List the plans, or run one."""
     if options.list:
-        for plan in shipped_plans():
-            sys.stdout.write(f"{plan.name:20} {plan.description}\n")
+        _list_plans()
         return 0
+    check_load(options.plan_load)
     if options.plan is None:
         raise UsageError("which plan? `coldloop chaos --list` names those that are shipped")
+    from rig.chaos.experiment import perform
+    from rig.chaos.plan import find_plan
+    from rig.chaos.progress import ChaosProgress
+    from rig.results import claim_folder
+
     plan = find_plan(options.plan, _changes(options))
-    settings = configuration(options).settings
+    effective = configuration(options)
+    _refuse_what_the_plan_has(effective)
     out = options.out or Path("chaos") / f"{plan.name}-{datetime.now():%Y%m%d-%H%M%S}"  # noqa: DTZ005
-    prepare_folder(out)
+    claim_folder(out, force=options.force)
     with ChaosProgress(plan.ticks) as progress:
-        experiment = perform(plan, settings, out, progress)
+        experiment = perform(plan, effective.settings, out, progress)
+    _report(out, plan, experiment, effective.settings)
+    if experiment.failure is not None:
+        raise LinkError(experiment.failure)
+    return 0
+
+
+def _list_plans() -> None:
+    from rig.chaos.plan import shipped_plans
+
+    for plan in shipped_plans():
+        sys.stdout.write(f"{plan.name:20} {plan.description}\n")
+
+
+def _refuse_what_the_plan_has(effective: "Configuration[Settings]") -> None:
+    """Refuse a value from the command line that the plan's own would replace."""
+    for key, option in OF_PLAN.items():
+        source = effective.sources.get(key, "")
+        if source.startswith("--set"):
+            raise UsageError(f"{source}: the plan has its own value of {key}; change it with {option}")
+
+
+def _report(out: Path, plan: "Plan", experiment: "Experiment", settings: "Settings") -> None:
+    from rig.chaos.report import as_text, summary_lines, table
+
     try:
-        _write(out, plan, experiment)
+        _write(out, plan, experiment, settings)
     except OSError as error:
         raise ResultsError(f"{out}: {error.strerror}; no report was written, choose another --out") from None
     sys.stdout.write(as_text(table(experiment.evaluation.rows)))
     for line in [*summary_lines(experiment.trace, experiment.evaluation), f"results in {out}"]:
         sys.stdout.write(f"{line}\n")
-    if experiment.failure is not None:
-        raise LinkError(experiment.failure)
-    return 0
 
 
 def _changes(options: argparse.Namespace) -> dict[str, Any]:
@@ -77,11 +113,19 @@ def _changes(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
 
 
-def _write(out: Path, plan: Plan, experiment: Experiment) -> None:
+def _write(out: Path, plan: "Plan", experiment: "Experiment", settings: "Settings") -> None:
+    from coldloop.lti_model import load as load_model
+    from rig.chaos.figure import plot_chaos
+    from rig.chaos.report import write_report
+    from rig.chaos.tables import write_tables
+    from rig.indicators import StageCost
+
     trace, undisturbed = experiment.trace, experiment.undisturbed
     hashes = {
         "trace_sha256": trace.recording().trace_sha256,
         "undisturbed_trace_sha256": undisturbed.trace_sha256,
     }
     write_report(out, plan, trace, experiment.evaluation, hashes, experiment.failure)
+    cost = StageCost(load_model(settings.model.file), settings.optimizer_plc.program.design)
+    write_tables(out, trace, cost)
     plot_chaos(out / "chaos.png", trace, undisturbed, f"{plan.name}: {plan.description}")

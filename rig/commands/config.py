@@ -4,7 +4,7 @@ import argparse
 import json
 import sys
 
-from coldloop.service import add_configuration_options
+from coldloop.command_line import add_configuration_options
 from rig.commands.options import configuration
 
 

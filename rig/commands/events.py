@@ -10,18 +10,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
 
+from coldloop.command_line import add_configuration_options
 from coldloop.errors import ResultsError, UsageError
 from coldloop.event_text import describe, utc_text
 from coldloop.process import TICK_S
 from coldloop.registers.audit import Event, EventKind
-from coldloop.service import add_configuration_options, run_event_loop
-from rig.register_listing import MAPS
+from rig.commands.choices import SERVICES
+from rig.commands.options import configuration, endpoint
 
 if TYPE_CHECKING:
-    from coldloop.endpoints import Endpoint
     from rig.journal_reader import JournalReader
 
 COLUMNS: Final = ("number", "boot", "utc", "tick", "plant_time_s", "kind", "subject", "cause", "value", "who")
+INTERRUPTED: Final = 130
 LOOK_AGAIN_S: Final = 1.0
 """With --follow: time between two looks at the journal."""
 
@@ -29,9 +30,9 @@ LOOK_AGAIN_S: Final = 1.0
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument("endpoint", type=_endpoint, metavar="HOST:PORT",
+    parser.add_argument("endpoint", type=endpoint, metavar="HOST:PORT",
                         help="where the service is; for TLS, set rig.tls in the configuration")  # fmt: skip
-    parser.add_argument("--service", choices=sorted(MAPS), default="control_plc", help="default: control_plc")
+    parser.add_argument("--service", choices=SERVICES, default="control_plc", help="default: control_plc")
     parser.add_argument("--kind", type=_kinds, default=(), metavar="KIND,...",
                         help="only events of these kinds, such as alarm-raised,mode")  # fmt: skip
     parser.add_argument("--since", type=_since, default=Since(1, 0.0), metavar="NUMBER|TIME",
@@ -48,12 +49,6 @@ class Since(NamedTuple):
     number: int
     utc: float
     """Seconds since 1970."""
-
-
-def _endpoint(text: str) -> "Endpoint":
-    from rig.commands.options import endpoint  # noqa: PLC0415 it reads the settings of all services
-
-    return endpoint(text)
 
 
 def _kinds(text: str) -> tuple[int, ...]:
@@ -80,23 +75,23 @@ def execute(options: argparse.Namespace) -> int:
     """Show the journal, or write it into a file."""
     if options.csv is not None and options.csv.is_file() and not options.force:
         raise UsageError(f"{options.csv} exists: name another file with --csv, or overwrite it with --force")
-    try:
-        return run_event_loop(lambda: _show(options))
-    except KeyboardInterrupt:
-        if options.follow:  # that is how it ends
-            return 0
-        raise
+    from rig.until_interrupted import run_until_interrupted
+
+    interrupted = run_until_interrupted(lambda: _show(options))
+    return INTERRUPTED if interrupted and not options.follow else 0  # that is how --follow ends
 
 
-async def _show(options: argparse.Namespace) -> int:
-    from coldloop.modbus.client import RegisterClient  # noqa: PLC0415 seconds that --help does without
-    from rig.commands.options import configuration  # noqa: PLC0415
-    from rig.journal_reader import JournalReader  # noqa: PLC0415
+async def _show(options: argparse.Namespace) -> None:
+    from coldloop.endpoints import Endpoint
+    from coldloop.modbus.client import RegisterClient
+    from rig.journal_reader import JournalReader
+    from rig.register_listing import MAPS
 
     settings = configuration(options).settings
     order = getattr(settings, options.service).word_order
-    endpoint = options.endpoint.model_copy(update={"tls": settings.rig.tls, "word_order": order})
-    client = RegisterClient.at(MAPS[options.service], endpoint)
+    host, port = options.endpoint
+    where = Endpoint(host=host, port=port, tls=settings.rig.tls, word_order=order)
+    client = RegisterClient.at(MAPS[options.service], where)
     reader = JournalReader(client, options.since.number, options.kind)
     output = _CsvFile(options.csv) if options.csv else _Lines()
     try:
@@ -105,7 +100,6 @@ async def _show(options: argparse.Namespace) -> int:
     finally:
         client.close()
         output.close()
-    return 0
 
 
 async def _copy(reader: "JournalReader", options: argparse.Namespace, output: "_Lines | _CsvFile", peer: str) -> None:

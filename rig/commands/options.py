@@ -2,13 +2,19 @@
 
 import argparse
 import re
-from collections.abc import Mapping
-from typing import Any
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from coldloop.config import Configuration, load_configuration
-from coldloop.endpoints import Endpoint
+from coldloop.errors import UsageError
 from coldloop.process import TICK_S
-from rig.settings import Settings
+from rig.commands.choices import LOADS
+
+if TYPE_CHECKING:
+    from coldloop.config import Configuration
+    from rig.rig_endpoints import RigEndpoints
+    from rig.settings import Settings
 
 _UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 
@@ -21,6 +27,13 @@ KEYS = {
     "factor": ("session.factor", "--factor"),
 }
 """Options that set one key of the configuration."""
+
+
+class HostPort(NamedTuple):
+    """Address of a server."""
+
+    host: str
+    port: int
 
 
 def duration(text: str) -> int:
@@ -38,31 +51,119 @@ def duration(text: str) -> int:
 
 def updating_period(text: str) -> float:
     """Return an updating period in seconds, 0 for `adaptive`."""
-    if text == "adaptive":
-        return 0.0
+    return 0.0 if text == "adaptive" else _period(text, "neither 'adaptive' nor seconds from 0.5 to 5")
+
+
+def fixed_updating_period(text: str) -> float:
+    """Return an updating period in seconds."""
+    value = _period(text, "not seconds from 0.5 to 5")
+    if value < 2 * TICK_S or value % TICK_S:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s from 0.5 to 5 s")
+    return value
+
+
+def _period(text: str, what: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = -1.0
     if not 0 < value <= 5:
-        raise argparse.ArgumentTypeError(f"'{text}' is neither 'adaptive' nor seconds from 0.5 to 5")
+        raise argparse.ArgumentTypeError(f"'{text}' is {what}")
     return value
 
 
-def endpoint(text: str) -> Endpoint:
-    """Return HOST:PORT as an endpoint."""
+def check_load(name: str | None) -> None:
+    """Refuse a load that is neither a name nor a file, before anything that takes time; the file is read later.
+
+    Raises:
+        UsageError: There is no such load.
+    """
+    if name is not None and name.partition("@")[0] not in LOADS and not (name and Path(name).exists()):
+        raise UsageError(f"load '{name}': neither a file nor one of {', '.join(LOADS)}")
+
+
+def endpoint(text: str) -> HostPort:
+    """Return HOST:PORT as an address."""
     host, separator, port = text.rpartition(":")
     if not separator or not host or not port.isdecimal() or not 0 < int(port) < 0x10000:
         raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT")
-    return Endpoint(host=host.strip("[]"), port=int(port))
+    return HostPort(host.strip("[]"), int(port))
 
 
-def configuration(options: argparse.Namespace) -> Configuration[Settings]:
+def port_base(text: str) -> int:
+    """Return the first of three ports in a row."""
+    if not text.isdecimal() or not 1 <= int(text) <= 0xFFFF - 2:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a port from 1 to {0xFFFF - 2}")
+    return int(text)
+
+
+def add_rig_options(parser: argparse.ArgumentParser) -> None:
+    """Declare where a rig that is up is found."""
+    parser.add_argument("--rig", nargs=3, type=endpoint, metavar="HOST:PORT",
+                        help="plant, control PLC, optimiser PLC (default: ports 5020 to 5022 here)")  # fmt: skip
+    parser.add_argument("--port-base", type=port_base, metavar="PORT", help="first of three ports in a row here")
+    parser.add_argument("--tls", type=Path, metavar="FOLDER",
+                        help="folder with the operator's certificate; a rig that is up here tells its own")  # fmt: skip
+
+
+def rig_endpoints(options: argparse.Namespace, settings: "Settings") -> "RigEndpoints":
+    """Return where a rig that is up is found.
+
+    Raises:
+        UsageError: --rig and --port-base were both given, or the folder of --tls has no configuration.
+    """
+    from coldloop.endpoints import Endpoint
+    from coldloop.modbus.settings import TlsSettings
+    from rig.rig_endpoints import RigEndpoints
+    from rig.started_rigs import ports_from, running_rig
+    from rig.wiring import SERVICES
+
+    if options.rig and options.port_base:
+        raise UsageError("--rig and --port-base: give one of them")
+    ports = ports_from(options.port_base)
+    tls, folder = settings.rig.tls, options.tls
+    if not options.rig and folder is None and tls is None:
+        known = running_rig(ports[0])
+        folder = Path(known.tls) if known is not None and known.tls else None
+    if options.tls is None and folder is not None:
+        own = {key: value for key, (value, _) in _tls_site(folder).items() if key.startswith("rig.tls.")}
+        tls = TlsSettings.model_validate({key.removeprefix("rig.tls."): value for key, value in own.items()})
+    places = options.rig or [HostPort("127.0.0.1", port) for port in ports]
+    return RigEndpoints(*(
+        Endpoint(host=place.host, port=place.port, tls=tls, word_order=getattr(settings, service).word_order)
+        for service, place in zip(SERVICES, places, strict=True)
+    ))  # fmt: skip
+
+
+def _tls_site(folder: Path) -> dict[str, tuple[object, str]]:
+    """Return the settings of a folder of `coldloop certificates`, and where they come from."""
+    file = folder / "tls.toml"
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise UsageError(f"{file}: {reason}; make it with `coldloop certificates --out {folder}`") from None
+    return {key: (value, "--tls") for key, value in _flat(content)}
+
+
+def _flat(section: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
+    for name, value in section.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def configuration(options: argparse.Namespace) -> "Configuration[Settings]":
     """Return the effective configuration of a command."""
+    from coldloop.config import load_configuration
+    from rig.settings import Settings
+
     given: Mapping[str, Any] = vars(options)
+    site = _tls_site(given["tls"]) if given.get("tls") is not None else {}
     return load_configuration(
         Settings,
         file=options.config,
         assignments=options.assignments,
-        options={key: (given[name], flag) for name, (key, flag) in KEYS.items() if given.get(name) is not None},
+        options=site | {key: (given[name], flag) for name, (key, flag) in KEYS.items() if given.get(name) is not None},
     )

@@ -4,30 +4,40 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
-from rig.commands.options import duration
-from rig.studies import STUDIES
-from rig.studies.execution import Workers
-from rig.studies.results import conduct
-from rig.studies.study import StudyOptions
+from rig.commands.choices import STUDIES
+from rig.commands.options import check_load, duration
+
+if TYPE_CHECKING:
+    from rig.studies.execution import Workers
+    from rig.studies.study import Study, StudyOptions
+
+DEFAULT_SEEDS: Final = 3
+OF_RUNS: Final = ("load", "duration", "seeds", "workers", "scheduler", "quick")
+"""Options that only a study with runs has a use for."""
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("name", nargs="?", metavar="NAME", help="see --list")
+    name = parser.add_argument("name", nargs="?", metavar="NAME", help="see --list")
+    name.completer = lambda **_: STUDIES  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--list", action="store_true", help="name the studies")
     parser.add_argument("--duration", type=duration, help="plant time of each run (default: that of its load)")
-    parser.add_argument("--load", nargs="+", metavar="LOAD", default=[], help="named loads or CSV files time_s,load_w")
+    parser.add_argument("--load", nargs="+", metavar="LOAD", default=[],
+                        help="named loads or CSV files time_s,load_w")  # fmt: skip
     add_scale_options(parser)
     parser.set_defaults(execute=execute)
 
 
 def add_scale_options(parser: argparse.ArgumentParser) -> None:
     """Declare how much is done, by whom, and where the results go."""
-    parser.add_argument("--seeds", type=_positive, default=3, metavar="N",
-                        help="draws of each load; of a file, draws of the sensors' noise (default: 3)")  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="one seed, ten minutes, fewer points")
+    scale = parser.add_mutually_exclusive_group()
+    scale.add_argument("--seeds", type=_positive, metavar="N",
+                       help=f"draws of each load; of a file, draws of the sensors' noise (default: {DEFAULT_SEEDS})"
+                       )  # fmt: skip
+    scale.add_argument("--quick", action="store_true", help="one seed, ten minutes, fewer points")
     parser.add_argument("--workers", type=_positive, metavar="N", help="processes to use (default: one a core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler that is up, such as tcp://host:8786")
     parser.add_argument("--out", type=Path, default=Path("studies"), help="folder for all results (default: studies)")
@@ -39,29 +49,53 @@ def _positive(text: str) -> int:
     return int(text)
 
 
-def workers(options: argparse.Namespace) -> Workers:
+def workers(options: argparse.Namespace) -> "Workers":
     """Return who does the runs.
 
     Raises:
         UsageError: Both workers and a scheduler are asked for.
     """
+    from rig.studies.execution import Workers
+
     if options.scheduler and options.workers:
         raise UsageError("--workers is for a local cluster and --scheduler for one that is up: give one of them")
     return Workers(options.workers or os.cpu_count() or 1, options.scheduler)
 
 
+def study_options(options: argparse.Namespace) -> "StudyOptions":
+    """Return how much is asked for."""
+    from rig.studies.study import StudyOptions
+
+    given = vars(options)
+    return StudyOptions(
+        options.seeds or DEFAULT_SEEDS, given.get("duration"), tuple(given.get("load", ())), options.quick
+    )
+
+
 def execute(options: argparse.Namespace) -> int:
     """Do a study, or list them."""
+    if options.name is not None and options.name not in STUDIES:
+        raise UsageError(f"study {options.name}: there is no such study; `coldloop study --list` names them")
+    for name in options.load:
+        check_load(name)
+    from rig import studies
+
     if options.list or options.name is None:
-        for name, study in STUDIES.items():
+        for name, study in studies.STUDIES.items():
             sys.stdout.write(f"{name:18} {study.title}\n")
         return 0
-    if options.name not in STUDIES:
-        raise UsageError(f"study {options.name}: there is no such study; `coldloop study --list` names them")
-    study = STUDIES[options.name]
-    asked = StudyOptions(options.seeds, options.duration, tuple(options.load), options.quick)
+    _do(studies.STUDIES[options.name], options)
+    return 0
+
+
+def _do(study: "Study", options: argparse.Namespace) -> None:
+    from rig.studies.results import conduct
+
+    asked = study_options(options)
+    useless = [f"--{name}" for name in OF_RUNS if getattr(options, name)]
+    if useless and not study.requests(asked):
+        raise UsageError(f"study {study.name} has no runs: {', '.join(useless)} would have no effect")
     result = conduct(study, asked, workers(options), options.out)
     for what, values in result.values.items():
         sys.stdout.write(f"{what}: {', '.join(f'{value:.4g}' for value in values)}\n")
     sys.stdout.write(f"results in {options.out / study.name}\n")
-    return 0

@@ -32,7 +32,8 @@ from optimizer_plc.reference_plc import (
     residuals,
     slow_down,
 )
-from rig.studies.drawing import COLOURS, panels, paper
+from rig.plot import COLOURS
+from rig.studies.drawing import legend_outside, panels, paper
 from rig.studies.request import RunRequest, Series
 from rig.studies.study import Cell, Outcomes, StudyOptions, StudyResult
 
@@ -158,7 +159,7 @@ def _figure(rows: list[tuple[Cell, ...]]) -> Figure:
         paper(place, table[:, 0], table[:, 3], COLOURS[1], "laptop (us), paper")
         place.plot(table[:, 0], table[:, 4], color=COLOURS[2], label="this machine (us)")
         place.set_yscale("log")
-        place.set_xlabel("size of the matrix")
-        place.set_ylabel("time of a Cholesky factorisation")
-        place.legend()
+        place.set_xlabel("size of the matrix (1)")
+        place.set_ylabel("time of a Cholesky factorisation (ms or us)")
+        legend_outside(figure, place)
     return figure

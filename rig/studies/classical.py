@@ -5,7 +5,8 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from rig.studies.drawing import COLOURS, panels
+from rig.plot import COLOURS
+from rig.studies.drawing import legend_outside, panels
 from rig.studies.request import RunRequest
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
 
@@ -72,7 +73,7 @@ def _figure(result: StudyResult) -> Figure:
             place.bar(np.arange(len(names)) + 0.27 * (offset - 1), heights, 0.25, color=colour, label=label)
         place.set_yscale("log")
         place.set_xticks(range(len(names)), names, rotation=0 if len(names) < 9 else 60)
-        place.set_xlabel("hour")
-        place.set_ylabel("$J^{BF}$")
-        place.legend()
+        place.set_xlabel("load")
+        place.set_ylabel("$J^{BF}$ (1)")
+        legend_outside(figure, place)
     return figure

@@ -1,8 +1,8 @@
 """How the figures of studies are drawn."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Final
 
 import matplotlib as mpl
 import numpy as np
@@ -10,15 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from coldloop.limits import InputLimits
 from coldloop.process import TICK_S
-from rig.plot import ACCENT, BAND, INK, THIRD
+from rig.plot import COLOURS, INK, LONGEST_TAU_U_S, STYLE, draw_tau_u, legend_above, limit
 from rig.studies.request import Outcome
-
-COLOURS = (INK, ACCENT, THIRD, "#8a6fae", "#b08d2f", "#4d4d4d")
-STYLE: Any = {
-    "font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False,
-    "legend.frameon": False,
-}  # fmt: skip
 
 
 @contextmanager
@@ -30,6 +25,19 @@ def panels(
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, sharex=sharex)
         yield figure, list(np.ravel(axes))
+
+
+def legend_outside(figure: Figure, axes: Axes, columns: int = 4) -> None:
+    """Put the legend of one panel above all panels, where it covers no curve."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(columns, len(labels)))
+
+
+def spans_decade(values: ArrayLike) -> bool:
+    """Return whether values are positive and the largest is more than ten times the smallest."""
+    finite = np.asarray(values, dtype=float)
+    finite = finite[np.isfinite(finite)]
+    return bool(len(finite) and finite.min() > 0 and finite.max() > 10 * finite.min())
 
 
 def spread(axes: Axes, x: ArrayLike, values: ArrayLike, colour: str, label: str) -> None:
@@ -46,26 +54,57 @@ def paper(axes: Axes, x: ArrayLike, y: ArrayLike, colour: str, label: str) -> No
               label=label)  # fmt: skip
 
 
+PANELS: Final = (
+    ("load", "load (W)"), ("cost", "stage cost (1)"), ("L1", "L1 (%)"), ("T5", "T5 (K)"), ("CV155", "CV155 (%)"),
+    ("NCR22_A", "NCR22_A (W)"), ("CV156", "CV156 (%)"), ("iterations", "iterations (1)"), ("tau_u", "tau_u (s)"),
+)  # fmt: skip
+
+
+LIMITED: Final = ("L1", "T5", "CV155", "NCR22_A", "CV156")
+"""Series with a band, or with bounds."""
+
+
 def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[float, float]]) -> Figure:
-    """Draw load, cost, constrained outputs, inputs, updating period and iterations of runs under one load."""
-    with panels(8, 1, (9.0, 13.0), sharex=True) as (figure, axes):
+    """Draw load, cost, constrained outputs, inputs, iterations and updating period of runs under one load.
+
+    The updating period is left out where all runs have the same fixed one.
+    """
+    periods = {period for _, outcome in outcomes for period in outcome.updates["tau_u"]}
+    shown = PANELS if len(periods) > 1 else PANELS[:-1]
+    with panels(len(shown), 1, (9.0, 1.65 * len(shown)), sharex=True) as (figure, axes):
+        place = dict(zip((name for name, _ in shown), axes, strict=True))
         for (label, outcome), colour in zip(outcomes, COLOURS, strict=False):
             hours = outcome.series("time_s") / 3600
-            for place, name in zip(axes[1:7], ("cost", "L1", "T5", "CV155", "NCR22_A", "CV156"), strict=True):
-                place.plot(hours, outcome.series(name), color=colour, linewidth=0.9, label=label)
-            start = outcome.column("tick") * TICK_S / 3600
-            axes[7].step(start, outcome.column("iterations"), where="post", color=colour, linewidth=0.7, label=label)
+            for name, _ in shown[1:7]:
+                place[name].plot(hours, outcome.series(name), color=colour, linewidth=0.9, label=label)
+            _updates(place, label, outcome, colour)
         _, first = outcomes[0]
-        axes[0].plot(first.series("time_s") / 3600, first.series("load"), color=INK, linewidth=0.9)
-        for place, label in zip(axes, (
-            "(a) load (W)", "(b) stage cost", "(c) L1 (%)", "(d) T5 (K)", "(e) CV155 (%)", "(f) NCR22 (W)",
-            "(g) CV156 (%)", "(h) iterations",
-        ), strict=True):  # fmt: skip
-            place.set_ylabel(label)
-        axes[1].set_yscale("log")
-        axes[1].set_ylim(bottom=1e-4)
-        for place, band in zip(axes[2:4], bands, strict=True):
-            place.axhspan(*band, color=BAND, alpha=0.3, zorder=0)
-        axes[0].legend(*axes[1].get_legend_handles_labels(), loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
-        axes[7].set_xlabel("time (h)")
+        place["load"].plot(first.series("time_s") / 3600, first.series("load"), color=INK, linewidth=0.9, label="load")
+        limits = InputLimits()
+        edges = [*bands, *zip(limits.low, limits.high, strict=True)]
+        for name, edge, what in zip(LIMITED, edges, ("band", "band", "bounds", "bounds", "bounds"), strict=True):
+            together = np.concatenate([outcome.series(name) for _, outcome in outcomes])
+            limit(place[name], together, edge, f"{what} {edge[0]:g} to {edge[1]:g}")
+        place["cost"].set_yscale("log")
+        place["cost"].set_ylim(bottom=1e-4)
+        for (name, label), letter in zip(shown, "abcdefghi", strict=False):
+            place[name].set_ylabel(label)
+            place[name].set_title(f"({letter})", loc="left", fontsize=8, pad=3)
+            legend_above(place[name])
+        axes[-1].set_xlabel("plant time (h)")
+        axes[-1].set_xlim(0, float(first.series("time_s")[-1]) / 3600)
+        figure.align_ylabels(axes)
     return figure
+
+
+def _updates(place: Mapping[str, Axes], label: str, outcome: Outcome, colour: str) -> None:
+    """Draw what changes at updating instants."""
+    start_s = outcome.column("tick") * TICK_S
+    place["iterations"].step(
+        start_s / 3600, outcome.column("iterations"), where="post", color=colour, linewidth=0.7, label=label
+    )
+    if "tau_u" in place and len(start_s) > 1:
+        time_s = np.arange(start_s[0], start_s[-1], TICK_S)
+        held = outcome.column("tau_u")[np.searchsorted(start_s, time_s, side="right") - 1]
+        draw_tau_u(place["tau_u"], time_s / 3600, held * TICK_S, time_s, colour, label)
+        place["tau_u"].set_ylim(0, LONGEST_TAU_U_S + 0.3)

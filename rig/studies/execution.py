@@ -5,15 +5,18 @@ runs it had in hand, which others do again; a study that is stopped goes on wher
 """
 
 import contextlib
+import logging
+import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from distributed import Client, LocalCluster, as_completed
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from coldloop.errors import ColdloopError, ResultsError, StudyError, UsageError
+from rig.interruption import INTERRUPTION
+from rig.progress import make_console
 from rig.results import whole_file
 from rig.studies.request import Outcome, RunRequest, perform, programs_digest
 
@@ -36,6 +39,7 @@ class Workers:
         Raises:
             UsageError: The scheduler does not answer.
         """
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its import has set it to INFO
         with contextlib.ExitStack() as stack:
             address: str | LocalCluster
             if self.scheduler is None:
@@ -92,7 +96,7 @@ def perform_all(
     known = {request: store.find(request) for request in dict.fromkeys(requests)}
     missing = [request for request, outcome in known.items() if outcome is None]
     if missing:
-        with workers.connected() as client, _bar(title, len(known)) as bar:
+        with workers.connected() as client, INTERRUPTION.passed_to(_end_workers), _bar(title, len(known)) as bar:
             bar.advance(bar.task_ids[0], len(known) - len(missing))
             for request, text in _done(client, missing):
                 outcome = known[request] = Outcome.from_json(text)
@@ -101,6 +105,11 @@ def perform_all(
                 store.keep(request, text)
                 bar.advance(bar.task_ids[0])
     return {request: outcome for request, outcome in known.items() if outcome is not None}
+
+
+def _end_workers(_: signal.Signals) -> None:
+    """Unwind, so that the workers of a local cluster end; this thread only waits for them."""
+    raise KeyboardInterrupt
 
 
 def _done(client: Client, requests: Sequence[RunRequest]) -> Iterator[tuple[RunRequest, str]]:
@@ -128,6 +137,6 @@ def _bar(title: str, total: int) -> Iterator[Progress]:
         TextColumn("{task.description}"), BarColumn(bar_width=32), MofNCompleteColumn(), TextColumn("runs"),
         TimeElapsedColumn(), TimeRemainingColumn(),
     )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), refresh_per_second=2) as bar:
+    with Progress(*columns, console=make_console(), refresh_per_second=2) as bar:
         bar.add_task(title, total=total)
         yield bar

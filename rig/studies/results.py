@@ -2,11 +2,11 @@
 
 import csv
 import io
-from functools import partial
 from pathlib import Path
 
 from coldloop.errors import ResultsError
 from rig.results import prepare_folder, whole_file
+from rig.run_plot import save_figure
 from rig.studies.execution import Store, Workers, perform_all
 from rig.studies.request import check
 from rig.studies.study import Cell, Study, StudyOptions, StudyResult
@@ -42,7 +42,8 @@ def _write(study: Study, result: StudyResult, folder: Path) -> None:
     writer.writerows(result.rows)
     whole_file(folder / "results.csv", lambda draft: draft.write_text(table.getvalue(), encoding="utf-8"))
     for name, figure in result.figures.items():
-        whole_file(folder / figure_file(name), partial(figure.savefig, dpi=110, format="png"))
+        save_figure(figure, folder / figure_file(name))
+        save_figure(figure, (folder / figure_file(name)).with_suffix(".pdf"))
     text = f"# {study.title}\n\n{section(result)}"
     whole_file(folder / "section.md", lambda draft: draft.write_text(text, encoding="utf-8"))
 

@@ -5,7 +5,8 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from rig.studies.drawing import COLOURS, panels
+from rig.plot import COLOURS, legend_above
+from rig.studies.drawing import panels
 from rig.studies.request import Outcome, RunRequest, Series
 from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
 
@@ -60,7 +61,8 @@ def _figure(double: Outcome, single: Outcome) -> Figure:
     hours = double.series("time_s") / 3600
     with panels(3, 1, (9.0, 5.5), sharex=True) as (figure, axes):
         for place, (name, unit), colour in zip(axes, INPUTS.items(), COLOURS, strict=False):
-            place.plot(hours, _difference(double, single, name), color=colour, linewidth=0.7)
-            place.set_ylabel(f"{name}: single - double ({unit})", fontsize=7)
-        axes[-1].set_xlabel("time (h)")
+            place.plot(hours, _difference(double, single, name), color=colour, linewidth=0.7, label=name)
+            place.set_ylabel(f"single - double ({unit})", fontsize=8)
+            legend_above(place)
+        axes[-1].set_xlabel("plant time (h)")
     return figure

@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from rig import paper as published
-from rig.studies.drawing import COLOURS, panels, paper, spread
+from rig.plot import COLOURS
+from rig.studies.drawing import legend_outside, panels, paper, spans_decade, spread
 from rig.studies.request import RunRequest, Series
 from rig.studies.solver_runs import throttled
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
@@ -118,8 +119,9 @@ def crossing(powers: Series, one: Series, other: Series) -> float:
 def _figure(powers: Series, tables: list[Table]) -> Figure:
     """Draw ours and the paper's, each relative to its own qpOASES at the largest power where units differ."""
     labels = {
-        "J_dev": "(a) $J^{dev}$, relative", "J_cst": "(b) $J^{cst}$, relative", "J_total": "(c) total, relative",
-        "c1": "(d) $c_1$ (%, K)", "c2": "(e) $c_2$ (%, K)", "J_BF": "(f) $J^{BF}$, relative",
+        "J_dev": "(a) $J^{dev}$, relative (1)",
+        "J_cst": "(b) $J^{cst}$, relative (1)", "J_total": "(c) total, relative (1)",
+        "c1": "(d) $c_1$ (%, K)", "c2": "(e) $c_2$ (%, K)", "J_BF": "(f) $J^{BF}$, relative (1)",
     }  # fmt: skip
     theirs = published.solver_comparison()
     with panels(3, 2, (9.5, 10.0), sharex=True) as (figure, axes):
@@ -131,10 +133,11 @@ def _figure(powers: Series, tables: list[Table]) -> Figure:
                 base = theirs["qpoases"][name][-1] if relative else 1.0
                 paper(place, theirs[solver]["normalized_power"], theirs[solver][name] / base, colour,
                       f"{SOLVERS[solver]}, paper")  # fmt: skip
-            _axes(place, labels[name], logarithmic=relative and name != "J_dev")
-        axes[0].legend()
+            drawn = np.concatenate([np.ravel(line.get_ydata()) for line in place.lines])
+            _axes(place, labels[name], logarithmic=spans_decade(drawn))
+        legend_outside(figure, axes[0])
         for place in axes[-2:]:
-            place.set_xlabel("normalised power $P$")
+            place.set_xlabel("normalised power $P$ (1)")
     return figure
 
 

@@ -11,7 +11,8 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from rig.studies.drawing import COLOURS, panels, spread
+from rig.plot import COLOURS, legend_above
+from rig.studies.drawing import panels, spread
 from rig.studies.request import Outcome, RunRequest
 from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
 from rig.studies.trajectories import follows_step
@@ -81,9 +82,9 @@ def _figure(periods: tuple[float, ...], curves: dict[str, list[list[tuple[float,
             values = np.array(draws)
             spread(place, periods, values[:, :, 0], colour, "$E$: won by the solver")
             spread(place, periods, values[:, :, 1], "#888888", "$D$: lost by shift and mismatch")
-            place.set_title(SOLVERS[solver], loc="left")
-            place.set_ylabel("cost a period")
-            place.legend(fontsize=8)
+            place.set_title(SOLVERS[solver], loc="left", pad=18)
+            place.set_ylabel("cost a period (1)")
+            legend_above(place)
         for place in axes[-2:]:
             place.set_xlabel("updating period (s)")
     return figure

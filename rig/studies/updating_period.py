@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from coldloop.process import TICK_S
 from rig import paper as published
-from rig.plot import ACCENT, INK, THIRD
-from rig.studies.drawing import COLOURS, panels
+from rig.plot import ACCENT, COLOURS, INK, THIRD
+from rig.studies.drawing import legend_outside, panels
 from rig.studies.request import Outcome, RunRequest, Series
 from rig.studies.study import NOISE, PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
 from rig.studies.trajectories import seconds_since_step
@@ -263,7 +263,7 @@ def _response_figure(hours: Sequence[_Hour]) -> Figure:
         place.set_xlabel("time since the load step (s)")
         place.set_ylabel("mean updating period (s)")
         place.set_ylim(bottom=0)
-        place.legend()
+        legend_outside(figure, place)
     return figure
 
 
@@ -287,16 +287,17 @@ def _figure(first: Mapping[str, _Hour], fresh: Mapping[str, _Hour]) -> Figure:
                     theirs["tau_u_s"], theirs["cost_adaptive_pct"], ":", color=ACCENT, label="Algorithm 1, paper"
                 )
             others = [other for other in fresh.values() if other.load.name.startswith((f"{name}@", f"{name}#"))]
-            for other in others:
+            for number, other in enumerate(others):
+                label = "" if number else "fixed, other draws"
                 scale = other.nine("J_open_mean").max() / 100.0
                 place.plot(list(other.fixed), [run.indicators.J_open_mean / scale for run in other.fixed.values()],
-                           color=INK, alpha=0.25, linewidth=0.8)  # fmt: skip
+                           color=INK, alpha=0.25, linewidth=0.8, label=label)  # fmt: skip
             place.set_title(f"({name})", loc="left")
             place.set_ylabel("cost (% of the worst)")
             place.set_yscale("log")
             place.set_yticks([20, 30, 50, 70, 100], ["20", "30", "50", "70", "100"])
             place.minorticks_off()
-        axes[0].legend(fontsize=7)
+        legend_outside(figure, axes[0], 3)
         for place in axes[-2:]:
             place.set_xlabel("updating period (s)")
         for place in axes[len(first) :]:

@@ -5,9 +5,11 @@ from collections.abc import Awaitable, Callable
 from typing import Final
 
 from coldloop.limits import InputLimits
+from coldloop.pace import Pace
 from coldloop.process import INPUT_NAMES, TICK_S
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
+from coldloop.registers.common import SessionPace, pace_subject
 from coldloop.registers.control_plc import (
     AwaitUpdate,
     ControlSession,
@@ -26,7 +28,6 @@ from coldloop.registers.declaration import Block, Role
 from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
 from coldloop.seal import sealed
 from coldloop.sequence import InputSequence
-from coldloop.session import Pace
 from coldloop.writer_lease import LeaseEvent, WriterLease
 from control_plc.program import ControlProgram
 from control_plc.publication import Publication
@@ -75,10 +76,13 @@ class Clients:
         """Lock-step scans every tick before this one."""
         self.asked: ControlSession | None = None
         """A session that is to begin."""
+        self.asked_pace: Pace | None = None
+        """A time base that the session under way is to have."""
         publication.lease = self.lease
         bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader, SequenceRow)
         bank.judged_by(self._judge_operator, Operator)
         bank.put(sealed(Plan(0, 0)))
+        bank.judged_by(self._judge_pace, SessionPace)
 
     # -- judged before anything is stored ------------------------------------------------------------------------------
 
@@ -104,6 +108,14 @@ class Clients:
         for name, value, low, high in zip(INPUT_NAMES, record[1:], self._limits.low, self._limits.high, strict=True):
             if not low <= value <= high:
                 raise IllegalValueError(f"setpoint of {name} = {value:g} is outside {low:g}..{high:g}")
+
+    def _judge_pace(self, asked: SessionPace, _row: int, _caller: Caller) -> None:
+        if self.asked is not None:
+            raise IllegalValueError("pace: a session is about to begin")
+        try:
+            asked.of(self._program.session if self._publication.running else 0)
+        except ValueError as error:
+            raise IllegalValueError(f"pace: {error}") from None
 
     # -- done ----------------------------------------------------------------------------------------------------------
 
@@ -164,8 +176,12 @@ class Clients:
             self.granted = self._bank.get(Grant).until_tick
         elif record is ControlSession:
             self.asked = asked = self._bank.get(ControlSession)
+            self.asked_pace = None
             self.granted = 0
             self._note(EventKind.SESSION, asked.realtime, caller.name, value=asked.factor)
+        elif record is SessionPace:
+            self.asked_pace = pace = self._bank.get(SessionPace).of(program.session)
+            self._note(EventKind.PACE, pace_subject(pace), caller.name, value=pace.factor)
         elif record is Operator:
             self._operate(self._bank.get(Operator), caller.name)
         elif record is AlarmCommand:

@@ -39,7 +39,7 @@ ALARMS: Final = {
 }
 SECOND_MASTER: Final = 2
 """Cause of the alarm SECOND_WRITER."""
-HARMLESS: Final = (LinkCause.STARTED, LinkCause.OVERSLEPT, LinkCause.LEAPT)
+HARMLESS: Final = (LinkCause.STARTED, LinkCause.OVERSLEPT, LinkCause.LEAPT, LinkCause.PACE)
 """Causes of JOINING that raise no alarm: what is read back is expected to be what we applied."""
 NOT_TAKEN: Final = (PlantLinkState.NOT_TAKEN, LinkCause.REFUSED)
 REFUSED_OUTPUTS: Final[Mapping[int, tuple[PlantLinkState, LinkCause]]] = {
@@ -74,7 +74,7 @@ class PlantLink:
         self.session = 0
         """That of the rack when it last answered; so the tick."""
         self.tick = 0
-        self._moved_at = 0.0
+        self._moved_at: float | None = None
         self._refused = 0
 
     @property
@@ -108,6 +108,12 @@ class PlantLink:
         """Note that this program stood still: what the rack has done meanwhile is not known."""
         if self.in_step:
             self._enter(PlantLinkState.JOINING, LinkCause.OVERSLEPT)
+
+    def repaced(self) -> None:
+        """Note that the time base was changed: where the rack is, and how fast it moves, is found out anew."""
+        self._moved_at = None
+        if self.in_step:
+            self._enter(PlantLinkState.JOINING, LinkCause.PACE)
 
     def read_back(self, reading: Measurement, session: int, now: float | None) -> bool:
         """Judge a reading that was asked for without writing; tell whether outputs may be written from it on.
@@ -177,8 +183,8 @@ class PlantLink:
         """Note where the rack is; tell whether its clock stands. At tick 0 it waits for the first outputs."""
         moved = (reading.session, reading.tick) != (self.session, self.tick)
         self.session, self.tick = reading.session, reading.tick
-        if now is None or moved or reading.tick == 0:
-            self._moved_at = now or 0.0
+        if now is None or moved or reading.tick == 0 or self._moved_at is None:
+            self._moved_at = now
             return False
         return now - self._moved_at >= self.frozen_ticks
 

@@ -85,6 +85,8 @@ class ControlProgram:
         classical = self._section.driver is ControlStrategy.CLASSICAL
         mode = Mode.CLASSICAL if classical else Mode.HOLD
         self._ladder = Ladder(self._section.ladder.hold_ticks, mode, Cause.SESSION_STARTED)
+        if session:
+            self._note_mode(0)
 
     def nobody_drives(self) -> None:
         """Let those drive whom the configuration names: no operator has said anything."""
@@ -131,6 +133,7 @@ class ControlProgram:
         ours = playing is not None and SequenceRow(*applied) in playing.rows[: max(0, tick - playing.header.first_tick)]
         self._player.resume(playing if ours else None, tick)
         self._ladder = Ladder(self._section.ladder.hold_ticks, Mode.HOLD, Cause.RESTARTED, tick)
+        self._note_mode(tick)
 
     def _begin(self, session: int, tick: int, applied: SequenceRow, *, updates: int) -> None:
         self.session = session
@@ -240,6 +243,9 @@ class ControlProgram:
                 self._loops.restart()
         elif before is Mode.CLASSICAL:
             self._failed_handshake = -math.inf
+        self._note_mode(tick)
+
+    def _note_mode(self, tick: int) -> None:
         self.journal.note(tick, EventKind.MODE, self._ladder.mode, self._ladder.cause)
 
     def _wanted(self, tick: int, row: SequenceRow | None) -> SequenceRow:
@@ -335,8 +341,10 @@ class ControlProgram:
         self._watch_sensors()
 
     def _watch_sensors(self) -> None:
-        """Raise the alarm for each sensor that has become bad; the cause is the newest one's output."""
+        """Note each sensor that became bad or good, and raise the alarm; its cause is the newest one's output."""
         bad = frozenset(self._sensors.bad)
+        for output in sorted(bad ^ self._bad_before):
+            self.journal.note(self.tick, EventKind.SENSOR, output, int(output in bad))
         for output in sorted(bad - self._bad_before):
             self.alarms.raised(AlarmKind.SENSOR_BAD, output)
         if not bad:

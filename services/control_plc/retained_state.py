@@ -11,12 +11,12 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from coldloop.pace import Pace
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Operator, OperatorMode, SequenceHeader, SequenceRow
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.retained import RetainedFile, RetainedStateError
 from coldloop.retained_writer import RetainedStateWriter
 from coldloop.sequence import InputSequence, checksum
-from coldloop.session import Pace
 from control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")

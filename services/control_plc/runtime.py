@@ -19,13 +19,15 @@ from coldloop.logs import dropped
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import ModelHeader, read_header
+from coldloop.pace import Pace
 from coldloop.process import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
+from coldloop.registers.common import SessionPace
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, LinkCause, PlantLinkState
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus, WatchdogTime
-from coldloop.session import Pace, TimeMode
+from coldloop.session import TimeMode
 from coldloop.telemetry import Telemetry
 from control_plc.clients import Clients
 from control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
@@ -46,11 +48,13 @@ LOOK_PAUSE_S: Final = 0.1
 ANSWER_TICKS: Final = 8
 """In real time an answer that takes longer is of no use: the rack is looked at anew."""
 SHORTEST_PATIENCE_S: Final = 0.1
-LONGEST_SLEEP_S: Final = 0.5
-"""Between two looks for a new session while a scan is not due."""
+LONGEST_SLEEP_S: Final = 0.25
+"""In real time it is seen so often whether an operator has called meanwhile."""
 ADOPT_AFTER_S: Final = 1.0
 """An operator who begins a session writes to one PLC after the other: one that the rack has begun is ours by
 `session.autostart` when it has not been asked for here meanwhile."""
+KEEP_ALIVE_S: Final = 1.0
+"""While paused, the rack is asked something so often."""
 EXPIRES_SOON: Final = 1
 """Causes of the alarm CERTIFICATE."""
 EXPIRED: Final = 2
@@ -115,8 +119,12 @@ class ControlPlc:
         while True:
             if self.clients.asked is not None:
                 self._start(self.clients.asked)
+            elif self.clients.asked_pace is not None:
+                self._change_pace(self.clients.asked_pace)
             elif not self._has_session:
                 await self._stand_by()
+            elif self._pace.paused:
+                await self._while_paused()
             elif not self._link.in_step:
                 await self._look()
             elif await (self._until_clock() if self._pace.realtime else self._until_granted()):
@@ -150,11 +158,13 @@ class ControlPlc:
         It always yields, however late it is.
         """
         program, due = self._program, self._clock.due(self._program.tick)
-        while due - time.monotonic() > LONGEST_SLEEP_S:  # a tick may last half a minute: a session does not wait for it
+        while (left := due - time.monotonic()) > LONGEST_SLEEP_S:
             await asyncio.sleep(LONGEST_SLEEP_S)
-            if self.clients.asked is not None:
+            if self._is_called:
                 return False
-        await asyncio.sleep(max(0.0, due - time.monotonic()))
+        await asyncio.sleep(max(0.0, left))
+        if self._is_called:
+            return False
         lateness = max(0.0, time.monotonic() - due)
         self.publication.lateness.add(lateness)
         if lateness * 1000 > self._settings.control_plc.scan_tolerance_ms:
@@ -162,11 +172,30 @@ class ControlPlc:
             program.alarms.happened(AlarmKind.SCAN_OVERRUN)
         if lateness > self._clock.tick_s and program.tick:  # at tick 0 the rack's clock waits for us
             self._link.overslept()
-        return self._link.in_step and self.clients.asked is None
+        return self._link.in_step
+
+    @property
+    def _is_called(self) -> bool:
+        """An operator has asked for another session, or another time base."""
+        return self.clients.asked is not None or self.clients.asked_pace is not None
+
+    async def _while_paused(self) -> None:
+        """Wait until an operator writes something; the connection to the rack is kept open meanwhile."""
+        self.clients.changed.clear()
+        try:
+            async with asyncio.timeout(KEEP_ALIVE_S):
+                await self.clients.changed.wait()
+        except TimeoutError:
+            try:
+                await self._plant.read(Measurement)
+            except LinkError as error:
+                self._say_lost(error)
 
     async def _until_granted(self) -> bool:
         """Wait until the next scan in lock-step has what it needs; tell whether it may begin."""
         program = self._program
+        if self._is_called:
+            return False
         granted = program.tick < self.clients.granted
         awaited = granted and (program.awaiting_plan or program.awaiting_sequence)
         if granted and not awaited:
@@ -298,7 +327,7 @@ class ControlPlc:
         """Read what the rack applies; in step with it, go on from there."""
         if self._looks:
             await self._pause()
-            if self.clients.asked is not None:
+            if self._is_called:
                 return
         self._looks += 1
         try:
@@ -417,14 +446,34 @@ class ControlPlc:
         self._publish()
         log.info("session started", extra={"session": asked.session, "realtime": bool(asked.realtime)})
 
+    def _change_pace(self, pace: Pace) -> None:
+        """Go on by another time base; before the next scan the rack is looked at."""
+        self.clients.asked_pace = None
+        self._pace = pace
+        self._set_clock()
+        self._looks = 0
+        self._link.repaced()
+        self._show_pace()
+        self._publish()
+        self._memory.keep(self._program, pace)
+        log.info("pace changed", extra={"realtime": pace.realtime, "factor": pace.factor, "paused": pace.paused})
+
+    def _set_clock(self) -> None:
+        self._clock = RackClock(self._pace.factor, time.monotonic())
+        self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
+
+    def _show_pace(self) -> None:
+        pace, session = self._pace, self._program.session
+        self.bank.put(ControlSession(session, int(pace.realtime), pace.factor))
+        self.bank.put(SessionPace.shown(session, pace))
+
     def _begin(self) -> None:
         self._looks = 0
         self._other = (0, 0.0)
-        self._clock = RackClock(self._pace.factor, time.monotonic())
-        self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
+        self._set_clock()
         self.publication.begin()
         self.clients.begin()
-        self.bank.put(ControlSession(self._program.session, int(self._pace.realtime), self._pace.factor))
+        self._show_pace()
 
     def _publish(self) -> None:
         self.publication.status()

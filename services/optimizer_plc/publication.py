@@ -4,11 +4,12 @@ from collections.abc import Mapping
 from typing import Final
 
 from coldloop.journal import Journal, JournalPublication
+from coldloop.pace import Pace
 from coldloop.process import TICK_S
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import Caller, IllegalValueError, RegisterBank
 from coldloop.registers.codec import WordOrder
-from coldloop.registers.common import Identity, ServiceState
+from coldloop.registers.common import Identity, ServiceState, SessionPace, pace_subject
 from coldloop.registers.declaration import Block
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, OPTIMIZER_MAP, Optimization, OptimizerSession
 from optimizer_plc.budget import PlcBudget
@@ -30,6 +31,9 @@ class Publication:
     def __init__(self, order: WordOrder, budget: PlcBudget, model_digest: int, holder: int) -> None:
         self.bank = RegisterBank(OPTIMIZER_MAP, order)
         self.bank.judged_by(self._judge, OptimizerSession)
+        self.bank.judged_by(self._judge_pace, SessionPace)
+        self.pace = Pace(realtime=False, factor=1.0)
+        """Time base of the session under way."""
         self._budget = budget
         self._model_digest = model_digest
         self._journal = Journal()
@@ -57,12 +61,23 @@ class Publication:
                 f"iteration takes {self._budget.answer_after_s(1):g} s with its preparation: give more, or 0 (adaptive)"
             )
 
+    def _judge_pace(self, asked: SessionPace, _row: int, _caller: Caller) -> None:
+        try:
+            asked.of(self._session)
+        except ValueError as error:
+            raise IllegalValueError(f"pace: {error}") from None
+
     def on_write(self, block: Block, caller: Caller) -> None:
         """Answer a query of the journal; the settings of a session are taken when it begins."""
         if block.record is JournalQuery:
             self._shown.answer(self.bank.get(JournalQuery))
         elif block.record is OptimizerSession:
             self._asked_by = caller.name
+        elif block.record is SessionPace:
+            pace = self.pace = self.bank.get(SessionPace).of(self._session)
+            self._journal.note(self.link.tick, EventKind.PACE, pace_subject(pace), value=pace.factor, who=caller.name)
+            self._shown.show()
+            self.bank.put(SessionPace.shown(self._session, pace))
 
     def asked_for(self, session: int) -> OptimizerSession | None:
         """Return the settings that an operator has written for a session."""
@@ -71,11 +86,13 @@ class Publication:
 
     # -- what is shown -------------------------------------------------------------------------------------------------
 
-    def session_started(self, session: int, *, realtime: bool, factor: float) -> None:
+    def session_started(self, session: int, pace: Pace) -> None:
         """Show that a session has begun."""
         who = self._asked_by if self.asked_for(session) is not None else ""
         self._session, self._last = session, None
-        self._journal.note(self.link.tick, EventKind.SESSION, int(realtime), value=factor, who=who)
+        self._journal.note(self.link.tick, EventKind.SESSION, int(pace.realtime), value=pace.factor, who=who)
+        self.pace = pace
+        self.bank.put(SessionPace.shown(session, pace))
         self._shown.show()
         self._show_identity(0)
 

@@ -14,11 +14,12 @@ from coldloop import __version__
 from coldloop.errors import ColdloopError, ConfigurationError, LinkError, ModelFileError
 from coldloop.lti_model import load
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
+from coldloop.pace import Pace
 from coldloop.process import TICK_S
 from coldloop.registers.control_plc import AwaitUpdate, Update, Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState
 from coldloop.sequence import InputSequence
-from coldloop.session import Pace, TimeMode
+from coldloop.session import TimeMode
 from coldloop.telemetry import Telemetry
 from optimizer_plc.control_client import ControlClient
 from optimizer_plc.program import OptimizerProgram
@@ -73,7 +74,7 @@ class OptimizerPlc:
         self.publication = Publication(section.word_order, self._program.budget, digest, holder)
         self._link = self.publication.link
         self._control = ControlClient(section.control_plc, self._link, digest, str(settings.model.file))
-        self._pace = self._configured_pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
+        self._configured_pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
         self._session = 0
         self._wanted = FRESH_UPDATE
         self._kept: _Answer | None = None
@@ -165,14 +166,14 @@ class OptimizerPlc:
     def _start(self, session: int) -> None:
         """Begin a session, with the operator's settings where they are for this one."""
         self._session = session
-        self._pace = self._configured_pace
+        pace = self._configured_pace
         period_s = self._settings.optimizer_plc.program.updating_period_s
         asked = self.publication.asked_for(session)
         if asked is not None:
-            self._pace = Pace(bool(asked.realtime), asked.factor)
+            pace = Pace(bool(asked.realtime), asked.factor)
             period_s = asked.updating_period * TICK_S
         self._program.restart(period_s)
-        self.publication.session_started(session, realtime=self._pace.realtime, factor=self._pace.factor)
+        self.publication.session_started(session, pace)
         log.info("session started", extra={"session": session, "updating_period_s": period_s})
 
     async def _answer(self, update: Update, arrived_at: float) -> None:
@@ -185,13 +186,13 @@ class OptimizerPlc:
         plan = program.plan(update)
         await self._control.plan(plan)
         sequence = program.solve()
-        ready = arrived_at + program.answer_after_s() / self._pace.factor
+        ready = arrived_at + program.answer_after_s() / self.publication.pace.factor
         await self._finish(_Answer(update, sequence, ready, interruptible=plan.load_step > 0))
 
     async def _finish(self, answer: _Answer) -> None:
         """Deliver an answer when it is ready; keep it, once, should the link be lost meanwhile."""
         self._kept = None if answer.resumed else answer
-        if self._pace.realtime and not await self._is_computed(answer):
+        if self.publication.pace.realtime and not await self._is_computed(answer):
             self._link.interrupted()
             await self._conclude(answer.update, Verdict.NONE)
             return
@@ -214,7 +215,7 @@ class OptimizerPlc:
 
     async def _is_computed(self, answer: _Answer) -> bool:
         """Wait until the PLC would have its answer; tell whether no load step or session has cut it off before."""
-        spacing_s = (LOOK_OUT_S if answer.interruptible else HEARTBEAT_S) / self._pace.factor
+        spacing_s = (LOOK_OUT_S if answer.interruptible else HEARTBEAT_S) / self.publication.pace.factor
         look_s = min(max(spacing_s, SHORTEST_PAUSE_S), LONGEST_PAUSE_S)
         while (remaining := answer.ready - time.monotonic()) > 0.0:
             await asyncio.sleep(min(remaining, look_s))

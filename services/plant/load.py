@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 from coldloop.errors import LoadFileError
 from coldloop.process import TICK_S
-from coldloop.registers.plant import LOAD_ROWS, MAX_LOAD_W, LoadStep
+from coldloop.registers.plant import MAX_LOAD_W, LoadStep
 from plant.program import LoadProfile
 
 MAX_TICK: Final = 2**32
@@ -150,8 +150,6 @@ def _step(row: dict[str, str | None], before: list[LoadStep], where: str) -> Loa
         raise LoadFileError(f"{where}: the first step is at {time:g} s; begin at 0 s")
     if before and tick <= before[-1].tick:
         raise LoadFileError(f"{where}: {time:g} s does not come after {before[-1].tick * TICK_S:g} s; sort by time_s")
-    if len(before) >= LOAD_ROWS:
-        raise LoadFileError(f"{where}: more than {LOAD_ROWS} steps, which is what the plant holds; split the file")
     return LoadStep(tick, load)
 
 

@@ -4,7 +4,7 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,6 +13,13 @@ from plant.cold_box import ColdBox, outputs
 from plant.helium.properties import load_helium
 from plant.integrator import advance_and_read, plain_tuples
 from plant.numeric import RealArray
+
+
+class HeatLoad(Protocol):
+    """The heat load over time."""
+
+    def value(self, tick: int) -> float:
+        """Return the load (W) that is held from `tick` to the next one."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +87,7 @@ class PlantProgram:
         box: ColdBox,
         x0: Sequence[float],
         u0: Sequence[float],
-        load: LoadProfile,
+        load: HeatLoad,
         noise: MeasurementNoise | None = None,
         tick_s: float = 0.25,
     ) -> None:

@@ -8,19 +8,30 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from coldloop.journal import Journal
+from coldloop.pace import Pace
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
-from coldloop.registers.plant import Actuators, Measurement, OutputVerdict, PlantSample, SensorFault
-from coldloop.session import Pace
+from coldloop.registers.common import pace_subject
+from coldloop.registers.plant import (
+    Actuators,
+    LiveLoad,
+    LoadAhead,
+    LoadStep,
+    Measurement,
+    OutputVerdict,
+    PlantSample,
+    SensorFault,
+)
 from coldloop.watchdog import Watchdog
 from plant.faults import SensorFaults
+from plant.load_schedule import LoadSchedule
 from plant.outputs import AppliedOutputs, Inputs, next_generation
-from plant.program import LoadProfile, PlantProgram
+from plant.program import HeatLoad, LoadProfile, PlantProgram
 from plant.retained_state import RetainedState
 from plant.settings import SafeAction, WatchdogSettings
 
-MakePlant = Callable[[LoadProfile, int], PlantProgram]
+MakePlant = Callable[[HeatLoad, int], PlantProgram]
 """Returns the plant at tick 0, for a load and a seed of the sensors' noise."""
 
 UNWATCHED_SILENCE_S: Final = 10.0
@@ -68,8 +79,11 @@ class Rack:
         self._set_up(session)
 
     def _set_up(self, session: Session) -> None:
-        self._program = self._make_plant(session.load, session.seed)
+        self.load = LoadSchedule(session.load)
+        self._program = self._make_plant(self.load, session.seed)
         self.session = session
+        self._load_by = ""
+        """Who writes steps of the load ahead."""
         self.faults = SensorFaults()
         self.watchdog.set(self.watchdog.time, 0)
         self.moving = False
@@ -105,11 +119,12 @@ class Rack:
             KeyError, TypeError, ValueError: It is not the state of such a plant; nothing has changed.
         """
         load = LoadProfile(state.times, state.watts)
-        program = self._make_plant(load, state.seed)
+        schedule = LoadSchedule(load)
+        program = self._make_plant(schedule, state.seed)
         program.resume(**state.program)
         cv155, ncr22, cv156 = state.program["u"]
         self._set_up(Session(state.session, state.pace, load, state.seed))
-        self._program = program
+        self._program, self.load = program, schedule
         self.watchdog.set(state.watchdog, program.tick)
         self.outputs = AppliedOutputs(
             (cv155, ncr22, cv156), holder=state.holder, generation=next_generation(state.generation)
@@ -119,10 +134,11 @@ class Rack:
     def retained(self) -> RetainedState:
         """Return what `resume` needs."""
         session, outputs, journal = self.session, self.outputs, self.journal
+        load = self.load.from_tick(self.tick)
         return RetainedState.model_construct(
             boot=journal.boot, events=journal.count, generation=outputs.generation, holder=outputs.holder,
             session=session.number, pace=session.pace, watchdog=self.watchdog.time,
-            times=session.load.times, watts=session.load.watts, seed=session.seed, program=self._program.retained(),
+            times=load.times, watts=load.watts, seed=session.seed, program=self._program.retained(),
         )  # fmt: skip
 
     # -- outputs -------------------------------------------------------------------------------------------------------
@@ -162,6 +178,36 @@ class Rack:
         """Change the time-out of the watchdog (ticks, 0 is off), and start it anew."""
         self.journal.note(self.tick, EventKind.WATCHDOG_TIME, time, self.watchdog.time, who=who)
         self.watchdog.set(time, self.tick)
+
+    def load_steps(self, asked: LiveLoad | LoadAhead) -> list[LoadStep]:
+        """Judge a load that was written while a session goes on; return its steps.
+
+        Raises:
+            ValueError: It is not for this session, or not a load that can be taken now.
+        """
+        if not self.session.number:
+            raise ValueError("there is no session: a new one takes its load from the load table")
+        if isinstance(asked, LiveLoad):
+            steps = [LoadStep(asked.tick or self.tick + 1, asked.watts)]
+        elif asked.session != self.session.number:
+            raise ValueError(f"session {self.session.number} is under way, not {asked.session}")
+        else:
+            steps = asked.steps
+        self.load.check(steps, self.tick)
+        return steps
+
+    def set_load(self, steps: Sequence[LoadStep], who: str, *, ahead: bool) -> None:
+        """Take steps of the load; of those that come in turn from one client, the first only is noted."""
+        self.load.put(steps, self.tick)
+        if not ahead or who != self._load_by:
+            self.journal.note(self.tick, EventKind.LIVE_LOAD, int(ahead), value=steps[0].watts, who=who)
+        self._load_by = who if ahead else ""
+
+    def set_pace(self, pace: Pace, who: str) -> None:
+        """Change the time base from the present tick on."""
+        self.session = self.session._replace(pace=pace)
+        self.moving = pace.realtime and (self.moving or self.tick > 0)
+        self.journal.note(self.tick, EventKind.PACE, pace_subject(pace), value=pace.factor, who=who)
 
     def set_faults(self, faults: Sequence[SensorFault], who: str) -> None:
         """Take the faults of all sensors."""

@@ -7,16 +7,20 @@ from collections.abc import Callable
 
 from coldloop.journal import Journal, JournalPublication
 from coldloop.model_file import ModelHeader
+from coldloop.pace import Pace
 from coldloop.process import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
-from coldloop.registers.common import Identity, ServiceState
+from coldloop.registers.common import Identity, ServiceState, SessionPace
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import (
     HISTORY_ROWS,
     LOAD_ROWS,
     PLANT_MAP,
     Actuators,
+    LiveLoad,
+    LoadAhead,
+    LoadStatus,
     LoadStep,
     Measurement,
     OutputVerdict,
@@ -26,7 +30,7 @@ from coldloop.registers.plant import (
 from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 from coldloop.registers.text import from_words
 from coldloop.seal import sealed
-from coldloop.session import Pace, TimeMode
+from coldloop.session import TimeMode
 from coldloop.writer_lease import LeaseEvent, WriterLease
 from plant.faults import HEALTHY
 from plant.load import find_load
@@ -120,15 +124,21 @@ class RackRegisters:
         bank.judged_by(self._judge_watchdog, WatchdogTime)
         bank.judged_by(self._judge_session, PlantSession)
         bank.judged_by(self._judge_load, LoadStep)
+        bank.judged_by(self._judge_live_load, LiveLoad, LoadAhead)
+        bank.judged_by(self._judge_pace, SessionPace)
         bank.keep_fresh(Identity, self._identity)
         bank.keep_fresh(Measurement, self._measurement)
         bank.keep_fresh(WatchdogStatus, lambda: self.rack.watchdog.registers(self.rack.tick))
         bank.keep_fresh(LeaseStatus, self.lease.registers)
+        bank.keep_fresh(LoadStatus, lambda: self.rack.load.status(self.rack.tick))
         self._takers: dict[type[tuple[object, ...]], Callable[[str], None]] = {
             PlantSession: self._start_session,
             WatchdogTime: self._set_watchdog,
             SensorFault: self._set_faults,
             LoadStep: self._note_load,
+            LiveLoad: self._set_load,
+            LoadAhead: self._set_load_ahead,
+            SessionPace: self._set_pace,
             JournalQuery: self._answer_query,
         }
 
@@ -155,6 +165,18 @@ class RackRegisters:
 
     def _judge_load(self, _step: LoadStep, row: int, _caller: Caller) -> None:
         self._written_row = row  # every load that is in range may be written: a session judges the table
+
+    def _judge_live_load(self, asked: LiveLoad | LoadAhead, _row: int, _caller: Caller) -> None:
+        try:
+            self.rack.load_steps(asked)
+        except ValueError as error:
+            raise IllegalValueError(f"load: {error}") from None
+
+    def _judge_pace(self, asked: SessionPace, _row: int, _caller: Caller) -> None:
+        try:
+            asked.of(self.rack.session.number)
+        except ValueError as error:
+            raise IllegalValueError(f"pace: {error}") from None
 
     def _load_of(self, asked: PlantSession) -> LoadProfile:
         steps = [self.bank.get(LoadStep, row) for row in range(asked.load_steps)]
@@ -185,6 +207,8 @@ class RackRegisters:
         self.rack.start(Session(asked.session, pace, self._load_of(asked), asked.seed), who)
         for output in range(len(OUTPUT_NAMES)):
             self.bank.put(HEALTHY, output)
+        self.bank.put(LiveLoad(0, self.rack.load.value(0)))
+        self._show_pace()
         self._show_applied()
 
     def _set_watchdog(self, who: str) -> None:
@@ -197,6 +221,23 @@ class RackRegisters:
         row = self._written_row
         watts = self.bank.get(LoadStep, row).watts
         self.rack.journal.note(self.rack.tick, EventKind.LOAD, row, value=watts, who=who)
+
+    def _set_load(self, who: str) -> None:
+        steps = self.rack.load_steps(self.bank.get(LiveLoad))
+        self.rack.set_load(steps, who, ahead=False)
+        # unsealed and for the next tick, so that a simple client need write no more than the watts
+        self.bank.put(LiveLoad(0, steps[0].watts))
+
+    def _set_load_ahead(self, who: str) -> None:
+        self.rack.set_load(self.rack.load_steps(self.bank.get(LoadAhead)), who, ahead=True)
+
+    def _set_pace(self, who: str) -> None:
+        self.rack.set_pace(self.bank.get(SessionPace).of(self.rack.session.number), who)
+        self._show_pace()
+
+    def _show_pace(self) -> None:
+        session = self.rack.session
+        self.bank.put(SessionPace.shown(session.number, session.pace))
 
     def _answer_query(self, _who: str) -> None:
         self._journal.answer(self.bank.get(JournalQuery))
@@ -255,6 +296,8 @@ class RackRegisters:
             self.bank.put(LoadStep(tick, watts), row)
         pace = session.pace
         self.bank.put(PlantSession(session.number, int(pace.realtime), pace.factor, session.seed, len(steps)))
+        self.bank.put(LiveLoad(0, self.rack.load.value(self.rack.tick)))
+        self._show_pace()
 
     def _show_applied(self) -> None:
         """Put what is applied into the registers of the outputs; the seal keeps others from completing it by a part."""

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from coldloop.pace import Pace
 from coldloop.retained import RetainedFile, RetainedStateError
-from coldloop.session import Pace
 
 log = logging.getLogger("coldloop.plant")
 

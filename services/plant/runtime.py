@@ -17,13 +17,14 @@ from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import ModelHeader, read_header
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S
 from coldloop.registers.bank import Caller
+from coldloop.registers.common import SessionPace
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, PlantSession
 from coldloop.telemetry import Telemetry
 from plant.cold_box import REFERENCE
 from plant.helium.properties import load_helium
 from plant.model import parameters_digest
-from plant.program import LoadProfile, MeasurementNoise, PlantProgram
+from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.registers import RackRegisters
 from plant.settings import PlantSettings, SensorSettings
 
@@ -48,7 +49,7 @@ def _own_parameters_digest() -> str:
     return parameters_digest(REFERENCE, load_helium())
 
 
-def make_program(header: ModelHeader, sensors: SensorSettings, load: LoadProfile, seed: int) -> PlantProgram:
+def make_program(header: ModelHeader, sensors: SensorSettings, load: HeatLoad, seed: int) -> PlantProgram:
     """Return the plant at the operating point of its model file."""
     deviations = sensors.deviations
     noise = MeasurementNoise(deviations, seed) if any(deviations) else None
@@ -63,6 +64,8 @@ class PlantRuntime:
         self._clock_rate = 1.0 + settings.plant.clock_error_ppm * 1e-6
         self._clock: asyncio.Task[None] | None = None
         self._schedule: Schedule | None = None
+        self._position: float | None = None
+        """While paused: where time stands, in ticks."""
         self._failure: asyncio.Future[None] | None = None
         self.registers = RackRegisters(
             settings, header, partial(make_program, header, settings.plant.sensors), age=self._age
@@ -74,6 +77,9 @@ class PlantRuntime:
         rack = self.registers.rack
         if block.record is PlantSession:
             self._stop_clock()
+            self._position = None
+        elif block.record is SessionPace:
+            self._change_pace()
         elif block.record is Actuators and rack.moving:
             if rack.session.pace.realtime:
                 self._start_clock()
@@ -105,13 +111,26 @@ class PlantRuntime:
 
     def _start_clock(self) -> None:
         """Let the plant move by the clock from its present tick on, if it does not yet."""
-        if self._clock is not None:
-            return
         rack = self.registers.rack
+        if self._clock is not None or rack.session.pace.paused:
+            return
         factor = rack.session.pace.factor * self._clock_rate
-        self._schedule = Schedule(time.monotonic() - rack.tick * TICK_S / factor, factor)
+        position = rack.tick if self._position is None else self._position
+        self._position = None
+        self._schedule = Schedule(time.monotonic() - position * TICK_S / factor, factor)
         self._clock = asyncio.get_running_loop().create_task(self._run_clock(self._schedule), name="plant clock")
         self._clock.add_done_callback(self._clock_ended)
+
+    def _change_pace(self) -> None:
+        """Go on, or stand still, from where time is now."""
+        if self._schedule is not None:
+            self._position = self._schedule.position(time.monotonic())
+        self._stop_clock()
+        rack = self.registers.rack
+        if not rack.session.pace.realtime:
+            self._position = None
+        elif rack.moving:
+            self._start_clock()
 
     def _stop_clock(self) -> None:
         if self._clock is not None:
@@ -139,11 +158,8 @@ class PlantRuntime:
         Tick n begins half a tick before it is due. The clock begins with the first outputs of a session, in the middle
         of a tick: so tick + age advances evenly from there on.
         """
-        schedule = self._schedule
-        if schedule is None:
-            return 0.0
-        begun = schedule.due(self.registers.rack.tick - 0.5)
-        return max(0.0, (time.monotonic() - begun) * schedule.factor / TICK_S)
+        position = self._schedule.position(time.monotonic()) if self._schedule is not None else self._position
+        return 0.0 if position is None else max(0.0, position - (self.registers.rack.tick - 0.5))
 
 
 async def serve(settings: PlantSettings) -> None:

@@ -26,6 +26,10 @@ class Schedule:
         """Return when `tick` (or a moment between two) is due."""
         return self.start + tick * TICK_S / self.factor
 
+    def position(self, now: float) -> float:
+        """Return where time is at `now`, in ticks."""
+        return (now - self.start) * self.factor / TICK_S
+
 
 class LatenessRecord:
     """Maximum and percentiles of latenesses, in bounded memory (bins of 50 us up to 0.2 s)."""

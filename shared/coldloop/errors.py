@@ -5,6 +5,7 @@
     │   ├── ConfigurationError      a key, a value or a configuration file
     │   └── LoadFileError           a load profile
     ├── ResultsError                the files of a run cannot be written
+    ├── RunInterruptedError         a signal stopped a run; exit code 128 and the signal's number
     ├── StudyError                  a run of a study failed
     ├── ModelFileError              a prediction model that is missing, damaged or of another plant
     └── LinkError                   the bus: a port, a peer, an answer
@@ -40,6 +41,14 @@ class LoadFileError(UsageError):
 
 class ResultsError(ColdloopError):
     """The files of a run cannot be written."""
+
+
+class RunInterruptedError(ColdloopError):
+    """A signal stopped a run."""
+
+    def __init__(self, signal_name: str, signal_number: int) -> None:
+        super().__init__(f"interrupted by {signal_name}")
+        self.exit_code = 128 + signal_number
 
 
 class StudyError(ColdloopError):

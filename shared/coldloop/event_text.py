@@ -91,6 +91,9 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
     EventKind.LOAD: _Wording(_row, unit="W"),
     EventKind.CERTIFICATE: _Wording(_listed(("", "expires soon", "has expired")), unit="days left"),
     EventKind.LOST: _Wording(unit="events or lines"),
+    EventKind.SENSOR: _Wording(_listed(OUTPUT_NAMES), _listed(("good again", "bad"))),
+    EventKind.LIVE_LOAD: _Wording(_listed(("from one tick on", "steps ahead")), unit="W"),
+    EventKind.PACE: _Wording(_listed(("lock-step", "real time", "paused")), unit="x real time"),
 }
 _ALARM_CAUSES: Final[Mapping[int, Words]] = {
     AlarmKind.MODE: _causes(Cause),

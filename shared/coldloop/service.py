@@ -7,12 +7,12 @@ import logging
 import signal
 import sys
 from collections.abc import Awaitable, Callable, Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
 from coldloop import __version__
+from coldloop.command_line import add_configuration_options
 from coldloop.config import load_configuration
 from coldloop.errors import ColdloopError
 from coldloop.logs import end_logs, set_up_logs
@@ -25,20 +25,11 @@ SECTIONS = ("limits", "model", "session", "plant", "control_plc", "optimizer_plc
 """Sections of a configuration file; each service reads those that concern it."""
 
 
-def add_configuration_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that every program has."""
-    parser.add_argument("--config", type=Path, metavar="FILE", help="configuration file (TOML)")
-    parser.add_argument(
-        "--set", dest="assignments", action="append", default=[], metavar="KEY=VALUE",
-        help="set one key, such as control_plc.server.port=5021; may be repeated",
-    )  # fmt: skip
-    parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
-
-
 def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], arguments: Sequence[str] | None) -> int:
     """Run a service until it is told to stop; return its exit code."""
     parser = argparse.ArgumentParser(prog=f"python -m {name}", description=f"Coldloop: the {name} service.")
     add_configuration_options(parser)
+    parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
     parser.add_argument(
         "--with-parent", action="store_true", help="end when standard input is closed: for programs that start services"
     )

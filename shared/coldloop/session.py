@@ -1,7 +1,7 @@
 """A session: one run of the rig from tick 0, in lock-step or in real time."""
 
 from enum import StrEnum
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -25,10 +25,3 @@ class SessionSettings(BaseModel):
     mode: TimeMode = TimeMode.LOCKSTEP
     factor: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
     """Seconds of plant time in one second of real time, in real time."""
-
-
-class Pace(NamedTuple):
-    """Time base of a session under way."""
-
-    realtime: bool
-    factor: float

@@ -5,7 +5,7 @@ import pytest
 
 from coldloop.process import INPUT_NAMES, L1, OUTPUT_NAMES, STATE_NAMES, T5
 from coldloop.registers.audit import Event, EventKind
-from coldloop.registers.control_plc import Cause, LadderStatus, Mode
+from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import PlantSample
 from coldloop.registers.safety import AlarmKind
 from rig.chaos.evaluation import Evaluation, RaisedAlarm, evaluate
@@ -79,8 +79,7 @@ def test_a_control_plc_that_was_started_again_is_not_in_mpc_because_it_was_befor
     trace = quiet()
     trace.events = [mode(0, Mode.MPC)]
     trace.marks = [Mark(KILL, 100, 100, first_event=1)]
-    trace.sight_mode(100, LadderStatus(Mode.HOLD, Cause.RESTARTED, 100, 0, 0, 0))
-    trace.events.append(mode(110, Mode.MPC))
+    trace.events += [mode(100, Mode.HOLD), mode(110, Mode.MPC)]
     (row,) = evaluated(trace).rows
     assert row.modes == ("MPC", "HOLD", "MPC")
     assert row.back_s == 2.5

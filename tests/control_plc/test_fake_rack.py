@@ -19,6 +19,7 @@ from coldloop.lease import Lease
 from coldloop.limits import InputLimits, RateReference
 from coldloop.model_file import read_header
 from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.pace import Pace
 from coldloop.process import TICK_S
 from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.codec import as_transmitted
@@ -35,7 +36,6 @@ from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import LeaseState
 from coldloop.sequence import InputSequence, with_checksum
-from coldloop.session import Pace
 from control_plc.plant_link import PlantLink
 from control_plc.rack_clock import PHASE, RackClock
 from control_plc.retained_state import Memory, RetainedState

@@ -60,13 +60,14 @@ def test_a_silent_optimiser_leads_down_the_ladder_rung_by_rung(rig: "Bench", at:
     rig.play([at(0.2)] * 30, ticks=2)
     rig.scans(30 + HOLD_TICKS + 5)
     assert modes(rig.program) == [
+        (Mode.HOLD, Cause.SESSION_STARTED),
         (Mode.MPC, Cause.SEQUENCE_BEGAN),
         (Mode.REST, Cause.SEQUENCE_LATE),
         (Mode.HOLD, Cause.SEQUENCE_EXHAUSTED),
         (Mode.CLASSICAL, Cause.HOLD_EXPIRED),
     ]
     assert [event.tick for event in rig.program.journal.since(0) if event.kind == EventKind.MODE] == [
-        2, 22, 32, 32 + HOLD_TICKS,
+        0, 2, 22, 32, 32 + HOLD_TICKS,
     ]  # fmt: skip
     for kind in (AlarmKind.MODE, AlarmKind.SEQUENCE_LATE, AlarmKind.SEQUENCE_EXHAUSTED):
         assert alarm(rig, kind) is AlarmState.UNACKNOWLEDGED

@@ -11,6 +11,7 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invar
 from coldloop.limits import InputLimits, RateReference
 from coldloop.model_file import read_header
 from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.pace import Pace
 from coldloop.process import L1, T5
 from coldloop.registers.audit import EventKind
 from coldloop.registers.codec import as_transmitted
@@ -28,7 +29,6 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.sequence import InputSequence, with_checksum
-from coldloop.session import Pace
 from control_plc.program import ControlProgram
 from control_plc.retained_state import Memory, RetainedState
 from control_plc.runtime import make_program

@@ -25,10 +25,11 @@ from optimizer_plc.settings import OptimizerSettings
 from plant.load import find_load
 from plant.program import LoadProfile
 from plant.settings import PlantSettings
-from rig.network import NetworkRig, RigEndpoints
+from rig.network import NetworkRig
 from rig.one_process import OneProcessRig
 from rig.ports import ReservedPorts
 from rig.recording import Recorder, Recording
+from rig.rig_endpoints import RigEndpoints
 from rig.scenario import Scenario
 from rig.settings import Settings
 

@@ -17,7 +17,7 @@ from rig.settings import Settings
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
 
-USAGE, FAILURE = 2, 1
+USAGE = 2
 CLIENTS = {"control", "optimizer", "operator", "reader"}
 SERVERS = {"plant", "control_plc", "optimizer_plc"}
 
@@ -113,8 +113,8 @@ def test_nothing_is_written_where_one_of_the_files_exists(coldloop: "Coldloop", 
         (["--out", "{}/site", "--host", "café"], USAGE, "'café' is not a host name or an address"),
         (["--out", "{}/site", "--days", "0"], USAGE, "'0' is not a number of days from 1 to 3650"),
         (["--out", "{}/site", "--days", "-3"], USAGE, "days"),
-        (["--out", "{}/file"], FAILURE, "{}/file: File exists; choose another --out"),
-        (["--out", "{}/file/site"], FAILURE, "Not a directory; choose another --out"),
+        (["--out", "{}/file"], USAGE, "{}/file: File exists; choose a folder"),
+        (["--out", "{}/file/site"], USAGE, "Not a directory; choose a folder"),
     ],
 )
 def test_what_is_asked_for_wrongly_is_told_in_one_line(

@@ -117,10 +117,6 @@ def assert_told(load: Path, *parts: str) -> None:
         pytest.param("time_s,load_w\n0,1e39\n", "line 2", id="a load beyond single precision"),
         pytest.param("time_s,load_w\n0,20000\n", "line 2", id="a load that the plant's registers refuse"),
         pytest.param('time_s,load_w\n0,"' + "3" * 200_000 + '"\n', "line 2", id="a field without end"),
-        pytest.param(
-            "time_s,load_w\n" + "".join(f"{n},{385 + n % 2}\n" for n in range(2049)), "2048",
-            id="more steps than the plant's load table holds",
-        ),
     ],
 )  # fmt: skip
 def test_a_load_that_the_plant_cannot_hold_is_told_when_it_is_read(content: str, place: str, write: Write) -> None:

@@ -2,13 +2,18 @@
 
 import json
 import math
+import re
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pyarrow as pa
+import duckdb
+import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from coldloop.errors import UsageError
+from coldloop.lti_model import load
 from coldloop.process import (
     INPUT_NAMES,
     INPUT_UNITS,
@@ -18,10 +23,14 @@ from coldloop.process import (
     STATE_UNITS,
 )
 from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.plant import PlantSample
 from rig import cli
+from rig.columns import FILES
+from rig.indicators import evaluate
 from rig.recording import LinkStatistics, Recorder, Recording
-from rig.results import whole_file, write_json, write_trace
+from rig.results import whole_file, write_json
 from rig.scenario import Scenario
+from rig.settings import Settings
 
 if TYPE_CHECKING:
     from plant.program import LoadProfile
@@ -31,9 +40,11 @@ if TYPE_CHECKING:
 TICKS = 240
 
 SUMMARY = {
-    "ticks", "updates", "trace_sha256", "J_dev", "J_cst", "J_BF", "c1", "c2", "tau_u_mean", "iterations_total",
-    "L1_outside_band_pct", "T5_outside_band_pct", "deadline_misses", "wall_seconds", "realtime_factor",
+    "complete", "reason", "ticks", "updates", "trace_sha256", "J_dev", "J_cst", "J_BF", "c1", "c2", "tau_u_mean",
+    "iterations_total", "L1_outside_band_pct", "T5_outside_band_pct", "deadline_misses", "wall_seconds",
+    "realtime_factor",
 }  # fmt: skip
+PREDICTED = ("J_dev", "J_cst", "J_open_mean", "c1", "c2", "tau_u_mean")
 
 
 @pytest.fixture(scope="module")
@@ -55,50 +66,99 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def test_a_run_leaves_these_files_and_no_others(folder: Path) -> None:
-    names = {"manifest.json", "summary.json", "trace.parquet", "updates.parquet", "run.png"}
+    names = {"manifest.json", "summary.json", "schema.json", "run.png", "run.pdf", "inputs", *FILES}
     assert {path.name for path in folder.iterdir()} == names
+    assert [path.name for path in (folder / "inputs").iterdir()] == ["model.json"]
     assert (folder / "run.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "run.pdf").read_bytes().startswith(b"%PDF")
 
 
-def test_the_summary_has_all_indicators_as_finite_numbers(folder: Path, minute: Recording) -> None:
+def test_the_summary_has_all_indicators_and_null_for_what_does_not_exist(folder: Path, minute: Recording) -> None:
     summary = read(folder / "summary.json")
     assert set(summary) >= SUMMARY
     assert summary.pop("trace_sha256") == minute.trace_sha256
-    assert all(isinstance(value, int | float) and math.isfinite(value) for value in summary.values())
+    absent = {"reason", "overruns", "lateness_max_ms", "lateness_p99_ms"}
+    assert {name for name, value in summary.items() if value is None} == absent, "in lock-step nothing is late"
+    assert all(math.isfinite(value) for value in summary.values() if value is not None)
     assert summary["ticks"] == TICKS
     assert summary["updates"] == len(minute.updates)
     assert summary["iterations_total"] == sum(row.iterations for row in minute.updates)
     assert summary["realtime_factor"] == pytest.approx(TICKS / 4 / summary["wall_seconds"], rel=0.05)
 
 
-def test_the_trace_has_a_row_a_tick_and_a_unit_for_each_column(folder: Path, minute: Recording) -> None:
+def test_a_streamed_run_and_a_recording_in_memory_have_the_same_indicators(folder: Path, minute: Recording) -> None:
+    settings = Settings()
+    indicators = evaluate(minute, load(settings.model.file), settings.optimizer_plc.program.design)
+    summary = read(folder / "summary.json")
+    assert {name: summary[name] for name in indicators._fields} == indicators._asdict()
+
+
+def test_the_trace_has_a_row_a_tick_and_the_values_of_the_run(folder: Path, minute: Recording) -> None:
     table = pq.read_table(folder / "trace.parquet")
-    units = {field.name: field.metadata[b"unit"].decode() for field in table.schema}
-    assert units == {
-        "time": "s", "load": "W", **dict(zip(INPUT_NAMES, INPUT_UNITS, strict=True)),
-        **dict(zip(OUTPUT_NAMES, OUTPUT_UNITS, strict=True)),
-        **{f"x.{name}": unit for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)},
-        "update": "1", "tau_u": "s", "iterations": "1", "J": "1",
-    }  # fmt: skip
-    assert table["time"].to_pylist() == [tick / 4 for tick in range(TICKS)]
-    assert table["load"].to_pylist() == minute.load.tolist()
+    assert table["tick"].to_pylist() == list(range(TICKS))
+    assert table["time_s"].to_pylist() == [tick / 4 for tick in range(TICKS)]
+    assert table["load_w"].to_pylist() == minute.load.tolist()
     assert table["CV156"].to_pylist() == minute.u[:, 2].tolist()
     assert table["L1"].to_pylist() == minute.y[:, 0].tolist()
-    assert table["x.T_nef34_12"].to_pylist() == minute.x[:, -1].tolist()
+    assert table["x_T_nef34_12"].to_pylist() == minute.x[:, -1].tolist()
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_each_column_has_its_unit_and_description_in_the_file_and_in_the_schema(name: str, folder: Path) -> None:
+    described = {column["name"]: column for column in read(folder / "schema.json")["files"][name]["columns"]}
+    schema = pq.read_schema(folder / name)
+    assert list(described) == schema.names
+    for field in schema:
+        assert re.fullmatch(r"[A-Za-z]\w*", field.name), "a name that SQL and MATLAB take as it is"
+        assert field.metadata[b"unit"].decode() == described[field.name]["unit"]
+        assert field.metadata[b"description"].decode() == described[field.name]["description"] != ""
+        assert str(field.type) == described[field.name]["type"]
+
+
+def test_the_units_of_the_trace_are_those_of_the_process(folder: Path) -> None:
+    units = {field.name: field.metadata[b"unit"].decode() for field in pq.read_schema(folder / "trace.parquet")}
+    assert units == {
+        "tick": "1", "time_s": "s", "load_w": "W", **dict(zip(INPUT_NAMES, INPUT_UNITS, strict=True)),
+        **dict(zip(OUTPUT_NAMES, OUTPUT_UNITS, strict=True)),
+        **{f"x_{name}": unit for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)},
+        "L1_measured": "%", "T5_measured": "K", **dict.fromkeys(("mode", "cause", "driver", "bad_sensors"), ""),
+        "stage_cost": "1", "update": "1", "tau_u_s": "s", "iterations": "1", "J": "1",
+    }  # fmt: skip
 
 
 def test_the_trace_says_at_each_tick_what_the_optimiser_was_doing(folder: Path, minute: Recording) -> None:
     table = pq.read_table(folder / "trace.parquet")
     for row in minute.updates:
         assert set(table["update"].to_pylist()[row.tick : row.tick + row.tau_u]) == {row.update}
-        assert set(table["tau_u"].to_pylist()[row.tick : row.tick + row.tau_u]) == {row.tau_u / 4}
+        assert set(table["tau_u_s"].to_pylist()[row.tick : row.tick + row.tau_u]) == {row.tau_u / 4}
         assert set(table["iterations"].to_pylist()[row.tick : row.tick + row.tau_u]) == {row.iterations}
 
 
-def test_the_updates_are_the_history_of_the_optimiser(folder: Path, minute: Recording) -> None:
-    table = pq.read_table(folder / "updates.parquet")
-    assert tuple(table.column_names) == Optimization._fields
-    assert table.to_pylist() == [row._asdict() for row in minute.updates]
+def test_the_updates_are_the_history_of_the_optimiser_in_seconds(folder: Path, minute: Recording) -> None:
+    rows = pq.read_table(folder / "updates.parquet").to_pylist()
+    for row, update in zip(rows, minute.updates, strict=True):
+        assert row.pop("time_s") == update.tick / 4
+        assert row.pop("tau_u_s") == update.tau_u / 4
+        expected = update._asdict()
+        del expected["tau_u"]
+        assert row == expected
+
+
+def test_the_events_say_when_mpc_took_over(folder: Path) -> None:
+    events = pq.read_table(folder / "events.parquet").to_pylist()
+    assert [(event["kind"], event["subject"], event["cause"]) for event in events] == [
+        ("mode", "hold", "session started"),
+        ("mode", "mpc", "sequence began"),
+    ]
+
+
+def test_duckdb_and_pandas_read_the_trace(folder: Path, minute: Recording) -> None:
+    path = folder / "trace.parquet"
+    query = f"select max(L1), count(x_P1), avg(tau_u_s) from '{path}' where time_s >= 30"  # noqa: S608 our own file
+    ((highest, count, _),) = duckdb.sql(query).fetchall()
+    assert (highest, count) == (minute.y[120:, 0].max(), TICKS - 120)
+    frame = pd.read_parquet(path)
+    assert frame["L1"].tolist() == minute.y[:, 0].tolist()
 
 
 def test_the_manifest_holds_what_is_needed_to_repeat_the_run(
@@ -106,19 +166,37 @@ def test_the_manifest_holds_what_is_needed_to_repeat_the_run(
 ) -> None:
     manifest = read(folder / "manifest.json")
     assert manifest["hashes"]["trace_sha256"] == minute.trace_sha256
-    assert {"coldloop", "python", "platform", "dependencies", "command", "arguments"} <= set(manifest)
+    assert {"coldloop", "python", "platform", "dependencies", "command", "arguments", "inputs"} <= set(manifest)
+    assert datetime.fromisoformat(manifest["started_utc"]) <= datetime.fromisoformat(manifest["ended_utc"])
+    assert datetime.fromisoformat(manifest["started_utc"]).tzinfo is UTC
     assert manifest["configuration"]["plant.load"] == "e"
-    settings = [f"--set={key}={json.dumps(value)}" for key, value in manifest["configuration"].items()]
+    settings = [f"--set={key}={json.dumps(value)}" for key, value in manifest["configuration"].items()
+                if key != "session.factor"]  # fmt: skip
     again = coldloop("run", "--in-process", "--duration", "60s", *settings, "--out", tmp_path / "again")
-    assert again.code == 0
+    assert again.code == 0, again.complaints
     assert read(tmp_path / "again" / "summary.json")["trace_sha256"] == minute.trace_sha256
 
 
 def test_a_run_shorter_than_its_first_update_has_results_too(coldloop: "Coldloop", results: Path) -> None:
     assert coldloop("run", "--in-process", "--duration", "0.25s", "--out", results).code == 0
-    assert read(results / "summary.json")["updates"] == 0
+    summary = read(results / "summary.json")
+    assert summary["updates"] == 0
     assert pq.read_table(results / "trace.parquet").num_rows == 1
+    assert pq.read_table(results / "trace.parquet")["update"].to_pylist() == [None]
     assert pq.read_table(results / "updates.parquet").num_rows == 0
+
+
+def test_an_existing_run_is_replaced_only_when_forced(coldloop: "Coldloop", results: Path) -> None:
+    run = ("run", "--in-process", "--duration", "2s", "--figures", "png", "--out", results)
+    assert coldloop(*run).code == 0
+    before = {path: path.read_bytes() for path in results.iterdir() if path.is_file()}
+    outcome = coldloop(*run, "--load", "b")
+    assert outcome.code == 2
+    assert len(outcome.complaints) == 1
+    assert "--force" in outcome.complaints[0]
+    assert {path: path.read_bytes() for path in results.iterdir() if path.is_file()} == before
+    assert coldloop(*run, "--load", "b", "--force").code == 0
+    assert read(results / "manifest.json")["configuration"]["plant.load"] == "b"
 
 
 class DiskFullError(OSError):
@@ -139,36 +217,22 @@ def test_a_file_that_cannot_be_written_whole_leaves_the_old_one(tmp_path: Path) 
     assert read(path) == {"run": 1}
 
 
-def test_a_trace_that_cannot_be_written_whole_leaves_no_file(
-    tmp_path: Path, minute: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail_halfway(_table: pa.Table, path: Path, **_: object) -> None:
-        path.write_bytes(b"PAR1")
-        raise DiskFullError
-
-    monkeypatch.setattr(pq, "write_table", fail_halfway)
-    with pytest.raises(DiskFullError):
-        write_trace(tmp_path / "trace.parquet", minute)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_full_disk_is_told_in_one_line(coldloop: "Coldloop", results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise DiskFullError(28, "No space left on device")
-
-    monkeypatch.setattr(pq, "write_table", fail)
-    outcome = coldloop("run", "--in-process", "--duration", "2s", "--out", results)
-    assert outcome.code == 1
-    assert "No space left" in outcome.complaints[-1]
+def test_a_device_is_not_replaced_by_a_file() -> None:
+    with pytest.raises(UsageError, match="not a regular file"):
+        write_json(Path("/dev/full"), {})
+    assert Path("/dev/full").is_char_device()
 
 
 def test_a_recording_keeps_the_updates_whose_sequence_was_played() -> None:
     recorder = Recorder(ticks=100)
     row = Optimization(*[0] * len(Optimization._fields))
-    for number, (tick, tau_u) in enumerate([(0, 40), (40, 59), (99, 10)]):
+    for number, (tick, tau_u) in enumerate([(0, 40), (40, 20), (50, 49), (99, 10)]):
         recorder.update(row._replace(update=number, tick=tick, tau_u=tau_u))
-    assert [kept.update for kept in recorder.recording().updates] == [0, 1]
+    for tick in range(100):
+        recorder.sample(PlantSample(tick, 0.0, (0.0,) * 3, (0.0,) * 22, (0.0,) * 28))
+    assert [kept.update for kept in recorder.recording().updates] == [0, 2], "1 was cut off, 3 reaches beyond the run"
     assert recorder.recording().link == LinkStatistics()
+    assert len(recorder.recording().load) == 100
 
 
 def test_a_run_without_updates_leaves_all_files_too(coldloop: "Coldloop", results: Path) -> None:
@@ -179,7 +243,8 @@ def test_a_run_without_updates_leaves_all_files_too(coldloop: "Coldloop", result
     assert outcome.code == 0, outcome.complaints
     assert "no updates" in outcome.out
     summary = json.loads((results / "summary.json").read_text(encoding="utf-8"))
-    assert (summary["updates"], summary["iterations_total"], summary["tau_u_mean"]) == (0, 0, 0.0)
+    assert (summary["updates"], summary["iterations_total"]) == (0, 0)
+    assert [summary[name] for name in PREDICTED] == [None] * len(PREDICTED)
     assert summary["J_BF"] > 0.0
     assert pq.read_table(results / "updates.parquet").num_rows == 0
     assert pq.read_table(results / "trace.parquet").num_rows == TICKS

@@ -52,6 +52,12 @@ class EventKind(IntEnum):
     """Events or log lines were lost: value how many."""
     CONTROL_LINK = 21
     """Subject is the new state of the optimiser's link to the control PLC; 2 is up."""
+    SENSOR = 22
+    """The control PLC began or ceased to substitute a measurement: subject the output, cause 1 bad, 0 good again."""
+    PACE = 23
+    """The time base of a session was changed: subject 0 lock-step, 1 real time, 2 paused; value the factor."""
+    LIVE_LOAD = 24
+    """The load of the session under way was written: subject 0 from now on, 1 steps ahead; value its first one, W."""
 
 
 class Event(NamedTuple):
@@ -67,7 +73,8 @@ class Event(NamedTuple):
         u16(
             "1 mode, 2 alarm raised, 3 returned, 4 acknowledged, 5 shelved, 6 unshelved, 7 out of service, 8 in "
             "service, 9 boot, 10 session, 11 operator mode, 12 setpoint, 13 watchdog time, 14 watchdog expired, "
-            "15 plant link, 16 lease, 17 sensor fault, 18 load, 19 certificate, 20 lost, 21 control link"
+            "15 plant link, 16 lease, 17 sensor fault, 18 load, 19 certificate, 20 lost, 21 control link, "
+            "22 sensor, 23 pace, 24 live load"
         ),
     ] = 0
     subject: Annotated[int, u16("The mode, the alarm, ...: depends on the kind")] = 0

@@ -3,6 +3,7 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
+from coldloop.pace import Pace
 from coldloop.registers.declaration import Block, f32, u16, u32
 
 MAGIC: Final = 123.456
@@ -26,6 +27,42 @@ class Identity(NamedTuple):
     session: Annotated[int, u32("Session being run")] = 0
     tick: Annotated[int, u32("Present tick of plant time, counted from the start of the session", unit="0.25 s")] = 0
     heartbeat: Annotated[int, u16("Rises with every tick or update, and wraps")] = 0
+
+
+class SessionPace(NamedTuple):
+    """Time base of the session under way; changed when written, from the present tick on.
+
+    It is the same record in all three maps; write it to the plant first, then to the control PLC and the optimiser PLC.
+    """
+
+    session: Annotated[int, u32("Session that it is for; 0 is the one under way")] = 0
+    realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)] = 0
+    factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)] = 1.0
+    paused: Annotated[int, u16("1 pause, 0 go on; in real time only", high=1)] = 0
+
+    def of(self, session: int) -> Pace:
+        """Return the time base that is asked for.
+
+        Raises:
+            ValueError: It is not for this session, or there is none.
+        """
+        if not session:
+            raise ValueError("there is no session")
+        if self.session not in {0, session}:
+            raise ValueError(f"session {session} is under way, not {self.session}")
+        if self.paused and not self.realtime:
+            raise ValueError("lock-step is not paused: grant no more ticks")
+        return Pace(bool(self.realtime), self.factor, bool(self.paused))
+
+    @classmethod
+    def shown(cls, session: int, pace: Pace) -> "SessionPace":
+        """Return the record of a time base."""
+        return cls(session, int(pace.realtime), pace.factor, int(pace.paused))
+
+
+def pace_subject(pace: Pace) -> int:
+    """Return the subject of the event PACE: 0 lock-step, 1 real time, 2 paused."""
+    return 2 if pace.paused else int(pace.realtime)
 
 
 class ServerStatistics(NamedTuple):

@@ -5,7 +5,7 @@ from typing import Annotated, Final, NamedTuple
 
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
-from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK
+from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
 from coldloop.registers.safety import Alarm, AlarmCommand, AlarmKind, LeaseStatus, WatchdogStatus, WatchdogTime
 
@@ -113,6 +113,8 @@ class LinkCause(IntEnum):
     STANDS = 11
     """The tick of the rack does not move."""
     STARTED = 12
+    PACE = 13
+    """The time base of the session was changed."""
 
 
 class Process(NamedTuple):
@@ -268,7 +270,7 @@ class PlantLinkStatus(NamedTuple):
         int,
         u16(
             "0 none, 1 no answer, 2 damaged, 3 not finite, 4 wrong session, 5 untimely, 6 changed, 7 second master, "
-            "8 refused, 9 overslept, 10 leapt, 11 stands, 12 started"
+            "8 refused, 9 overslept, 10 leapt, 11 stands, 12 started, 13 pace"
         ),
     ] = LinkCause.NONE
     since: Annotated[int, u32("Tick at which this state began")] = 0
@@ -323,6 +325,7 @@ CONTROL_MAP: Final = RegisterMap(
         Block("alarm command", 480, AlarmCommand, "What is to be done with an alarm", Role.OPERATOR),
         Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
         Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
+        Block("pace", 1950, SessionPace, "Time base of the session under way", Role.OPERATOR),
         Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(AlarmKind)),
         Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
         Block("journal page", 45010, JournalPage, "State of the journal"),

@@ -68,6 +68,11 @@ def u32(description: str, *, unit: str = "", low: int | None = None) -> Field:
     return Field(Kind.U32, description, unit, low)
 
 
+def u16_array(description: str, elements: tuple[str, ...], *, unit: str = "") -> Field:
+    """Declare one unsigned 16-bit register for each element."""
+    return Field(Kind.U16, description, unit, elements=elements)
+
+
 def text(description: str, words: int) -> Field:
     """Declare a text of two ASCII characters a word, padded with zeros; `registers.text` converts it."""
     return Field(Kind.U16, description, elements=tuple(f"{word}" for word in range(words)))

@@ -4,7 +4,7 @@ from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
-from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK
+from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, u16, u32
 
 HISTORY_ROWS: Final = 256
@@ -79,6 +79,7 @@ OPTIMIZER_MAP: Final = RegisterMap(
         Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
         Block("control link", 40, ControlLinkStatus, "Link to the control PLC"),
         STATISTICS_BLOCK,
+        Block("pace", 100, SessionPace, "Time base of the session under way", Role.OPERATOR),
         Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
         Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
         Block("journal page", 45010, JournalPage, "State of the journal"),

@@ -1,17 +1,20 @@
 """Register map of the plant: a remote I/O rack, and the controls of a simulation."""
 
 from enum import IntEnum
+from itertools import accumulate
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
-from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK
-from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
+from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
+from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u16_array, u32
 from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 
 HISTORY_ROWS: Final = 256
 LOAD_ROWS: Final = 2048
 MAX_LOAD_W: Final = 10_000.0
+AHEAD_STEPS: Final = 24
+"""Steps of the load in one request."""
 
 
 class OutputVerdict(IntEnum):
@@ -97,6 +100,55 @@ class LoadStep(NamedTuple):
     watts: Annotated[float, f32("Heat load", unit="W", low=0, high=MAX_LOAD_W)]
 
 
+class LoadStatus(NamedTuple):
+    """The heat load, and what is known of it."""
+
+    watts: Annotated[float, f32("Heat load now", unit="W")] = 0.0
+    next_tick: Annotated[int, u32("Tick of the next step that is known; 0 is none", unit="0.25 s")] = 0
+    next_watts: Annotated[float, f32("Heat load from then on", unit="W")] = 0.0
+    last_tick: Annotated[int, u32("Tick of the last step that is known; it is held from there on", unit="0.25 s")] = 0
+    upcoming: Annotated[int, u16("Steps to come that are known")] = 0
+    free: Annotated[int, u16("Further steps that can be taken now")] = 0
+
+
+class LiveLoad(NamedTuple):
+    """Changes the heat load of the session under way; what was known of later ticks is dropped."""
+
+    tick: Annotated[int, u32("First tick of it, which is to come; 0 is the next one", unit="0.25 s")] = 0
+    watts: Annotated[float, f32("Heat load", unit="W", low=0, high=MAX_LOAD_W)] = 0.0
+    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
+
+
+class LoadAhead(NamedTuple):
+    """Steps of the heat load that are to come, for loads of any length; what was known from the first on is dropped."""
+
+    session: Annotated[int, u32("Session that they are for")] = 0
+    tick: Annotated[int, u32("Tick of the first step, which is to come", unit="0.25 s")] = 0
+    length: Annotated[int, u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
+    watts: Annotated[
+        tuple[float, ...], f32_array("Heat load of step", tuple(map(str, range(AHEAD_STEPS))), ("W",) * AHEAD_STEPS)
+    ] = (0.0,) * AHEAD_STEPS
+    ticks: Annotated[
+        tuple[int, ...],
+        u16_array("Ticks from this step to the next one; of the last one unused", tuple(map(str, range(AHEAD_STEPS)))),
+    ] = (0,) * AHEAD_STEPS
+    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
+
+    @property
+    def steps(self) -> list[LoadStep]:
+        """The steps in use.
+
+        Raises:
+            ValueError: There are none, or a step lasts no time.
+        """
+        if not 1 <= self.length <= AHEAD_STEPS:
+            raise ValueError(f"{self.length} steps are not 1 to {AHEAD_STEPS}")
+        if not all(self.ticks[: self.length - 1]):
+            raise ValueError("a step lasts one tick or more")
+        starts = accumulate(self.ticks[: self.length - 1], initial=self.tick)
+        return [LoadStep(*step) for step in zip(starts, self.watts, strict=False)]
+
+
 class PlantSample(NamedTuple):
     """One row of the history: everything physical at one tick. The row of tick n is n modulo the number of rows."""
 
@@ -119,7 +171,11 @@ PLANT_MAP: Final = RegisterMap(
         Block("watchdog time", 340, WatchdogTime, "Sets that watchdog", Role.CONTROL),
         Block("lease", 350, LeaseStatus, "Who may write outputs"),
         Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
+        Block("pace", 410, SessionPace, "Time base of the session under way", Role.OPERATOR),
+        Block("load status", 420, LoadStatus, "The heat load, and what is known of it"),
+        Block("live load", 440, LiveLoad, "Heat load from a tick on", Role.OPERATOR, sealed=True),
         Block("sensor faults", 500, SensorFault, "Faults put into the outputs", Role.OPERATOR, len(OUTPUT_NAMES)),
+        Block("load ahead", 600, LoadAhead, "Steps of the heat load to come", Role.OPERATOR, sealed=True),
         Block("load table", 1000, LoadStep, "Heat load over the session", Role.OPERATOR, LOAD_ROWS),
         Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
         Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),

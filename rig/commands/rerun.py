@@ -1,0 +1,23 @@
+"""`coldloop rerun`: repeat a recorded run from its manifest, in one process, and compare the traces."""
+
+import argparse
+import sys
+from pathlib import Path
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("manifest", type=Path, metavar="MANIFEST", help="manifest.json of a run, or its folder")
+    parser.add_argument("--out", type=Path, help="folder for the results of the repetition (default: none are kept)")
+    parser.add_argument("--force", action="store_true", help="replace the run in a folder that is not empty")
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run again; 0 for the same trace, 1 for another one."""
+    from rig.rerun import repeat
+
+    path: Path = options.manifest
+    same, text = repeat(path if path.is_dir() else path.parent, options.out, force=options.force)
+    sys.stdout.write(text)
+    return 0 if same else 1

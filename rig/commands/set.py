@@ -1,0 +1,93 @@
+"""`coldloop set`: an operator's commands to a rig that is up.
+
+Each is a Modbus request with the operator's role, which any client with it can make; it says what came back.
+"""
+
+import argparse
+import sys
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from coldloop.command_line import add_configuration_options
+from coldloop.errors import UsageError
+from rig.commands.options import add_rig_options, configuration, rig_endpoints
+
+if TYPE_CHECKING:
+    from rig.operator_client import OperatorClient
+
+MODES: Final = ("auto", "classical", "manual")
+INPUTS: Final = ("cv155", "ncr22", "cv156")
+Done = Awaitable[str]
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_configuration_options(parser)
+    add_rig_options(parser)
+    what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
+    load = what.add_parser("load", help="watts, or a CSV file time_s,load_w")
+    load.add_argument("new_load", metavar="WATTS|FILE", help="watts, or a CSV file time_s,load_w that begins now")
+    load.add_argument("--at", type=_seconds, metavar="SECONDS", help="plant time at which it begins (default: now)")
+    load.set_defaults(command=_load)
+    mode = what.add_parser("mode", help="who drives")
+    mode.add_argument("new_mode", choices=MODES, metavar="auto|classical|manual")
+    mode.set_defaults(command=lambda client, options: client.set_mode(options.new_mode))
+    setpoint = what.add_parser("setpoint", help="an input in manual mode")
+    setpoint.add_argument("input", choices=INPUTS, metavar="cv155|ncr22|cv156")
+    setpoint.add_argument("value", type=float)
+    setpoint.set_defaults(command=lambda client, options: client.set_setpoint(options.input, options.value))
+    factor = what.add_parser("factor", help="seconds of plant time in a second; also changes over to real time")
+    factor.add_argument("new_factor", type=float, metavar="FACTOR")
+    factor.set_defaults(command=lambda client, options: client.set_factor(options.new_factor))
+    pause = what.add_parser("pause", help="let plant time stand")
+    pause.set_defaults(command=lambda client, _: client.set_paused(paused=True))
+    resume = what.add_parser("resume", help="let plant time go on")
+    resume.set_defaults(command=lambda client, _: client.set_paused(paused=False))
+    acknowledge = what.add_parser("acknowledge", help="an alarm, or all")
+    acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as t5-band (default: all)")
+    acknowledge.set_defaults(command=lambda client, options: client.acknowledge(options.alarm))
+    parser.set_defaults(execute=execute)
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = -1.0
+    if seconds < 0 or seconds * 4 != round(seconds * 4):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds in multiples of 0.25")
+    return seconds
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Do it, and say what came back."""
+    from rig.until_interrupted import run_until_interrupted
+
+    return 130 if run_until_interrupted(lambda: _do(options)) else 0
+
+
+async def _do(options: argparse.Namespace) -> None:
+    from rig.operator_client import OperatorClient
+
+    settings = configuration(options).settings
+    command: Callable[[OperatorClient, argparse.Namespace], Done] = options.command
+    async with OperatorClient(rig_endpoints(options, settings), settings.limits) as client:
+        sys.stdout.write(f"{await command(client, options)}\n")
+
+
+def _load(client: "OperatorClient", options: argparse.Namespace) -> Done:
+    try:
+        watts = float(options.new_load)
+    except ValueError:
+        if not Path(options.new_load).is_file():
+            raise UsageError(f"load '{options.new_load}': neither watts nor a file") from None
+        from plant.load import read_load_file
+
+        return client.stream_load(read_load_file(Path(options.new_load)), options.at, _say)
+    return client.set_load(watts, options.at)
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()

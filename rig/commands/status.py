@@ -1,0 +1,41 @@
+"""`coldloop status`: what a rig that is up is doing."""
+
+import argparse
+import asyncio
+import sys
+from typing import Final
+
+from coldloop.command_line import add_configuration_options
+from rig.commands.options import add_rig_options, configuration, rig_endpoints
+
+LOOK_S: Final = 1.0
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_configuration_options(parser)
+    add_rig_options(parser)
+    parser.add_argument("--follow", action="store_true", help="a line a second until Ctrl-C")
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Print the state once, or again and again."""
+    from rig.until_interrupted import run_until_interrupted
+
+    interrupted = run_until_interrupted(lambda: _show(options))
+    return 130 if interrupted and not options.follow else 0
+
+
+async def _show(options: argparse.Namespace) -> None:
+    from rig.operator_client import OperatorClient
+    from rig.rig_status import line, page, read_status
+
+    settings = configuration(options).settings
+    async with OperatorClient(rig_endpoints(options, settings), settings.limits) as client:
+        if not options.follow:
+            sys.stdout.write(page(await read_status(client)))
+        while options.follow:
+            sys.stdout.write(f"{line(await read_status(client))}\n")
+            sys.stdout.flush()
+            await asyncio.sleep(LOOK_S)

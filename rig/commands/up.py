@@ -1,0 +1,50 @@
+"""`coldloop up`: the rig on fixed ports, in real time, until Ctrl-C."""
+
+import argparse
+from pathlib import Path
+
+from coldloop.command_line import add_configuration_options
+from rig.commands.choices import LOADS, SOLVERS
+from rig.commands.options import check_load, port_base, updating_period
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_configuration_options(parser)
+    parser.add_argument("--factor", type=float, help="seconds of plant time in a second (default: 1)")
+    load = parser.add_argument(
+        "--load", help=f"{', '.join(LOADS)}, or a CSV file time_s,load_w; its end is held (default: 2h)"
+    )
+    load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
+    parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
+    parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
+                        help="default: adaptive")  # fmt: skip
+    parser.add_argument("--seed", type=int, help="seed of the sensors' noise (default: 1)")
+    parser.add_argument("--tls", type=Path, metavar="FOLDER",
+                        help="Modbus/TCP Security with what `coldloop certificates --out FOLDER` made")  # fmt: skip
+    parser.add_argument("--port-base", type=port_base, metavar="PORT",
+                        help="first of three ports in a row (default: 5020)")  # fmt: skip
+    parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")
+    parser.add_argument("--quiet", action="store_true", help="do not say where everything is")
+    parser.set_defaults(execute=execute, mode="realtime")
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Start the rig; end it with Ctrl-C."""
+    check_load(options.load)
+    from rig.commands.options import configuration
+    from rig.running import check_certificates
+    from rig.started_rigs import check_ports, detached, ports_from
+
+    effective = configuration(options)
+    check_certificates(effective.settings)
+    ports = ports_from(options.port_base)
+    check_ports(ports)
+    if options.detach:
+        return detached(ports)
+    from rig.until_interrupted import run_until_interrupted
+    from rig.up import UpRig
+
+    rig = UpRig(effective.settings, ports, options.tls)
+    run_until_interrupted(lambda: rig.run(announce=not options.quiet))
+    return 0

@@ -1,0 +1,65 @@
+"""What Ctrl-C and SIGTERM do to a command.
+
+A run takes them as a request to stop and writes what it has (`INTERRUPTION.passed_to`). Anything else ends at once:
+no exception is raised inside an import or a compiled kernel, where it would surface as a traceback.
+"""
+
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from types import FrameType, TracebackType
+from typing import Final, NoReturn, Self
+
+SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+SHOW_CURSOR: Final = b"\r\033[?25h\n"
+"""A progress bar on a terminal hides the cursor."""
+
+
+class Interruption:
+    """The handler of both signals, within the context."""
+
+    def __init__(self) -> None:
+        self._request: Callable[[signal.Signals], None] | None = None
+        self._before: dict[signal.Signals, object] = {}
+
+    def __enter__(self) -> Self:
+        """Install the handler; outside the main thread nothing is changed."""
+        with contextlib.suppress(ValueError):
+            for number in SIGNALS:
+                self._before[number] = signal.signal(number, self._received)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        """Restore the handlers that were there before."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+        self._before.clear()
+
+    @contextlib.contextmanager
+    def passed_to(self, request: Callable[[signal.Signals], None]) -> Iterator[None]:
+        """Pass the first signal on to `request` within the context; a second one ends the program."""
+        self._request = request
+        try:
+            yield
+        finally:
+            self._request = None
+
+    def _received(self, number: int, _: FrameType | None) -> None:
+        request, self._request = self._request, None
+        if request is None:
+            end_at_once(number)
+        request(signal.Signals(number))
+
+
+def end_at_once(number: int) -> NoReturn:
+    """End the process with the exit code of a signal; its services end with their standard input."""
+    if sys.stderr is not None and sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
+        os.write(2, SHOW_CURSOR)
+    os.write(2, b"coldloop: interrupted\n")
+    os._exit(128 + number)
+
+
+INTERRUPTION: Final = Interruption()
+"""That of the command line."""

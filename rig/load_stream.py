@@ -1,0 +1,108 @@
+"""A load of any length, written to the plant ahead of its clock."""
+
+from bisect import bisect_right
+from typing import TYPE_CHECKING, Final
+
+from coldloop.errors import LinkError, RequestRefusedError
+from coldloop.modbus.client import RegisterClient
+from coldloop.registers.plant import AHEAD_STEPS, LOAD_ROWS, LoadAhead, LoadStatus, LoadStep
+from coldloop.seal import sealed
+
+if TYPE_CHECKING:  # the simulation behind it takes a second
+    from plant.program import LoadProfile
+
+KEPT_AHEAD: Final = LOAD_ROWS
+"""Steps that the plant is to know in advance; it keeps twice as many."""
+LONGEST_STEP: Final = 0xFFFF
+"""Ticks that one record can say that a step lasts."""
+
+
+class LoadStream:
+    """Keeps the plant supplied with the steps of a load.
+
+    Args:
+        plant: Client of the plant.
+        session: Whose load it is.
+        load: All of it.
+        sent: Steps that the plant has already.
+        begin: Tick of the session at which the load begins.
+        ahead: Steps that the plant is to know in advance.
+    """
+
+    def __init__(
+        self,
+        plant: RegisterClient,
+        session: int,
+        load: "LoadProfile",
+        *,
+        sent: int = 0,
+        begin: int = 0,
+        ahead: int = KEPT_AHEAD,
+    ) -> None:
+        self._plant = plant
+        self._session = session
+        self._times = [begin + tick for tick in load.times]
+        self._watts = load.watts
+        self._sent = sent
+        self._ahead = ahead
+
+    @property
+    def steps(self) -> int:
+        """Steps of the load."""
+        return len(self._times)
+
+    @property
+    def done(self) -> bool:
+        """Whether the plant has all steps."""
+        return self._sent >= len(self._times)
+
+    @property
+    def known_until(self) -> int | None:
+        """First tick whose load the plant does not know yet; None when it knows all of it."""
+        return None if self.done else self._times[self._sent]
+
+    async def feed(self, tick: int) -> None:
+        """Write what the plant should know at `tick`.
+
+        Raises:
+            LinkError: The plant does not answer, or the steps have come too late.
+        """
+        while not self.done and self._sent - bisect_right(self._times, tick) < self._ahead:
+            record = self._next()
+            try:
+                await self._plant.write(sealed(record))
+            except RequestRefusedError as error:
+                raise LinkError(
+                    f"{error}: the load from tick {record.tick} on was not taken: it came too late, or the session is "
+                    "another one"
+                ) from None
+            self._sent += record.length
+
+    def _next(self) -> LoadAhead:
+        first, length, gaps = self._sent, 1, []
+        while length < AHEAD_STEPS and first + length < len(self._times):
+            gap = self._times[first + length] - self._times[first + length - 1]
+            if gap > LONGEST_STEP:
+                break
+            gaps.append(gap)
+            length += 1
+        watts = (*self._watts[first : first + length], *[0.0] * (AHEAD_STEPS - length))
+        ticks = (*gaps, *[0] * (AHEAD_STEPS - len(gaps)))
+        return LoadAhead(self._session, self._times[first], length, watts, ticks)
+
+    async def was_replaced(self) -> bool:
+        """Tell whether somebody else has written the load since: what is known last is not what was sent last."""
+        status = await self._plant.read(LoadStatus)
+        last = self._times[self._sent - 1] if self._sent else 0
+        return status.last_tick != last
+
+
+async def write_table(plant: RegisterClient, load: "LoadProfile") -> int:
+    """Write the load table of a session that is to begin; return the steps that are in it.
+
+    Raises:
+        LinkError: The plant does not answer, or refuses.
+    """
+    steps = [LoadStep(*step) for step in zip(load.times[:LOAD_ROWS], load.watts[:LOAD_ROWS], strict=True)]
+    await plant.write_rows(steps)
+    return len(steps)

@@ -1,0 +1,97 @@
+"""A recorded run as one HTML page with interactive plots; the page holds all that it needs."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import plotly.graph_objects as go
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from plotly.offline import get_plotlyjs
+from plotly.subplots import make_subplots
+
+from coldloop.process import INPUT_NAMES, INPUT_UNITS
+from rig.plot import ACCENT, BAND, DRAWN, INK, Bounds, alarm_times, time_unit
+from rig.run_folder import Curves, RunFolder
+from rig.run_plot import identity_of, title_of
+
+DRAWN_TICKS: Final = 20_000
+"""A longer trace is reduced, so that the page stays small and quick."""
+MOST_EVENTS: Final = 500
+PANELS: Final = (
+    ("load_w", "heat load (W)"), ("L1", "L1 (%)"), ("T5", "T5 (K)"),
+    *((name, f"{name} ({unit})") for name, unit in zip(INPUT_NAMES, INPUT_UNITS, strict=True)),
+    ("tau_u_s", "tau_u (s)"), ("stage_cost", "stage cost (1)"),
+)  # fmt: skip
+
+
+def run_page(folder: Path) -> str:
+    """Return the page of the run in a folder.
+
+    Raises:
+        UsageError: There is no run.
+    """
+    run = RunFolder(folder)
+    manifest = run.manifest
+    environment = Environment(
+        loader=PackageLoader("rig", "report"), autoescape=True, trim_blocks=True, undefined=StrictUndefined
+    )
+    environment.filters["shown"] = _shown
+    return environment.get_template("run.html.j2").render(
+        title=f"Coldloop: {title_of(run.configuration)}",
+        identity=identity_of(manifest),
+        manifest=manifest,
+        summary=run.summary,
+        events=run.events(),
+        most=MOST_EVENTS,
+        versions={name: manifest[name] for name in ("coldloop", "python", "platform")} | manifest["dependencies"],
+        reduced=manifest["recorded_ticks"] > DRAWN_TICKS,
+        library=get_plotlyjs(),
+        plot=_plot(run),
+    )
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _plot(run: RunFolder) -> str:
+    """Return the curves as an HTML element."""
+    curves = run.series(DRAWN, DRAWN_TICKS)
+    scale_s, unit = time_unit(curves["time_s"])
+    figure = make_subplots(rows=len(PANELS), cols=1, shared_xaxes=True, vertical_spacing=0.02)
+    for row, (name, label) in enumerate(PANELS, start=1):
+        _add_curve(figure, row, curves, name, scale_s)
+        figure.update_yaxes(title_text=label, row=row, col=1)
+    _add_bounds(figure, Bounds.of(run.configuration))
+    if len(curves["time_s"]):
+        for begin, end in alarm_times(run.events(), scale_s, float(curves["time_s"][-1]) / scale_s):
+            figure.add_vrect(x0=begin, x1=end, fillcolor="#b3261e", opacity=0.12, line_width=0)
+    figure.update_yaxes(type="log", row=len(PANELS), col=1)
+    figure.update_xaxes(title_text=f"plant time ({unit})", row=len(PANELS), col=1)
+    figure.update_layout(
+        height=190 * len(PANELS), template="plotly_white", hovermode="x", margin={"l": 70, "r": 20, "t": 20, "b": 50},
+        legend={"orientation": "h", "y": 1.01, "yanchor": "bottom"},
+    )  # fmt: skip
+    html: str = figure.to_html(full_html=False, include_plotlyjs=False, config={"displaylogo": False})
+    return html
+
+
+def _add_curve(figure: Any, row: int, curves: Curves, name: str, scale_s: float) -> None:  # noqa: ANN401 plotly has no types
+    shape = "hv" if name in ("load_w", "tau_u_s") else "linear"
+    line = {"color": INK if row % 2 else ACCENT, "width": 1.2, "shape": shape}
+    curve = go.Scattergl(
+        x=curves["time_s"] / scale_s, y=curves[name].astype("float32"), name=name, mode="lines", line=line
+    )
+    figure.add_trace(curve, row=row, col=1)
+
+
+def _add_bounds(figure: Any, bounds: Bounds) -> None:  # noqa: ANN401 plotly has no types
+    """Draw bands and bounds, which do not change the scale."""
+    rows = {name: row for row, (name, _) in enumerate(PANELS, start=1)}
+    edges: Mapping[str, tuple[float, float]] = {**bounds.bands, **bounds.inputs}
+    for name, (low, high) in edges.items():
+        figure.add_hrect(y0=low, y1=high, fillcolor=BAND, opacity=0.2, line_width=0, row=rows[name], col=1)
+        for edge in (low, high):
+            figure.add_hline(y=edge, line={"color": ACCENT, "width": 1, "dash": "dash"}, row=rows[name], col=1)

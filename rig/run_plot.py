@@ -1,0 +1,68 @@
+"""The figure of a run from its folder, as PNG, PDF or SVG."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from matplotlib.figure import Figure
+
+from rig.plot import DRAWN, Bounds, RunCurves, draw_run
+from rig.results import whole_file
+from rig.run_folder import RunFolder
+
+DPI: Final = 130
+
+
+def plot_run(folder: Path, formats: Sequence[str]) -> list[Path]:
+    """Draw the run of a folder; return the files, `run.png` for the format png.
+
+    Raises:
+        OSError: A file cannot be written.
+        UsageError: There is no run in the folder.
+    """
+    figure = draw_run(curves_of(RunFolder(folder)))
+    paths = [folder / f"run.{extension}" for extension in formats]
+    for path in paths:
+        save_figure(figure, path)
+    return paths
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure in the format of the file's name; nothing in it depends on the time of day."""
+    extension = path.suffix.removeprefix(".")
+    metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(extension)
+    whole_file(path, lambda draft: figure.savefig(draft, dpi=DPI, format=extension, metadata=metadata))
+
+
+def curves_of(run: RunFolder) -> RunCurves:
+    """Return what is drawn of a run."""
+    manifest = run.manifest
+    return RunCurves(
+        run.series(DRAWN),
+        run.events(),
+        Bounds.of(run.configuration),
+        title_of(run.configuration),
+        identity_of(manifest),
+    )
+
+
+def title_of(configuration: Mapping[str, Any]) -> str:
+    """Return what a run was, in a few words."""
+    load = f"load {Path(configuration['plant.load']).name}"
+    if configuration["control_plc.driver"] == "classical":
+        return f"{load}, classical loops"
+    period = configuration["optimizer_plc.program.updating_period_s"]
+    updating = f"tau_u {period:g} s" if period else "tau_u adaptive"
+    return f"{load}, solver {configuration['optimizer_plc.program.solver']}, {updating}"
+
+
+def identity_of(manifest: Mapping[str, Any]) -> str:
+    """Return which run it was: trace, version, start, way; and whether it is complete."""
+    trace = manifest["hashes"]["trace_sha256"] or ""
+    parts = [
+        f"trace {trace[:12]}", f"coldloop {manifest['coldloop']}", manifest["started_utc"], manifest["way"],
+        f"model {manifest['hashes']['model_sha256'][:12]}",
+    ]  # fmt: skip
+    if not manifest["complete"]:
+        parts.append(f"INCOMPLETE, {manifest['recorded_ticks']} of {manifest['ticks']} ticks: {manifest['reason']}")
+    return "  ·  ".join(parts)

@@ -1,0 +1,185 @@
+"""The loop from Python: a run in memory, in one process.
+
+from rig import simulate
+
+result = simulate(load="a", solver="ode", updating_period="adaptive", duration_s=600)
+result.summary["J_BF"]
+result.trace.to_pandas()
+result.plot("run.png")
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import pyarrow as pa
+from matplotlib.figure import Figure
+
+from coldloop import __version__
+from coldloop.config import Configuration, load_configuration
+from coldloop.errors import UsageError
+from coldloop.lti_model import load as load_model
+from coldloop.process import TICK_S
+from coldloop.registers.audit import Event
+from rig.driving import DrivingHistory
+from rig.indicators import RunEvaluation, StageCost
+from rig.one_process import OneProcessRig
+from rig.plot import DRAWN, Bounds, RunCurves, draw_run
+from rig.recording import MemorySink, Recorder, Recording
+from rig.run_files import summary_of
+from rig.run_folder import batch_series
+from rig.run_plot import save_figure, title_of
+from rig.running import make_scenario
+from rig.settings import Settings
+from rig.tables import events_table, trace_table, updates_table
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a result; its columns are those of `rig/columns.py`."""
+
+    arrow: pa.Table
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The unit of each column."""
+        return {field.name: field.metadata[b"unit"].decode() for field in self.arrow.schema}
+
+    def to_pandas(self) -> Any:  # noqa: ANN401 pandas is not a dependency
+        """Return the table as a DataFrame, with the units in `attrs["units"]`; needs pandas."""
+        frame = self.arrow.to_pandas()
+        frame.attrs["units"] = self.units
+        return frame
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """Return the columns as lists by name."""
+        columns: dict[str, list[Any]] = self.arrow.to_pydict()
+        return columns
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """The result of `simulate`."""
+
+    recording: Recording
+    """The trace as arrays."""
+    summary: dict[str, Any]
+    """What `summary.json` has."""
+    configuration: dict[str, Any]
+    """The effective configuration by dotted key."""
+    _cost: StageCost
+    _events: tuple[tuple[str, Event], ...]
+
+    @cached_property
+    def trace(self) -> Table:
+        """One row a tick."""
+        history = DrivingHistory()
+        for service, event in self._events:
+            history.event(service, event)
+        return Table(trace_table(self.recording.block, self.recording.updates, self._cost, history))
+
+    @cached_property
+    def updates(self) -> Table:
+        """One row an update whose sequence was played."""
+        return Table(updates_table(self.recording.updates))
+
+    @cached_property
+    def events(self) -> Table:
+        """One row a change of mode or of an alarm."""
+        return Table(events_table(self._events))
+
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Return the figure of the run; with a path it is written there too, as .png, .pdf or .svg."""
+        curves = RunCurves(
+            batch_series(self.trace.arrow.select(["time_s", *DRAWN])),
+            self.events.arrow.to_pylist(),
+            Bounds.of(self.configuration),
+            title_of(self.configuration),
+            f"trace {self.summary['trace_sha256'][:12]}  ·  coldloop {__version__}  ·  in-process",
+        )
+        figure = draw_run(curves)
+        if path is not None:
+            save_figure(figure, Path(path))
+        return figure
+
+
+def simulate(
+    load: str | Path = "2h",
+    solver: str = "ode",
+    updating_period: float | Literal["adaptive"] = "adaptive",
+    *,
+    duration_s: float | None = None,
+    seed: int = 1,
+    config: str | Path | None = None,
+    **settings: Mapping[str, Any] | object,
+) -> Simulation:
+    """Run the three programs in this process, in lock-step; return what they did.
+
+    Args:
+        load: Named load such as `a`, or a CSV file with the columns time_s and load_w.
+        solver: `ode`, `qpoases`, `osqp`, `fast-gradient` or `daqp`.
+        updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`.
+        duration_s: Plant time in multiples of 0.25 s; that of the load if not given.
+        seed: Seed of the sensors' noise.
+        config: TOML file with further settings.
+        settings: Sections of the configuration, such as `plant={"sensors": {"level": 0.01}}`; they come before the
+            file. The environment has no influence.
+
+    Raises:
+        UsageError: An argument cannot be used; one line that says why.
+    """
+    effective = load_configuration(
+        Settings,
+        file=None if config is None else Path(config),
+        environment={},
+        options={
+            "plant.load": (str(load), "load"),
+            "plant.seed": (seed, "seed"),
+            "optimizer_plc.program.solver": (solver, "solver"),
+            "optimizer_plc.program.updating_period_s": (_period(updating_period), "updating_period"),
+            **_flattened(settings),
+        },
+    )
+    return _run(effective, _ticks(duration_s))
+
+
+def _period(updating_period: float | str) -> object:
+    return 0.0 if updating_period == "adaptive" else updating_period
+
+
+def _ticks(duration_s: float | None) -> int | None:
+    if duration_s is None:
+        return None
+    ticks = duration_s / TICK_S
+    if not ticks > 0 or ticks != round(ticks):
+        raise UsageError(f"duration_s={duration_s}: not a positive multiple of {TICK_S} s")
+    return round(ticks)
+
+
+def _flattened(sections: Mapping[str, object], prefix: str = "") -> dict[str, tuple[object, str]]:
+    flat: dict[str, tuple[object, str]] = {}
+    for key, value in sections.items():
+        if isinstance(value, Mapping):
+            flat |= _flattened(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = (value, f"{prefix}{key}")
+    return flat
+
+
+def _run(effective: Configuration[Settings], ticks: int | None) -> Simulation:
+    settings = effective.settings
+    scenario = make_scenario(settings, ticks)
+    model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
+    evaluation, memory = RunEvaluation(model, design), MemorySink()
+    recorder = Recorder(scenario.ticks, [evaluation, memory])
+    OneProcessRig(settings).run(scenario, recorder)
+    recorder.close()
+    return Simulation(
+        recording=memory.recording(recorder.link),
+        summary=summary_of(evaluation, recorder, realtime=False, reason=None),
+        configuration={key: value for key, value, _ in effective.effective() if value is not None},
+        _cost=StageCost(model, design),
+        _events=tuple(memory.events),
+    )

@@ -1,0 +1,79 @@
+"""A rig that stays up: three services on fixed ports, in real time, until they are told to end."""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from rig.local_services import LocalServices
+from rig.network import NetworkRig
+from rig.results import write_json
+from rig.rig_endpoints import RigEndpoints
+from rig.running import make_scenario
+from rig.settings import Settings
+from rig.started_rigs import DEFAULT_PORTS, STATE_FILE, state_folder
+from rig.wiring import SERVICES, START_PATIENCE_S
+
+LOOK_S: Final = 0.5
+"""Between two looks at the load that the plant knows of."""
+
+
+class UpRig:
+    """Starts the services, begins a session in real time, and follows it until it is cancelled."""
+
+    def __init__(self, settings: Settings, ports: Sequence[int], tls: Path | None) -> None:
+        self._settings = settings
+        self._ports = tuple(ports)
+        self._tls = tls
+        self.folder = state_folder(ports[0])
+
+    async def run(self, *, announce: bool) -> None:
+        """Run until cancelled; load steps beyond what the plant holds are written as time goes on.
+
+        Raises:
+            ColdloopError: A service ended, or the session could not begin.
+        """
+        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        services = LocalServices(self._settings, self.folder / "logs", ports=self._ports)
+        async with services:
+            rig = NetworkRig(services.endpoints, self._settings)
+            try:
+                await services.during(self._serve(rig, services.endpoints, announce=announce))
+            finally:
+                rig.close()
+                (self.folder / STATE_FILE).unlink(missing_ok=True)
+
+    async def _serve(self, rig: NetworkRig, endpoints: RigEndpoints, *, announce: bool) -> None:
+        scenario = make_scenario(self._settings)
+        await rig.connect(START_PATIENCE_S)
+        session = await rig.start(scenario)
+        tls = "" if self._tls is None else str(self._tls.resolve())
+        if announce:
+            sys.stdout.write(whereabouts(self._settings, self._ports, self.folder))
+            sys.stdout.flush()
+        write_json(self.folder / STATE_FILE, {"pid": os.getpid(), "ports": self._ports, "tls": tls})
+        await rig.hold(session, LOOK_S)
+
+
+def whereabouts(settings: Settings, ports: Sequence[int], folder: Path) -> str:
+    """Return where everything is, with a line to paste."""
+    base = "" if tuple(ports) == DEFAULT_PORTS else f" --port-base {ports[0]}"
+    tls = any(getattr(settings, service).server.tls for service in SERVICES)
+    lines = [
+        f"the rig is up: load {settings.plant.load}, {settings.session.factor:g} x real time",
+        *(f"  {service:14} 127.0.0.1:{port}" for service, port in zip(SERVICES, ports, strict=True)),
+        f"  logs           {folder / 'logs'}",
+    ]
+    if tls:
+        lines += ["Modbus/TCP Security: clients show a certificate; `coldloop certificates` has made some"]
+    else:
+        lines += [
+            "read T5 (K):",
+            f"  mbpoll -0 -1 -m tcp -p {ports[0]} -t 4:float -B -r 216 -c 1 127.0.0.1",
+        ]
+    lines += [
+        f"coldloop status{base} --follow    what it does",
+        f"coldloop set{base} load 420       and load FILE.csv, mode, setpoint, factor, pause, resume, acknowledge",
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,13 @@
+"""The time base of a session under way."""
+
+from typing import NamedTuple
+
+
+class Pace(NamedTuple):
+    """In lock-step the factor has no meaning."""
+
+    realtime: bool
+    factor: float
+    """Seconds of plant time in one second of real time."""
+    paused: bool = False
+    """In real time: plant time stands until it is to go on."""

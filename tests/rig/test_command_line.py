@@ -1,0 +1,157 @@
+"""The command line: it starts at once, completes, and writes no control sequences where nobody sees them."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from coldloop.session import TimeMode
+from optimizer_plc.settings import SolverName
+from plant.load import NAMED
+from rig.chaos.plan import shipped_plans
+from rig.cli import COMMANDS, make_parser
+from rig.commands import choices
+from rig.register_listing import FORMATS, MAPS
+from rig.studies import STUDIES
+
+if TYPE_CHECKING:
+    from tests.conftest import Coldloop
+
+HEAVY = {"numpy", "numba", "scipy", "matplotlib", "pydantic", "pyarrow", "distributed", "rich", "plotly", "argcomplete"}
+
+
+def python(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [sys.executable, *arguments], env=os.environ | environment, check=False, capture_output=True, text=True
+    )
+
+
+def test_the_names_that_are_offered_are_those_that_exist() -> None:
+    assert tuple(mode.value for mode in TimeMode) == choices.MODES
+    assert tuple(solver.value for solver in SolverName) == choices.SOLVERS
+    assert tuple(NAMED) == choices.LOADS
+    assert sorted(choices.SERVICES) == sorted(MAPS)
+    assert sorted(choices.REGISTER_FORMATS) == sorted(FORMATS)
+    assert tuple(STUDIES) == choices.STUDIES
+    assert choices.plans() == [plan.name for plan in shipped_plans()]
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, None])
+def test_help_imports_nothing_that_takes_time(command: str | None) -> None:
+    words = ["--help"] if command is None else [command, "--help"]
+    program = (
+        "import sys, atexit\n"
+        "from rig.cli import main\n"
+        "atexit.register(lambda: print(*sorted({name.partition('.')[0] for name in sys.modules}), file=sys.stderr))\n"
+        f"main({words!r})\n"
+    )
+    done = python("-c", program)
+    assert "usage: coldloop" in done.stdout
+    assert not HEAVY & set(done.stderr.split())
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "--load", "zz"], ["run", "--load", ""], ["run", "--solver", "simplex"], ["study", "zz"],
+        ["study", "limited", "--load", "zz"], ["chaos", "kill", "--load", "zz"], ["budget", "--updating-period", "7"],
+        ["budget", "--updating-period", "adaptive"], ["run", "--in-process", "--attach", "a:1", "b:2", "c:3"],
+    ],
+)  # fmt: skip
+def test_a_typo_is_told_before_anything_that_takes_time_is_imported(words: list[str]) -> None:
+    program = (
+        "import sys\n"
+        "from rig.cli import main\n"
+        "try: code = main(sys.argv[1:])\n"
+        "except SystemExit as end: code = end.code\n"
+        f"sys.exit(100 if {HEAVY!r} & set(sys.modules) else code)\n"
+    )
+    done = python("-c", program, *words)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_version_is_an_option_and_a_command(coldloop: "Coldloop") -> None:
+    option, command = coldloop("--version"), coldloop("version")
+    assert option.code == command.code == 0
+    assert option.out == command.out
+    assert option.out.startswith("coldloop ")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish", "tcsh"])
+def test_a_shell_gets_a_script_for_completion(shell: str, coldloop: "Coldloop") -> None:
+    assert "coldloop" in coldloop("completion", shell).out
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [("coldloop re", "rerun"), ("coldloop run --so", "--solver"), ("coldloop run --solver fa", "fast-gradient"),
+     ("coldloop study tra", "trade-off"), ("coldloop chaos ki", "kill")],
+)  # fmt: skip
+def test_a_line_is_completed(line: str, offered: str, tmp_path: Path) -> None:
+    answer = tmp_path / "answer"
+    answer.touch()
+    python(
+        "-m", "rig.cli", _ARGCOMPLETE="1", COMP_LINE=line, COMP_POINT=str(len(line)), _ARGCOMPLETE_IFS="\n",
+        _ARGCOMPLETE_STDOUT_FILENAME=str(answer),
+    )  # fmt: skip
+    assert offered in answer.read_text().split()
+
+
+@pytest.mark.parametrize("environment", [{}, {"NO_COLOR": "1"}, {"COLUMNS": "20"}, {"TERM": "dumb"}])
+def test_a_run_that_is_piped_writes_no_control_sequences(environment: dict[str, str], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    done = python("-m", "rig.cli", "run", "--in-process", "--duration", "2s", "--out", str(out), **environment)
+    assert done.returncode == 0
+    assert "\x1b" not in done.stdout + done.stderr
+    assert "\r" not in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("command", ["registers", "version", "study --list"])
+def test_a_full_standard_output_is_one_line(command: str) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "rig.cli", *command.split()], check=False, stdout=full, stderr=subprocess.PIPE,
+            text=True,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr == "coldloop: standard output: No space left on device\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["run", "--factor", "3"], "--mode realtime"),
+        (["run", "--attach", "a:1", "b:2", "c:3", "--solver", "osqp"], "optimizer_plc.program.solver"),
+        (["run", "--attach", "a:1", "b:2", "c:3", "--set", "plant.sensors.level=5"], "plant.sensors.level"),
+        (["study", "cholesky", "--load", "a"], "--load would have no effect"),
+        (["study", "limited", "--quick", "--seeds", "2"], "not allowed with"),
+        (["chaos", "kill", "--set", "session.factor=3"], "--factor"),
+        (["run", "--log-level", "debug"], "--log-level"),
+    ],
+)
+def test_an_option_without_effect_is_refused(words: list[str], part: str, coldloop: "Coldloop", tmp_path: Path) -> None:
+    outcome = coldloop(*words, "--out", tmp_path / "out")
+    assert outcome.code == 2
+    assert part in outcome.complaints[-1]
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("device", ["/dev/null", "/dev/full"])
+@pytest.mark.parametrize("command", ["run --in-process --duration 2s", "certificates", "model", "chaos kill"])
+def test_a_device_as_the_place_for_results_is_refused_and_stays(
+    command: str, device: str, coldloop: "Coldloop"
+) -> None:
+    outcome = coldloop(*command.split(), "--out", device)
+    assert outcome.code == 2
+    assert len(outcome.complaints) == 1
+    assert device in outcome.complaints[0]
+    assert Path(device).is_char_device()
+
+
+def test_all_commands_can_be_parsed() -> None:
+    for command in COMMANDS:
+        assert make_parser(command)

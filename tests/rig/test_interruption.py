@@ -1,0 +1,170 @@
+"""What is left of a run that a signal, a failure or a full disk ended: records that can be read and say so."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+import rig.disk_reserve
+import rig.file_sinks
+from coldloop.errors import LinkError
+from coldloop.registers.plant import PlantSample
+from rig.one_process import OneProcessRig
+from rig.recording import Recorder, SampleBlock, Sink
+
+if TYPE_CHECKING:
+    from tests.conftest import Coldloop
+
+PATIENCE_S = 120.0
+
+
+def read(path: Path) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return document
+
+
+def assert_incomplete_but_readable(folder: Path, reason: str) -> int:
+    """Check all files of a run; return its number of ticks."""
+    summary, manifest = read(folder / "summary.json"), read(folder / "manifest.json")
+    for document in (summary, manifest):
+        assert document["complete"] is False
+        assert reason in document["reason"]
+    frame = pd.read_parquet(folder / "trace.parquet")
+    assert len(frame) == summary["ticks"] == manifest["recorded_ticks"] < manifest["ticks"]
+    assert frame["tick"].tolist() == list(range(len(frame)))
+    updates = pq.read_table(folder / "updates.parquet").to_pylist()
+    assert len(updates) == summary["updates"]
+    assert all(row["time_s"] + row["tau_u_s"] < len(frame) / 4 for row in updates)
+    assert (folder / "run.png").read_bytes().startswith(b"\x89PNG")
+    return len(frame)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("way", [("--in-process",), ()], ids=["in process", "networked"])
+def test_a_signal_in_the_middle_leaves_what_was_recorded(
+    number: signal.Signals, way: tuple[str, ...], tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "rig.cli", "run", *way, "--load", "6h", "--figures", "png", "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ, text=True)
+    deadline = time.monotonic() + PATIENCE_S
+    while not (out / "trace.parquet").exists() or (out / "trace.parquet").stat().st_size < 100_000:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(0.05)
+    process.send_signal(number)
+    _, complaints = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 128 + number
+    assert "Traceback" not in complaints
+    assert f"interrupted by {number.name}" in complaints.splitlines()[-1]
+    assert assert_incomplete_but_readable(out, f"interrupted by {number.name}") > 10_000
+
+
+@pytest.mark.parametrize("delay_s", [0.05, 0.3, 0.8])
+def test_ctrl_c_before_there_is_anything_to_record_leaves_nothing(delay_s: float, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "rig.cli", "run", "--in-process", "--load", "6h", "--out", str(tmp_path / "run")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ, text=True)
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(delay_s)
+    process.send_signal(signal.SIGINT)
+    _, complaints = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode in (130, -signal.SIGINT), "the interpreter itself may not be up yet"
+    if process.returncode == 130:
+        assert "Traceback" not in complaints
+
+
+def fail_at(tick: int, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the recorder of the next run raise an error in the middle."""
+    take = Recorder.sample
+
+    def sample(recorder: Recorder, one: PlantSample) -> None:
+        take(recorder, one)
+        if one.tick == tick:
+            raise error
+
+    monkeypatch.setattr(Recorder, "sample", sample)
+
+
+def test_a_failure_in_the_middle_leaves_what_was_recorded(
+    coldloop: "Coldloop", results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fail_at(399, LinkError("the plant is gone"), monkeypatch)
+    outcome = coldloop("run", "--in-process", "--duration", "5min", "--out", results)
+    assert outcome.code == 1
+    assert outcome.complaints[-1] == (
+        f"coldloop: the plant is gone; 400 of 1200 ticks are recorded in {results}"
+    )  # fmt: skip
+    assert assert_incomplete_but_readable(results, "the plant is gone") == 400
+
+
+def test_a_failure_before_the_first_tick_leaves_no_folder(
+    coldloop: "Coldloop", results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise LinkError("nobody there")
+
+    monkeypatch.setattr(OneProcessRig, "run", fail)
+    outcome = coldloop("run", "--in-process", "--duration", "5min", "--out", results)
+    assert (outcome.code, outcome.complaints) == (1, ["coldloop: nobody there"])
+    assert not results.exists()
+
+
+class SmallDisk:
+    """Lets the files of a run grow to a limit, then tells that the disk is full until the reserve is free."""
+
+    def __init__(self, limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._limit = limit
+        write = rig.disk_reserve.ReservedFile.write
+
+        def limited(file: rig.disk_reserve.ReservedFile, data: bytes) -> int:
+            self._limit -= len(data)
+            if self._limit < 0 and not file._reserve.released:  # noqa: SLF001
+                file._reserve.release()  # noqa: SLF001
+            return write(file, data)
+
+        monkeypatch.setattr(rig.disk_reserve.ReservedFile, "write", limited)
+
+
+def test_a_disk_that_fills_up_leaves_what_was_recorded(
+    coldloop: "Coldloop", results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    SmallDisk(1_000_000, monkeypatch)
+    monkeypatch.setattr(rig.file_sinks, "GROUP_TICKS", 1024)
+    outcome = coldloop("run", "--in-process", "--load", "a", "--figures", "png", "--out", results)
+    assert outcome.code == 1
+    assert "the disk is full" in outcome.complaints[-1]
+    assert assert_incomplete_but_readable(results, "the disk is full") > 3000
+
+
+class Counter(Sink):
+    """Counts ticks, and fails at a block."""
+
+    def __init__(self, *, fails: bool) -> None:
+        self.ticks = 0
+        self._fails = fails
+
+    def block(self, block: SampleBlock) -> None:
+        self.ticks += len(block.load)
+        if self._fails:
+            raise OSError(5, "broken")
+
+
+def test_a_sink_that_fails_does_not_keep_blocks_from_the_others() -> None:
+    sinks = [Counter(fails=True), Counter(fails=False)]
+    recorder = Recorder(600, sinks)
+    sample = PlantSample(0, 0.0, (0.0,) * 3, (0.0,) * 22, (0.0,) * 28)
+    for tick in range(511):
+        recorder.sample(sample._replace(tick=tick))
+    with pytest.raises(OSError, match="broken"):
+        recorder.sample(sample._replace(tick=511))
+    assert [sink.ticks for sink in sinks] == [512, 512]

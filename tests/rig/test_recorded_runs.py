@@ -1,0 +1,199 @@
+"""What is done with a recorded run: exported, compared, drawn, reported, repeated."""
+
+import csv
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from scipy.io import loadmat
+
+from rig import cli
+from rig.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from tests.conftest import Coldloop
+
+LOAD = "time_s,load_w\n0,385\n10,445\n40,330\n"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of two runs of 90 s under a load of one's own: mpc and classical."""
+    folder = tmp_path_factory.mktemp("runs")
+    (folder / "my_load.csv").write_text(LOAD)
+    common = ["run", "--in-process", "--load", str(folder / "my_load.csv"), "--duration", "90s", "--figures", "png"]
+    assert cli.main([*common, "--out", str(folder / "mpc")]) == 0
+    assert cli.main([*common, "--set", "control_plc.driver=classical", "--out", str(folder / "classical")]) == 0
+    return folder
+
+
+@pytest.fixture
+def mpc(runs: Path, tmp_path: Path) -> Path:
+    """A copy of the run that a test may change."""
+    return Path(shutil.copytree(runs / "mpc", tmp_path / "mpc"))
+
+
+def trace(run: Path) -> dict[str, list[Any]]:
+    columns: dict[str, list[Any]] = pq.read_table(run / "trace.parquet").to_pydict()
+    return columns
+
+
+# -- export ------------------------------------------------------------------------------------------------------------
+
+
+def test_csv_has_the_columns_and_values_of_the_trace(coldloop: "Coldloop", mpc: Path) -> None:
+    assert coldloop("export", mpc, "--csv").code == 0
+    rows = list(csv.DictReader((mpc / "trace.csv").read_text().splitlines()))
+    expected = trace(mpc)
+    assert list(rows[0]) == list(expected)
+    assert [np.float32(row["L1"]) for row in rows] == expected["L1"]
+    assert {path.name for path in mpc.glob("*.csv")} == {"trace.csv", "updates.csv", "events.csv"}
+
+
+def test_a_matlab_file_has_structures_with_units(coldloop: "Coldloop", mpc: Path, tmp_path: Path) -> None:
+    outcome = coldloop("export", mpc, "--mat", "--out", tmp_path / "exported")
+    assert outcome.out.splitlines() == [str(tmp_path / "exported" / "run.mat")]
+    content = loadmat(tmp_path / "exported" / "run.mat", simplify_cells=True)
+    expected = trace(mpc)
+    assert content["trace"]["L1"].tolist() == expected["L1"]
+    assert content["trace"]["x_T_nef34_12"].tolist() == expected["x_T_nef34_12"]
+    assert content["units"]["trace"]["T5"] == "K"
+    assert content["updates"]["tau_u_s"].tolist() == pq.read_table(mpc / "updates.parquet")["tau_u_s"].to_pylist()
+    assert content["run"]["complete"]
+
+
+def test_an_hdf5_file_has_groups_whose_datasets_know_their_units(coldloop: "Coldloop", runs: Path, mpc: Path) -> None:
+    for run in (mpc, Path(shutil.copytree(runs / "classical", mpc.parent / "classical"))):
+        assert coldloop("export", run, "--hdf5").code == 0
+        with h5py.File(run / "run.h5") as file:
+            assert file["trace/L1"][:].tolist() == trace(run)["L1"]
+            assert file["trace/L1"].attrs["unit"] == "%"
+    with h5py.File(mpc / "run.h5") as file:
+        assert file["events/subject"].asstr()[0] == "hold"
+    with h5py.File(mpc.parent / "classical" / "run.h5") as file:
+        assert np.isnan(file["trace/tau_u_s"][:]).all(), "the classical loops have no updating period"
+
+
+def test_an_export_does_not_replace_a_file_unless_forced(coldloop: "Coldloop", mpc: Path) -> None:
+    (mpc / "updates.csv").write_text("precious")
+    outcome = coldloop("export", mpc, "--csv")
+    assert outcome.code == 2
+    assert "updates.csv: exists" in outcome.complaints[0]
+    assert (mpc / "updates.csv").read_text() == "precious"
+    assert not (mpc / "trace.csv").exists()
+    assert coldloop("export", mpc, "--csv", "--force").code == 0
+
+
+@pytest.mark.parametrize("command", ["export --csv", "report", "plot", "rerun"])
+def test_a_folder_without_a_run_is_refused_in_one_line(command: str, coldloop: "Coldloop", tmp_path: Path) -> None:
+    outcome = coldloop(*command.split(), tmp_path)
+    assert outcome.code == 2
+    (complaint,) = outcome.complaints
+    assert "manifest.json" in complaint
+    assert not list(tmp_path.iterdir())
+
+
+# -- compare -----------------------------------------------------------------------------------------------------------
+
+
+def test_runs_are_compared_by_indicators_and_by_what_differs_in_their_configuration(
+    coldloop: "Coldloop", runs: Path, tmp_path: Path
+) -> None:
+    figure = tmp_path / "both.png"
+    outcome = coldloop("compare", runs / "mpc", runs / "classical", "--out", figure)
+    assert outcome.code == 0
+    rows = {line.split()[0]: line.split()[1:] for line in outcome.out.splitlines()[1:]}
+    assert rows["control_plc.driver"] == ["mpc", "classical"]
+    assert rows["J_dev"][1] == "-", "the classical loops predict nothing"
+    assert "plant.seed" not in rows
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    assert coldloop("compare", runs / "mpc", runs / "classical", "--out", figure).code == 2, "it exists"
+
+
+@pytest.mark.parametrize("arguments", [["{}/mpc"], ["{}/mpc", "{}/mpc", "--out", "both.txt"]])
+def test_one_run_or_an_unknown_format_is_refused(arguments: list[str], coldloop: "Coldloop", runs: Path) -> None:
+    assert coldloop("compare", *[argument.format(runs) for argument in arguments]).code == 2
+
+
+# -- plot and report ---------------------------------------------------------------------------------------------------
+
+
+def test_a_run_is_drawn_again_in_all_formats(coldloop: "Coldloop", mpc: Path) -> None:
+    assert coldloop("plot", mpc).code == 0
+    assert (mpc / "run.pdf").read_bytes().startswith(b"%PDF")
+    svg = (mpc / "run.svg").read_text()
+    assert "<svg" in svg
+
+
+def test_the_page_of_a_run_needs_no_other_host_and_shows_alarms_and_settings(coldloop: "Coldloop", mpc: Path) -> None:
+    assert coldloop("report", mpc).code == 0
+    page = (mpc / "report.html").read_text(encoding="utf-8")
+    own = page[: page.index("<script>")] + page[page.index("</script>") :]
+    assert not re.search(r"<(script|link|img|iframe)[^>]*(src|href)=", page[: page.index("<script>")])
+    assert "http" not in re.sub(r"<script.*?</script>", "", own, flags=re.DOTALL)
+    for part in ("sequence began", "plant.sensors.level", RunFolder(mpc).summary["trace_sha256"], "my_load.csv"):
+        assert part in page
+    assert "Plotly.newPlot" in page
+    assert coldloop("report", mpc).code == 2, "it exists"
+
+
+def test_a_page_says_that_a_run_is_not_complete(coldloop: "Coldloop", mpc: Path) -> None:
+    manifest = json.loads((mpc / "manifest.json").read_text())
+    (mpc / "manifest.json").write_text(json.dumps(manifest | {"complete": False, "reason": "interrupted by <SIGINT>"}))
+    assert coldloop("report", mpc).code == 0
+    assert "interrupted by &lt;SIGINT&gt;" in (mpc / "report.html").read_text(encoding="utf-8")
+
+
+# -- rerun -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["mpc", "classical"])
+def test_a_run_is_repeated_from_its_folder_alone(
+    name: str, coldloop: "Coldloop", runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = Path(shutil.copytree(runs / name, tmp_path / "moved"))
+    monkeypatch.setenv("COLDLOOP__PLANT__SEED", "7")
+    outcome = coldloop("rerun", moved / "manifest.json")
+    assert (outcome.code, outcome.out.split(",")[0]) == (0, "360 ticks")
+    assert "the same trace" in outcome.out
+    assert outcome.out.split()[-1] == RunFolder(moved).summary["trace_sha256"]
+
+
+def test_a_repetition_can_be_kept(coldloop: "Coldloop", mpc: Path, results: Path) -> None:
+    assert coldloop("rerun", mpc, "--out", results).code == 0
+    assert RunFolder(results).summary["trace_sha256"] == RunFolder(mpc).summary["trace_sha256"]
+
+
+@pytest.mark.parametrize("name", ["load.csv", "model.json"])
+def test_an_input_that_was_changed_is_named(name: str, coldloop: "Coldloop", mpc: Path) -> None:
+    file = mpc / "inputs" / name
+    file.write_text(file.read_text().replace("385", "386"))
+    outcome = coldloop("rerun", mpc)
+    assert outcome.code == 2
+    (complaint,) = outcome.complaints
+    assert str(file) in complaint
+
+
+def test_a_configuration_that_was_changed_is_named(coldloop: "Coldloop", mpc: Path) -> None:
+    manifest = json.loads((mpc / "manifest.json").read_text())
+    manifest["configuration"]["plant.seed"] = 3
+    (mpc / "manifest.json").write_text(json.dumps(manifest))
+    (complaint,) = coldloop("rerun", mpc).complaints
+    assert "configuration" in complaint
+
+
+def test_another_trace_is_told_with_the_versions_that_differ(coldloop: "Coldloop", mpc: Path) -> None:
+    manifest = json.loads((mpc / "manifest.json").read_text())
+    manifest["hashes"]["trace_sha256"] = "0" * 64
+    manifest["dependencies"]["numba"] = "0.1"
+    (mpc / "manifest.json").write_text(json.dumps(manifest))
+    outcome = coldloop("rerun", mpc)
+    assert outcome.code == 1
+    assert "another trace" in outcome.out
+    assert "instead of 0.1" in outcome.out

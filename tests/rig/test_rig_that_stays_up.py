@@ -1,0 +1,153 @@
+"""`coldloop up`, `down`, `status`, `set` and `run --attach`: a rig that stays up, and what is done with it."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rig import cli
+from rig.ports import ReservedPorts
+from rig.started_rigs import check_ports, running_rig
+from tests.conftest import Coldloop
+
+FACTOR = "5"
+
+
+@pytest.fixture(scope="module")
+def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The first port of a rig that is up."""
+    os.environ["XDG_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
+    base = str(_three_free_ports())
+    command = [sys.executable, "-m", "rig.cli", "up", "--port-base", base, "--load", "e", "--factor", FACTOR]
+    try:
+        subprocess.run([*command, "--detach"], check=True, timeout=120, stdout=subprocess.DEVNULL)
+        yield base
+        assert cli.main(["down", "--port-base", base]) == 0
+        assert running_rig(int(base)) is None
+    finally:
+        del os.environ["XDG_RUNTIME_DIR"]
+
+
+def _three_free_ports() -> int:
+    for _ in range(100):
+        with ReservedPorts(1) as reserved:
+            base = reserved.numbers[0]
+        try:
+            check_ports((base, base + 1, base + 2))
+        except Exception:  # noqa: BLE001, S112 taken by somebody else
+            continue
+        return base
+    raise AssertionError("no three free ports in a row")
+
+
+def shown(coldloop: Coldloop, base: str) -> dict[str, str]:
+    """What `coldloop status` shows, by its first words."""
+    outcome = coldloop("status", "--port-base", base)
+    assert outcome.code == 0, outcome.complaints
+    return dict(line.split(maxsplit=1) for line in outcome.out.splitlines())
+
+
+def until(coldloop: Coldloop, base: str, row: str, part: str) -> str:
+    deadline = time.monotonic() + 60
+    while part not in (text := shown(coldloop, base)[row]):
+        assert time.monotonic() < deadline, f"{row} is {text}, not {part}"
+    return text
+
+
+def test_status_shows_session_mode_load_outputs_and_alarms(coldloop: Coldloop, up: str) -> None:
+    rows = shown(coldloop, up)
+    assert set(rows) == {"session", "mode", "operator", "load", "L1", "T5", "tau_u", "alarms"}
+    assert f"{FACTOR} x real time" in rows["session"]
+    assert rows["L1"].endswith("%")
+
+
+def test_each_command_says_what_came_back(coldloop: Coldloop, up: str) -> None:
+    def told(*words: str) -> str:
+        outcome = coldloop("set", "--port-base", up, *words)
+        assert outcome.code == 0, outcome.complaints
+        return str(outcome.out)
+
+    assert "was 384.7" in told("load", "450")
+    until(coldloop, up, "load", "450 W")
+    assert "in manual (operator)" in told("mode", "manual")
+    assert "setpoint of CV155 45 %" in told("setpoint", "cv155", "45")
+    assert "operator's mode auto" in told("mode", "auto")
+    assert "paused" in told("pause")
+    stood = shown(coldloop, up)["session"]
+    assert shown(coldloop, up)["session"] == stood
+    assert "factor 5" in told("resume")
+    assert "acknowledged" in told("acknowledge")
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (("setpoint", "cv155", "80"), "20 to 60"),
+        (("setpoint", "cv155", "45"), "first `coldloop set mode manual`"),
+        (("load", "-1"), "load -1 W"),
+        (("load", "absent.csv"), "neither watts nor a file"),
+        (("acknowledge", "everything"), "no alarm is called"),
+        (("factor", "0"), "0.01"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(coldloop: Coldloop, up: str, words: tuple[str, ...], part: str) -> None:
+    outcome = coldloop("set", "--port-base", up, *words)
+    assert outcome.code == 2
+    assert len(outcome.complaints) == 1
+    assert part in outcome.complaints[0]
+
+
+def test_a_load_file_begins_now(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
+    file = tmp_path / "load.csv"
+    file.write_text("time_s,load_w\n" + "".join(f"{second},{400 + second % 2}\n" for second in range(3000)))
+    outcome = coldloop("set", "--port-base", up, "load", str(file), "--at", "90000")
+    assert outcome.code == 0, outcome.complaints
+    assert "load of 3000 steps from 90000 s to 92999 s" in outcome.out
+    assert "400 W from 90000 s" in shown(coldloop, up)["load"]
+    assert coldloop("set", "--port-base", up, "load", "385").code == 0
+
+
+def test_a_second_rig_on_the_same_ports_is_refused_and_the_holder_named(coldloop: Coldloop, up: str) -> None:
+    outcome = coldloop("up", "--port-base", up)
+    assert outcome.code == 2
+    assert "a rig is up here" in outcome.complaints[0]
+    assert "coldloop down" in outcome.complaints[0]
+
+
+def test_a_port_of_another_program_is_named(coldloop: Coldloop) -> None:
+    base = _three_free_ports()
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", base + 1))
+        other.listen()
+        outcome = coldloop("up", "--port-base", str(base))
+    assert outcome.code == 2
+    assert f"port {base + 1} of the control_plc" in outcome.complaints[0]
+
+
+def test_a_rig_that_was_attached_to_runs_on_in_real_time(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
+    ends = [f"127.0.0.1:{int(up) + place}" for place in range(3)]
+    run = ("run", "--attach", *ends, "--load", "e", "--duration", "30s", "--figures", "png", "--out")
+    outcome = coldloop(*run, tmp_path / "run")
+    assert outcome.code == 0, outcome.complaints
+    until(coldloop, up, "session", f"{FACTOR} x real time")
+    before, deadline = shown(coldloop, up)["session"], time.monotonic() + 30
+    while shown(coldloop, up)["session"] == before:
+        assert time.monotonic() < deadline, "plant time goes on"
+
+
+def test_ctrl_c_gives_an_attached_rig_back_too(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
+    ends = [f"127.0.0.1:{int(up) + place}" for place in range(3)]
+    command = [sys.executable, "-m", "rig.cli", "run", "--attach", *ends, "--load", "e", "--duration", "100h"]
+    with subprocess.Popen(
+        [*command, "--figures", "png", "--out", str(tmp_path / "run")], stderr=subprocess.DEVNULL
+    ) as run:
+        until(coldloop, up, "session", "lock-step")
+        run.send_signal(signal.SIGINT)
+        assert run.wait(60) == 130
+    until(coldloop, up, "session", f"{FACTOR} x real time")
