@@ -9,7 +9,6 @@ from typing import Final
 from rig.local_services import LocalServices
 from rig.network import NetworkRig
 from rig.results import write_json
-from rig.rig_endpoints import RigEndpoints
 from rig.running import make_scenario
 from rig.settings import Settings
 from rig.started_rigs import DEFAULT_PORTS, STATE_FILE, state_folder
@@ -39,12 +38,12 @@ class UpRig:
         async with services:
             rig = NetworkRig(services.endpoints, self._settings)
             try:
-                await services.during(self._serve(rig, services.endpoints, announce=announce))
+                await services.during(self._serve(rig, announce=announce))
             finally:
                 rig.close()
                 (self.folder / STATE_FILE).unlink(missing_ok=True)
 
-    async def _serve(self, rig: NetworkRig, endpoints: RigEndpoints, *, announce: bool) -> None:
+    async def _serve(self, rig: NetworkRig, *, announce: bool) -> None:
         scenario = make_scenario(self._settings)
         await rig.connect(START_PATIENCE_S)
         session = await rig.start(scenario)
