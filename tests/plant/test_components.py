@@ -71,10 +71,10 @@ def test_the_pressure_drops_of_the_return_line_add_up(P_bath: float, exhaust: fl
     flow, P_mix = return_flow(line, P_bath, 1.05e5, exhaust)
     assert flow >= 0.0
     assert P_mix == pytest.approx(1.05e5 + line.warm_resistance * (flow + exhaust) ** 2)
-    if flow > 0.0:
+    if flow > 1e-12:  # less is the rounding of a root
         assert P_bath - P_mix == pytest.approx(line.cold_resistance * flow**2, abs=1e-4)
     else:
-        assert P_mix >= P_bath
+        assert P_mix >= P_bath or P_mix == pytest.approx(P_bath)
 
 
 @given(m_high=flows, m_low=flows, T_high=st.floats(15.0, 80.0), T_low=st.floats(4.6, 14.0))
