@@ -132,7 +132,7 @@ async def test_a_second_optimiser_is_refused_and_takes_over_when_the_first_is_ki
         found = await states()
         standing_by = found.index(ControlLinkState.FOREIGN)
         assert found[1 - standing_by] != ControlLinkState.FOREIGN
-        alarm, lease = await control.alarm(AlarmKind.SECOND_OPTIMIZER), await control.client.read(LeaseStatus)
+        alarm, lease = await control.alarm(AlarmKind.SECOND_WRITER), await control.client.read(LeaseStatus)
         assert alarm.active
         assert lease.refused >= 1
         working = await clients[1 - standing_by].read(ControlLinkStatus)

@@ -54,16 +54,25 @@ def is_right(block: Block, raw: bytes) -> bool:
     """Tell whether these bytes are a record that may be stored."""
     codec = codec_of(block)
     values = dict(zip(fields_of(block.record), codec.decode(raw), strict=True))
-    ranges = all(within(values[name], field) for name, field in fields_of(block.record).items())
+    ranges = all(
+        within(value, field)
+        for name, field in fields_of(block.record).items()
+        for value in (values[name] if field.elements else (values[name],))
+    )
     return ranges and not (block.sealed and seal_of(codec, raw) is Seal.BROKEN)
 
 
 def starting_record(block: Block, kind: str) -> tuple[Any, ...]:
     """Return what is there before the write: what a server starts with, or a valid record."""
     if kind == "zeros":
-        return block.record(*[0] * len(fields_of(block.record)))
-    low = block.record(*[field.low or 0 for field in fields_of(block.record).values()])
+        return block.record(*[spread(0, field) for field in fields_of(block.record).values()])
+    low = block.record(*[spread(field.low or 0, field) for field in fields_of(block.record).values()])
     return sealed(low) if kind == "sealed" and block.sealed else low
+
+
+def spread(value: float, field: Field) -> Any:  # noqa: ANN401 - what a field of a record may be
+    """Return a value for a field: for each of its elements, where it is an array."""
+    return (value,) * len(field.elements) if field.elements else value
 
 
 def memory(bank: RegisterBank) -> bytes:
@@ -89,7 +98,7 @@ def a_word(function: int, register: Register, half: int, word: int) -> Write:
 def some_words(function: int, first: Register, last: Register, values: list[int]) -> Write:
     """Return FC16 or FC23 of the registers from one to another."""
     count = last.address + last.kind.words - first.address
-    raw = struct.pack(f">{count}H", *values[:count])
+    raw = struct.pack(f">{count}H", *(values * (count // len(values) + 1))[:count])
     write = struct.pack(">HHB", first.address, count, len(raw)) + raw
     head = b"\x10" if function == 16 else bytes.fromhex("17 0000 0002")
     return Write(first.address, head + write, raw, halves=False)
