@@ -30,8 +30,8 @@ from coldloop.modbus.tls import client_context
 from coldloop.registers.common import STATISTICS_BLOCK
 from coldloop.registers.declaration import RegisterMap
 from rig import cli
+from rig.certificate_files import CLIENTS
 from rig.chaos.resources import resident_mb
-from rig.commands.certificates import CLIENTS
 from rig.local_services import LocalServices
 from rig.register_listing import MAPS
 from rig.settings import Settings
