@@ -218,7 +218,10 @@ def test_new_containers_go_on_where_those_before_were(rig: "ComposedRig") -> Non
     wait_until_healthy(rig, "control-plc", started)
     after = identity_of_plant(rig)
     assert (after.session, after.tick >= before.tick) == (before.session, True)
-    assert "session resumed" in rig.compose("logs", "--no-color", "plant")
+    logged = [line.partition("| ")[2] for line in rig.compose("logs", "--no-color", "plant").splitlines()]
+    events = [json.loads(line) for line in logged if line.startswith("{")]
+    boots = [event for event in events if event["event"] == "boot"]
+    assert [boot["subject"] for boot in boots] == [1], "it goes on with its retained state"
 
 
 def test_an_hour_in_lock_step_is_that_of_one_process(
