@@ -5,17 +5,13 @@ that has a rack of its own. Time is the rack's: after a break the program goes o
 """
 
 from collections.abc import Callable
-from typing import Final
 
-from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
+from coldloop.errors import BUSY, DamagedAnswerError, LinkError, RequestRefusedError
 from coldloop.registers.control_plc import LinkCause, Update
 from coldloop.registers.plant import Actuators, Measurement
 from control_plc.plant_link import PlantLink
 from control_plc.program import ControlProgram
 from control_plc.rack_clock import PHASE
-
-BUSY: Final = 6
-"""Modbus exception of a rack whose lease somebody else holds."""
 
 Adopt = Callable[[Measurement], bool]
 """Takes a reading of a rack in another session; tells whether the program has gone over to that session."""

@@ -4,7 +4,7 @@ from collections.abc import Awaitable, Callable
 from typing import Final, TypeVar
 
 from coldloop.endpoints import Endpoint
-from coldloop.errors import DamagedAnswerError, LinkError, ModelFileError, RequestRefusedError
+from coldloop.errors import BUSY, DamagedAnswerError, LinkError, ModelFileError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import (
@@ -19,7 +19,7 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.optimizer_plc import ControlLinkState
 from coldloop.sequence import InputSequence
-from optimizer_plc.control_link import BUSY, ControlLink
+from optimizer_plc.control_link import ControlLink
 
 T = TypeVar("T")
 

@@ -13,14 +13,12 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from coldloop.errors import ColdloopError, DamagedAnswerError, ModelFileError, RequestRefusedError
+from coldloop.errors import BUSY, ColdloopError, DamagedAnswerError, ModelFileError, RequestRefusedError
 from coldloop.journal import Journal
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 
-BUSY: Final = 6
-"""Exception code of a server whose lease somebody else holds."""
 REPEAT_S: Final = 10.0
 """The same reason is logged at most once in this real time."""
 MOST_REASONS: Final = 32

@@ -2,13 +2,12 @@
 
 from typing import Final
 
+from coldloop.lease import SIMPLE_CLIENT
 from coldloop.registers.bank import Caller
 from coldloop.registers.plant import Actuators, OutputVerdict
 
 STALE_TICKS: Final = 8
 """In real time, outputs that are further than this from the present tick are not taken."""
-SIMPLE_CLIENT: Final = 0
-"""Holder of outputs that come from a client without a number, from the safe state, or from the session's begin."""
 
 Inputs = tuple[float, float, float]
 
@@ -22,7 +21,8 @@ class AppliedOutputs:
 
     Args:
         u: CV155 %, NCR22_A W, CV156 %.
-        holder: Number of the client whose outputs these are.
+        holder: Number of the client whose outputs these are; `SIMPLE_CLIENT` is also that of the safe state, and of
+            what a session begins with.
         generation: 1 or more.
     """
 

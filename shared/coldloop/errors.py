@@ -18,6 +18,11 @@
 A message is one line that says what, where, and what to do.
 """
 
+from typing import Final
+
+BUSY: Final = 6
+"""Modbus exception code of a server at which somebody else holds the lease of the role."""
+
 
 class ColdloopError(Exception):
     """Root of the tree; `exit_code` is what a program ends with when it cannot go on."""
