@@ -14,7 +14,14 @@ from coldloop.lti_model import LtiModel
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
-from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.optimizer_plc import (
+    INPUT_SAMPLES,
+    PREDICTED_SAMPLES,
+    OperatingLimits,
+    Optimization,
+    Prediction,
+    UpdatingRuleStatus,
+)
 from coldloop.sequence import InputSequence, with_checksum
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.costs import augmented_cost, indicators
@@ -274,6 +281,32 @@ class OptimizerProgram:
         return max(self._real(cost) + (qp.constant + floor), floor)
 
     # -- diagnostics --------------------------------------------------------------------------------------------------
+
+    def prediction(self) -> Prediction:
+        """Return what the last profile is expected to lead to."""
+        sent = self._sent
+        if sent is None or sent.sequence is None:
+            raise RuntimeError("prediction follows solve")
+        horizon = self._problem.design.horizon
+        outputs = self._problem.outputs(sent.z, sent.situation)
+        inputs = self._problem.inputs(sent.z, horizon)
+        shown = outputs[[min(sample, horizon) - 1 for sample in PREDICTED_SAMPLES]]
+        planned = inputs[[min(sample, horizon) - 1 for sample in INPUT_SAMPLES]]
+        header = sent.sequence.header
+        return Prediction(
+            header.update, header.first_tick, tuple(shown[:, 0].tolist()), tuple(shown[:, 1].tolist()),
+            tuple(planned.ravel().tolist()),
+        )  # fmt: skip
+
+    @property
+    def operating_limits(self) -> OperatingLimits:
+        """Bands, bounds and rates that profiles keep."""
+        design, limits = self.settings.design, self._problem.limits
+        return OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
+
+    def rule_status(self) -> UpdatingRuleStatus:
+        """Return what decides the updating period in this session."""
+        return self._rule.status._replace(**self.budget.times._asdict())
 
     def report(self, verdict: Verdict) -> Optimization:
         """Return what was done with the last update, once the control PLC has answered."""

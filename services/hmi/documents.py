@@ -1,0 +1,232 @@
+"""What the page and other programs are sent, as JSON; `docs/operator-page.md` describes every field."""
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+from coldloop import __version__
+from coldloop.event_text import alarm_cause, describe, utc_text, word
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
+from coldloop.registers.audit import EventKind
+from coldloop.registers.control_plc import Mode, OperatorMode
+from coldloop.registers.optimizer_plc import INPUT_SAMPLES, PREDICTED_SAMPLES, Prediction
+from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriority, AlarmState
+from hmi.explanation import explain
+from hmi.model import Model, Told
+from hmi.signals import MAPS, signals_of
+from hmi.trends import NAMES, mode_name, rounded, thin
+
+Document = dict[str, Any]
+
+MARKED: Final = {
+    EventKind.ALARM_RAISED: "alarm",
+    EventKind.LIVE_LOAD: "load",
+    EventKind.LOAD: "load",
+    EventKind.OPERATOR_MODE: "operator",
+    EventKind.SETPOINT: "operator",
+    EventKind.SENSOR_FAULT: "fault",
+}
+"""Events that are marked on the trends, and what as."""
+MOST_MARKS: Final = 200
+EARLIER_PREDICTIONS: Final = 12
+
+
+def encoded(document: Document) -> bytes:
+    """Return a document as JSON; numbers that are not finite are null."""
+    return json.dumps(document, ensure_ascii=False, separators=(",", ":"), default=str).encode()
+
+
+def finite(value: float | str) -> float | int | str | None:
+    """Return a value that JSON has."""
+    if isinstance(value, float):
+        return rounded(value) if math.isfinite(value) else None
+    return value
+
+
+def catalog(*, training: bool, replay: bool) -> Document:
+    """Return what the page is made from: signals, alarms, modes."""
+    return {
+        "version": __version__,
+        "training": training,
+        "replay": replay,
+        "services": list(MAPS),
+        "signals": {
+            signal.name: {
+                "service": service, "block": signal.block, "label": signal.label, "unit": signal.unit,
+                "decimals": signal.decimals, "words": signal.words, "description": signal.description,
+                "address": signal.address, "writer": signal.writer,
+            }
+            for service in MAPS
+            for signal in signals_of(service)
+        },
+        "trended": list(NAMES),
+        "inputs": list(INPUT_NAMES),
+        "outputs": list(OUTPUT_NAMES),
+        "modes": [mode_name(mode) for mode in Mode],
+        "operator_modes": [word(mode) for mode in OperatorMode],
+        "alarm_actions": {word(action): int(action) for action in AlarmAction},
+        "tick_s": TICK_S,
+    }  # fmt: skip
+
+
+def alarm_document(kind: AlarmKind, alarm: Alarm) -> Document:
+    """Return one alarm in words."""
+    known = alarm.state in AlarmState.__members__.values()
+    return {
+        "number": int(kind),
+        "name": word(kind),
+        "state": word(AlarmState(alarm.state)) if known else str(alarm.state),
+        "active": bool(alarm.active),
+        "cause": alarm_cause(kind, alarm.cause) if alarm.times else "",
+        "priority": int(alarm.priority),
+        "priority_word": word(AlarmPriority(alarm.priority)) if alarm.priority else "",
+        "times": alarm.times,
+        "raised_s": alarm.raised * TICK_S,
+        "returned_s": alarm.returned * TICK_S,
+        "shelved_until_s": alarm.shelved_until * TICK_S,
+    }
+
+
+def alarms_document(model: Model) -> list[Document]:
+    """Return all alarms, those that want an operator first, then by priority and age."""
+    rank = {AlarmState.UNACKNOWLEDGED: 0, AlarmState.RETURNED: 1, AlarmState.ACKNOWLEDGED: 2}
+    rows = sorted(
+        model.alarm_rows(), key=lambda row: (rank.get(AlarmState(row[1].state), 3), -row[1].priority, -row[1].raised)
+    )
+    return [alarm_document(kind, alarm) for kind, alarm in rows]
+
+
+def event_document(told: Told) -> Document:
+    """Return one event in words."""
+    text = describe(told.event)
+    return {
+        "service": told.service, "number": told.event.number, "boot": told.event.boot, "utc": utc_text(told.event),
+        "tick": told.event.tick, "time_s": told.event.tick * TICK_S, "kind": text.kind, "subject": text.subject,
+        "cause": text.cause, "value": text.value, "unit": text.unit, "who": text.who, "sentence": text.sentence,
+    }  # fmt: skip
+
+
+def services_document(model: Model) -> Document:
+    """Return whether each service is live, and the age of what is known of it."""
+    found = {}
+    for service in MAPS:
+        age = model.age_s(service)
+        live = model.is_live(service)
+        found[service] = {
+            "live": live,
+            "age_s": None if age is None else round(age, 2),
+            "reason": "" if live else model.sources[service].reason or "does not answer",
+        }
+    return found
+
+
+def state_document(model: Model, changed: Iterable[str] | None = None) -> Document:
+    """Return the state of everything that is shown; of signals only those that have changed, if these are named."""
+    names = model.values if changed is None else [name for name in changed if name in model.values]
+    document: Document = {
+        "whole": changed is None,
+        "tick": model.tick,
+        "time_s": model.tick * TICK_S,
+        "services": services_document(model),
+        "stale": model.stale_prefixes(),
+        "values": {name: finite(model.values[name]) for name in names},
+    }
+    parts = set(changed) if changed is not None else {"alarms", "updates"}
+    if "alarms" in parts:
+        document["alarms"] = alarms_document(model)
+    if "updates" in parts:
+        document["update"] = explanation_document(model, None)
+    return document
+
+
+def explanation_document(model: Model, number: int | None) -> Document | None:
+    """Return why the updating period of an update, or of the last one, is as long as it is; None without such an update."""
+    updates = model.updates
+    place = len(updates) - 1
+    if number is not None:
+        place = next((i for i in range(len(updates) - 1, -1, -1) if updates[i].update == number), -1)
+    if place < 0:
+        return None
+    update = updates[place]
+    before = updates[place - 1] if place else None
+    after = updates[place + 1] if place + 1 < len(updates) else None
+    found = explain(update, before, after, model.rule)
+    document = asdict(found)
+    document["update"] = update._asdict()
+    document["before"] = before._asdict() if before is not None else None
+    document["increments"] = found.increments._asdict() if found.increments else None
+    document["budget"]["slack"] = found.budget.slack
+    document["time_s"] = update.tick * TICK_S
+    document["neighbours"] = [before.update if before else None, after.update if after else None]
+    document["rule"] = model.rule._asdict()
+    return document
+
+
+def prediction_document(prediction: Prediction) -> Document:
+    """Return a prediction as curves over plant time."""
+    start = prediction.tick * TICK_S
+    inputs = [prediction.u[i :: len(INPUT_NAMES)] for i in range(len(INPUT_NAMES))]
+    return {
+        "update": prediction.update,
+        "time": [start + sample * SAMPLING_PERIOD_S for sample in PREDICTED_SAMPLES],
+        "L1": [rounded(value) for value in prediction.l1],
+        "T5": [rounded(value) for value in prediction.t5],
+        "input_time": [start + sample * SAMPLING_PERIOD_S for sample in INPUT_SAMPLES],
+        **{name: [rounded(value) for value in one] for name, one in zip(INPUT_NAMES, inputs, strict=True)},
+    }
+
+
+def trend_document(model: Model, names: Sequence[str], start: int, end: int, points: int) -> Document:
+    """Return everything that is drawn between two ticks."""
+    times, series = model.trends.thinned(names, start, end, points)
+    updates = [update for update in model.updates if start <= update.tick <= end]
+    update_times, update_series = thin(
+        [update.tick * TICK_S for update in updates],
+        {
+            "tau_u": [update.tau_u * TICK_S for update in updates],
+            "q": [float(update.iterations) for update in updates],
+            "J": [update.j_effective for update in updates],
+            "J_predicted": [update.j_delivered for update in updates],
+        },
+        points,
+    )
+    shown = [one for one in model.predictions if one.tick >= start]
+    limits = model.limits
+    return {
+        "from_s": start * TICK_S,
+        "to_s": end * TICK_S,
+        "now_s": model.tick * TICK_S,
+        "time": times,
+        "series": series,
+        "updates": {"time": update_times, **update_series},
+        "modes": [
+            {"from": one.start, "to": one.end, "mode": mode_name(one.mode)} for one in model.trends.modes(start, end)
+        ],
+        "marks": _marks(model, start, end),
+        "predictions": [prediction_document(one) for one in _some(shown)],
+        "bands": {"L1": [limits.output_low[0], limits.output_high[0]], "T5": [limits.output_low[1], limits.output_high[1]]},
+        "bounds": {
+            name: [limits.input_low[i], limits.input_high[i]] for i, name in enumerate(INPUT_NAMES)
+        },
+    }  # fmt: skip
+
+
+def _some(predictions: list[Prediction]) -> list[Prediction]:
+    """Return the newest prediction and some of the earlier ones, evenly spaced."""
+    every = max(1, -(-len(predictions) // EARLIER_PREDICTIONS))
+    return predictions[::-1][::every][::-1]
+
+
+def _marks(model: Model, start: int, end: int) -> list[Document]:
+    found = [
+        {
+            "time": told.event.tick * TICK_S,
+            "kind": MARKED[EventKind(told.event.kind)],
+            "text": describe(told.event).sentence,
+        }
+        for told in model.events
+        if told.event.kind in MARKED and start <= told.event.tick <= end
+    ]
+    return found[-MOST_MARKS:]
