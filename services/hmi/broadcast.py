@@ -1,4 +1,4 @@
-"""One stream of changes for all browsers: written once, sent to each; a slow one is begun anew instead of waited for."""
+"""One stream of changes for all browsers: encoded once, sent to each; for a slow browser nobody waits."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable

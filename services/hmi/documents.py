@@ -2,6 +2,7 @@
 
 import json
 import math
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any, Final
@@ -11,10 +12,11 @@ from coldloop.event_text import alarm_cause, describe, utc_text, word
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode, OperatorMode
-from coldloop.registers.optimizer_plc import INPUT_SAMPLES, PREDICTED_SAMPLES, Prediction
+from coldloop.registers.optimizer_plc import BANDED_OUTPUTS, INPUT_SAMPLES, PREDICTED_SAMPLES, Prediction
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriority, AlarmState
 from hmi.explanation import explain
 from hmi.model import Model, Told
+from hmi.sentences import sentence
 from hmi.signals import MAPS, signals_of
 from hmi.trends import NAMES, mode_name, rounded, thin
 
@@ -91,9 +93,10 @@ def alarm_document(kind: AlarmKind, alarm: Alarm) -> Document:
 
 def alarms_document(model: Model) -> list[Document]:
     """Return all alarms, those that want an operator first, then by priority and age."""
-    rank = {AlarmState.UNACKNOWLEDGED: 0, AlarmState.RETURNED: 1, AlarmState.ACKNOWLEDGED: 2}
+    rank = {AlarmState.UNACKNOWLEDGED: 0, AlarmState.RETURNED: 0, AlarmState.ACKNOWLEDGED: 1}
     rows = sorted(
-        model.alarm_rows(), key=lambda row: (rank.get(AlarmState(row[1].state), 3), -row[1].priority, -row[1].raised)
+        model.alarm_rows(),
+        key=lambda row: (rank.get(AlarmState(row[1].state), 2), -row[1].priority, not row[1].active, -row[1].raised),
     )
     return [alarm_document(kind, alarm) for kind, alarm in rows]
 
@@ -141,11 +144,19 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
     return document
 
 
-def explanation_document(model: Model, number: int | None) -> Document | None:
-    """Return why the updating period of an update, or of the last one, is as long as it is; None without such an update."""
+def explanation_document(model: Model, number: int | None, at_tick: int | None = None) -> Document | None:
+    """Return why an updating period is as long as it is; None without such an update.
+
+    Args:
+        model: What is known.
+        number: Of the update; None is the last one.
+        at_tick: The update whose period this tick is in, in the place of a number.
+    """
     updates = model.updates
     place = len(updates) - 1
-    if number is not None:
+    if at_tick is not None:
+        place = bisect_right(updates, at_tick, key=lambda update: update.tick) - 1
+    elif number is not None:
         place = next((i for i in range(len(updates) - 1, -1, -1) if updates[i].update == number), -1)
     if place < 0:
         return None
@@ -153,14 +164,17 @@ def explanation_document(model: Model, number: int | None) -> Document | None:
     before = updates[place - 1] if place else None
     after = updates[place + 1] if place + 1 < len(updates) else None
     found = explain(update, before, after, model.rule)
+    prediction = next((one for one in reversed(model.predictions) if one.update == update.update), None)
     document = asdict(found)
+    document["sentence"] = sentence(found, model.rule)
     document["update"] = update._asdict()
-    document["before"] = before._asdict() if before is not None else None
+    document["before"] = found.before._asdict() if found.before is not None else None
     document["increments"] = found.increments._asdict() if found.increments else None
     document["budget"]["slack"] = found.budget.slack
     document["time_s"] = update.tick * TICK_S
     document["neighbours"] = [before.update if before else None, after.update if after else None]
     document["rule"] = model.rule._asdict()
+    document["prediction"] = prediction_document(prediction) if prediction else None
     return document
 
 
@@ -206,11 +220,13 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
         ],
         "marks": _marks(model, start, end),
         "predictions": [prediction_document(one) for one in _some(shown)],
-        "bands": {"L1": [limits.output_low[0], limits.output_high[0]], "T5": [limits.output_low[1], limits.output_high[1]]},
-        "bounds": {
-            name: [limits.input_low[i], limits.input_high[i]] for i, name in enumerate(INPUT_NAMES)
-        },
-    }  # fmt: skip
+        "bands": _ranges(BANDED_OUTPUTS, limits.output_low, limits.output_high),
+        "bounds": _ranges(INPUT_NAMES, limits.input_low, limits.input_high),
+    }
+
+
+def _ranges(names: Sequence[str], low: Sequence[float], high: Sequence[float]) -> Document:
+    return {name: list(ends) for name, *ends in zip(names, low, high, strict=True)}
 
 
 def _some(predictions: list[Prediction]) -> list[Prediction]:

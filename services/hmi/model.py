@@ -20,7 +20,7 @@ from hmi.trends import TrendStore
 R = TypeVar("R", bound=tuple[Any, ...])
 
 UPDATES_KEPT: Final = 20_000
-PREDICTIONS_KEPT: Final = 64
+PREDICTIONS_KEPT: Final = 1000
 EVENTS_KEPT: Final = 10_000
 STALE_S: Final = 1.5
 """A value whose source has been silent for this long is crossed out."""

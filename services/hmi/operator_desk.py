@@ -1,10 +1,11 @@
-"""Carries out commands: two steps, a client with the operator's role that lives as long as the command, and a read-back."""
+"""Carries out commands: two steps, a connection with the operator's role only meanwhile, and a read-back."""
 
 import asyncio
 import secrets
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
-from typing import Final, NamedTuple
+from itertools import pairwise
+from typing import Any, Final, NamedTuple
 
 from coldloop.endpoints import Endpoint
 from coldloop.errors import BUSY, LinkError, RequestRefusedError, UsageError
@@ -133,23 +134,12 @@ class OperatorDesk:
                 return Outcome(asked, "", str(error))
 
     async def _carry_out(self, command: Command) -> str:
-        match command:
-            case SetMode():
-                return await self._with("control_plc", lambda client: _set_mode(client, command))
-            case SetSetpoint():
-                return await self._with("control_plc", lambda client: _set_setpoint(client, command))
-            case SetLoad():
-                return await self._with("plant", lambda client: _set_load(client, command))
-            case PlayLoad():
-                return await self._with("plant", lambda client: _play_load(client, command))
-            case TreatAlarm():
-                return await self._with("control_plc", lambda client: _treat_alarm(client, command))
-            case FaultSensor():
-                return await self._with("plant", lambda client: _fault_sensor(client, command))
-            case SetFactor():
-                return await self._set_pace(lambda pace: pace._replace(realtime=1, factor=command.factor))
-            case SetPaused():
-                return await self._set_pace(lambda pace: pace._replace(paused=int(command.paused)))
+        if isinstance(command, SetFactor):
+            return await self._set_pace(lambda pace: pace._replace(realtime=1, factor=command.factor))
+        if isinstance(command, SetPaused):
+            return await self._set_pace(lambda pace: pace._replace(paused=int(command.paused)))
+        service, work = _WORK[type(command)]
+        return await self._with(service, lambda client: work(client, command))
 
     async def _with(self, service: str, work: Callable[[RegisterClient], Awaitable[str]]) -> str:
         client = self._client(service)
@@ -237,7 +227,7 @@ async def _play_load(client: RegisterClient, command: PlayLoad) -> str:
     begin = identity.tick + LEAD_TICKS
     for first in range(0, len(steps), AHEAD_STEPS):
         part = steps[first : first + AHEAD_STEPS]
-        gaps = [later[0] - earlier[0] for earlier, later in zip(part, part[1:], strict=False)]
+        gaps = [later[0] - earlier[0] for earlier, later in pairwise(part)]
         if max(gaps, default=0) > LONGEST_STEP:
             raise UsageError(
                 f"a step of more than {LONGEST_STEP * TICK_S:g} s cannot be sent: repeat its value in between"
@@ -265,3 +255,14 @@ async def _fault_sensor(client: RegisterClient, command: FaultSensor) -> str:
     await client.write_rows([SensorFault(command.fault, command.value)], row)
     (back,) = await client.read_rows(SensorFault, row, 1)
     return f"sensor of {command.output}: {word(SensorFaultKind(back.kind))}"
+
+
+_WORK: Final[dict[type[Command], tuple[str, Callable[[RegisterClient, Any], Awaitable[str]]]]] = {
+    SetMode: ("control_plc", _set_mode),
+    SetSetpoint: ("control_plc", _set_setpoint),
+    SetLoad: ("plant", _set_load),
+    PlayLoad: ("plant", _play_load),
+    TreatAlarm: ("control_plc", _treat_alarm),
+    FaultSensor: ("plant", _fault_sensor),
+}
+"""Who is written to, and how."""

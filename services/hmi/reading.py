@@ -148,12 +148,14 @@ class Reading:
 
     async def explanation(self, request: web.Request) -> web.Response:
         """Answer with why an updating period is as long as it is."""
-        text = request.query.get("update", "")
-        if text and not text.isdecimal():
-            raise web.HTTPBadRequest(reason="update is a number")
-        document = explanation_document(self._model, int(text) if text else None)
+        number, at = request.query.get("update", ""), request.query.get("at", "")
+        try:
+            at_tick = round(float(at) / TICK_S) if at else None
+            document = explanation_document(self._model, int(number) if number else None, at_tick)
+        except (ValueError, OverflowError):
+            raise web.HTTPBadRequest(reason="update and at are numbers") from None
         if document is None:
-            return refusal(404, f"update {text or '(the last one)'} is not known: only the newest are kept")
+            return refusal(404, f"update {number or at or '(the last one)'} is not known: only the newest are kept")
         return json_answer(encoded(document))
 
     async def alarms(self, _request: web.Request) -> web.Response:

@@ -20,6 +20,7 @@ COST: Final = 2**14
 BLOCK_SIZE: Final = 8
 SALT_BYTES: Final = 16
 SHORTEST_PASSWORD: Final = 8
+HASH_FIELDS: Final = 5
 MOST_MEMORY: Final = 64 * 1024 * 1024
 
 
@@ -100,9 +101,11 @@ class Users:
 def _user(line: str, place: str) -> User:
     name, _, rest = line.partition(":")
     role, _, stored = rest.partition(":")
-    if not name or role not in set(PageRole) or len(stored.split("$")) != 5 or not stored.startswith("scrypt$"):
+    fields = stored.split("$")
+    if not name or role not in set(PageRole) or len(fields) != HASH_FIELDS or fields[0] != "scrypt":
         raise ConfigurationError(
-            f"hmi.login.users: {place}: not name:role:hash; `python -m hmi.users FILE NAME view|operate` writes such lines"
+            f"hmi.login.users: {place}: not name:role:hash; "
+            "`python -m hmi.users FILE NAME view|operate` writes such lines"
         )
     return User(name, PageRole(role), stored.strip())
 

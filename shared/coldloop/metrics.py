@@ -1,4 +1,4 @@
-"""Registers in Prometheus' text format: each register that is a number is a gauge, named by service, block and register.
+"""Registers in Prometheus' text format: each number is a gauge, named by service, block and register.
 
 coldloop_plant_measurement_y{element="T5"} 12.5
 """
