@@ -40,6 +40,18 @@ def check_page(section: HmiSection) -> None:
             ) from None
 
 
+def pointed_at(section: HmiSection, endpoints: RigEndpoints) -> HmiSection:
+    """Return the settings of a page of the services at these endpoints."""
+    return section.model_copy(
+        update={
+            service: getattr(section, service).model_copy(
+                update={"host": end.host, "port": end.port, "word_order": end.word_order, "tls": end.tls}
+            )
+            for service, end in endpoints._asdict().items()
+        }
+    )
+
+
 class FirstLogin(NamedTuple):
     """The operator of a rig whose configuration names no users."""
 
@@ -67,12 +79,8 @@ class PageProcess:
     def __init__(self, section: HmiSection, endpoints: RigEndpoints, folder: Path) -> None:
         self._log = folder / "logs" / "hmi.log"
         self._login = None if section.login.users else FirstLogin.made_in(folder)
-        update: dict[str, object] = {
-            service: getattr(section, service).model_copy(
-                update={"host": end.host, "port": end.port, "word_order": end.word_order, "tls": end.tls}
-            )
-            for service, end in endpoints._asdict().items()
-        }
+        section = pointed_at(section, endpoints)
+        update: dict[str, object] = {}
         if self._login is not None:
             update["login"] = section.login.model_copy(update={"users": self._login.file})
         if section.audit is None:

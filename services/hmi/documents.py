@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from coldloop import __version__
-from coldloop.event_text import alarm_cause, describe, utc_text, word
+from coldloop.event_text import alarm_cause, word
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode, OperatorMode
@@ -23,14 +23,14 @@ from hmi.trends import NAMES, mode_name, rounded, thin
 Document = dict[str, Any]
 
 MARKED: Final = {
-    EventKind.ALARM_RAISED: "alarm",
-    EventKind.LIVE_LOAD: "load",
-    EventKind.LOAD: "load",
-    EventKind.OPERATOR_MODE: "operator",
-    EventKind.SETPOINT: "operator",
-    EventKind.SENSOR_FAULT: "fault",
+    word(EventKind.ALARM_RAISED): "alarm",
+    word(EventKind.LIVE_LOAD): "load",
+    word(EventKind.LOAD): "load",
+    word(EventKind.OPERATOR_MODE): "operator",
+    word(EventKind.SETPOINT): "operator",
+    word(EventKind.SENSOR_FAULT): "fault",
 }
-"""Events that are marked on the trends, and what as."""
+"""Kinds of events that are marked on the trends, and what as."""
 MOST_MARKS: Final = 200
 EARLIER_PREDICTIONS: Final = 12
 
@@ -103,11 +103,11 @@ def alarms_document(model: Model) -> list[Document]:
 
 def event_document(told: Told) -> Document:
     """Return one event in words."""
-    text = describe(told.event)
+    text = told.text
     return {
-        "service": told.service, "number": told.event.number, "boot": told.event.boot, "utc": utc_text(told.event),
-        "tick": told.event.tick, "time_s": told.event.tick * TICK_S, "kind": text.kind, "subject": text.subject,
-        "cause": text.cause, "value": text.value, "unit": text.unit, "who": text.who, "sentence": text.sentence,
+        "service": told.service, "number": told.number, "boot": told.boot, "utc": told.utc, "tick": told.tick,
+        "time_s": told.tick * TICK_S, "kind": text.kind, "subject": text.subject, "cause": text.cause,
+        "value": text.value, "unit": text.unit, "who": text.who, "sentence": text.sentence,
     }  # fmt: skip
 
 
@@ -136,6 +136,8 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
         "stale": model.stale_prefixes(),
         "values": {name: finite(model.values[name]) for name in names},
     }
+    if model.replay is not None:
+        document["replay"] = model.replay
     parts = set(changed) if changed is not None else {"alarms", "updates"}
     if "alarms" in parts:
         document["alarms"] = alarms_document(model)
@@ -236,13 +238,8 @@ def _some(predictions: list[Prediction]) -> list[Prediction]:
 
 
 def _marks(model: Model, start: int, end: int) -> list[Document]:
-    found = [
-        {
-            "time": told.event.tick * TICK_S,
-            "kind": MARKED[EventKind(told.event.kind)],
-            "text": describe(told.event).sentence,
-        }
-        for told in model.events
-        if told.event.kind in MARKED and start <= told.event.tick <= end
+    found = [told for told in model.events if told.text.kind in MARKED and start <= told.tick <= end]
+    return [
+        {"time": told.tick * TICK_S, "kind": MARKED[told.text.kind], "text": told.text.sentence}
+        for told in found[-MOST_MARKS:]
     ]
-    return found[-MOST_MARKS:]

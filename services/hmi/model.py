@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeVar, cast
 
+from coldloop.event_text import EventText, describe, utc_text
 from coldloop.process import TICK_S
 from coldloop.registers.audit import Event
 from coldloop.registers.common import Identity, SessionPace
@@ -27,10 +28,19 @@ STALE_S: Final = 1.5
 
 
 class Told(NamedTuple):
-    """An event, and the service whose journal it is from."""
+    """An event in words, and the service whose journal it is from."""
 
     service: str
-    event: Event
+    number: int
+    boot: int
+    utc: str
+    tick: int
+    text: EventText
+
+    @classmethod
+    def of(cls, service: str, event: Event) -> "Told":
+        """Return an event of a journal."""
+        return cls(service, event.number, event.boot, utc_text(event), event.tick, describe(event))
 
 
 @dataclass
@@ -67,9 +77,11 @@ class Model:
         self.events_told = 0
         """Events so far; the last ones are in `events`."""
         self.changed: set[str] = set()
-        """Names of signals, `alarms`, `updates`, `events`, `prediction`: what changed since it was last looked at."""
+        """Names of signals, `alarms`, `updates`, `prediction`: what changed since it was last looked at."""
         self._values: dict[str, float | int | str] = {}
         self._session = 0
+        self.replay: dict[str, object] | None = None
+        """State of the replay; None on a rig that is up."""
         self.on_change: Callable[[], None] = lambda: None
 
     # -- what readers write --------------------------------------------------------------------------------------------
@@ -132,12 +144,11 @@ class Model:
             self.updates.append(update)
             self.changed.add("updates")
 
-    def put_events(self, service: str, events: Iterable[Event]) -> None:
+    def put_events(self, events: Iterable[Told]) -> None:
         """Take events that are new, oldest first."""
-        for event in events:
-            self.events.append(Told(service, event))
+        for told in events:
+            self.events.append(told)
             self.events_told += 1
-            self.changed.add("events")
 
     def heard(self, service: str) -> None:
         """Note that a service has answered."""

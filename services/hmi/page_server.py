@@ -3,7 +3,8 @@
 import asyncio
 import ssl
 import time
-from typing import Final
+from contextlib import suppress
+from typing import Final, NamedTuple
 
 from aiohttp import web
 
@@ -15,7 +16,7 @@ from hmi.documents import encoded, state_document
 from hmi.guard import Guard
 from hmi.model import Model
 from hmi.operator_desk import OperatorDesk
-from hmi.reading import Reading
+from hmi.reading import STATIC, Reading
 from hmi.settings import HmiSection
 from hmi.users import Users
 
@@ -26,40 +27,54 @@ LONGEST_S: Final = 0.4
 SHUTDOWN_S: Final = 0.5
 
 
+class Exhibit(NamedTuple):
+    """One rig, or one recorded run, and what can be done with it."""
+
+    model: Model
+    desk: OperatorDesk | None = None
+    """Carries out commands; None where there are none."""
+    routes: tuple[web.AbstractRouteDef, ...] = ()
+    """Further requests that are served."""
+
+
 class PageServer:
-    """Serves one model to browsers.
+    """Serves one exhibit to browsers, or several side by side.
 
     Args:
         settings: Of the page.
-        model: What is shown.
-        desk: Carries out commands; None where there are none.
-        extra: Further requests that are served.
+        exhibits: What is shown.
 
     Raises:
         ConfigurationError: A file of the settings cannot be used.
     """
 
-    def __init__(
-        self,
-        settings: HmiSection,
-        model: Model,
-        desk: OperatorDesk | None,
-        extra: list[web.AbstractRouteDef] | None = None,
-    ) -> None:
+    def __init__(self, settings: HmiSection, *exhibits: Exhibit) -> None:
         self._settings = settings
-        self._model = model
-        self._news = asyncio.Event()
-        model.on_change = self._news.set
-        audit = Audit(settings.audit)
-        guard = Guard(settings, audit)
-        users = Users(settings.login.users)
-        self.broadcast = Broadcast(lambda: message(state_document(model)), settings.browsers)
-        app = web.Application(middlewares=[guard.middleware], client_max_size=LONGEST_REQUEST)
-        reading = Reading(settings, model, self.broadcast, guard, users, replay=desk is None)
-        commanding = Commanding(settings, guard, users, desk, audit)
-        app.add_routes([*reading.routes(), *commanding.routes(), *(extra or [])])
+        self._audit = Audit(settings.audit)
+        self._guard = Guard(settings, self._audit)
+        self._users = Users(settings.login.users)
+        self._streams: list[tuple[Model, Broadcast, asyncio.Event]] = []
+        app = web.Application(middlewares=[self._guard.middleware], client_max_size=LONGEST_REQUEST)
+        if len(exhibits) == 1:
+            app.add_routes(self._routes(exhibits[0]))
+        else:
+            app.add_routes([web.get("/", _side_by_side), web.static("/static", STATIC)])
+            for number, exhibit in enumerate(exhibits, 1):
+                part = web.Application()
+                part.add_routes(self._routes(exhibit))
+                app.add_subapp(f"/run/{number}/", part)
         self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S)
         self.port = 0
+
+    def _routes(self, exhibit: Exhibit) -> list[web.AbstractRouteDef]:
+        model, desk, extra = exhibit
+        broadcast = Broadcast(lambda: message(state_document(model)), self._settings.browsers)
+        news = asyncio.Event()
+        model.on_change = news.set
+        self._streams.append((model, broadcast, news))
+        reading = Reading(self._settings, model, broadcast, self._guard, self._users, replay=desk is None)
+        commanding = Commanding(self._settings, self._guard, self._users, desk, self._audit)
+        return [*reading.routes(), *commanding.routes(), *extra]
 
     async def start(self) -> None:
         """Listen.
@@ -89,23 +104,31 @@ class PageServer:
 
     async def run(self) -> None:
         """Send what changes to all browsers until cancelled."""
-        sent = 0.0
-        while True:
-            try:
-                async with asyncio.timeout(LONGEST_S):
-                    await self._news.wait()
-            except TimeoutError:
-                pass
-            await asyncio.sleep(max(0.0, sent + SHORTEST_S - time.monotonic()))
-            self._news.clear()
-            sent = time.monotonic()
-            changed, self._model.changed = self._model.changed, set()
-            if len(self.broadcast):
-                self.broadcast.send(message(state_document(self._model, changed)))
+        async with asyncio.TaskGroup() as tasks:
+            for stream in self._streams:
+                tasks.create_task(_send_changes(*stream), name="stream")
 
     async def close(self) -> None:
         """End all streams and stop listening."""
         await self._runner.cleanup()
+
+
+async def _send_changes(model: Model, broadcast: Broadcast, news: asyncio.Event) -> None:
+    sent = 0.0
+    while True:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(LONGEST_S):
+                await news.wait()
+        await asyncio.sleep(max(0.0, sent + SHORTEST_S - time.monotonic()))
+        news.clear()
+        sent = time.monotonic()
+        changed, model.changed = model.changed, set()
+        if len(broadcast):
+            broadcast.send(message(state_document(model, changed)))
+
+
+async def _side_by_side(_request: web.Request) -> web.StreamResponse:
+    return web.FileResponse(STATIC / "two-runs.html")
 
 
 def message(document: dict[str, object]) -> bytes:

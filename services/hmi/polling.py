@@ -14,7 +14,7 @@ from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStat
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, ControlLinkStatus, Optimization, Prediction
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import Alarm, AlarmKind
-from hmi.model import Model
+from hmi.model import Model, Told
 from hmi.signals import MAPS, shown_blocks
 
 log = logging.getLogger("coldloop.hmi")
@@ -140,7 +140,8 @@ class Poller:
             self._next_event = 0
         first = max(self._next_event, page.newest - EVENTS_AT_ONCE + 1, 1)
         rows = await self._rows(Event, first, page.newest, EVENT_ROWS)
-        self._model.put_events(self._service, sorted(row for row in rows if first <= row.number <= page.newest))
+        news = sorted(row for row in rows if first <= row.number <= page.newest)
+        self._model.put_events(Told.of(self._service, row) for row in news)
         self._next_event = page.newest + 1
 
     async def _rows(self, record: type[Any], first: int, last: int, ring: int) -> list[Any]:

@@ -5,7 +5,7 @@ import csv
 import io
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from aiohttp import BasicAuth, hdrs, web
 
@@ -23,7 +23,7 @@ from hmi.documents import (
     trend_document,
 )
 from hmi.guard import Guard, add_headers, refusal
-from hmi.model import Model
+from hmi.model import Model, Told
 from hmi.page_metrics import page_families
 from hmi.settings import HmiSection
 from hmi.trends import NAMES
@@ -162,21 +162,22 @@ class Reading:
         """Answer with all alarms."""
         return json_answer(encoded({"alarms": alarms_document(self._model)}))
 
-    def _events(self, query: Mapping[str, str]) -> list[dict[str, Any]]:
+    def _events(self, query: Mapping[str, str]) -> list[Told]:
         wanted, service = query.get("search", "").lower(), query.get("service", "")
         found = []
         for told in reversed(self._model.events):
-            document = event_document(told)
             if service and told.service != service:
                 continue
-            if not wanted or wanted in f"{document['sentence']} {document['utc']} {told.service}".lower():
-                found.append(document)
+            if not wanted or wanted in f"{told.text.sentence} {told.utc} {told.service}".lower():
+                found.append(told)
         return found
 
     async def events(self, request: web.Request) -> web.Response:
         """Answer with the newest events that a search finds."""
         found = self._events(request.query)
-        return json_answer(encoded({"found": len(found), "events": found[:EVENTS_SHOWN]}))
+        return json_answer(
+            encoded({"found": len(found), "events": [event_document(told) for told in found[:EVENTS_SHOWN]]})
+        )
 
     async def events_table(self, request: web.Request) -> web.Response:
         """Answer with all events that a search finds as CSV."""
@@ -198,7 +199,9 @@ class Reading:
         )
         writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
-        writer.writerows({name: safe_cell(row[name]) for name in names} for row in found)
+        for told in found:
+            row = event_document(told)
+            writer.writerow({name: safe_cell(row[name]) for name in names})
         return csv_answer(text.getvalue(), "coldloop-events.csv")
 
     async def health(self, _request: web.Request) -> web.Response:

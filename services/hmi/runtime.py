@@ -7,7 +7,7 @@ import time
 from coldloop.endpoints import Endpoint
 from hmi.model import Model
 from hmi.operator_desk import OperatorDesk
-from hmi.page_server import PageServer
+from hmi.page_server import Exhibit, PageServer
 from hmi.polling import Poller
 from hmi.settings import HmiSection, HmiSettings
 from hmi.signals import MAPS
@@ -25,7 +25,7 @@ async def serve(settings: HmiSettings) -> None:
     hmi = settings.hmi
     model = Model(time.monotonic, hmi.kept_s)
     desk = OperatorDesk(operator_endpoints(hmi), model, time.monotonic, training=hmi.training)
-    server = PageServer(hmi, model, desk)
+    server = PageServer(hmi, Exhibit(model, desk))
     pollers = [Poller(service, getattr(hmi, service), model, hmi.poll_s) for service in MAPS]
     await server.start()
     log.info("serving", extra={"host": hmi.host, "port": server.port, "address": server.address})

@@ -28,16 +28,10 @@ from optimizer_plc.costs import augmented_cost, indicators
 from optimizer_plc.estimator import Estimate, Estimator, EstimatorKind, KalmanFilter, StateFeedback
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
-from optimizer_plc.settings import ProgramSettings, RuleName
+from optimizer_plc.rules import make_rule
+from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import make_solver
-from optimizer_plc.updating_period import (
-    Algorithm1,
-    Assessment,
-    ContractionRule,
-    FixedPeriod,
-    Observation,
-    UpdatingRule,
-)
+from optimizer_plc.updating_period import Assessment, Observation
 
 Array = NDArray[np.float64]
 
@@ -101,7 +95,7 @@ class OptimizerProgram:
     def restart(self, updating_period_s: float) -> None:
         """Forget everything and begin a session at the operating point; 0 s is the adaptive updating period."""
         self._fixed_ticks = round(updating_period_s / TICK_S)
-        self._rule = self._make_rule()
+        self._rule = make_rule(self.settings, self.budget, self._fixed_ticks)
         self._estimator.reset()
         self._solver.reset()
         at_rest = np.zeros(3, self._real)
@@ -110,14 +104,6 @@ class OptimizerProgram:
         self._sent: Delivery | None = None
         self._last: _Period | None = None
         self._sequences = 0
-
-    def _make_rule(self) -> UpdatingRule:
-        adaptive = self.settings.adaptive
-        if self._fixed_ticks:
-            return FixedPeriod(self.budget.iterations(self._fixed_ticks))
-        if adaptive.rule is RuleName.CONTRACTION:
-            return ContractionRule(**adaptive.contraction.model_dump())
-        return Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta)
 
     def _make_estimator(self) -> Estimator:
         if self.settings.estimator.kind is EstimatorKind.STATE_FEEDBACK:

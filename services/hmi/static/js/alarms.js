@@ -17,7 +17,7 @@ function line() {
   const waiting = told.filter((one) => WAITING.includes(one.state)).length;
   const hidden = state.alarms.filter((one) => ["shelved", "out of service"].includes(one.state)).length;
   const parts = told.slice(0, 4).map((one) => element("a", { class: `alarm ${WAITING.includes(one.state) ? "unacknowledged" : ""}`, href: "#alarms" }, badge(one), `${one.name}${one.cause ? ` (${one.cause})` : ""}, ${STATES[one.state]}`));
-  if (!parts.length) parts.push(element("span", { class: "minor", text: "No alarms" }));
+  if (!parts.length) parts.push(element("span", { class: "minor", text: state.catalog.replay ? "A recorded run: its alarms are in the history" : "No alarms" }));
   const counts = `${told.length} alarms, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}`;
   holder.replaceChildren(element("span", { class: "told" }, ...parts), element("span", { class: "count", text: counts }));
   if (waiting) holder.append(element("button", { type: "button", class: "quiet operate-only", text: "Acknowledge all", hidden: !state.me.operates, onclick: () => command({ kind: "alarm", alarm: 65535, action: 1 }, true) }));
@@ -50,15 +50,15 @@ function table() {
 async function history() {
   if (byId("alarms").hidden) return;
   const query = `search=${encodeURIComponent(byId("event-search").value)}&service=${encodeURIComponent(byId("event-service").value)}`;
-  byId("event-csv").href = `/api/events.csv?${query}`;
+  byId("event-csv").href = `api/events.csv?${query}`;
   try {
-    const { found, events } = await ask(`/api/events?${query}`);
+    const { found, events } = await ask(`api/events?${query}`);
     byId("event-count").textContent = `${found} events${found > events.length ? `, the newest ${events.length} shown` : ""}`;
     byId("event-table").querySelector("tbody").replaceChildren(...events.map((one) => element("tr", {}, element("td", { text: timeText(one.time_s) }), element("td", { text: one.utc.replace("T", " ").replace("Z", "") }), element("td", { text: one.service }), element("td", { text: one.sentence }))));
   } catch { /* the banner says it */ }
   if (!state.me.operates) return;
   try {
-    const { entries } = await ask("/api/audit");
+    const { entries } = await ask("api/audit");
     byId("audit-table").querySelector("tbody").replaceChildren(...entries.slice(0, 200).map((one) => element("tr", {}, element("td", { text: one.utc.replace("T", " ").replace("Z", "") }), element("td", { text: one.who || "nobody" }), element("td", { text: one.what }), element("td", { text: one.outcome, class: one.outcome === "done" ? "" : "refused" }), element("td", { text: one.detail }))));
   } catch { /* logged out meanwhile */ }
 }

@@ -19,10 +19,10 @@ function note(asked, outcome, refused) {
 // `atOnce` is for what does not touch the process, such as acknowledging an alarm.
 export async function command(body, atOnce = false) {
   let prepared;
-  try { prepared = await send("/api/commands", body); } catch (error) { note(body.kind, error.message, true); if (error.status === 401) await refreshUser(); return; }
+  try { prepared = await send("api/commands", body); } catch (error) { note(body.kind, error.message, true); if (error.status === 401) await refreshUser(); return; }
   if (!atOnce && !(await confirmed(prepared.text))) return;
   try {
-    const outcome = await send(`/api/commands/${prepared.token}`, {});
+    const outcome = await send(`api/commands/${prepared.token}`, {});
     note(outcome.asked, outcome.refused_because || outcome.applied, Boolean(outcome.refused_because));
   } catch (error) { note(prepared.text, error.message, true); if (error.status === 401) await refreshUser(); }
 }
@@ -57,7 +57,7 @@ function faceplates() {
 }
 
 export async function refreshUser() {
-  state.me = await ask("/api/me");
+  state.me = await ask("api/me");
   byId("login-open").hidden = Boolean(state.me.user);
   byId("logout").hidden = !state.me.user;
   byId("logout").textContent = `Log out ${state.me.user}`;
@@ -89,11 +89,11 @@ export function initCommands(userChanged) {
   byId("fault-set").addEventListener("click", () => command({ kind: "sensor_fault", output: byId("fault-output").value, fault: Number(byId("fault-kind").value), value: Number(byId("fault-value").value) }));
   for (const id of ["login-open", "login-open-2"]) byId(id).addEventListener("click", login);
   byId("login-cancel").addEventListener("click", () => byId("login").close());
-  byId("logout").addEventListener("click", async () => { await send("/api/logout", {}); await refreshUser(); });
+  byId("logout").addEventListener("click", async () => { await send("api/logout", {}); await refreshUser(); });
   byId("login-form").addEventListener("submit", async (event) => {
     event.preventDefault();
     try {
-      await send("/api/login", { user: byId("login-user").value, password: byId("login-password").value });
+      await send("api/login", { user: byId("login-user").value, password: byId("login-password").value });
       byId("login-password").value = "";
       byId("login").close();
       await refreshUser();

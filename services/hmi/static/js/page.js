@@ -71,19 +71,19 @@ function overview() {
 }
 
 async function mimic() {
-  const text = await (await fetch("/static/mimic.svg")).text();
+  const text = await (await fetch("static/mimic.svg")).text();
   byId("mimic").append(document.importNode(new DOMParser().parseFromString(text, "image/svg+xml").documentElement, true));
 }
 
 async function start() {
-  [state.catalog, state.me] = await Promise.all([ask("/api/catalog"), ask("/api/me"), mimic()]);
+  [state.catalog, state.me] = await Promise.all([ask("api/catalog"), ask("api/me"), mimic()]);
   theme(localStorage.getItem("theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
   byId("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; localStorage.setItem("theme", next); theme(next); });
   initDetail(); for (const one of [document.querySelector("header"), byId("overview"), byId("commands")]) bindAll(one);
   links(); overview();
   initTrends((time) => { location.hash = "#why"; pick(`?at=${time}`); });
   initWhy(); initCommands(redrawAlarms); initAlarms(); initReplay();
-  try { take(await ask("/api/state")); } catch (error) { if (!state.me.role) byId("login-open").click(); }
+  try { take(await ask("api/state")); } catch (error) { if (!state.me.role) byId("login-open").click(); }
   await refreshUser();
   connect(); show();
   addEventListener("hashchange", () => { show(); byId("view").focus({ preventScroll: true }); });

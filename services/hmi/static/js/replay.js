@@ -5,8 +5,8 @@ export function initReplay() {
   if (!state.catalog.replay) return;
   const byId = (id) => document.getElementById(id), position = byId("replay-position");
   byId("replay").hidden = false;
-  for (const one of document.querySelectorAll(".live-only")) one.hidden = true;
-  const ask = (body) => send("/api/replay", body).catch(() => {});
+  document.body.classList.add("replaying");
+  const ask = (body) => send("api/replay", body).catch(() => {});
   byId("replay-play").addEventListener("click", () => ask({ playing: !state.replay.playing }));
   byId("replay-speed").addEventListener("change", (event) => ask({ speed: Number(event.target.value) }));
   position.addEventListener("change", () => ask({ tick: Number(position.value) }));

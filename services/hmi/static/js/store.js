@@ -32,7 +32,7 @@ export function signal(name) { return state.catalog.signals[name] || null; }
 export function connect() {
   let source = null;
   const open = () => {
-    source = new EventSource("/api/stream");
+    source = new EventSource("api/stream");
     source.onmessage = (event) => take(JSON.parse(event.data));
     source.onerror = () => { source.close(); setTimeout(open, 500); };
   };

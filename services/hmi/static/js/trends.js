@@ -64,11 +64,11 @@ async function refresh() {
   const span = zoom ? Math.max(1, end - zoom[0]) : seconds;
   if (held && newest && !zoom) return;
   const query = `names=${NAMES}&seconds=${span}&points=900${zoom ? `&end=${end}` : ""}`;
-  try { newest = await ask(`/api/trend?${query}`); } catch { return; }
+  try { newest = await ask(`api/trend?${query}`); } catch { return; }
   if (!charts) build();
   charts.forEach(show);
   document.getElementById("charts").dataset.now = newest.now_s;
-  document.getElementById("export-csv").href = `/api/trend.csv?${query}`;
+  document.getElementById("export-csv").href = `api/trend.csv?${query}`;
 }
 
 export function initTrends(pick) {
@@ -102,7 +102,7 @@ let strips = null, stripsNow = 0;
 export async function refreshStrips() {
   if (document.getElementById("overview").hidden) return;
   let found;
-  try { found = await ask("/api/trend?names=L1,T5,load&seconds=300&points=400"); } catch { return; }
+  try { found = await ask("api/trend?names=L1,T5,load&seconds=300&points=400"); } catch { return; }
   const holder = document.getElementById("strips");
   stripsNow = found.now_s;
   if (!strips) {

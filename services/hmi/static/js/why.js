@@ -51,7 +51,7 @@ function budget(found) {
 async function curves(found) {
   const from = found.time_s - 30, to = found.time_s + (found.prediction ? 200 : 60);
   let trend;
-  try { trend = await ask(`/api/trend?names=L1,T5&seconds=${to - from}&end=${to}&points=400`); } catch { return; }
+  try { trend = await ask(`api/trend?names=L1,T5&seconds=${to - from}&end=${to}&points=400`); } catch { return; }
   window_ = [from, to];
   if (!charts) {
     charts = ["L1", "T5"].map((name) => { const box = element("div", { class: "chart" }); byId("why-charts").append(box); return { name, ...makeChart(box, [{ label: name, stroke: "trend" }], { title: `${name} ${name === "L1" ? "%" : "K"}`, spread: 0.5, axis: true, range: () => window_ }) }; });
@@ -67,7 +67,7 @@ async function curves(found) {
 export async function showUpdate(query) {
   const mine = ++asked;
   let found;
-  try { found = await ask(`/api/explanation${query}`); } catch (error) { if (!shown) byId("why-sentence").textContent = error.message; return; }
+  try { found = await ask(`api/explanation${query}`); } catch (error) { if (!shown) byId("why-sentence").textContent = error.message; return; }
   if (mine !== asked) return;
   shown = found;
   byId("why-number").value = found.update.update;
