@@ -112,6 +112,12 @@ class RateLimit:
             self._buckets.popitem(last=False)
         return allowed
 
+    def give_back(self, address: str) -> None:
+        """Give a request back that shall not count."""
+        if address in self._buckets:
+            level, since = self._buckets[address]
+            self._buckets[address] = (min(self._burst, level + 1.0), since)
+
 
 def host_of(header: str) -> str:
     """Return the name in a Host header, without its port."""

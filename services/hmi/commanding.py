@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from aiohttp import web
 
-from coldloop.errors import UsageError
+from coldloop.errors import LinkError, UsageError
 from hmi.access import LoginSession
 from hmi.audit import Audit
 from hmi.commands import read_command
@@ -80,6 +80,7 @@ class Commanding:
                 "login", who=name[:40], address=address, outcome="refused", detail="wrong name or password"
             )
             return refusal(401, "wrong name or password")
+        self._guard.logins.give_back(address)
         answer = web.json_response({"user": user.name, "role": user.role.value})
         answer.set_cookie(
             COOKIE, self._guard.sessions.begin(user), httponly=True, samesite="Strict", path="/",
@@ -110,8 +111,8 @@ class Commanding:
             return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
         try:
             command = read_command(await _document(request))
-            token = self._desk.prepare(command, operator.user.name)
-        except UsageError as error:
+            token = await self._desk.prepare(command, operator.user.name)
+        except (UsageError, LinkError) as error:
             self._note(request, "command", "refused", str(error))
             return refusal(422, str(error))
         return web.json_response({"token": token, "text": command.text})

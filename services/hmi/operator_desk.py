@@ -86,20 +86,21 @@ class OperatorDesk:
         self._prepared: OrderedDict[str, Prepared] = OrderedDict()
         self._turn = asyncio.Lock()
 
-    def prepare(self, command: Command, user: str) -> str:
+    async def prepare(self, command: Command, user: str) -> str:
         """Take a command, and return the token that confirms it.
 
         Raises:
-            UsageError: It is not possible, as far as is known.
+            UsageError: It is not possible now.
+            LinkError: The service does not answer.
         """
-        self._check(command)
+        await self._check(command)
         token = secrets.token_urlsafe(16)
         self._prepared[token] = Prepared(command, user, self._now() + CONFIRM_WITHIN_S)
         while len(self._prepared) > MOST_PREPARED:
             self._prepared.popitem(last=False)
         return token
 
-    def _check(self, command: Command) -> None:
+    async def _check(self, command: Command) -> None:
         if isinstance(command, FaultSensor) and not self._training:
             raise UsageError("sensor faults are offered only where hmi.training is switched on")
         if isinstance(command, SetSetpoint):
@@ -108,9 +109,7 @@ class OperatorDesk:
             if high > low and not low <= command.value <= high:
                 unit = INPUT_UNITS[place]
                 raise UsageError(f"{command.input} = {command.value:g} {unit} is not from {low:g} to {high:g} {unit}")
-            operator = self._model.record("control_plc", Operator)
-            if operator is not None and operator.mode != OperatorMode.MANUAL:
-                raise UsageError("setpoints count in manual mode: take over in manual first")
+            await self._with("control_plc", _check_manual)
 
     async def confirm(self, token: str, user: str) -> Outcome:
         """Carry out a command that was prepared, once.
@@ -193,11 +192,16 @@ async def _set_mode(client: RegisterClient, command: SetMode) -> str:
     )
 
 
+async def _check_manual(client: RegisterClient) -> str:
+    if (await client.read(Operator)).mode != OperatorMode.MANUAL:
+        raise UsageError("setpoints count in manual mode: take over in manual first")
+    return ""
+
+
 async def _set_setpoint(client: RegisterClient, command: SetSetpoint) -> str:
     place = INPUT_NAMES.index(command.input)
+    await _check_manual(client)
     operator = await client.read(Operator)
-    if operator.mode != OperatorMode.MANUAL:
-        raise UsageError("setpoints count in manual mode: take over in manual first")
     values = [command.value if i == place else present for i, present in enumerate(operator[1:])]
     await client.write(Operator(operator.mode, *values))
     back = await client.read(Operator)

@@ -222,6 +222,7 @@ class Reading:
                 return refusal(401, "log in first, or send name and password (basic)")
             if await asyncio.to_thread(self._users.check, auth.login, auth.password) is None:
                 return refusal(401, "wrong name or password")
+            self._guard.logins.give_back(address)
         text = exposition(page_families(self._model, len(self._broadcast)))
         return web.Response(body=text.encode(), headers={hdrs.CONTENT_TYPE: CONTENT_TYPE})
 

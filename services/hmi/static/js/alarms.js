@@ -37,14 +37,28 @@ function actions(alarm) {
   return box;
 }
 
-function table() {
-  const body = byId("alarm-table").querySelector("tbody");
-  if (body.contains(document.activeElement) && document.activeElement.tagName === "SELECT") return;
-  body.replaceChildren(...state.alarms.map((one) => element("tr", { class: WAITING.includes(one.state) ? "unacknowledged" : "", "data-alarm": one.name },
+function row(one) {
+  return element("tr", { class: WAITING.includes(one.state) ? "unacknowledged" : "", "data-alarm": one.name },
     element("td", {}, badge(one), ` ${one.priority_word}`), element("td", { text: one.name }),
     element("td", { class: "alarm-state", text: `${STATES[one.state] || one.state}${one.active ? ", active" : ""}${one.state === "shelved" ? ` until ${timeText(one.shelved_until_s)}` : ""}` }),
     element("td", { text: one.cause }), element("td", { class: "number", text: one.times ? timeText(one.raised_s) : "" }), element("td", { class: "number", text: one.times }),
-    element("td", {}, state.me.operates ? actions(one) : ""))));
+    element("td", {}, state.me.operates ? actions(one) : ""));
+}
+
+// Only rows that have changed are made anew: a button is not replaced under somebody's hand.
+const rows = new Map();
+function table() {
+  const body = byId("alarm-table").querySelector("tbody");
+  state.alarms.forEach((one, place) => {
+    const text = JSON.stringify([one, state.me.operates]), known = rows.get(one.number);
+    if (!known || known.text !== text) {
+      const made = row(one);
+      if (known) known.row.replaceWith(made);
+      rows.set(one.number, { row: made, text });
+    }
+    const own = rows.get(one.number).row;
+    if (body.children[place] !== own) body.insertBefore(own, body.children[place] || null);
+  });
 }
 
 async function history() {

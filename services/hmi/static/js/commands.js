@@ -46,8 +46,7 @@ function faceplates() {
   for (const [input, field] of [["CV155", "cv155"], ["NCR22_A", "ncr22"], ["CV156", "cv156"]]) {
     const limits = `optimizer_plc.operating limits.input_low.${input} optimizer_plc.operating limits.input_high.${input}`;
     const value = element("input", { type: "number", step: "any", id: `setpoint-${input}`, "aria-label": `New setpoint of ${input} in ${units[input]}` });
-    const button = element("button", { type: "button", text: "Write", onclick: () => command({ kind: "setpoint", input, value: Number(value.value) }) });
-    value.addEventListener("focus", () => { if (!value.value) value.value = Number(state.values[`control_plc.operator.${field}`].toPrecision(6)); });
+    const button = element("button", { type: "button", text: "Write", onclick: () => { if (value.value) command({ kind: "setpoint", input, value: Number(value.value) }); else value.focus(); } });
     const plate = element("div", { class: "faceplate" },
       element("div", { class: "bar", "data-name": input, "data-signal": `control_plc.process.u.${input}`, "data-bounds": limits, "data-low": input === "NCR22_A" ? -10 : 15, "data-high": input === "NCR22_A" ? 160 : 65 }),
       element("div", { class: "row" }, element("span", { class: "label", text: "setpoint" }), element("span", { class: "value", "data-signal": `control_plc.operator.${field}` }), element("span", { class: "spacer" }), value, button));
