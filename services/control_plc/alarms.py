@@ -89,6 +89,8 @@ class AlarmPanel:
         self._settings = settings
         self._rules = [settings.rule(kind) for kind in AlarmKind]
         self._pending: dict[AlarmKind, _Pending] = {}
+        self._causes: dict[AlarmKind, set[int]] = {}
+        """Those for which an alarm that is active has been raised already."""
         self._now = 0
         self.rows = [Alarm(priority=rule.priority) for rule in self._rules]
         """What the registers show, by number of the alarm."""
@@ -131,7 +133,7 @@ class AlarmPanel:
     # -- conditions ----------------------------------------------------------------------------------------------------
 
     def holds(self, kind: AlarmKind, *, condition: bool, cause: int = 0) -> None:
-        """Tell whether the condition of an alarm holds, and why; another cause raises the alarm again."""
+        """Tell whether the condition of an alarm holds, and why; a cause that it had not yet raises the alarm again."""
         row = self.rows[kind]
         if condition != bool(row.active):
             earlier = self._pending.get(kind)
@@ -140,7 +142,10 @@ class AlarmPanel:
             return
         self._pending.pop(kind, None)
         if condition and cause != row.cause:
-            self._raise(kind, cause)
+            if cause in self._causes[kind]:  # causes that take turns are no news
+                self._store(kind, cause=cause)
+            else:
+                self._raise(kind, cause)
 
     def raised(self, kind: AlarmKind, cause: int = 0) -> None:
         """Tell that the condition of an alarm holds, and why."""
@@ -171,6 +176,7 @@ class AlarmPanel:
 
     def _raise(self, kind: AlarmKind, cause: int) -> None:
         row = self.rows[kind]
+        self._causes.setdefault(kind, set()).add(cause)
         if row.state == AlarmState.OUT_OF_SERVICE:  # it is worked on: followed, and not noted
             self._store(kind, active=1, cause=cause)
         else:
@@ -178,6 +184,7 @@ class AlarmPanel:
             self._step(kind, EventKind.ALARM_RAISED, active=1, cause=cause, times=times, raised=self.now)
 
     def _return(self, kind: AlarmKind) -> None:
+        self._causes.pop(kind, None)
         if self.rows[kind].state == AlarmState.OUT_OF_SERVICE:
             self._store(kind, active=0, returned=self.now)
         else:
@@ -212,6 +219,7 @@ class AlarmPanel:
     def restore(self, rows: Sequence[Alarm]) -> None:
         """Take the alarms of before a restart; priorities are those of the configuration."""
         self.rows = [row._replace(priority=rule.priority) for row, rule in zip(rows, self._rules, strict=True)]
+        self._causes = {kind: {row.cause} for kind, row in zip(AlarmKind, rows, strict=True) if row.active}
         # Who tells of instants does not tell that they are over.
         self._pending = {kind: _Pending(self.now, 0) for kind in PASSING if self.rows[kind].active}
         self.changes += 1
