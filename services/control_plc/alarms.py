@@ -90,7 +90,7 @@ class AlarmPanel:
         self._rules = [settings.rule(kind) for kind in AlarmKind]
         self._pending: dict[AlarmKind, _Pending] = {}
         self._causes: dict[AlarmKind, set[int]] = {}
-        """Those for which an alarm that is active has been raised already."""
+        """Those for which an alarm that is active has been raised since it was last acknowledged, and the last one before."""
         self._now = 0
         self.rows = [Alarm(priority=rule.priority) for rule in self._rules]
         """What the registers show, by number of the alarm."""
@@ -236,6 +236,8 @@ class AlarmPanel:
             fields["shelved_until"] = 0
         self._store(kind, state=after, **fields)
         row = self.rows[kind]
+        if event is EventKind.ALARM_ACKNOWLEDGED:
+            self._causes[kind] = {row.cause}
         self._journal.note(self.now, event, kind, row.cause, value=value, who=who)
         suppressed = before in (AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)
         if suppressed and after is AlarmState.NORMAL and row.active:
