@@ -90,7 +90,7 @@ class AlarmPanel:
         self._rules = [settings.rule(kind) for kind in AlarmKind]
         self._pending: dict[AlarmKind, _Pending] = {}
         self._causes: dict[AlarmKind, set[int]] = {}
-        """Those for which an alarm that is active has been raised since it was last acknowledged, and the last one before."""
+        """Those that are no news: for which an active alarm has been raised since it was last acknowledged."""
         self._now = 0
         self.rows = [Alarm(priority=rule.priority) for rule in self._rules]
         """What the registers show, by number of the alarm."""
@@ -176,7 +176,9 @@ class AlarmPanel:
 
     def _raise(self, kind: AlarmKind, cause: int) -> None:
         row = self.rows[kind]
-        self._causes.setdefault(kind, set()).add(cause)
+        if not row.active:
+            self._causes[kind] = set()
+        self._causes[kind].add(cause)
         if row.state == AlarmState.OUT_OF_SERVICE:  # it is worked on: followed, and not noted
             self._store(kind, active=1, cause=cause)
         else:
@@ -184,7 +186,6 @@ class AlarmPanel:
             self._step(kind, EventKind.ALARM_RAISED, active=1, cause=cause, times=times, raised=self.now)
 
     def _return(self, kind: AlarmKind) -> None:
-        self._causes.pop(kind, None)
         if self.rows[kind].state == AlarmState.OUT_OF_SERVICE:
             self._store(kind, active=0, returned=self.now)
         else:
