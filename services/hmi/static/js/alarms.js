@@ -33,7 +33,7 @@ function actions(alarm) {
     const time = element("select", { "aria-label": `Shelve ${alarm.name} for` }, ...[["15 min", 900], ["1 h", 3600], ["8 h", 28800]].map(([text, value]) => element("option", { value, text })));
     box.append(button("Shelve", () => act("shelve", Number(time.value))()), time);
   }
-  box.append(alarm.state === "out of service" ? button("In service", act("in service again")) : button("Out of service", act("out of service")));
+  box.append(alarm.state === "out of service" ? button("In service", act("in service")) : button("Out of service", act("out of service")));
   return box;
 }
 
