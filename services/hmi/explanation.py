@@ -14,6 +14,8 @@ from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
 
 ROUNDING: Final = 1e-6
+RESOLUTION: Final = 2.0**-22
+"""A change of E that is smaller is lost in the single precision of the registers."""
 LONGEST_TICKS: Final = TICKS_PER_SAMPLE
 
 
@@ -163,7 +165,8 @@ def increments_of(update: Optimization, iterations_before: int) -> Increments:
     else:
         log_K = math.log(K)
         dK = (update.gamma * log_K**2 + log_K) * K / iterations_before
-    return Increments(dD, (dK - E * dD) / D, dK)
+    dE = (dK - E * dD) / D
+    return Increments(dD, dE if abs(dE) * iterations_before > RESOLUTION else 0.0, dK)
 
 
 def budget_of(update: Optimization, rule: UpdatingRuleStatus) -> Budget:
