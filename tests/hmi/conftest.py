@@ -254,7 +254,7 @@ class Served:
 
     def end(self) -> None:
         self._process.terminate()
-        self._process.wait(20)
+        self._process.communicate(timeout=20)
 
     def ask(self, path: str, body: object = None) -> Any:  # noqa: ANN401 JSON
         request = urllib.request.Request(self.address + path)  # noqa: S310 our own page
