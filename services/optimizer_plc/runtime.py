@@ -215,6 +215,8 @@ class OptimizerPlc:
         unplanned = verdict is Verdict.WRONG_UPDATE and not await self._is_superseded(update)
         # late once is late for ever with updates that have been waiting: begin again with a fresh one
         begin_again = unplanned or verdict is Verdict.LATE
+        if begin_again or verdict is Verdict.ACCEPTED:
+            self._program.answered(late=begin_again)
         self._wanted = FRESH_UPDATE if begin_again else AwaitUpdate(update.session, update.update + 1)
 
     async def _is_computed(self, answer: _Answer) -> bool:
