@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final
 
 from rig.local_services import LocalServices
-from rig.network import NetworkRig
 from rig.results import write_json
 from rig.running import make_scenario
+from rig.session_client import SessionClient
 from rig.settings import Settings
 from rig.started_rigs import DEFAULT_PORTS, STATE_FILE, state_folder
 from rig.wiring import SERVICES, START_PATIENCE_S
@@ -36,14 +36,14 @@ class UpRig:
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         services = LocalServices(self._settings, self.folder / "logs", ports=self._ports)
         async with services:
-            rig = NetworkRig(services.endpoints, self._settings)
+            rig = SessionClient(services.endpoints, self._settings)
             try:
                 await services.during(self._serve(rig, announce=announce))
             finally:
                 rig.close()
                 (self.folder / STATE_FILE).unlink(missing_ok=True)
 
-    async def _serve(self, rig: NetworkRig, *, announce: bool) -> None:
+    async def _serve(self, rig: SessionClient, *, announce: bool) -> None:
         scenario = make_scenario(self._settings)
         await rig.connect(START_PATIENCE_S)
         session = await rig.start(scenario)

@@ -23,9 +23,9 @@ from rig.chaos.faults import (
     WrongModel,
 )
 from rig.chaos.models import WRONG_MODEL
-from rig.chaos.observer import Observer
 from rig.chaos.proxy import LinkProxy
 from rig.local_services import LocalServices
+from rig.session_client import SessionClient
 from rig.wiring import SERVICES
 
 ATTEMPTS: Final = 20
@@ -39,12 +39,12 @@ class Injector:
         self,
         services: LocalServices,
         proxies: Mapping[Link, LinkProxy],
-        observer: Observer,
+        client: SessionClient,
         folder: Path,
     ) -> None:
         self._services = services
         self._proxies = proxies
-        self._observer = observer
+        self._client = client
         self._wrong_model = folder / WRONG_MODEL
 
     async def begin(self, fault: AnyFault) -> None:
@@ -89,7 +89,11 @@ class Injector:
 
     async def _set_sensor(self, output: str, fault: SensorFault) -> None:
         for _ in range(ATTEMPTS):
-            if await self._observer.set_sensor_fault(OUTPUT_NAMES.index(output), fault):
+            if await self._client.contact(self._write_fault(OUTPUT_NAMES.index(output), fault)):
                 return
             await asyncio.sleep(0.5)
         raise LinkError(f"the plant took no sensor fault for {output}: see its log")
+
+    async def _write_fault(self, output: int, fault: SensorFault) -> bool:
+        await self._client.plant.write_rows([fault], output)
+        return True

@@ -11,15 +11,15 @@ from coldloop.process import TICK_S
 from rig.chaos.faults import Link, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
-from rig.chaos.observer import Observer
 from rig.chaos.plan import Plan
 from rig.chaos.proxy import LinkProxy
 from rig.chaos.sequencer import FaultSequencer, Progress
 from rig.chaos.trace import ChaosTrace
 from rig.local_services import LocalServices
-from rig.network import NetworkRig
 from rig.ports import ReservedPorts
+from rig.recording import Recorder
 from rig.scenario import Scenario
+from rig.session_client import SessionClient
 from rig.settings import Settings
 from rig.wiring import START_PATIENCE_S, Detours
 
@@ -28,9 +28,15 @@ SLOWEST: Final = 20.0
 
 
 async def conduct(
-    plan: Plan, scenario: Scenario, settings: Settings, folder: Path, trace: ChaosTrace, progress: Progress
+    plan: Plan,
+    scenario: Scenario,
+    settings: Settings,
+    folder: Path,
+    recorder: Recorder,
+    trace: ChaosTrace,
+    progress: Progress,
 ) -> None:
-    """Run a plan on three services started for it; `trace` holds what there was even when it fails.
+    """Run a plan on three services started for it; `trace`, a sink of the recorder, has what there was.
 
     Raises:
         LinkError: A service ended by itself, the rig stood still, or it all took too long.
@@ -48,17 +54,15 @@ async def conduct(
             ),
         }
         await stack.enter_async_context(services)
-        rig = NetworkRig(services.endpoints, settings)
-        stack.callback(rig.close)
-        await services.during(rig.connect(START_PATIENCE_S))
+        client = SessionClient(services.endpoints, settings, tolerant=True)
+        stack.callback(client.close)
+        await services.during(client.connect(START_PATIENCE_S))
         for proxy in proxies.values():  # until now nobody listened there, as nobody did behind
             await proxy.start()
             stack.push_async_callback(proxy.close)
-        session = await services.during(rig.start(scenario))
-        observer = Observer(services.endpoints, trace, session)
-        stack.callback(observer.close)
-        injector = Injector(services, proxies, observer, folder)
-        driver = FaultSequencer(plan, services, observer, injector, trace, progress)
+        await services.during(client.begin(scenario, recorder))
+        injector = Injector(services, proxies, client, folder)
+        driver = FaultSequencer(plan, services, client, injector, trace, progress)
         try:
             async with asyncio.timeout(_patience_s(plan)):
                 await services.during(driver.run())
@@ -69,6 +73,7 @@ async def conduct(
             ) from None
         finally:
             driver.finish()
+            await client.last_look()
 
 
 def _retained(folder: Path) -> dict[str, str]:
