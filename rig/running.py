@@ -20,6 +20,7 @@ from rig.interruption import INTERRUPTION
 from rig.local_services import run_on_localhost
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder, Sink
+from rig.rig_configuration import attached, running_configuration
 from rig.rig_endpoints import RigEndpoints
 from rig.run_files import RunFiles
 from rig.scenario import Scenario, natural_ticks
@@ -68,6 +69,23 @@ def make_scenario(settings: Settings, ticks: int | None = None) -> Scenario:
         realtime=settings.session.mode is TimeMode.REALTIME,
         factor=settings.session.factor,
     )
+
+
+def as_attached(effective: Configuration[Settings], endpoints: Sequence[Endpoint]) -> Configuration[Settings]:
+    """Return a configuration with what a rig that is up really runs.
+
+    Raises:
+        UsageError: The user asks for something else, which a client cannot change.
+        LinkError: A service does not answer.
+    """
+    running: dict[str, Any] = {}
+
+    async def read() -> int:
+        running.update(await running_configuration(RigEndpoints(*endpoints), effective.settings, ATTACH_PATIENCE_S))
+        return 0
+
+    run_event_loop(read)
+    return attached(effective, running)
 
 
 def check_certificates(settings: Settings) -> None:

@@ -13,6 +13,7 @@ import time
 from typing import Final
 
 from coldloop import __version__
+from coldloop.config import selected
 from coldloop.errors import ConfigurationError, LinkError, PeerUnreachableError
 from coldloop.limits import InputLimits
 from coldloop.logs import dropped
@@ -24,6 +25,7 @@ from coldloop.process import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import SessionPace
+from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, LinkCause, PlantLinkState
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus, WatchdogTime
@@ -36,7 +38,7 @@ from control_plc.publication import Publication
 from control_plc.rack_clock import PHASE, RackClock
 from control_plc.retained_state import Memory, RetainedState
 from control_plc.scan_cycle import ScanCycle
-from control_plc.settings import ControlSection, ControlSettings
+from control_plc.settings import SHOWN, ControlSection, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
 
@@ -93,6 +95,7 @@ class ControlPlc:
         if self._kept is not None:
             self._clock.synchronise(self._kept.tick + PHASE, time.monotonic())
         self.bank = RegisterBank(CONTROL_MAP, section.word_order)
+        publish_configuration(self.bank, selected(settings, SHOWN))
         self.publication = Publication(program, self._link, self.bank, header.short_digest, self._keep)
         self.clients = Clients(program, settings.limits, self.bank, self.publication, lambda: self._pace)
         self._reached = False

@@ -1,7 +1,7 @@
 """Configuration of the optimiser PLC, checked when it is made and immutable after."""
 
 from enum import StrEnum
-from typing import Annotated, Self
+from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -24,6 +24,8 @@ from optimizer_plc.solvers.ode import OdeSettings
 from optimizer_plc.solvers.osqp import OsqpSettings
 from optimizer_plc.solvers.qpoases import QpoasesSettings
 
+SHOWN: Final = ("limits", "optimizer_plc.program")
+"""What of the configuration decides results: shown in the registers."""
 ADAPTIVE = 0
 
 

@@ -6,6 +6,7 @@ from typing import Annotated, Final, NamedTuple
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
+from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
 from coldloop.registers.safety import Alarm, AlarmCommand, AlarmKind, LeaseStatus, WatchdogStatus, WatchdogTime
 
@@ -331,5 +332,7 @@ CONTROL_MAP: Final = RegisterMap(
         Block("journal page", 45010, JournalPage, "State of the journal"),
         Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
         Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+        CONFIGURATION_BLOCK,
+        CONFIGURATION_LINES_BLOCK,
     ),
 )
