@@ -10,7 +10,7 @@ from coldloop.command_line import add_configuration_options
 from coldloop.errors import LinkError, ResultsError, UsageError
 from coldloop.process import TICK_S
 from rig.commands.choices import FIGURE_FORMATS, MODES, plans
-from rig.commands.options import check_load, configuration, duration
+from rig.commands.options import OWN_PORTS, PLACES, check_load, configuration, duration, refuse_ineffective
 
 if TYPE_CHECKING:
     from coldloop.config import Configuration
@@ -61,7 +61,7 @@ def execute(options: argparse.Namespace) -> int:
 
     plan = find_plan(options.plan, _changes(options))
     effective = configuration(options)
-    _refuse_what_the_plan_has(effective)
+    _refuse_what_has_no_effect(effective)
     out = options.out or Path("chaos") / f"{plan.name}-{datetime.now():%Y%m%d-%H%M%S}"  # noqa: DTZ005
     claim_folder(out, force=options.force)
     with ChaosProgress(plan.ticks) as progress:
@@ -81,14 +81,20 @@ def _list_plans() -> None:
         sys.stdout.write(f"{plan.name:20} {plan.description}\n")
 
 
-def _refuse_what_the_plan_has(effective: "Configuration[Settings]") -> None:
-    """Refuse a value from the command line that the plan's own would replace."""
+def _refuse_what_has_no_effect(effective: "Configuration[Settings]") -> None:
+    """Refuse a value from the command line that the plan's own, or that of the command, would replace."""
     from rig.chaos.plan import OF_PLAN
 
-    for key, option in OF_PLAN.items():
-        source = effective.sources.get(key, "")
-        if source.startswith("--set"):
-            raise UsageError(f"{source}: the plan has its own value of {key}; change it with {option}")
+    refuse_ineffective(
+        effective,
+        {
+            **{key: f"the plan has its own value; change it with {option}" for key, option in OF_PLAN.items()},
+            **dict.fromkeys(PLACES, OWN_PORTS),
+            "session.autostart": "it begins a session",
+            "plant.retain.file": "the states are retained in the folder of the results",
+            "control_plc.retain.file": "the states are retained in the folder of the results",
+        },
+    )
 
 
 def _report(out: Path, plan: "Plan", experiment: "Experiment") -> None:

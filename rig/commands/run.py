@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 from coldloop.command_line import add_configuration_options
 from coldloop.errors import UsageError
 from rig.commands.choices import FIGURE_FORMATS, LOADS, MODES, SOLVERS
-from rig.commands.options import check_load, configuration, duration, endpoint, updating_period
+from rig.commands.options import (
+    OWN_PORTS,
+    PLACES,
+    check_load,
+    configuration,
+    duration,
+    endpoint,
+    refuse_ineffective,
+    updating_period,
+)
 
 if TYPE_CHECKING:
     from rig.running import Job
@@ -76,6 +85,7 @@ def _job(options: argparse.Namespace) -> "Job":
     if options.attach:
         ends = [Endpoint(host=end.host, port=end.port, tls=settings.rig.tls) for end in options.attach]
         return Job(as_attached(effective, ends), scenario, Way.ATTACHED, tuple(ends))
+    refuse_ineffective(effective, {**dict.fromkeys(PLACES, OWN_PORTS), "session.autostart": "it begins a session"})
     if options.in_process:
         return Job(effective, scenario, Way.IN_PROCESS)
     check_certificates(settings)

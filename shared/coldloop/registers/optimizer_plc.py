@@ -6,6 +6,7 @@ from typing import Annotated, Final, NamedTuple
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
+from coldloop.registers.control_plc import Verdict
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, u16, u32
 
 HISTORY_ROWS: Final = 256
@@ -42,7 +43,11 @@ class ControlLinkStatus(NamedTuple):
 
     state: Annotated[
         int,
-        u16("0 searching, 1 introducing, 2 waiting, 3 computing, 4 delivering, 5 foreign, 6 wrong model", high=6),
+        u16(
+            "0 searching, 1 introducing, 2 waiting, 3 computing, 4 delivering, 5 foreign, 6 wrong model",
+            high=6,
+            values=ControlLinkState,
+        ),
     ] = ControlLinkState.SEARCHING
     holder: Annotated[int, u32("Number that this optimiser has given itself")] = 0
     breaks: Annotated[int, u32("Times that the link was lost")] = 0
@@ -58,7 +63,7 @@ class Optimization(NamedTuple):
     tick: Annotated[int, u32("Tick of the updating instant t_i")]
     tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i", unit="0.25 s")]
     iterations: Annotated[int, u16("Iterations done: q(t_i), or fewer if more would have changed nothing")]
-    verdict: Annotated[int, u16("Verdict of the control PLC on the sequence")]
+    verdict: Annotated[int, u16("Verdict of the control PLC on the sequence", values=Verdict)]
     j_effective: Annotated[float, f32("J_i: the profile being played, at the state reached")]
     j_hot_start: Annotated[float, f32("J+_i: the shifted profile, at the predicted state")]
     j_delivered: Annotated[float, f32("Ĵ_{i+1}: the delivered profile, at the predicted state")]

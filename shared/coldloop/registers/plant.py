@@ -61,7 +61,11 @@ class Measurement(NamedTuple):
         int, u32("Rises when outputs change in another way than by their writer: safe state, session, new writer")
     ] = 0
     verdict: Annotated[
-        int, u16("Outputs sent last: 0 none, 1 taken, 2 wrong session, 3 untimely, 4 changed since they were read back")
+        int,
+        u16(
+            "Outputs sent last: 0 none, 1 taken, 2 wrong session, 3 untimely, 4 changed since they were read back",
+            values=OutputVerdict,
+        ),
     ] = OutputVerdict.NONE
     refused: Annotated[int, u16("Writes of others that were refused so far; wraps")] = 0
     age: Annotated[float, f32("Time since this tick began, by the rack's clock, in ticks; 0 in lock-step")] = 0.0
@@ -80,7 +84,10 @@ class SensorFaultKind(IntEnum):
 class SensorFault(NamedTuple):
     """A fault put into one output of the simulation. Row i is output i; the history keeps the true value."""
 
-    kind: Annotated[int, u16("0 none, 1 not a number, 2 frozen at its present value, 3 the value below", high=3)]
+    kind: Annotated[
+        int,
+        u16("0 none, 1 not a number, 2 frozen at its present value, 3 the value below", high=3, values=SensorFaultKind),
+    ]
     value: Annotated[float, f32("Value that the sensor shows with fault 3")]
 
 
