@@ -1,6 +1,7 @@
 """Ctrl-C or SIGTERM at random instants of a run, of a plan with faults and of a study: how they end, and what is left.
 
-Each process gets the signal at a seeded instant after its start. It should end with 128 and the signal's number and
+Each process gets the signal at a seeded instant: half of them count from its start, the others, where there is a run,
+from the moment at which the run is under way. It should end with 128 and the signal's number and
 without a traceback, and what it has recorded should be readable with pandas, DuckDB and, exported, `scipy.io.loadmat`.
 """
 
@@ -11,6 +12,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -19,6 +21,7 @@ import pandas as pd
 from scipy.io import loadmat
 
 PATIENCE_S: Final = 120.0
+LOOK_S: Final = 0.05
 COMMANDS: Final = {
     "in-process": ("run", "--in-process", "--load", "6h", "--figures", "png"),
     "networked": ("run", "--load", "6h", "--figures", "png"),
@@ -42,11 +45,13 @@ def coldloop(*words: str) -> list[str]:
     return [sys.executable, "-m", "rig.cli", *words]
 
 
-def interrupt(command: tuple[str, ...], number: signal.Signals, after_s: float, out: Path) -> End:
-    """Start a command, send it a signal, and look at what is left."""
+def interrupt(command: tuple[str, ...], number: signal.Signals, after_s: float, out: Path, *, under_way: bool) -> End:
+    """Start a command, send it a signal after a while from its start, or from its run's, and look at what is left."""
     process = subprocess.Popen(
         coldloop(*command, "--out", str(out)), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
+    while under_way and process.poll() is None and not (out / "manifest.json").exists():
+        time.sleep(LOOK_S)
     try:
         process.wait(after_s)
     except subprocess.TimeoutExpired:
@@ -100,12 +105,16 @@ def main() -> int:
         for name in options.only:
             for instant in range(options.count):
                 after_s = draw.uniform(0.0, options.latest)
-                end = interrupt(
-                    COMMANDS[name], signal.Signals[options.signal], after_s, Path(scratch, f"{name}{instant}")
-                )
+                under_way = name != "study" and bool(instant % 2)
+                out = Path(scratch, f"{name}{instant}")
+                end = interrupt(COMMANDS[name], signal.Signals[options.signal], after_s, out, under_way=under_way)
                 unsound += not end.sound
                 mark = "ok " if end.sound else "BAD"
-                print(f"{mark} {name:10} {after_s:6.2f} s  rc {end.code:4}  {end.left:40} {end.complaints}", flush=True)
+                since = "of run  " if under_way else "of start"
+                print(
+                    f"{mark} {name:10} {after_s:6.2f} s {since} rc {end.code:4}  {end.left:32} {end.complaints}",
+                    flush=True,
+                )
     print(f"{unsound} did not end as they should")
     return 1 if unsound else 0
 

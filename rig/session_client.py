@@ -15,7 +15,7 @@ from coldloop.process import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, LadderStatus, Mode, Status
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
-from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, PlantSession
+from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, PlantSession, SensorFault
 from plant.runtime import own_header
 from rig.driving import CONTROL, PLANT
 from rig.load_stream import LoadStream, write_table
@@ -236,6 +236,14 @@ class SessionClient:
             return None
         self._noted_events = ladder.events
         return ladder
+
+    async def set_sensor_fault(self, output: int, fault: SensorFault) -> bool:
+        """Write the fault of an output's sensor, by the output's index; return whether the plant has taken it."""
+        return await self.contact(self._write_fault(output, fault)) is not None
+
+    async def _write_fault(self, output: int, fault: SensorFault) -> bool:
+        await self.plant.write_rows([fault], output)
+        return True
 
     async def contact(self, request: Awaitable[T]) -> T | None:
         """Return the answer to a request; with `tolerant`, None when the service does not answer in time."""

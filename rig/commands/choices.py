@@ -7,7 +7,7 @@ from importlib.resources import files
 from typing import Final
 
 MODES: Final = ("lockstep", "realtime")
-SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "daqp")
+SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "daqp")
 LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h")
 SERVICES: Final = ("control_plc", "optimizer_plc", "plant")
 REGISTER_FORMATS: Final = ("csv", "json", "markdown", "table")

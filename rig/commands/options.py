@@ -204,7 +204,7 @@ def refuse_ineffective(effective: "Configuration[Settings]", keys: Mapping[str, 
     for key, remedy in keys.items():
         source = effective.sources.get(key, "")
         if source.startswith("--"):
-            raise UsageError(f"{source}: {key} has no effect here: {remedy}")
+            raise UsageError(f"{source}: has no effect on this command: {remedy}")
 
 
 OWN_PORTS = "services that it starts get ports of their own; `coldloop up --port-base` has fixed ones"

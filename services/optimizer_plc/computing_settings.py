@@ -110,3 +110,20 @@ class DaqpSettings(BaseModel):
     primal_tolerance: PositiveFloat = 1e-9
     tau_1_s: PositiveFloat = 4.75
     """One solve in an updating period of 5 s at P = 1: an oracle's time, not a measured one."""
+
+
+class InteriorPointSettings(BaseModel):
+    """Settings of the interior-point method."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    alpha: PositiveFloat = PENALTY_WEIGHT
+    first_mu: PositiveFloat = 3.0
+    """mu that the guess is put on the central path for, as a share of its J over the number of rows and variables: a
+    guess that costs much is far from the optimum, and needs a path that begins far from the bounds."""
+    least_mu: PositiveFloat = 1.0
+    """It is never less than this."""
+    margin: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1
+    """Share of the box's width by which the guess is at least moved away from its bounds."""
+    tau_1_s: PositiveFloat = 0.17
+    """87,700 operations at 0.529 Mflop/s are 0.166 s (`docs/budget.md`)."""

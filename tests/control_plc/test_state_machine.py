@@ -4,6 +4,7 @@ import json
 import math
 from itertools import pairwise
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -216,7 +217,7 @@ class Link(RuleBasedStateMachine):
         content = Memory(None, HEADER.short_digest).content(self.program, Pace(realtime=False, factor=1.0))
         kept = RetainedState.parsed(json.loads(json.dumps(content)))
         self.program = self.new_program()
-        self.program.alarms.rows = list(kept.alarms)
+        self.program.alarms.restore(kept.alarms)
         self.program.resume(kept.session, kept.tick, self.trace[-1], updates=kept.updates, operator=kept.operator)
         self.promised = None
         self.began.append(len(self.trace))
@@ -270,5 +271,5 @@ class Link(RuleBasedStateMachine):
             assert events[-1].subject == self.program.mode
 
 
-TestLink = Link.TestCase
+TestLink = pytest.mark.slow(Link.TestCase)
 TestLink.settings = settings(max_examples=60, stateful_step_count=60)

@@ -2,9 +2,11 @@
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 from rig.cli import make_parser
 from rig.register_listing import FORMATS, MAPS
@@ -24,12 +26,12 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
         assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
-def test_every_coldloop_command_in_the_readme_is_understood() -> None:
-    blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    lines = [line for block in blocks for line in block.splitlines() if line.startswith("coldloop ")]
-    assert len(lines) > 5
-    for line in lines:
-        words = shlex.split(line, comments=True)[1:]
+def test_every_coldloop_command_of_the_pages_is_understood() -> None:
+    blocks = [block for page in PAGES for block in re.findall(r"```sh\n(.*?)```", page.read_text("utf-8"), re.DOTALL)]
+    lines = [line.removeprefix(".venv/bin/") for block in blocks for line in block.splitlines()]
+    commands = [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("coldloop ")]
+    assert len(commands) > 30
+    for words in commands:
         make_parser(words[0]).parse_args(words)
 
 
@@ -40,3 +42,15 @@ def test_every_mbpoll_line_in_the_readme_reads_declared_floats() -> None:
     for port, address in lines:
         registers = [register for block in MAPS[ports[port]].blocks for register in block.registers()]
         assert any(r.address == int(address) and r.kind.label == "float32" for r in registers), (port, address)
+
+
+def test_the_hosted_workflow_calls_scripts_that_exist_with_pinned_actions_on_each_python() -> None:
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text("utf-8"))
+    steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
+    scripts = [step["run"].split()[0] for step in steps if step.get("run", "").startswith("scripts/")]
+    assert {"scripts/check", "scripts/test"} <= set(scripts)
+    assert all((ROOT / script).is_file() for script in scripts)
+    assert all(re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40}", step["uses"]) for step in steps if "uses" in step)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    supported = [each.rpartition(" ")[2] for each in project["classifiers"] if "Python :: 3." in each]
+    assert workflow["jobs"]["tests"]["strategy"]["matrix"]["python"] == supported
