@@ -1,5 +1,6 @@
 """`coldloop up`, `down`, `status`, `set` and `run --attach`: a rig that stays up, and what is done with it."""
 
+import asyncio
 import json
 import os
 import signal
@@ -12,6 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from coldloop.errors import RequestRefusedError
+from coldloop.modbus.client import RegisterClient
+from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
 from rig import cli
 from rig.ports import ReservedPorts
 from rig.started_rigs import check_ports, running_rig
@@ -109,6 +113,20 @@ def test_what_cannot_be_done_is_one_line(coldloop: Coldloop, up: str, words: tup
     assert outcome.code == 2
     assert len(outcome.complaints) == 1
     assert part in outcome.complaints[0]
+
+
+@pytest.mark.parametrize("mode", list(OperatorMode))
+def test_a_setpoint_beyond_the_bounds_is_refused_by_the_control_plc_itself(up: str, mode: OperatorMode) -> None:
+    async def write() -> None:
+        control = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=int(up) + 1, timeout_s=10.0)
+        before = await control.read(Operator)
+        with pytest.raises(RequestRefusedError) as refusal:
+            await control.write(Operator(mode, 80.0, before.ncr22, before.cv156))
+        assert refusal.value.exception_code == 3
+        assert (await control.read(Operator)).mode == before.mode
+        control.close()
+
+    asyncio.run(write())
 
 
 def test_a_load_file_begins_now(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
