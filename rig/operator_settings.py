@@ -6,7 +6,7 @@ from coldloop.limits import InputLimits
 from coldloop.modbus.settings import TlsSettings
 from coldloop.registers.codec import WordOrder
 
-OTHERS = ("model", "session", "telemetry")
+OTHERS = ("model", "session", "telemetry", "hmi")
 """Sections that a configuration may have and an operator's client does not read."""
 
 

@@ -26,6 +26,7 @@ KEYS = {
     "updating_period": ("optimizer_plc.program.updating_period_s", "--updating-period"),
     "mode": ("session.mode", "--mode"),
     "factor": ("session.factor", "--factor"),
+    "page_port": ("hmi.port", "--page-port"),
 }
 """Options that set one key of the configuration."""
 
@@ -109,7 +110,7 @@ def add_rig_options(parser: argparse.ArgumentParser, *, again: bool = False) -> 
                         help="folder with the operator's certificate; a rig that is up here tells its own")  # fmt: skip
 
 
-def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings") -> "RigEndpoints":
+def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Settings") -> "RigEndpoints":
     """Return where a rig that is up is found.
 
     Raises:
