@@ -23,9 +23,11 @@ from coldloop.registers.optimizer_plc import (
     UpdatingRuleStatus,
 )
 from coldloop.sequence import InputSequence, with_checksum
+from optimizer_plc.arithmetic import real_of
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
+from optimizer_plc.computing_settings import EstimatorKind
 from optimizer_plc.costs import augmented_cost, indicators
-from optimizer_plc.estimator import Estimate, Estimator, EstimatorKind, KalmanFilter, StateFeedback
+from optimizer_plc.estimator import Estimate, Estimator, KalmanFilter, StateFeedback
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.rules import make_rule
@@ -74,7 +76,7 @@ class OptimizerProgram:
     def __init__(self, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
         self.settings = settings
         self.model_digest = model.short_digest
-        self._real = settings.arithmetic.real
+        self._real = real_of(settings.arithmetic)
         self._prediction = PredictionModel(model)
         self._problem = PredictiveProblem(self._prediction, settings.design, limits, self._real)
         self._solver = make_solver(settings)

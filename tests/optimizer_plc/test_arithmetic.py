@@ -16,20 +16,20 @@ import optimizer_plc
 from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel
 from coldloop.registers.control_plc import Update, Verdict
-from optimizer_plc.arithmetic import Arithmetic
+from optimizer_plc.arithmetic import real_of
+from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings, OdeSettings
 from optimizer_plc.costs import augmented_cost
-from optimizer_plc.estimator import EstimatorKind, EstimatorSettings
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings, SolverName
-from optimizer_plc.solvers.ode import OdeSettings, OdeSolver
+from optimizer_plc.solvers.ode import OdeSolver
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Jump, PenalisedOptimum
 
 Array = NDArray[np.float64]
 
-SINGLE = Arithmetic.FLOAT32.real
+SINGLE = real_of(Arithmetic.FLOAT32)
 
 ON_LINE = {
     "apply", "augmented_cost", "begin", "cholesky", "cholesky_solve", "deviation_cost", "hold_at_bounds", "_inputs",

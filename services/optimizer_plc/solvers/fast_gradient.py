@@ -14,31 +14,18 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, PositiveFloat
 
 from coldloop.compiled import kernel
+from optimizer_plc.computing_settings import FastGradientSettings
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.solution import Solution, judge, penalty_multipliers
-from optimizer_plc.solvers.interface import PENALTY_WEIGHT
 
 Array = NDArray[np.float64]
 
 POWER_ITERATIONS = 200
 BOUND_MARGIN = 1.02
 """On the largest eigenvalue, which power iteration approaches from below."""
-
-
-class FastGradientSettings(BaseModel):
-    """Settings of the fast gradient method."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    alpha: PositiveFloat = PENALTY_WEIGHT
-    adaptive_restart: bool = True
-    """Whether the momentum is dropped when it points uphill."""
-    tau_1_s: PositiveFloat = 0.03
-    """14,656 operations at 0.529 Mflop/s are 0.028 s (`docs/budget.md`)."""
 
 
 class Momentum(NamedTuple):
