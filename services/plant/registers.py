@@ -5,6 +5,7 @@ import secrets
 import time
 from collections.abc import Callable
 
+from coldloop.config import selected
 from coldloop.journal import Journal, JournalPublication
 from coldloop.model_file import ModelHeader
 from coldloop.pace import Pace
@@ -12,6 +13,7 @@ from coldloop.process import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
 from coldloop.registers.common import Identity, ServiceState, SessionPace
+from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import (
     HISTORY_ROWS,
@@ -38,7 +40,7 @@ from plant.outputs import next_generation
 from plant.program import LoadProfile
 from plant.rack import MakePlant, Rack, Session
 from plant.retained_state import Memory, refused
-from plant.settings import PlantSettings
+from plant.settings import SHOWN, PlantSettings
 
 log = logging.getLogger("coldloop.plant")
 
@@ -71,6 +73,7 @@ class RackRegisters:
         self._model_digest = header.short_digest
         self._age = age
         self.bank = RegisterBank(PLANT_MAP, settings.plant.word_order)
+        publish_configuration(self.bank, selected(settings, SHOWN))
         self._memory = Memory(settings.plant.retain.file, header.short_digest)
         self.rack, resumed = self._switched_on(
             settings, header, make_plant, utc, first_generation or secrets.randbelow(2**31) + 1

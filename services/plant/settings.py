@@ -1,7 +1,7 @@
 """Configuration of the plant service, checked when it is made and immutable after."""
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -14,6 +14,9 @@ from coldloop.registers.codec import WordOrder
 from coldloop.retained import RetainSettings
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
+
+SHOWN: Final = ("plant.sensors", "plant.clock_error_ppm", "plant.watchdog")
+"""What of the configuration decides results: shown in the registers. Load and seed are those of a session."""
 
 Deviation = Annotated[float, Field(ge=0)]
 Percent = Annotated[float, Field(ge=0, le=100)]
