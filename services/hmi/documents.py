@@ -37,7 +37,22 @@ EARLIER_PREDICTIONS: Final = 12
 
 def encoded(document: Document) -> bytes:
     """Return a document as JSON; numbers that are not finite are null."""
-    return json.dumps(document, ensure_ascii=False, separators=(",", ":"), default=str).encode()
+    try:
+        return _json(document)
+    except ValueError:
+        return _json(_finite_parts(document))
+
+
+def _json(document: object) -> bytes:
+    return json.dumps(document, ensure_ascii=False, separators=(",", ":"), default=str, allow_nan=False).encode()
+
+
+def _finite_parts(part: object) -> object:
+    if isinstance(part, dict):
+        return {key: _finite_parts(value) for key, value in part.items()}
+    if isinstance(part, list | tuple):
+        return [_finite_parts(value) for value in part]
+    return None if isinstance(part, float) and not math.isfinite(part) else part
 
 
 def finite(value: float | str) -> float | int | str | None:
@@ -83,7 +98,9 @@ def alarm_document(kind: AlarmKind, alarm: Alarm) -> Document:
         "active": bool(alarm.active),
         "cause": alarm_cause(kind, alarm.cause) if alarm.times else "",
         "priority": int(alarm.priority),
-        "priority_word": word(AlarmPriority(alarm.priority)) if alarm.priority else "",
+        "priority_word": word(AlarmPriority(alarm.priority))
+        if alarm.priority in AlarmPriority.__members__.values()
+        else "",
         "times": alarm.times,
         "raised_s": alarm.raised * TICK_S,
         "returned_s": alarm.returned * TICK_S,
@@ -93,10 +110,10 @@ def alarm_document(kind: AlarmKind, alarm: Alarm) -> Document:
 
 def alarms_document(model: Model) -> list[Document]:
     """Return all alarms, those that want an operator first, then by priority and age."""
-    rank = {AlarmState.UNACKNOWLEDGED: 0, AlarmState.RETURNED: 0, AlarmState.ACKNOWLEDGED: 1}
+    rank: dict[int, int] = {AlarmState.UNACKNOWLEDGED: 0, AlarmState.RETURNED: 0, AlarmState.ACKNOWLEDGED: 1}
     rows = sorted(
         model.alarm_rows(),
-        key=lambda row: (rank.get(AlarmState(row[1].state), 2), -row[1].priority, not row[1].active, -row[1].raised),
+        key=lambda row: (rank.get(row[1].state, 2), -row[1].priority, not row[1].active, -row[1].raised),
     )
     return [alarm_document(kind, alarm) for kind, alarm in rows]
 
@@ -165,7 +182,10 @@ def explanation_document(model: Model, number: int | None, at_tick: int | None =
     update = updates[place]
     before = updates[place - 1] if place else None
     after = updates[place + 1] if place + 1 < len(updates) else None
-    found = explain(update, before, after, model.rule)
+    try:
+        found = explain(update, before, after, model.rule)
+    except (ArithmeticError, ValueError):  # numbers that no optimiser of ours writes
+        return None
     prediction = next((one for one in reversed(model.predictions) if one.update == update.update), None)
     document = asdict(found)
     document["sentence"] = sentence(found, model.rule)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeVar, cast
 
 from coldloop.event_text import EventText, describe, utc_text
-from coldloop.process import TICK_S
+from coldloop.process import OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import Event
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Process
@@ -207,19 +207,21 @@ class Model:
     def stands_still(self, service: str) -> bool:
         """Tell whether the tick of a service does not move although its session goes on by the clock."""
         pace = self.record("plant", SessionPace)
-        if pace is None or not pace.realtime or pace.paused or not pace.session:
+        if pace is None or not pace.realtime or pace.paused or not pace.session or not pace.factor > 0:
             return False
         patience = max(STALE_S, 3 * TICK_S / pace.factor)
         return self.now() - self.sources[service].moved > patience
 
     def stale_prefixes(self) -> list[str]:
-        """Return the beginnings of the names of signals that are not current."""
+        """Return what is not current: names of signals and, with a dot at the end, beginnings of names."""
         stale = [f"{service}." for service in MAPS if not self.is_live(service)]
         if self.is_live("control_plc") and self.stands_still("control_plc"):
             stale.append("control_plc.process.")
         if self.is_live("plant") and self.stands_still("plant"):
             stale.append("plant.measurement.")
-        return stale
+        ladder = self.record("control_plc", LadderStatus)
+        bad = ladder.bad_sensors if ladder else 0  # the last good value of such a sensor stands in for it
+        return stale + [f"control_plc.process.y.{name}" for i, name in enumerate(OUTPUT_NAMES) if bad >> i & 1]
 
     def alarm_rows(self) -> list[tuple[AlarmKind, Alarm]]:
         """Return the alarms with their kinds."""

@@ -9,9 +9,11 @@ from collections.abc import Iterator
 import pytest
 
 from coldloop.metrics import exposition
+from coldloop.process import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Process
+from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
 from hmi.broadcast import WAITING, Broadcast
 from hmi.commands import read_load
@@ -160,6 +162,24 @@ def test_a_message_has_only_what_changed_and_numbers_that_json_has(model: Model)
     assert "control_plc.process.load" not in document["values"]
     whole = json.loads(encoded(state_document(model)))
     assert whole["values"]["control_plc.process.y.L1"] is None
+
+
+def test_a_measurement_that_is_substituted_is_stale_and_no_other(model: Model) -> None:
+    assert model.stale_prefixes() == []
+    t1, l1 = OUTPUT_NAMES.index("T1"), OUTPUT_NAMES.index("L1")
+    model.put("control_plc", LadderStatus(1, 0, 0, 1, 1 << t1 | 1 << l1, 0))
+    assert sorted(model.stale_prefixes()) == ["control_plc.process.y.L1", "control_plc.process.y.T1"]
+
+
+def test_what_is_sent_is_json_even_when_numbers_or_words_are_none(model: Model) -> None:
+    model.put("control_plc", process(2, level=float("nan")))
+    model.put("plant", SessionPace(1, 1, 0.0, 0))
+    model.put_updates([Optimization(1, 2, 4, 3, 0, *(float("inf"),) * 11)])
+    model.put_alarms([Alarm(state=99, priority=77) for _ in AlarmKind])
+    trend = json.loads(encoded(trend_document(model, ["L1"], 0, 10, 100)), parse_constant=pytest.fail)
+    assert trend["series"]["L1"] == [60.0, None]
+    state = json.loads(encoded(state_document(model)), parse_constant=pytest.fail)
+    assert state["alarms"][0]["state"] == "99"
 
 
 def test_loads_and_alarms_are_marked_on_the_trends(model: Model) -> None:

@@ -98,6 +98,15 @@ def test_when_the_page_itself_is_killed_the_browser_says_so_and_comes_back(page:
     eventually(lambda: page.is_hidden("#banner"), "the banner goes", 30)
 
 
+def test_a_stream_on_which_nothing_comes_is_given_up_for_another(page: "Page", site: Site) -> None:
+    try:
+        with page.expect_request("**/api/stream", timeout=30_000):
+            site.freeze("hmi")
+    finally:
+        site.thaw("hmi")
+    eventually(lambda: page.is_hidden("#banner"), "the banner goes", 30)
+
+
 def test_the_alarm_line_is_on_every_view(page: "Page") -> None:
     for view in ("overview", "trends", "why", "alarms", "commands", "detail"):
         page.click(f"nav a[href='#{view}']")

@@ -2,7 +2,7 @@
 
 export const state = { catalog: null, me: null, values: {}, services: {}, stale: [], alarms: [], update: null, tick: 0, heard: 0 };
 const listeners = [];
-const SILENT_MS = 1500;
+const SILENT_MS = 1500, GIVEN_UP_MS = 5000;
 
 export function onChange(listener) { listeners.push(listener); }
 
@@ -24,20 +24,27 @@ export function take(message) {
 export function pageIsSilent() { return performance.now() - state.heard > SILENT_MS; }
 
 export function isStale(name) {
-  return pageIsSilent() || state.stale.some((prefix) => name.startsWith(prefix));
+  return pageIsSilent() || state.stale.some((one) => name === one || (one.endsWith(".") && name.startsWith(one)));
 }
 
 export function signal(name) { return state.catalog.signals[name] || null; }
 
+// A connection on which nothing comes any more, as after a server's loss of power, tells no error: it is given up.
 export function connect() {
-  let source = null;
+  let source = null, begun = 0;
   const open = () => {
+    begun = performance.now();
     source = new EventSource("api/stream");
-    source.onmessage = (event) => take(JSON.parse(event.data));
-    source.onerror = () => { source.close(); setTimeout(open, 500); };
+    const own = source, again = () => { own.close(); if (own === source) { source = null; setTimeout(open, 500); } };
+    own.onmessage = (event) => take(JSON.parse(event.data));
+    own.onerror = again;
+    own.giveUp = again;
   };
   open();
-  setInterval(() => tell({ names: new Set(), alarms: false, update: false }), 250);
+  setInterval(() => {
+    if (source && performance.now() - Math.max(begun, state.heard) > GIVEN_UP_MS) source.giveUp();
+    tell({ names: new Set(), alarms: false, update: false });
+  }, 250);
 }
 
 export function timeText(seconds) {
