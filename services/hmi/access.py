@@ -14,7 +14,8 @@ MOST_SESSIONS: Final = 200
 MOST_ADDRESSES: Final = 1000
 LOGINS_A_MINUTE: Final = 6.0
 LOGIN_BURST: Final = 6.0
-REQUESTS_A_SECOND: Final = 30.0
+REQUESTS_A_BROWSER: Final = 3.0
+"""In a second. Behind a proxy all browsers have one address, and each asks for two trends a second."""
 REQUEST_BURST: Final = 150.0
 LOCAL_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 
@@ -83,7 +84,7 @@ class Sessions:
 
 
 def _digest(token: str) -> str:
-    return hashlib.sha256(token.encode()).hexdigest()
+    return hashlib.sha256(token.encode(errors="surrogatepass")).hexdigest()
 
 
 class RateLimit:
@@ -120,8 +121,11 @@ class RateLimit:
 
 
 def host_of(header: str) -> str:
-    """Return the name in a Host header, without its port."""
-    return urlsplit(f"//{header}").hostname or ""
+    """Return the name in a Host header, without its port; empty when there is none."""
+    try:
+        return urlsplit(f"//{header}").hostname or ""
+    except ValueError:
+        return ""
 
 
 def is_own_origin(origin: str | None, host: str) -> bool:

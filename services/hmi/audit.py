@@ -56,7 +56,7 @@ class Audit:
         )
         if self._file is not None:
             try:
-                with self._file.open("a", encoding="utf-8") as lines:
+                with self._file.open("a", encoding="utf-8", errors="backslashreplace") as lines:
                     lines.write(json.dumps(entry, ensure_ascii=False) + "\n")
             except OSError as error:
                 log.error("audit not written", extra={"file": str(self._file), "reason": error.strerror})  # noqa: TRY400

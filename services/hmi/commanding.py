@@ -1,7 +1,6 @@
 """Requests that change something: login, logout, and commands in two steps."""
 
 import asyncio
-import json
 from typing import Any, Final
 
 from aiohttp import web
@@ -76,11 +75,10 @@ class Commanding:
             return refusal(400, "user and password are texts")
         user = await asyncio.to_thread(self._users.check, name, password)
         if user is None:
-            self._audit.note(
-                "login", who=name[:40], address=address, outcome="refused", detail="wrong name or password"
-            )
+            self._guard.refuse_login(name, address)
             return refusal(401, "wrong name or password")
         self._guard.logins.give_back(address)
+        self._guard.sessions.end(request.cookies.get(COOKIE))
         answer = web.json_response({"user": user.name, "role": user.role.value})
         answer.set_cookie(
             COOKIE, self._guard.sessions.begin(user), httponly=True, samesite="Strict", path="/",
@@ -125,6 +123,7 @@ class Commanding:
         try:
             outcome = await self._desk.confirm(request.match_info["token"], operator.user.name)
         except UsageError as error:
+            self._note(request, "command", "refused", str(error))
             return refusal(409, str(error))
         refused = bool(outcome.refused_because)
         detail = f"{outcome.asked}: {outcome.refused_because or outcome.applied}"
@@ -155,7 +154,7 @@ async def _document(request: web.Request) -> dict[str, Any]:
     """
     try:
         document = await request.json()
-    except (json.JSONDecodeError, UnicodeDecodeError):
+    except (ValueError, LookupError, RecursionError):  # no JSON, no such character set, too deep
         document = None
     if not isinstance(document, dict):
         raise web.HTTPBadRequest(reason="the request is not a JSON object")

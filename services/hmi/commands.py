@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Iterator
 from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
@@ -173,6 +174,13 @@ def read_command(document: object) -> Command:
         raise UsageError(f"{place}: {message[0].lower()}{message[1:]}") from None
 
 
+def _rows(content: str) -> Iterator[list[str]]:
+    try:
+        yield from csv.reader(io.StringIO(content, newline=None))
+    except csv.Error as error:
+        raise ValueError(f"not a table of comma-separated values: {error}") from None
+
+
 def read_load(content: str) -> list[tuple[int, float]]:
     """Return the steps of a load file as (ticks since its beginning, W).
 
@@ -180,7 +188,7 @@ def read_load(content: str) -> list[tuple[int, float]]:
         ValueError: One line that names the row.
     """
     steps: list[tuple[int, float]] = []
-    for number, row in enumerate(csv.reader(io.StringIO(content)), 1):
+    for number, row in enumerate(_rows(content), 1):
         if not row or (number == 1 and row[0].strip() == "time_s"):
             continue
         try:

@@ -1,5 +1,6 @@
 """What every request passes: whose it is, where it comes from, how often, and the headers of every answer."""
 
+import re
 import time
 from collections.abc import Awaitable, Callable
 from typing import Final
@@ -11,7 +12,7 @@ from hmi.access import (
     LOGIN_BURST,
     LOGINS_A_MINUTE,
     REQUEST_BURST,
-    REQUESTS_A_SECOND,
+    REQUESTS_A_BROWSER,
     LoginSession,
     RateLimit,
     Sessions,
@@ -31,10 +32,14 @@ HEADERS: Final = {
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 SAFE: Final = frozenset({hdrs.METH_GET, hdrs.METH_HEAD})
-BY_ITSELF: Final = frozenset({"/api/stream", "/api/trend", "/api/events", "/api/me", "/api/explanation", "/api/replay"})
+BY_ITSELF: Final = frozenset(
+    {"/api/stream", "/api/trend", "/api/events", "/api/audit", "/api/me", "/api/explanation", "/api/replay"}
+)
 """What a page asks for without a hand on it: no sign of life of its user."""
-OPEN: Final = frozenset({"/", "/healthz", "/metrics", "/api/login", "/api/me", "/favicon.ico"})
+OPEN: Final = frozenset({"/", "/healthz", "/metrics", "/api/catalog", "/api/login", "/api/me", "/favicon.ico"})
 """What is served without a login; `/metrics` looks at it itself."""
+
+_RUN: Final = re.compile(r"\A/run/\d+/")
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -42,6 +47,11 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 def refusal(status: int, message: str) -> web.Response:
     """Return a refusal, one line of JSON."""
     return web.json_response({"error": message}, status=status)
+
+
+def path_in_exhibit(request: web.Request) -> str:
+    """Return what is asked for of one rig or run, without the number of the run among several."""
+    return _RUN.sub("/", request.path, count=1)
 
 
 class Guard:
@@ -58,17 +68,21 @@ class Guard:
         login = settings.login
         self.sessions = Sessions(time.monotonic, login.idle_minutes * 60, login.longest_minutes * 60)
         self.logins = RateLimit(time.monotonic, LOGINS_A_MINUTE / 60, LOGIN_BURST)
-        self._requests = RateLimit(time.monotonic, REQUESTS_A_SECOND, REQUEST_BURST)
+        self._requests = RateLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
         self._hosts = LOCAL_NAMES | {settings.host, *settings.allowed_hosts}
 
     def session(self, request: web.Request) -> LoginSession | None:
         """Return the session of a request."""
-        return self.sessions.find(request.cookies.get(COOKIE), is_use=request.path not in BY_ITSELF)
+        return self.sessions.find(request.cookies.get(COOKIE), is_use=path_in_exhibit(request) not in BY_ITSELF)
 
     def who(self, request: web.Request) -> str:
         """Return the user of a request; empty when nobody has logged in."""
         session = self.sessions.find(request.cookies.get(COOKIE), is_use=False)
         return session.user.name if session else ""
+
+    def refuse_login(self, name: str, address: str) -> None:
+        """Note a wrong password, or a name that nobody has."""
+        self._audit.note("login", who=name[:40], address=address, outcome="refused", detail="wrong name or password")
 
     def _refused(self, request: web.Request, status: int, reason: str) -> web.Response:
         self._audit.note(
@@ -85,7 +99,8 @@ class Guard:
             return refusal(429, "too many requests: wait a little")
         if request.method not in SAFE and not is_own_origin(request.headers.get(hdrs.ORIGIN), request.host):
             return self._refused(request, 403, "a command comes from the page itself, not from another site")
-        is_open = request.path in OPEN or request.path.startswith("/static/")
+        path = path_in_exhibit(request)
+        is_open = path in OPEN or path.startswith("/static/")
         if not is_open and not self._settings.login.anonymous_view and self.session(request) is None:
             return refusal(401, "log in first")
         return None

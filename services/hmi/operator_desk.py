@@ -162,8 +162,9 @@ class OperatorDesk:
             pace = change(present)
             if pace.paused and not pace.realtime:
                 raise UsageError("the session is in lock-step: it goes as far as it is granted")
-            for client in clients.values():
+            for client in clients.values():  # all are there before one is written to
                 await client.connect(0.0)
+            for client in clients.values():
                 if (await client.read(Identity)).session == present.session:
                     await client.write(pace)
             back = await plant.read(SessionPace)

@@ -35,6 +35,8 @@ MOST_POINTS: Final = 4000
 WINDOW_S: Final = 300.0
 EVENTS_SHOWN: Final = 500
 CACHED: Final = 16
+STALLED_S: Final = 20.0
+"""A browser that takes nothing for so long loses its stream, so that another one can look."""
 
 
 class Reading:
@@ -101,8 +103,9 @@ class Reading:
             async for message in self._broadcast.messages():
                 if not self._settings.login.anonymous_view and self._guard.session(request) is None:
                     break
-                await answer.write(message)
-        except (ConnectionError, asyncio.CancelledError):
+                async with asyncio.timeout(STALLED_S):
+                    await answer.write(message)
+        except (ConnectionError, TimeoutError, asyncio.CancelledError):
             pass
         return answer
 
@@ -221,6 +224,7 @@ class Reading:
             if auth is None or not self._guard.logins.allows(address):
                 return refusal(401, "log in first, or send name and password (basic)")
             if await asyncio.to_thread(self._users.check, auth.login, auth.password) is None:
+                self._guard.refuse_login(auth.login, address)
                 return refusal(401, "wrong name or password")
             self._guard.logins.give_back(address)
         text = exposition(page_families(self._model, len(self._broadcast)))

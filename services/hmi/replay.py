@@ -105,7 +105,7 @@ class Replay:
     async def steer(self, request: web.Request) -> web.Response:
         """Play, stand still, go elsewhere."""
         try:
-            wish = Wish.model_validate_json(await request.text())
+            wish = Wish.model_validate_json(await request.read())
         except ValidationError as error:
             first = error.errors()[0]
             return refusal(422, f"{'.'.join(map(str, first['loc'])) or 'request'}: {first['msg']}")

@@ -9,6 +9,7 @@ import getpass
 import hashlib
 import hmac
 import secrets
+import stat
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -19,6 +20,7 @@ from coldloop.errors import ColdloopError, ConfigurationError, UsageError
 COST: Final = 2**14
 BLOCK_SIZE: Final = 8
 SALT_BYTES: Final = 16
+DIGEST_BYTES: Final = 32
 SHORTEST_PASSWORD: Final = 8
 HASH_FIELDS: Final = 5
 MOST_MEMORY: Final = 64 * 1024 * 1024
@@ -54,7 +56,15 @@ def is_password(password: str, stored: str) -> bool:
 
 
 def _scrypt(password: str, salt: bytes, cost: int, block_size: int) -> bytes:
-    return hashlib.scrypt(password.encode(), salt=salt, n=cost, r=block_size, p=1, maxmem=MOST_MEMORY, dklen=32)
+    return hashlib.scrypt(
+        password.encode(errors="surrogatepass"),
+        salt=salt,
+        n=cost,
+        r=block_size,
+        p=1,
+        maxmem=MOST_MEMORY,
+        dklen=DIGEST_BYTES,
+    )
 
 
 def _text(raw: bytes) -> str:
@@ -69,7 +79,7 @@ class Users:
     """The users of a file; without a file there are none.
 
     Raises:
-        ConfigurationError: The file cannot be read, or a line is wrong.
+        ConfigurationError: The file cannot be read, everybody may write to it, or a line is wrong.
     """
 
     def __init__(self, file: Path | None) -> None:
@@ -78,11 +88,14 @@ class Users:
             return
         try:
             lines = file.read_text(encoding="utf-8").splitlines()
+            mode = file.stat().st_mode
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
             raise ConfigurationError(
                 f"hmi.login.users: {file}: {reason}; `python -m hmi.users {file} NAME operate` writes it"
             ) from None
+        if mode & stat.S_IWOTH:
+            raise ConfigurationError(f"hmi.login.users: {file}: everybody may write to it; `chmod o-w {file}`")
         for number, line in enumerate(lines, 1):
             if line.strip() and not line.startswith("#"):
                 user = _user(line, f"{file}:{number}")
@@ -101,13 +114,25 @@ class Users:
 def _user(line: str, place: str) -> User:
     name, _, rest = line.partition(":")
     role, _, stored = rest.partition(":")
-    fields = stored.split("$")
-    if not name or role not in set(PageRole) or len(fields) != HASH_FIELDS or fields[0] != "scrypt":
+    if not name or role not in set(PageRole) or not _is_hash(stored.strip()):
         raise ConfigurationError(
             f"hmi.login.users: {place}: not name:role:hash; "
             "`python -m hmi.users FILE NAME view|operate` writes such lines"
         )
     return User(name, PageRole(role), stored.strip())
+
+
+def _is_hash(stored: str) -> bool:
+    """Tell whether a password can be compared with this hash: it is whole, and scrypt takes its cost."""
+    fields = stored.split("$")
+    if len(fields) != HASH_FIELDS or fields[0] != "scrypt":
+        return False
+    try:
+        digest = base64.b64decode(fields[4], validate=True)
+        is_password("", stored)
+    except (ValueError, OverflowError, MemoryError):
+        return False
+    return len(digest) == DIGEST_BYTES
 
 
 def write_user(file: Path, name: str, role: PageRole, password: str) -> None:

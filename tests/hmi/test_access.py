@@ -1,19 +1,31 @@
 """Who may look, who may operate, and what becomes of those who may not: refused, and audited."""
 
+import asyncio
+import json
+from http import HTTPStatus
+from http.client import HTTPConnection
 from pathlib import Path
 
 import pytest
+from aiohttp import web
+from aiohttp.test_utils import make_mocked_request
 
 from coldloop.endpoints import Endpoint
-from coldloop.errors import ConfigurationError, UsageError
+from coldloop.errors import ConfigurationError, LinkError, UsageError
 from coldloop.modbus.settings import TlsSettings
-from hmi.access import RateLimit, Sessions, host_of, is_own_origin
-from hmi.settings import HmiSection
-from hmi.users import PageRole, User, Users, write_user
+from hmi.access import REQUEST_BURST, REQUESTS_A_BROWSER, RateLimit, Sessions, host_of, is_own_origin
+from hmi.audit import Audit
+from hmi.commands import SetFactor
+from hmi.guard import COOKIE, Guard
+from hmi.model import Model
+from hmi.operator_desk import OperatorDesk, Outcome
+from hmi.settings import HmiSection, LoginSettings
+from hmi.users import PageRole, User, Users, hash_password, write_user
 from rig.page_process import pointed_at
 from rig.rig_endpoints import RigEndpoints
 from tests.hmi.conftest import OPERATOR, VIEWER, Site
 
+WHOLE_HASH = hash_password("a long password")
 LOAD = {"kind": "load", "watts": 400.0}
 
 
@@ -83,6 +95,7 @@ def test_scripts_come_from_the_page_alone(site: Site) -> None:
         ({"kind": "nonsense"}, "kind"),
         ({"kind": "load_file", "content": "time_s,load_w\n0,400\n0.3,400\n"}, "multiple of 0.25"),
         ({"kind": "load_file", "content": "nothing"}, "row 1"),
+        ({"kind": "load_file", "content": "9" * 200_000}, "comma-separated"),
         ({"kind": "alarm", "alarm": 999, "action": 1}, "no alarm 999"),
         ({"kind": "sensor_fault", "output": "T99", "fault": 1}, "no output T99"),
         ({"kind": "setpoint", "input": "CV155", "value": 99.0}, "not from 20 to 60"),
@@ -103,6 +116,40 @@ def test_a_confirmation_counts_once_and_only_from_who_asked(site: Site) -> None:
     assert site.ask(f"/api/commands/{token}", {}, cookie=site.log_in(VIEWER)).status == 403
     assert site.ask(f"/api/commands/{token}", {}, cookie=cookie).status == 200
     assert site.ask(f"/api/commands/{token}", {}, cookie=cookie).status == 409
+    last = site.audited()[-1]
+    assert (last["who"], last["outcome"]) == (OPERATOR[0], "refused")
+    assert "nothing to confirm" in last["detail"]
+
+
+@pytest.mark.parametrize(
+    ("headers", "body", "status"),
+    [
+        ({"Host": "["}, "{}", 421),
+        ({"Host": "\xff"}, "{}", 421),
+        ({"Content-Type": "application/json; charset=none"}, "{}", 400),
+        ({}, "[" * 50_000, 400),
+        ({}, '{"user": "\\ud800", "password": "\\ud800"}', 401),
+        ({"Cookie": f"{COOKIE}=\xff"}, '{"user": "lena", "password": "wrong"}', 401),
+    ],
+)
+def test_requests_that_no_browser_sends_are_refused_like_others(
+    site: Site, headers: dict[str, str], body: str, status: int
+) -> None:
+    connection = HTTPConnection("127.0.0.1", site.ports["hmi"], timeout=20)
+    connection.request("POST", "/api/login", body, {"Origin": site.address, **headers})
+    answer = connection.getresponse()
+    assert answer.status == status
+    assert "error" in json.loads(answer.read())
+    connection.close()
+    site.log_in()
+    assert site.audited()[-1]["outcome"] == "done", "the audit can still be written and read"
+
+
+def test_who_logs_in_again_leaves_no_session_behind(site: Site) -> None:
+    earlier = site.log_in()
+    body = {"user": OPERATOR[0], "password": OPERATOR[1]}
+    assert site.ask("/api/login", body, cookie=earlier).status == 200
+    assert not site.ask("/api/me", cookie=earlier).document["operates"]
 
 
 # -- the parts, by themselves ------------------------------------------------------------------------------------------
@@ -134,6 +181,45 @@ def test_a_session_ends_when_nobody_uses_it_and_after_its_longest_time() -> None
     assert sessions.find("guessed") is None
 
 
+@pytest.fixture
+def guard() -> Guard:
+    return Guard(HmiSection(login=LoginSettings(anonymous_view=False)), Audit(None))
+
+
+def test_an_open_list_of_alarms_is_no_sign_of_life(guard: Guard) -> None:
+    clock = Clock()
+    guard.sessions = Sessions(clock, idle_s=100, longest_s=1000)
+    cookie = {"Cookie": f"{COOKIE}={guard.sessions.begin(User('anna', PageRole.OPERATE, ''))}"}
+    clock.time = 90.0
+    for path in ("/api/events", "/api/audit", "/run/1/api/trend"):
+        assert guard.session(make_mocked_request("GET", path, cookie)), path
+    clock.time = 110.0
+    assert guard.session(make_mocked_request("GET", "/api/audit", cookie)) is None
+
+
+@pytest.mark.parametrize("run", ["", "/run/2"])
+def test_a_page_that_wants_a_login_can_be_opened_to_log_in(guard: Guard, run: str) -> None:
+    async def status(path: str) -> int:
+        async def answered(_request: web.Request) -> web.Response:
+            return web.Response()
+
+        return (await guard.middleware(make_mocked_request("GET", run + path, {"Host": "localhost"}), answered)).status
+
+    for path in ("/", "/static/page.css", "/api/me", "/api/catalog"):
+        assert asyncio.run(status(path)) == HTTPStatus.OK, path
+    for path in ("/api/state", "/api/trend", "/api/stream", "/api/audit"):
+        assert asyncio.run(status(path)) == HTTPStatus.UNAUTHORIZED, path
+
+
+def test_as_many_browsers_as_are_served_may_draw_trends_from_one_address() -> None:
+    clock = Clock()
+    browsers = HmiSection().browsers
+    limit = RateLimit(clock, REQUESTS_A_BROWSER * browsers, REQUEST_BURST)
+    for second in range(60):
+        clock.time = float(second)
+        assert all(limit.allows("proxy") for _ in range(2 * browsers))
+
+
 def test_requests_of_one_address_are_limited_and_others_not() -> None:
     clock = Clock()
     limit = RateLimit(clock, per_second=1.0, burst=3.0)
@@ -143,11 +229,48 @@ def test_requests_of_one_address_are_limited_and_others_not() -> None:
     assert [limit.allows("here") for _ in range(3)] == [True, True, False]
 
 
+def test_time_goes_as_before_when_a_service_that_follows_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[str] = []
+
+    class Peer:
+        def __init__(self, service: str) -> None:
+            self.service = service
+
+        async def connect(self, _patience_s: float) -> None:
+            if self.service == "optimizer_plc":
+                raise LinkError("nobody listens as optimizer_plc")
+
+        async def read(self, record: type[tuple[object, ...]]) -> tuple[object, ...]:
+            return record()
+
+        async def write(self, _record: object) -> None:
+            written.append(self.service)
+
+        def close(self) -> None:
+            pass
+
+    desk = OperatorDesk({}, Model(Clock(), 300), Clock(), training=False)
+    monkeypatch.setattr(desk, "_client", Peer)
+
+    async def ask() -> Outcome:
+        return await desk.confirm(await desk.prepare(SetFactor(kind="factor", factor=2.0), "anna"), "anna")
+
+    outcome = asyncio.run(ask())
+    assert outcome.refused_because == "nobody listens as optimizer_plc"
+    assert written == [], "what is told as refused has not been done at any service"
+
+
 def test_own_origin_and_host() -> None:
     assert is_own_origin("http://127.0.0.1:8020", "127.0.0.1:8020")
     assert not is_own_origin(None, "127.0.0.1:8020")
     assert not is_own_origin("http://127.0.0.1:8021", "127.0.0.1:8020")
-    assert [host_of(name) for name in ("localhost:8020", "[::1]:8020", "a.b", "")] == ["localhost", "::1", "a.b", ""]
+    assert [host_of(name) for name in ("localhost:8020", "[::1]:8020", "a.b", "[", "")] == [
+        "localhost",
+        "::1",
+        "a.b",
+        "",
+        "",
+    ]
 
 
 def test_passwords_are_kept_as_hashes_in_a_file_of_their_owner(tmp_path: Path) -> None:
@@ -165,11 +288,26 @@ def test_passwords_are_kept_as_hashes_in_a_file_of_their_owner(tmp_path: Path) -
     assert users.check("nobody", "another password") is None
 
 
-@pytest.mark.parametrize("line", ["anna", "anna:operate", "anna:root:scrypt$1$1$a$b", "anna:view:plain"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "anna", "anna:operate", "anna:root:scrypt$1$1$a$b", "anna:view:plain",
+        f"anna:view:{WHOLE_HASH[:-5]}", f"anna:view:{WHOLE_HASH.replace('$16384$', '$16383$')}",
+        f"anna:view:{WHOLE_HASH.replace('$16384$', '$much$')}", f"anna:view:{WHOLE_HASH.replace('$8$', '$80000$')}",
+    ],
+)  # fmt: skip
 def test_a_line_that_is_no_user_is_named(tmp_path: Path, line: str) -> None:
     file = tmp_path / "users"
     file.write_text(f"# users\n{line}\n", encoding="utf-8")
     with pytest.raises(ConfigurationError, match="users:2: not name:role:hash"):
+        Users(file)
+
+
+def test_a_file_that_everybody_may_write_to_makes_nobody_an_operator(tmp_path: Path) -> None:
+    file = tmp_path / "users"
+    write_user(file, "anna", PageRole.OPERATE, "a long password")
+    file.chmod(0o606)
+    with pytest.raises(ConfigurationError, match=r"everybody may write to it; `chmod o-w"):
         Users(file)
 
 
