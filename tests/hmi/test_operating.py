@@ -81,6 +81,21 @@ def test_a_refused_command_says_why(operated: "Page") -> None:
     assert "take over in manual first" in (operated.text_content("#toast") or "")
 
 
+def test_an_empty_field_is_not_a_zero(operated: "Page") -> None:
+    view(operated, "commands")
+    for field, button in (("load-number", "load-set"), ("factor", "factor-set")):
+        operated.fill(f"#{field}", "")
+        operated.click(f"#{button}")
+        assert operated.evaluate("document.activeElement.id") == field, "nothing is asked for: a number is missing"
+
+
+@pytest.mark.parametrize("width", [821, 1024, 1180, 1280])
+def test_the_header_of_an_operator_fits(operated: "Page", width: int) -> None:
+    operated.set_viewport_size({"width": width, "height": 720})
+    assert operated.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert operated.evaluate("document.querySelector('#logout').getBoundingClientRect().right") <= width
+
+
 def test_a_command_that_is_not_confirmed_does_nothing(operated: "Page", site: Site) -> None:
     view(operated, "commands")
     before = load(site)

@@ -16,6 +16,9 @@ function note(asked, outcome, refused) {
   note.timer = setTimeout(() => banner.remove(), 8000);
 }
 
+// Asks for the number in a field; for nothing when it has none: an empty field is not a zero.
+function numberIn(field, then) { if (field.value === "") field.focus(); else then(Number(field.value)); }
+
 // `atOnce` is for what does not touch the process, such as acknowledging an alarm.
 export async function command(body, atOnce = false) {
   let prepared;
@@ -46,7 +49,7 @@ function faceplates() {
   for (const [input, field] of [["CV155", "cv155"], ["NCR22_A", "ncr22"], ["CV156", "cv156"]]) {
     const limits = `optimizer_plc.operating limits.input_low.${input} optimizer_plc.operating limits.input_high.${input}`;
     const value = element("input", { type: "number", step: "any", id: `setpoint-${input}`, "aria-label": `New setpoint of ${input} in ${units[input]}` });
-    const button = element("button", { type: "button", text: "Write", onclick: () => { if (value.value) command({ kind: "setpoint", input, value: Number(value.value) }); else value.focus(); } });
+    const button = element("button", { type: "button", text: "Write", onclick: () => numberIn(value, (wanted) => command({ kind: "setpoint", input, value: wanted })) });
     const plate = element("div", { class: "faceplate" },
       element("div", { class: "bar", "data-name": input, "data-signal": `control_plc.process.u.${input}`, "data-bounds": limits, "data-low": input === "NCR22_A" ? -10 : 15, "data-high": input === "NCR22_A" ? 160 : 65 }),
       element("div", { class: "row" }, element("span", { class: "label", text: "setpoint" }), element("span", { class: "value", "data-signal": `control_plc.operator.${field}` }), element("span", { class: "spacer" }), value, button));
@@ -80,12 +83,12 @@ export function initCommands(userChanged) {
   const slider = byId("load-slider"), number = byId("load-number");
   slider.addEventListener("input", () => { number.value = slider.value; });
   number.addEventListener("input", () => { slider.value = number.value; });
-  byId("load-set").addEventListener("click", () => command({ kind: "load", watts: Number(number.value) }));
+  byId("load-set").addEventListener("click", () => numberIn(number, (watts) => command({ kind: "load", watts })));
   byId("load-play").addEventListener("click", async () => { const [file] = byId("load-file").files; if (file) command({ kind: "load_file", content: await file.text() }); });
-  byId("factor-set").addEventListener("click", () => command({ kind: "factor", factor: Number(byId("factor").value) }));
+  byId("factor-set").addEventListener("click", () => numberIn(byId("factor"), (factor) => command({ kind: "factor", factor })));
   byId("training").hidden = !state.catalog.training;
   for (const output of state.catalog.outputs) byId("fault-output").append(element("option", { text: output }));
-  byId("fault-set").addEventListener("click", () => command({ kind: "sensor_fault", output: byId("fault-output").value, fault: Number(byId("fault-kind").value), value: Number(byId("fault-value").value) }));
+  byId("fault-set").addEventListener("click", () => numberIn(byId("fault-value"), (value) => command({ kind: "sensor_fault", output: byId("fault-output").value, fault: Number(byId("fault-kind").value), value })));
   for (const id of ["login-open", "login-open-2"]) byId(id).addEventListener("click", login);
   byId("login-cancel").addEventListener("click", () => byId("login").close());
   byId("logout").addEventListener("click", async () => { await send("api/logout", {}); await refreshUser(); });

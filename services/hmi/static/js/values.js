@@ -44,6 +44,7 @@ function place(one, parts, width) {
     parts.band.setAttribute("x", at(ends[0]) * width);
     parts.band.setAttribute("width", Math.max(0, (at(ends[1]) - at(ends[0])) * width));
   }
+  parts.pointer.classList.toggle("unknown", !Number.isFinite(value));
   if (Number.isFinite(value)) parts.pointer.setAttribute("x", at(value) * width - 1.5);
   const outside = known && (value < ends[0] || value > ends[1]);
   one.classList.toggle("abnormal", Boolean(band) && outside);
