@@ -53,6 +53,7 @@ class Poller:
         self._slow_at = 0.0
         self._alarms_at = 0.0
         self._next_event = 0
+        self._last_event: Event | None = None
         self._next_update = 0
         self._checked = False
         self._told = ""
@@ -92,6 +93,7 @@ class Poller:
             await self._client.connect(0.0)
             self._checked = True
             self._slow_at = 0.0
+            await self._check_journal()
         model, service = self._model, self._service
         model.put(service, await self._client.read(Identity))
         for record in FAST[service]:
@@ -132,6 +134,12 @@ class Poller:
         self._next_update = newest.update + 1
         self._model.put("optimizer_plc", await self._client.read(Prediction))
 
+    async def _check_journal(self) -> None:
+        """Begin with the first event again where the last one is not known any more: the service counts anew."""
+        last = self._last_event
+        if last is not None and await self._client.read_rows(Event, last.number % EVENT_ROWS, 1) != [last]:
+            self._next_event, self._last_event = 0, None
+
     async def _read_events(self) -> None:
         page = self._model.record(self._service, JournalPage)
         if page is None or page.newest + 1 == self._next_event:
@@ -141,6 +149,7 @@ class Poller:
         first = max(self._next_event, page.newest - EVENTS_AT_ONCE + 1, 1)
         rows = await self._rows(Event, first, page.newest, EVENT_ROWS)
         news = sorted(row for row in rows if first <= row.number <= page.newest)
+        self._last_event = news[-1] if news else self._last_event
         self._model.put_events(Told.of(self._service, row) for row in news)
         self._next_event = page.newest + 1
 

@@ -8,9 +8,11 @@ from collections.abc import Iterator
 
 import pytest
 
+from coldloop.endpoints import Endpoint
+from coldloop.errors import LinkError
 from coldloop.metrics import exposition
 from coldloop.process import OUTPUT_NAMES
-from coldloop.registers.audit import Event, EventKind
+from coldloop.registers.audit import Event, EventKind, JournalPage
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Process
 from coldloop.registers.optimizer_plc import Optimization
@@ -20,6 +22,7 @@ from hmi.commands import read_load
 from hmi.documents import alarms_document, encoded, state_document, trend_document
 from hmi.model import STALE_S, Model, Told
 from hmi.page_metrics import page_families
+from hmi.polling import Poller
 from hmi.reading import safe_cell
 from hmi.signals import MAPS, signals_of, words_in
 from hmi.trends import MOST_ROWS, TrendStore, thin
@@ -107,6 +110,45 @@ def test_another_session_begins_with_empty_trends(model: Model) -> None:
     assert len(model.trends) == 51
     model.put("control_plc", Identity(session=2, tick=0))
     assert len(model.trends) == 0
+
+
+def test_a_service_that_counts_its_events_anew_loses_none(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Service:
+        """Answers with its journal; its requests are numbered by the start that it is in."""
+
+        boot, newest = 1, 5
+
+        async def connect(self, _patience_s: float) -> None:
+            pass
+
+        async def read(self, record: type[tuple[object, ...]]) -> tuple[object, ...]:
+            return JournalPage(1, self.newest) if record is JournalPage else record()
+
+        async def read_rows(self, _record: type[Event], start: int, count: int) -> list[Event]:
+            return [
+                Event(each, self.boot, kind=EventKind.BOOT) if each <= self.newest else Event()
+                for each in range(start, start + count)
+            ]
+
+        def close(self) -> None:
+            pass
+
+    service = Service()
+    poller = Poller("plant", Endpoint(port=1), model, 0.0)
+    monkeypatch.setattr(poller, "_client", service)
+    monkeypatch.setattr(poller, "_slow", [JournalPage])
+
+    async def look(*, again: bool = False) -> list[tuple[int, int]]:
+        if again:
+            poller._lose(LinkError("its connection has closed"))  # noqa: SLF001 `run` waits in between
+        await poller._look()  # noqa: SLF001
+        return [(told.boot, told.number) for told in model.events]
+
+    first = [(1, number) for number in range(1, 6)]
+    assert asyncio.run(look()) == first
+    assert asyncio.run(look(again=True)) == first, "the same start: nothing is told twice"
+    service.boot, service.newest = 2, 7
+    assert asyncio.run(look(again=True)) == first + [(2, number) for number in range(1, 8)]
 
 
 def test_thinning_keeps_every_excursion_and_says_nothing_that_was_not_there() -> None:
