@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.registers.plant import StationSample
 from plant.cold_box import ColdBox, outputs
 from plant.helium.properties import load_helium
 from plant.integrator import advance_and_read, plain_tuples
@@ -136,6 +137,11 @@ class PlantProgram:
     def load(self) -> float:
         """The heat load (W) held from the current tick to the next."""
         return self._load.value(self.tick)
+
+    @property
+    def station(self) -> StationSample | None:
+        """Compression station and nitrogen at the current tick; a cold box alone has none."""
+        return None
 
     def measure(self) -> tuple[float, ...]:
         """Return the 22 outputs at the current tick, taken before inputs applied at this tick act."""

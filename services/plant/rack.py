@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from coldloop.journal import Journal
 from coldloop.pace import Pace
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import pace_subject
@@ -22,6 +22,9 @@ from coldloop.registers.plant import (
     OutputVerdict,
     PlantSample,
     SensorFault,
+    StationAlarm,
+    StationMode,
+    StationSample,
 )
 from coldloop.watchdog import Watchdog
 from plant.faults import SensorFaults
@@ -93,6 +96,11 @@ class Rack:
     def tick(self) -> int:
         """The present tick."""
         return self._program.tick
+
+    @property
+    def station(self) -> StationSample | None:
+        """Compression station and nitrogen at the present tick; a cold box alone has none."""
+        return self._program.station
 
     @property
     def silence_s(self) -> float:
@@ -232,11 +240,21 @@ class Rack:
 
     def snapshot(self) -> Mapping[str, object]:
         """Return what telemetry publishes."""
-        program = self._program
+        program, station = self._program, self._program.station
         return {
             "session": self.session.number,
             "tick": program.tick,
             "load_w": program.load,
             "inputs": dict(zip(INPUT_NAMES, self.outputs.u, strict=True)),
             "outputs": dict(zip(OUTPUT_NAMES, program.measure(), strict=True)),
+            **({} if station is None else {"station": station_snapshot(station)}),
         }
+
+
+def station_snapshot(station: StationSample) -> Mapping[str, object]:
+    """Return what telemetry publishes of compression station and nitrogen."""
+    return {
+        **dict(zip(STATION_SIGNAL_NAMES, station.signals, strict=True)),
+        "mode": StationMode(station.mode).name.lower(),
+        "alarms": [alarm.name.lower() for alarm in StationAlarm(station.alarms) if alarm.name],
+    }

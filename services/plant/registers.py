@@ -257,6 +257,9 @@ class RackRegisters:
     def advance(self) -> None:
         """Advance the plant by one tick."""
         generation = self.rack.outputs.generation
+        station = self.rack.station
+        if station is not None:
+            self.bank.put(station, station.tick % HISTORY_ROWS)
         sample = self.rack.advance()
         self.bank.put(sample, sample.tick % HISTORY_ROWS)
         self._outdated = True

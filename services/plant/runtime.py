@@ -7,7 +7,7 @@ real time the plant moves by the clock, half a tick away from the scans, whateve
 import asyncio
 import logging
 import time
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 from coldloop import __version__
@@ -23,10 +23,10 @@ from coldloop.registers.plant import Actuators, PlantSession
 from coldloop.telemetry import Telemetry
 from plant.cold_box import REFERENCE
 from plant.helium.properties import load_helium
+from plant.kinds import plant_maker
 from plant.model import parameters_digest
-from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.registers import RackRegisters
-from plant.settings import PlantSettings, SensorSettings
+from plant.settings import PlantSettings
 
 log = logging.getLogger("coldloop.plant")
 
@@ -49,13 +49,6 @@ def _own_parameters_digest() -> str:
     return parameters_digest(REFERENCE, load_helium())
 
 
-def make_program(header: ModelHeader, sensors: SensorSettings, load: HeatLoad, seed: int) -> PlantProgram:
-    """Return the plant at the operating point of its model file."""
-    deviations = sensors.deviations
-    noise = MeasurementNoise(deviations, seed) if any(deviations) else None
-    return PlantProgram(box=REFERENCE, x0=header.x0, u0=header.u0, load=load, noise=noise)
-
-
 class PlantRuntime:
     """Moves the rack on: in lock-step behind each exchange, in real time by its clock."""
 
@@ -67,9 +60,7 @@ class PlantRuntime:
         self._position: float | None = None
         """While paused: where time stands, in ticks."""
         self._failure: asyncio.Future[None] | None = None
-        self.registers = RackRegisters(
-            settings, header, partial(make_program, header, settings.plant.sensors), age=self._age
-        )
+        self.registers = RackRegisters(settings, header, plant_maker(header, settings.plant), age=self._age)
 
     def on_write(self, block: Block, caller: Caller) -> None:
         """Take what a client has written, and see to it that the plant moves."""

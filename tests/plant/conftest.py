@@ -23,9 +23,9 @@ from coldloop.seal import Seal, seal_of, sealed
 from plant.cold_box import REFERENCE, ColdBox, derivative, outputs
 from plant.helium.properties import Helium, load_helium
 from plant.integrator import advance
+from plant.kinds import make_program
 from plant.numeric import RealArray
 from plant.registers import RackRegisters
-from plant.runtime import make_program
 from plant.settings import PlantSettings
 
 R = TypeVar("R", bound=tuple[Any, ...])

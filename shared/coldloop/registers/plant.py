@@ -1,10 +1,19 @@
 """Register map of the plant: a remote I/O rack, and the controls of a simulation."""
 
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from itertools import accumulate
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
+from coldloop.process import (
+    INPUT_NAMES,
+    INPUT_UNITS,
+    OUTPUT_NAMES,
+    OUTPUT_UNITS,
+    STATE_NAMES,
+    STATE_UNITS,
+    STATION_SIGNAL_NAMES,
+    STATION_SIGNAL_UNITS,
+)
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u16_array, u32
@@ -159,6 +168,47 @@ class PlantSample(NamedTuple):
     x: Annotated[tuple[float, ...], f32_array("Simulated state", STATE_NAMES, STATE_UNITS)]
 
 
+class StationMode(IntEnum):
+    """What the controller of the compression station can do about the pressures."""
+
+    AUTOMATIC = 0
+    """All valves are within their ranges."""
+    LIMITED = 1
+    """A valve is at the end of its range: a pressure may leave its set point."""
+    CHARGE_STOPPED = 2
+    """The low pressure is so high that helium is no longer let in from the buffer."""
+    ONE_COMPRESSOR = 3
+    STOPPED = 4
+    """No compressor runs; the valves are closed."""
+
+
+class StationAlarm(IntFlag):
+    """Alarms of compression station and nitrogen pre-cooler, one bit each."""
+
+    HP_HIGH = 1
+    HP_LOW = 2
+    LP_HIGH = 4
+    LP_LOW = 8
+    NC1_TRIPPED = 16
+    NC2_TRIPPED = 32
+    NITROGEN_LOW = 64
+    HELIUM_LOST = 128
+
+
+class StationSample(NamedTuple):
+    """Compression station and nitrogen pre-cooler at one tick; all 0 where the plant is a cold box alone."""
+
+    tick: Annotated[int, u32("Tick of the row")]
+    signals: Annotated[tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS)]
+    mode: Annotated[
+        int, u16("Pressure control: 0 automatic, 1 a valve at its end, 2 charging stopped, 3 one compressor, 4 stopped")
+    ] = StationMode.AUTOMATIC
+    alarms: Annotated[
+        int,
+        u16("Bits: 1 HP high, 2 HP low, 4 LP high, 8 LP low, 16 NC1, 32 NC2 tripped, 64 nitrogen low, 128 helium lost"),
+    ] = 0
+
+
 PLANT_MAP: Final = RegisterMap(
     service="plant",
     version=3,
@@ -182,5 +232,6 @@ PLANT_MAP: Final = RegisterMap(
         Block("journal page", 45010, JournalPage, "State of the journal"),
         Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
         Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+        Block("station history", 54672, StationSample, "The last ticks of the warm part", rows=HISTORY_ROWS),
     ),
 )
