@@ -85,6 +85,7 @@ def as_markdown(maps: Sequence[RegisterMap]) -> str:
             f"## {register_map.service} (port {PORTS[register_map.service]}, map version {register_map.version}, "
             f"digest {register_map.digest:08x})\n"
         )
+        parts.append(f"Addresses 0 to {register_map.end - 1}; those in no table read 0 and are not written.\n")
         parts += [_block_markdown(register_map.service, block) for block in register_map.blocks]
     return "\n".join(parts)
 

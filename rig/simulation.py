@@ -12,13 +12,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pyarrow as pa
 from matplotlib.figure import Figure
 
 from coldloop import __version__
-from coldloop.config import Configuration, load_configuration
+from coldloop.config import Configuration
 from coldloop.errors import UsageError
 from coldloop.lti_model import load as load_model
 from coldloop.process import TICK_S
@@ -27,6 +27,7 @@ from rig.driving import DrivingHistory
 from rig.indicators import RunEvaluation, StageCost
 from rig.one_process import OneProcessRig
 from rig.plot import DRAWN, Bounds, RunCurves, draw_run
+from rig.python_settings import Period, configured
 from rig.recording import MemorySink, Recorder, Recording
 from rig.run_files import summary_of
 from rig.run_folder import batch_series
@@ -108,7 +109,7 @@ class Simulation:
 def simulate(
     load: str | Path = "2h",
     solver: str = "ode",
-    updating_period: float | Literal["adaptive"] = "adaptive",
+    updating_period: Period = "adaptive",
     *,
     duration_s: float | None = None,
     seed: int = 1,
@@ -130,23 +131,10 @@ def simulate(
     Raises:
         UsageError: An argument cannot be used; one line that says why.
     """
-    effective = load_configuration(
-        Settings,
-        file=None if config is None else Path(config),
-        environment={},
-        options={
-            "plant.load": (str(load), "load"),
-            "plant.seed": (seed, "seed"),
-            "optimizer_plc.program.solver": (solver, "solver"),
-            "optimizer_plc.program.updating_period_s": (_period(updating_period), "updating_period"),
-            **_flattened(settings),
-        },
+    effective = configured(
+        load=load, solver=solver, updating_period=updating_period, seed=seed, config=config, sections=settings
     )
     return _run(effective, _ticks(duration_s))
-
-
-def _period(updating_period: float | str) -> object:
-    return 0.0 if updating_period == "adaptive" else updating_period
 
 
 def _ticks(duration_s: float | None) -> int | None:
@@ -156,16 +144,6 @@ def _ticks(duration_s: float | None) -> int | None:
     if not ticks > 0 or ticks != round(ticks):
         raise UsageError(f"duration_s={duration_s}: not a positive multiple of {TICK_S} s")
     return round(ticks)
-
-
-def _flattened(sections: Mapping[str, object], prefix: str = "") -> dict[str, tuple[object, str]]:
-    flat: dict[str, tuple[object, str]] = {}
-    for key, value in sections.items():
-        if isinstance(value, Mapping):
-            flat |= _flattened(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = (value, f"{prefix}{key}")
-    return flat
 
 
 def _run(effective: Configuration[Settings], ticks: int | None) -> Simulation:

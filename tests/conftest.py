@@ -1,10 +1,12 @@
 """What all tests share: how Hypothesis searches, coroutines as tests, no configuration from outside, a free port, and
-the command line.
+the command line, and Debian's mbpoll.
 """
 
 import asyncio
 import inspect
 import os
+import shutil
+import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -54,6 +56,24 @@ def free_port() -> Iterator[int]:
     """A port on localhost that nobody else gets during the test; connections are refused until a server listens."""
     with ReservedPorts(1) as reserved:
         yield reserved.numbers[0]
+
+
+def install(*packages: str) -> None:
+    """Install Debian packages, or skip the test with the reason why that cannot be."""
+    if os.geteuid() != 0 or shutil.which("apt-get") is None:
+        pytest.skip(f"needs {' '.join(packages)}: not installed, and only root on Debian can install it here")
+    environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
+    for command in (["apt-get", "update"], ["apt-get", "install", "-y", "--no-install-recommends", *packages]):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+        if done.returncode != 0:
+            pytest.skip(f"`{' '.join(command)}` failed: {done.stderr.strip().splitlines()[-1:]}")
+
+
+@pytest.fixture(scope="session")
+def mbpoll() -> str:
+    if shutil.which("mbpoll") is None:
+        install("mbpoll")
+    return "mbpoll"
 
 
 class Outcome(NamedTuple):

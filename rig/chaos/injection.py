@@ -4,7 +4,7 @@ import asyncio
 import signal
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 from coldloop.config import PREFIX
 from coldloop.errors import LinkError
@@ -23,13 +23,19 @@ from rig.chaos.faults import (
     WrongModel,
 )
 from rig.chaos.models import WRONG_MODEL
-from rig.chaos.observer import Observer
 from rig.chaos.proxy import LinkProxy
 from rig.local_services import LocalServices
 from rig.wiring import SERVICES
 
 ATTEMPTS: Final = 20
 _SHOWN: Final = {"nan": SensorFaultKind.NOT_A_NUMBER, "frozen": SensorFaultKind.FROZEN, "value": SensorFaultKind.VALUE}
+
+
+class SensorFaultWriter(Protocol):
+    """Puts faults into the plant's sensors."""
+
+    async def set_sensor_fault(self, output: int, fault: SensorFault) -> bool:
+        """Write the fault of an output, by its index; return whether the plant has taken it."""
 
 
 class Injector:
@@ -39,12 +45,12 @@ class Injector:
         self,
         services: LocalServices,
         proxies: Mapping[Link, LinkProxy],
-        observer: Observer,
+        sensors: SensorFaultWriter,
         folder: Path,
     ) -> None:
         self._services = services
         self._proxies = proxies
-        self._observer = observer
+        self._sensors = sensors
         self._wrong_model = folder / WRONG_MODEL
 
     async def begin(self, fault: AnyFault) -> None:
@@ -89,7 +95,7 @@ class Injector:
 
     async def _set_sensor(self, output: str, fault: SensorFault) -> None:
         for _ in range(ATTEMPTS):
-            if await self._observer.set_sensor_fault(OUTPUT_NAMES.index(output), fault):
+            if await self._sensors.set_sensor_fault(OUTPUT_NAMES.index(output), fault):
                 return
             await asyncio.sleep(0.5)
         raise LinkError(f"the plant took no sensor fault for {output}: see its log")

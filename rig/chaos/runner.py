@@ -5,23 +5,20 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Final
 
-from coldloop.config import PREFIX
 from coldloop.errors import LinkError
 from coldloop.process import TICK_S
-from rig.chaos.faults import Link, WrongModel
+from rig.chaos.faults import WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
 from rig.chaos.observer import Observer
 from rig.chaos.plan import Plan
-from rig.chaos.proxy import LinkProxy
+from rig.chaos.proxied_services import ProxiedServices
 from rig.chaos.sequencer import FaultSequencer, Progress
 from rig.chaos.trace import ChaosTrace
-from rig.local_services import LocalServices
 from rig.network import NetworkRig
-from rig.ports import ReservedPorts
 from rig.scenario import Scenario
 from rig.settings import Settings
-from rig.wiring import START_PATIENCE_S, Detours
+from rig.wiring import START_PATIENCE_S
 
 SLOWEST: Final = 20.0
 """Seconds of plant time in a second that lock-step should reach with proxies and all."""
@@ -38,26 +35,16 @@ async def conduct(
     if any(isinstance(fault, WrongModel) for fault in plan.schedule()):  # not while the clock is running
         await asyncio.to_thread(save_wrong_model, settings.model.file, folder / WRONG_MODEL)
     async with AsyncExitStack() as stack:
-        reserved = stack.enter_context(ReservedPorts(len(Detours._fields)))
-        detours = Detours(*reserved.numbers)
-        services = LocalServices(settings, folder / "logs", detours=detours, environment=_retained(folder))
-        proxies = {
-            Link.PLANT: LinkProxy(detours.plant, services.endpoints.plant.port, f"{plan.seed}/plant"),
-            Link.OPTIMIZER: LinkProxy(
-                detours.control_plc, services.endpoints.control_plc.port, f"{plan.seed}/optimizer"
-            ),
-        }
-        await stack.enter_async_context(services)
+        proxied = await stack.enter_async_context(ProxiedServices(settings, folder, str(plan.seed)))
+        services = proxied.services
         rig = NetworkRig(services.endpoints, settings)
         stack.callback(rig.close)
         await services.during(rig.connect(START_PATIENCE_S))
-        for proxy in proxies.values():  # until now nobody listened there, as nobody did behind
-            await proxy.start()
-            stack.push_async_callback(proxy.close)
+        await proxied.connect_links()
         session = await services.during(rig.start(scenario))
         observer = Observer(services.endpoints, trace, session)
         stack.callback(observer.close)
-        injector = Injector(services, proxies, observer, folder)
+        injector = Injector(services, proxied.proxies, observer, folder)
         driver = FaultSequencer(plan, services, observer, injector, trace, progress)
         try:
             async with asyncio.timeout(_patience_s(plan)):
@@ -69,14 +56,6 @@ async def conduct(
             ) from None
         finally:
             driver.finish()
-
-
-def _retained(folder: Path) -> dict[str, str]:
-    """Return the variables that let the control PLC and the plant come back where they were killed."""
-    files = {service: folder / f"retained_{service}.json" for service in ("control_plc", "plant")}
-    for file in files.values():
-        file.unlink(missing_ok=True)
-    return {f"{PREFIX}{service.upper()}__RETAIN__FILE": str(file) for service, file in files.items()}
 
 
 def _patience_s(plan: Plan) -> float:

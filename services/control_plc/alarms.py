@@ -89,6 +89,8 @@ class AlarmPanel:
         self._settings = settings
         self._rules = [settings.rule(kind) for kind in AlarmKind]
         self._pending: dict[AlarmKind, _Pending] = {}
+        self._causes: dict[AlarmKind, set[int]] = {}
+        """Those that are no news: for which an active alarm has been raised since it was last acknowledged."""
         self._now = 0
         self.rows = [Alarm(priority=rule.priority) for rule in self._rules]
         """What the registers show, by number of the alarm."""
@@ -131,7 +133,7 @@ class AlarmPanel:
     # -- conditions ----------------------------------------------------------------------------------------------------
 
     def holds(self, kind: AlarmKind, *, condition: bool, cause: int = 0) -> None:
-        """Tell whether the condition of an alarm holds, and why; another cause raises the alarm again."""
+        """Tell whether the condition of an alarm holds, and why; a cause that it had not yet raises the alarm again."""
         row = self.rows[kind]
         if condition != bool(row.active):
             earlier = self._pending.get(kind)
@@ -140,7 +142,10 @@ class AlarmPanel:
             return
         self._pending.pop(kind, None)
         if condition and cause != row.cause:
-            self._raise(kind, cause)
+            if cause in self._causes[kind]:  # causes that take turns are no news
+                self._store(kind, cause=cause)
+            else:
+                self._raise(kind, cause)
 
     def raised(self, kind: AlarmKind, cause: int = 0) -> None:
         """Tell that the condition of an alarm holds, and why."""
@@ -171,6 +176,9 @@ class AlarmPanel:
 
     def _raise(self, kind: AlarmKind, cause: int) -> None:
         row = self.rows[kind]
+        if not row.active:
+            self._causes[kind] = set()
+        self._causes[kind].add(cause)
         if row.state == AlarmState.OUT_OF_SERVICE:  # it is worked on: followed, and not noted
             self._store(kind, active=1, cause=cause)
         else:
@@ -212,6 +220,7 @@ class AlarmPanel:
     def restore(self, rows: Sequence[Alarm]) -> None:
         """Take the alarms of before a restart; priorities are those of the configuration."""
         self.rows = [row._replace(priority=rule.priority) for row, rule in zip(rows, self._rules, strict=True)]
+        self._causes = {kind: {row.cause} for kind, row in zip(AlarmKind, rows, strict=True) if row.active}
         # Who tells of instants does not tell that they are over.
         self._pending = {kind: _Pending(self.now, 0) for kind in PASSING if self.rows[kind].active}
         self.changes += 1
@@ -228,6 +237,8 @@ class AlarmPanel:
             fields["shelved_until"] = 0
         self._store(kind, state=after, **fields)
         row = self.rows[kind]
+        if event is EventKind.ALARM_ACKNOWLEDGED:
+            self._causes[kind] = {row.cause}
         self._journal.note(self.now, event, kind, row.cause, value=value, who=who)
         suppressed = before in (AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)
         if suppressed and after is AlarmState.NORMAL and row.active:

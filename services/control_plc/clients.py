@@ -1,7 +1,7 @@
 """What optimisers and operators write to the control PLC, and what it makes of it."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable
 from typing import Final
 
 from coldloop.limits import InputLimits
@@ -31,6 +31,7 @@ from coldloop.sequence import InputSequence
 from coldloop.writer_lease import LeaseEvent, WriterLease
 from control_plc.program import ControlProgram
 from control_plc.publication import Publication
+from control_plc.sessions import Sessions
 
 LONGEST_WAIT_S: Final = 1.0
 """Longest time that a read of the latch waits for an update; the optimiser then asks again."""
@@ -50,7 +51,7 @@ class Clients:
         limits: What setpoints may be.
         bank: The registers.
         publication: Shows what has changed.
-        pace: Returns the time base of the session.
+        sessions: The session under way, and its time base.
     """
 
     def __init__(
@@ -59,16 +60,16 @@ class Clients:
         limits: InputLimits,
         bank: RegisterBank,
         publication: Publication,
-        pace: Callable[[], Pace],
+        sessions: Sessions,
     ) -> None:
         self._program = program
         self._limits = limits
         self._bank = bank
         self._publication = publication
-        self._pace = pace
+        self._sessions = sessions
         self._news = asyncio.Event()
         self._waits = 0
-        self._sessions = 0
+        self._begun = 0
         """Sessions that have begun."""
         self.lease = WriterLease("the optimiser's registers", self._silence_s, self._note_lease)
         self.changed = asyncio.Event()
@@ -88,7 +89,7 @@ class Clients:
 
     def _silence_s(self) -> float:
         """Return the silence, in real time, after which another optimiser may write."""
-        pace, watchdog = self._pace(), self._program.watchdog
+        pace, watchdog = self._sessions.pace, self._program.watchdog
         if not watchdog.time:
             return UNWATCHED_S
         return watchdog.time * TICK_S / (pace.factor if pace.realtime else 1.0)
@@ -113,7 +114,7 @@ class Clients:
         if self.asked is not None:
             raise IllegalValueError("pace: a session is about to begin")
         try:
-            asked.of(self._program.session if self._publication.running else 0)
+            asked.of(self._program.session if self._sessions.running else 0)
         except ValueError as error:
             raise IllegalValueError(f"pace: {error}") from None
 
@@ -121,7 +122,7 @@ class Clients:
 
     def begin(self) -> None:
         """Show nothing of the session before: a session begins."""
-        self._sessions += 1
+        self._begun += 1
         self._bank.put(sealed(self._bank.get(Update)._replace(session=0)))
         self._bank.put(sealed(LatchedUpdate()))
         self._bank.put(sealed(self._program.player.acknowledgement))
@@ -226,7 +227,7 @@ class Clients:
         program = self._program
         program.optimizer_seen()
         wanted = asked.update
-        if asked.session != program.session or not self._publication.running:
+        if asked.session != program.session or not self._sessions.running:
             latched = program.player.update
             if latched is not None and not (program.awaiting_plan and latched.tick == program.tick - 1):
                 program.abandon()
@@ -244,13 +245,13 @@ class Clients:
 
     async def _wait_for(self, wanted: int) -> None:
         """Wait for an update; one of a session that has begun since, which counts from 0 again, will do."""
-        sessions = self._sessions
+        begun = self._begun
         self._waits += 1
         try:
             async with asyncio.timeout(LONGEST_WAIT_S):
                 while not self._latched(wanted):
                     await self._news.wait()
-                    if self._sessions != sessions:
+                    if self._begun != begun:
                         return
         except TimeoutError:
             return

@@ -40,7 +40,7 @@ ALARMS: Final = {
 SECOND_MASTER: Final = 2
 """Cause of the alarm SECOND_WRITER."""
 HARMLESS: Final = (LinkCause.STARTED, LinkCause.OVERSLEPT, LinkCause.LEAPT, LinkCause.PACE)
-"""Causes of JOINING that raise no alarm: what is read back is expected to be what we applied."""
+"""Causes that raise no alarm: what will be read back is expected to be what we applied."""
 NOT_TAKEN: Final = (PlantLinkState.NOT_TAKEN, LinkCause.REFUSED)
 REFUSED_OUTPUTS: Final[Mapping[int, tuple[PlantLinkState, LinkCause]]] = {
     OutputVerdict.WRONG_SESSION: (PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION),
@@ -88,6 +88,10 @@ class PlantLink:
         """Begin a session: read back first. What the rack applied in the one before does not matter."""
         self.generation = 0
         self._enter(PlantLinkState.JOINING, LinkCause.STARTED)
+
+    def starting(self) -> None:
+        """Note that the rack does not answer yet: both are being powered up."""
+        self._enter(PlantLinkState.SEARCHING, LinkCause.STARTED)
 
     def end(self) -> None:
         """There is no session: nothing is written."""
@@ -209,7 +213,7 @@ class PlantLink:
     def _alarm(self, state: PlantLinkState, cause: LinkCause) -> None:
         """Raise the alarm of a state; those of the states before return when a scan is taken, or another is raised."""
         alarm = ALARMS.get(state)
-        if alarm is None or (state is PlantLinkState.JOINING and cause in HARMLESS):
+        if alarm is None or cause in HARMLESS:
             return
         self._alarms.raised(alarm, cause)
         for other in set(ALARMS.values()) - {alarm}:

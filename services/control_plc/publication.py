@@ -16,6 +16,7 @@ from coldloop.writer_lease import WriterLease
 from control_plc.plant_link import PlantLink
 from control_plc.program import ControlProgram
 from control_plc.rack_clock import Skew
+from control_plc.sessions import Sessions
 
 log = logging.getLogger("coldloop.control_plc")
 
@@ -30,20 +31,20 @@ class Publication:
     def __init__(
         self,
         program: ControlProgram,
+        sessions: Sessions,
         link: PlantLink,
         bank: RegisterBank,
         model_digest: int,
         keep: Callable[[], None] = lambda: None,
     ) -> None:
         self._program = program
+        self._sessions = sessions
         self._link = link
         self._bank = bank
         self._model_digest = model_digest
         self._keep = keep
         self.journal = JournalPublication(program.journal, bank)
         self._told_alarms = -1
-        self.running = False
-        """A session is under way."""
         self.overruns = 0
         """Scans that began too late."""
         self.lateness = LatenessRecord()
@@ -56,7 +57,6 @@ class Publication:
 
     def begin(self) -> None:
         """Count anew: a session begins."""
-        self.running = True
         self.overruns = 0
         self.lateness = LatenessRecord()
         self.skew, self.offset_ms = Skew(0.0, math.inf), 0.0
@@ -68,7 +68,7 @@ class Publication:
             Identity(
                 map_digest=CONTROL_MAP.digest,
                 map_version=CONTROL_MAP.version,
-                state=ServiceState.RUNNING if self.running else ServiceState.READY,
+                state=ServiceState.RUNNING if self._sessions.running else ServiceState.READY,
                 model_digest=self._model_digest,
                 session=program.session,
                 tick=program.tick,

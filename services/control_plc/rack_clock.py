@@ -84,6 +84,10 @@ class RackClock:
     """
 
     def __init__(self, factor: float, now: float) -> None:
+        self.begin(factor, now)
+
+    def begin(self, factor: float, now: float) -> None:
+        """Begin anew with another factor: nothing is known of the rack."""
         self.tick_s = TICK_S / factor
         self.offset = 0.0
         """Last phase error, in ticks: positive when the rack is ahead of our schedule."""

@@ -39,7 +39,7 @@ class RetainedState(BaseModel):
     """Number of the start that wrote it."""
     holder: Annotated[int, Field(ge=1, lt=2**32)]
     """Number by which the rack knows this control PLC."""
-    events: Count
+    events: Annotated[int, Field(ge=0, lt=2**31)]
     """Number of the last event."""
     session: Count
     tick: Count

@@ -13,7 +13,7 @@ import time
 from typing import Final
 
 from coldloop import __version__
-from coldloop.errors import ConfigurationError, LinkError, PeerUnreachableError
+from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.limits import InputLimits
 from coldloop.logs import dropped
 from coldloop.modbus.client import RegisterClient
@@ -24,43 +24,32 @@ from coldloop.process import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import SessionPace
-from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, LinkCause, PlantLinkState
+from coldloop.registers.control_plc import CONTROL_MAP, ControlSession
 from coldloop.registers.plant import PLANT_MAP, Measurement
-from coldloop.registers.safety import AlarmKind, LeaseState, LeaseStatus, WatchdogTime
-from coldloop.session import TimeMode
+from coldloop.registers.safety import AlarmKind, WatchdogTime
 from coldloop.telemetry import Telemetry
+from control_plc.certificate_watch import CertificateWatch
 from control_plc.clients import Clients
 from control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
 from control_plc.program import ControlProgram, OperatingPoint
 from control_plc.publication import Publication
 from control_plc.rack_clock import PHASE, RackClock
-from control_plc.retained_state import Memory, RetainedState
+from control_plc.rack_finder import RackFinder
+from control_plc.retained_state import Memory
 from control_plc.scan_cycle import ScanCycle
+from control_plc.sessions import Sessions
 from control_plc.settings import ControlSection, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
 
 TICKS_PER_SECOND: Final = round(1 / TICK_S)
-SEARCH_S: Final = 0.5
-"""How long one attempt to reach a lost rack may take."""
-LOOK_PAUSE_S: Final = 0.1
-"""Between two looks at a rack that is not in step; the first one after a break is made at once."""
 ANSWER_TICKS: Final = 8
 """In real time an answer that takes longer is of no use: the rack is looked at anew."""
 SHORTEST_PATIENCE_S: Final = 0.1
 LONGEST_SLEEP_S: Final = 0.25
 """In real time it is seen so often whether an operator has called meanwhile."""
-ADOPT_AFTER_S: Final = 1.0
-"""An operator who begins a session writes to one PLC after the other: one that the rack has begun is ours by
-`session.autostart` when it has not been asked for here meanwhile."""
 KEEP_ALIVE_S: Final = 1.0
 """While paused, the rack is asked something so often."""
-EXPIRES_SOON: Final = 1
-"""Causes of the alarm CERTIFICATE."""
-EXPIRED: Final = 2
-UNREADABLE: Final = 3
-CERTIFICATES_S: Final = 3600.0
-"""Between two looks at the certificates, in real time."""
 
 
 def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:
@@ -82,25 +71,21 @@ class ControlPlc:
         program.journal.continue_from(self._memory.boot, recalled.events if recalled else 0)
         if recalled is not None:
             program.recall(recalled.operator, recalled.alarms, recalled.watchdog, recalled.tick)
-        self._kept: RetainedState | None = recalled if recalled is not None and recalled.session else None
-        """The session to be gone on with, until the rack has been found in it, or in another one."""
+        self.sessions = Sessions(program, settings.session, recalled)
         self._link = PlantLink(program.alarms, program.journal, self._memory.holder)
         self._cycle = ScanCycle(program, self._link, self._adopt)
         self._plant = RegisterClient.at(PLANT_MAP, section.plant)
-        configured = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
-        self._pace = self._kept.pace if self._kept else configured
-        self._clock = RackClock(self._pace.factor, time.monotonic())
-        if self._kept is not None:
-            self._clock.synchronise(self._kept.tick + PHASE, time.monotonic())
+        self._clock = RackClock(self.sessions.pace.factor, time.monotonic())
+        if self.sessions.kept is not None:
+            self._clock.synchronise(self.sessions.kept.tick + PHASE, time.monotonic())
+        self._finder = RackFinder(self._plant, self._link, self._cycle, self._clock, power_up_s=section.power_up_s)
         self.bank = RegisterBank(CONTROL_MAP, section.word_order)
-        self.publication = Publication(program, self._link, self.bank, header.short_digest, self._keep)
-        self.clients = Clients(program, settings.limits, self.bank, self.publication, lambda: self._pace)
-        self._reached = False
-        self._looks = 0
+        self.publication = Publication(program, self.sessions, self._link, self.bank, header.short_digest, self._keep)
+        self.clients = Clients(program, settings.limits, self.bank, self.publication, self.sessions)
+        certificates = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]
+        self.certificates = CertificateWatch(certificates, program, self.publication.safety)
         self._lost_lines = 0
         self._awaiting_since: float | None = None
-        self._other = (0, 0.0)
-        """Another session that the rack was found in while ours ran, and since when (s)."""
         self.bank.put(program.operator)
         self.bank.put(WatchdogTime(program.watchdog.time))
         program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None))
@@ -121,35 +106,25 @@ class ControlPlc:
                 self._start(self.clients.asked)
             elif self.clients.asked_pace is not None:
                 self._change_pace(self.clients.asked_pace)
-            elif not self._has_session:
+            elif not self.sessions.expected:
                 await self._stand_by()
-            elif self._pace.paused:
+            elif self.sessions.pace.paused:
                 await self._while_paused()
             elif not self._link.in_step:
                 await self._look()
-            elif await (self._until_clock() if self._pace.realtime else self._until_granted()):
+            elif await (self._until_clock() if self.sessions.pace.realtime else self._until_granted()):
                 await self._scan()
-
-    @property
-    def _has_session(self) -> bool:
-        """There is a session, or the rack may have one that is to be gone on with."""
-        return self.publication.running or self._settings.session.autostart or self._kept is not None
 
     async def _stand_by(self) -> None:
         """Wait for a session; until the rack has answered once, look for it."""
-        if self._reached:
+        if self._finder.reached:
             self.clients.changed.clear()
             await self.clients.changed.wait()
             return
-        try:
-            await self._plant.connect(SEARCH_S)
-        except LinkError as error:
-            self._cycle.failed(error)
-            self._say_lost(error)
-            await self._pause()
-        else:
-            self._reached = True
+        if await self._finder.reach():
             self._link.end()
+        else:
+            await self._finder.pause(self.clients.changed)
         self._publish()
 
     async def _until_clock(self) -> bool:
@@ -186,10 +161,8 @@ class ControlPlc:
             async with asyncio.timeout(KEEP_ALIVE_S):
                 await self.clients.changed.wait()
         except TimeoutError:
-            try:
+            with contextlib.suppress(LinkError):  # when time goes on, the rack is looked at
                 await self._plant.read(Measurement)
-            except LinkError as error:
-                self._say_lost(error)
 
     async def _until_granted(self) -> bool:
         """Wait until the next scan in lock-step has what it needs; tell whether it may begin."""
@@ -233,8 +206,7 @@ class ControlPlc:
                 raise PeerUnreachableError(f"{self._plant.peer} has closed the connection")
             answer = await self._plant.exchange(outputs, Measurement, patience_s=self._patience_s)
         except LinkError as error:
-            self._cycle.failed(error)
-            self._say_lost(error)
+            self._finder.failed(error)
             self._publish()
             return
         answered_at = time.monotonic()
@@ -243,8 +215,8 @@ class ControlPlc:
         if not self._link.in_step:
             self._publish()
             return
-        self._looks = 0
-        if self._pace.realtime and answer.tick:
+        self._finder.look_at_once()
+        if self.sessions.pace.realtime and answer.tick:
             self._clock.observe(answer.tick + answer.age, at, (answered_at - asked_at) / 2)
         if update is not None:
             self.clients.tell(update)
@@ -270,11 +242,11 @@ class ControlPlc:
 
     def _keep(self) -> None:
         """Keep the state of now; of a session that is still to be gone on with, that of before the restart."""
-        self._memory.keep(self._program, self._pace, self._kept)
+        self._memory.keep(self._program, self.sessions.pace, self.sessions.kept)
 
     def _watch_ourselves(self) -> None:
         """Raise the alarms about clock and memory, and note log lines that were lost."""
-        if self._pace.realtime:
+        if self.sessions.pace.realtime:
             skew = self.publication.skew = self._clock.skew()
             self.publication.offset_ms = self._clock.offset * self._clock.tick_s * 1000
             limit = self._settings.control_plc.skew_alarm_ppm
@@ -290,190 +262,75 @@ class ControlPlc:
     def _patience_s(self) -> float:
         """How long an answer of the rack may take."""
         longest = self._settings.control_plc.plant.timeout_s
-        if not self._pace.realtime:
+        if not self.sessions.pace.realtime:
             return longest
         return min(longest, max(SHORTEST_PATIENCE_S, ANSWER_TICKS * self._clock.tick_s))
 
     def _in_ticks(self, at: float) -> float | None:
         """Return a moment of real time in ticks; None in lock-step."""
-        return at / self._clock.tick_s if self._pace.realtime else None
-
-    async def watch_certificates(self) -> None:
-        """Raise the alarm while a certificate has expired, or will soon; look again every hour, until cancelled."""
-        section = self._settings.control_plc
-        files = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]
-        if not files:
-            return
-        from coldloop.modbus.tls import certificate_days_left  # noqa: PLC0415 not needed without TLS
-
-        def days_of_those_to_renew() -> list[float]:
-            return [days for tls in files if (days := certificate_days_left(tls)) < tls.warn_days]
-
-        while True:
-            try:
-                days = await asyncio.to_thread(days_of_those_to_renew)  # no scan waits for a disk
-            except ConfigurationError as error:  # somebody is renewing them, perhaps; what was read at the start serves
-                log.warning("certificates unreadable", extra={"reason": str(error)})
-                condition, cause = True, UNREADABLE
-            else:
-                condition, cause = bool(days), EXPIRED if min(days, default=0.0) < 0.0 else EXPIRES_SOON
-            self._program.alarms.holds(AlarmKind.CERTIFICATE, condition=condition, cause=cause)
-            self.publication.safety()
-            await asyncio.sleep(CERTIFICATES_S)
+        return at / self._clock.tick_s if self.sessions.pace.realtime else None
 
     # -- out of step ---------------------------------------------------------------------------------------------------
 
     async def _look(self) -> None:
         """Read what the rack applies; in step with it, go on from there."""
-        if self._looks:
-            await self._pause()
-            if self._is_called:
-                return
-        self._looks += 1
-        try:
-            await self._read_back()
-        except LinkError as error:
-            self._cycle.failed(error)
-            self._say_lost(error)
-        if not self._link.in_step and self._pace.realtime:
-            now = self._clock.tick_at(time.monotonic())
-            self._program.alarms.now = max(self._program.tick, now)
-            self._program.alarms.pass_by()
+        realtime = self.sessions.pace.realtime
+        answered = await self._finder.look(self.clients.changed, self._patience_s if realtime else None)
+        if not self._link.in_step:
+            if answered and not self.sessions.rack_answered():
+                self.bank.put(self._program.operator)
+                self._link.end()
+            if realtime:
+                now = self._clock.tick_at(time.monotonic())
+                self._program.alarms.now = max(self._program.tick, now)
+                self._program.alarms.pass_by()
         self._publish()
-
-    async def _read_back(self) -> None:
-        """Read what the rack applies; in real time an attempt is as short as a scan is urgent.
-
-        Raises:
-            LinkError: The rack does not answer, or not in time.
-        """
-        try:
-            async with asyncio.timeout(SEARCH_S if self._pace.realtime else None):
-                if self._link.state is PlantLinkState.SEARCHING:
-                    await self._plant.connect(SEARCH_S)
-                held = self._link.cause is LinkCause.SECOND_MASTER and await self._is_held_by_another()
-                asked_at = time.monotonic()
-                reading = await self._plant.read(Measurement)
-        except TimeoutError:
-            raise PeerUnreachableError(f"{self._plant.peer} has not answered within {SEARCH_S:g} s") from None
-        self._reached = True
-        if not held:
-            self._join(reading, (asked_at + time.monotonic()) / 2)
-
-    async def _is_held_by_another(self) -> bool:
-        """Tell whether the control PLC that we were refused for still holds the lease of the rack."""
-        lease = await self._plant.read(LeaseStatus)
-        ours = lease.holder == self._link.holder
-        return lease.state == LeaseState.HELD or (lease.state == LeaseState.LINGERING and not ours)
-
-    def _join(self, reading: Measurement, at: float) -> None:
-        """Go on from a reading, where that may be done; `at` is when the rack was read, s."""
-        self._cycle.answered(reading, self._in_ticks(at))
-        if self._link.in_step:
-            # at tick 0 the rack's clock waits for the first outputs
-            self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
-        elif not self.publication.running and not self._settings.session.autostart:
-            self._forget_kept()  # the rack has left the session that was retained
-            self._link.end()
-
-    async def _pause(self) -> None:
-        """Wait before the next look, unless somebody writes something."""
-        self.clients.changed.clear()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(min(LOOK_PAUSE_S, max(0.005, self._clock.tick_s))):
-                await self.clients.changed.wait()
-
-    def _say_lost(self, error: LinkError) -> None:
-        log.warning("plant not in step", extra={"reason": str(error), "tick": self._program.tick})
 
     # -- sessions ------------------------------------------------------------------------------------------------------
 
     def _adopt(self, reading: Measurement) -> bool:
-        """Go over to the session of the rack, where that is ours to do: after a restart, or by `session.autostart`."""
-        kept, program = self._kept, self._program
-        if kept is not None and kept.session == reading.session != 0:
-            self._kept = None
-            program.resume(
-                reading.session, reading.tick, reading.u,
-                updates=kept.updates, operator=program.operator, playing=kept.sequence,
-            )  # fmt: skip
-            self._go_on(reading)
-            return True
-        self._forget_kept()
-        if not self._settings.session.autostart or not self._is_ours_to_adopt(reading.session):
-            return False
-        if reading.tick == 0:
-            program.restart(reading.session)
-        else:
-            program.resume(
-                reading.session, reading.tick, reading.u, updates=program.player.updates, operator=program.operator
-            )
-        self._go_on(reading)
-        return True
-
-    def _go_on(self, reading: Measurement) -> None:
-        log.warning("session resumed", extra={"session": reading.session, "tick": reading.tick})
-        self._begin()
-
-    def _forget_kept(self) -> None:
-        """Do without the session that was retained; what an operator has said since the start stays."""
-        kept, self._kept = self._kept, None
-        if kept is None:
-            return
-        configured = self._settings.session
-        self._pace = Pace(configured.mode is TimeMode.REALTIME, configured.factor)
-        if self._program.operator == kept.operator:
-            self._program.nobody_drives()
-            self.bank.put(self._program.operator)
-
-    def _is_ours_to_adopt(self, session: int) -> bool:
-        """Tell whether a session of the rack has not been asked for by an operator, as far as one can tell by now."""
-        if not session or not self.publication.running:
-            return session > 0
-        now = time.monotonic()
-        if self._other[0] != session:
-            self._other = session, now
-        return now - self._other[1] >= ADOPT_AFTER_S
+        """Go over to the session of the rack, where that is ours to do."""
+        adopted = self.sessions.adopt(reading)
+        self.bank.put(self._program.operator)
+        if adopted:
+            self._begin()
+        return adopted
 
     def _start(self, asked: ControlSession) -> None:
         """Begin the session that an operator has asked for; nothing is written before the rack has been read."""
         self.clients.asked = None
-        self._forget_kept()
-        self._program.restart(asked.session)
-        self._pace = Pace(bool(asked.realtime), asked.factor)
+        self.sessions.start(asked)
         self._begin()
         self._link.begin()
         self._publish()
-        log.info("session started", extra={"session": asked.session, "realtime": bool(asked.realtime)})
 
     def _change_pace(self, pace: Pace) -> None:
         """Go on by another time base; before the next scan the rack is looked at."""
         self.clients.asked_pace = None
-        self._pace = pace
+        self.sessions.pace = pace
         self._set_clock()
-        self._looks = 0
         self._link.repaced()
         self._show_pace()
         self._publish()
-        self._memory.keep(self._program, pace)
+        self._keep()
         log.info("pace changed", extra={"realtime": pace.realtime, "factor": pace.factor, "paused": pace.paused})
 
-    def _set_clock(self) -> None:
-        self._clock = RackClock(self._pace.factor, time.monotonic())
-        self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
-
-    def _show_pace(self) -> None:
-        pace, session = self._pace, self._program.session
-        self.bank.put(ControlSession(session, int(pace.realtime), pace.factor))
-        self.bank.put(SessionPace.shown(session, pace))
-
     def _begin(self) -> None:
-        self._looks = 0
-        self._other = (0, 0.0)
+        """Begin the session that the program has been put into."""
         self._set_clock()
         self.publication.begin()
         self.clients.begin()
         self._show_pace()
+
+    def _set_clock(self) -> None:
+        self._clock.begin(self.sessions.pace.factor, time.monotonic())
+        self._finder.look_at_once()
+        self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
+
+    def _show_pace(self) -> None:
+        pace, session = self.sessions.pace, self._program.session
+        self.bank.put(ControlSession(session, int(pace.realtime), pace.factor))
+        self.bank.put(SessionPace.shown(session, pace))
 
     def _publish(self) -> None:
         self.publication.status()
@@ -494,7 +351,7 @@ async def serve(settings: ControlSettings) -> None:
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(plc.run(), name="scan cycle")
-            tasks.create_task(plc.watch_certificates(), name="certificates")
+            tasks.create_task(plc.certificates.run(), name="certificates")
             telemetry = Telemetry(settings.telemetry, "control_plc", plc.publication.snapshot)
             tasks.create_task(telemetry.run(), name="telemetry")
     finally:

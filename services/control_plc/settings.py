@@ -71,6 +71,8 @@ class ControlSection(BaseModel):
     server: ControlServer = ControlServer()
     word_order: WordOrder = WordOrder.HIGH_FIRST
     plant: PlantEndpoint = PlantEndpoint()
+    power_up_s: Annotated[float, Field(ge=0)] = 10.0
+    """A rack that is powered up together with this PLC may take so long (real time) before it counts as lost."""
     scan_tolerance_ms: Annotated[float, Field(gt=0)] = 5.0
     """Lateness of a scan, in real time, that counts as an overrun."""
     skew_alarm_ppm: Annotated[float, Field(gt=0)] = 500.0

@@ -23,7 +23,7 @@ class RetainedState(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     boot: Count
-    events: Count
+    events: Annotated[int, Field(ge=0, lt=2**31)]
     generation: Annotated[int, Field(ge=1, lt=2**32)]
     holder: Count
     session: Count

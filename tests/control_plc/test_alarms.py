@@ -84,6 +84,32 @@ def test_an_alarm_that_stands_is_raised_again_only_for_another_cause(panel: Alar
     )
 
 
+def test_causes_that_take_turns_raise_an_alarm_once_each_while_it_is_active(panel: AlarmPanel) -> None:
+    for cause in (1, 2, 1, 2, 1):
+        panel.raised(KIND, cause)
+    assert (panel.rows[KIND].times, panel.rows[KIND].cause) == (2, 1)
+    do(panel, "acknowledge")
+    panel.raised(KIND, 1)
+    assert panel.rows[KIND].state == AlarmState.ACKNOWLEDGED, "no news"
+    for cause in (2, 1, 2):
+        panel.raised(KIND, cause)
+    assert (panel.rows[KIND].times, panel.rows[KIND].state) == (3, AlarmState.UNACKNOWLEDGED), (
+        "news to who acknowledged"
+    )
+    panel.returned(KIND)
+    panel.raised(KIND, 1)
+    assert panel.rows[KIND].times == 4
+
+
+def test_a_cause_that_an_alarm_had_before_a_restart_is_no_news_after_it(panel: AlarmPanel) -> None:
+    panel.raised(KIND, 1)
+    again = AlarmPanel(Journal())
+    again.restore(panel.rows)
+    again.raised(KIND, 2)
+    again.raised(KIND, 1)
+    assert again.rows[KIND].times == 2
+
+
 def test_all_alarms_are_acknowledged_at_once_and_unknown_ones_are_nobodys(panel: AlarmPanel) -> None:
     for kind in AlarmKind:
         panel.raised(kind)

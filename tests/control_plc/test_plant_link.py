@@ -145,6 +145,16 @@ def test_alarms_tell_what_is_wrong_and_return_when_a_scan_is_taken() -> None:
     assert states == [S.JOINING, S.SEARCHING, S.FOREIGN, S.IN_STEP]
 
 
+def test_a_rack_that_is_powered_up_with_us_is_searched_for_before_it_counts_as_lost(link: PlantLink) -> None:
+    alarms = link._alarms  # noqa: SLF001
+    link.starting()
+    assert (link.state, link.cause) == (S.SEARCHING, LinkCause.STARTED)
+    assert not alarms.rows[AlarmKind.PLANT_LOST].active
+    link.unanswered(LinkCause.NO_ANSWER)
+    row = alarms.rows[AlarmKind.PLANT_LOST]
+    assert (row.active, row.cause) == (1, LinkCause.NO_ANSWER)
+
+
 def test_outputs_that_somebody_else_has_moved_during_a_break_raise_the_alarm(link: PlantLink) -> None:
     """A control PLC that stood still until the rack was at its safe state: nothing else tells."""
     alarms = link._alarms  # noqa: SLF001

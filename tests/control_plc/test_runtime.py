@@ -29,8 +29,9 @@ from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVe
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.retained import RetainedFile
 from coldloop.seal import sealed
+from control_plc.certificate_watch import EXPIRES_SOON, UNREADABLE
 from control_plc.retained_state import OWNER
-from control_plc.runtime import EXPIRES_SOON, UNREADABLE, ControlPlc
+from control_plc.runtime import ControlPlc
 from control_plc.settings import ControlSettings
 from rig.certificates import Authority
 from rig.ports import ReservedPorts
@@ -119,7 +120,7 @@ def alarm(plc: ControlPlc, kind: AlarmKind) -> AlarmState:
 
 async def test_an_alarm_with_a_delay_is_raised_also_while_no_scans_are_made() -> None:
     rules = {"rules": {"plant_lost": {"on_delay_s": 1.0}}}
-    async with running(control_plc={"alarms": rules}) as plc:
+    async with running(control_plc={"alarms": rules, "power_up_s": 0.0}) as plc:
         ask(plc, ControlSession(3, 1, 10.0))
         await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.SEARCHING)
         await until(lambda: alarm(plc, AlarmKind.PLANT_LOST) is AlarmState.UNACKNOWLEDGED)
@@ -155,7 +156,7 @@ async def test_autostart_leaves_a_session_to_the_operator_who_is_about_to_ask_fo
         await asyncio.sleep(0.4)
         assert rack.written[-1].session == 1
         await until(lambda: rack.written[-1].session == 2)  # nobody has asked
-        assert plc.publication.running
+        assert plc.sessions.running
 
 
 async def test_no_number_of_a_start_or_of_an_event_is_given_out_twice(tmp_path: Path) -> None:
@@ -176,14 +177,14 @@ async def test_what_an_operator_says_before_the_rack_is_found_holds(tmp_path: Pa
     settings = {"retain": {"file": tmp_path / "state"}}
     async with running(SmallRack(4), control_plc=settings) as plc:
         ask(plc, ControlSession(4, 0, 1.0))
-        await until(lambda: plc.publication.running)
+        await until(lambda: plc.sessions.running)
         ask(plc, AlarmCommand(AlarmKind.CLOCK_SKEW, AlarmAction.SHELVE, 600))
     for asked in (Operator(OperatorMode.MANUAL, 43.0, 75.0, 36.0), None):
         async with running(SmallRack(4), control_plc=settings) as plc:
             if asked is not None:
                 ask(plc, asked)
                 ask(plc, AlarmCommand(AlarmKind.T5_BAND, AlarmAction.SHELVE, 600))
-            await until(lambda: plc.publication.running)
+            await until(lambda: plc.sessions.running)
             assert plc.bank.get(Identity).session == 4
             assert plc.bank.get(Operator).mode == OperatorMode.MANUAL
             assert alarm(plc, AlarmKind.T5_BAND) is AlarmState.SHELVED
@@ -194,17 +195,17 @@ async def test_a_session_is_gone_on_with_after_several_starts_without_the_rack(t
     settings = {"retain": {"file": tmp_path / "state"}}
     async with running(SmallRack(4), control_plc=settings) as plc:
         ask(plc, ControlSession(4, 0, 1.0))
-        await until(lambda: plc.publication.running)
+        await until(lambda: plc.sessions.running)
     for _ in range(2):
         async with running(control_plc=settings) as plc:
             ask(plc, Operator(OperatorMode.CLASSICAL, 43.0, 75.0, 36.0))
     async with running(SmallRack(4), control_plc=settings) as plc:
-        await until(lambda: plc.publication.running)
+        await until(lambda: plc.sessions.running)
         assert plc.bank.get(Operator).mode == OperatorMode.CLASSICAL
     async with running(SmallRack(5), control_plc=settings) as plc:
         await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IDLE)
         await asyncio.sleep(0.1)
-        assert not plc.publication.running
+        assert not plc.sessions.running
         assert plc.bank.get(Operator).mode == OperatorMode.AUTO
 
 
@@ -216,10 +217,10 @@ async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
     authority = Authority.new("site", 20)
     for file, pair in ((tmp_path / "ca", authority.pair), (certificate, authority.issue_client("a", "control"))):
         file.write_bytes(pair.certificate_pem)
-    monkeypatch.setattr("control_plc.runtime.CERTIFICATES_S", 0.01)
+    monkeypatch.setattr("control_plc.certificate_watch.PERIOD_S", 0.01)
     tls = {"certificate": certificate, "key": tmp_path / "key", "ca": tmp_path / "ca"}
     async with running(control_plc={"server": {"tls": tls}}) as plc:
-        watching = asyncio.create_task(plc.watch_certificates())
+        watching = asyncio.create_task(plc.certificates.run())
         await until(lambda: plc.bank.get(Alarm, AlarmKind.CERTIFICATE).cause == EXPIRES_SOON)
         content = certificate.read_bytes()
         certificate.unlink()
@@ -237,7 +238,7 @@ async def test_a_retained_state_that_cannot_be_keeps_nobody_from_starting(tmp_pa
     file = tmp_path / "state"
     async with running(SmallRack(4), control_plc={"retain": {"file": file}}) as plc:
         ask(plc, ControlSession(4, 0, 1.0))
-        await until(lambda: plc.publication.running)
+        await until(lambda: plc.sessions.running)
     kept = RetainedFile(file, OWNER, HEADER.short_digest)
     state = kept.load()
     assert state is not None

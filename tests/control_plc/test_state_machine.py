@@ -216,7 +216,7 @@ class Link(RuleBasedStateMachine):
         content = Memory(None, HEADER.short_digest).content(self.program, Pace(realtime=False, factor=1.0))
         kept = RetainedState.parsed(json.loads(json.dumps(content)))
         self.program = self.new_program()
-        self.program.alarms.rows = list(kept.alarms)
+        self.program.alarms.restore(kept.alarms)
         self.program.resume(kept.session, kept.tick, self.trace[-1], updates=kept.updates, operator=kept.operator)
         self.promised = None
         self.began.append(len(self.trace))

@@ -1,7 +1,6 @@
 """Clients that we did not write read the magic float and the temperature T5."""
 
 import asyncio
-import os
 import shutil
 import subprocess
 import textwrap
@@ -13,6 +12,7 @@ import pytest
 from coldloop.process import OUTPUT_NAMES, T5
 from coldloop.registers.common import Identity
 from coldloop.registers.plant import PLANT_MAP, Measurement
+from tests.conftest import install
 
 if TYPE_CHECKING:
     from coldloop.registers.declaration import Register
@@ -80,24 +80,6 @@ def address_of(block: str, name: str) -> str:
 
 
 ADDRESSES = [address_of("identity", "magic"), address_of("measurement", "y.T5")]
-
-
-def install(*packages: str) -> None:
-    """Install Debian packages, or skip the test with the reason why that cannot be."""
-    if os.geteuid() != 0 or shutil.which("apt-get") is None:
-        pytest.skip(f"needs {' '.join(packages)}: not installed, and only root on Debian can install it here")
-    environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
-    for command in (["apt-get", "update"], ["apt-get", "install", "-y", "--no-install-recommends", *packages]):
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
-        if done.returncode != 0:
-            pytest.skip(f"`{' '.join(command)}` failed: {done.stderr.strip().splitlines()[-1:]}")
-
-
-@pytest.fixture(scope="session")
-def mbpoll() -> str:
-    if shutil.which("mbpoll") is None:
-        install("mbpoll")
-    return "mbpoll"
 
 
 @pytest.fixture(scope="session")

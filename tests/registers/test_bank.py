@@ -56,11 +56,11 @@ def test_what_is_written_is_what_is_read(
 @given(address=st.integers(0, 0xFFFF), data=st.binary(min_size=1, max_size=123).map(lambda half: half + half))
 def test_a_refused_write_stores_nothing_and_an_accepted_one_everything(address: int, data: bytes) -> None:
     bank = BANKS[WordOrder.HIGH_FIRST][CONTROL_MAP]
-    whole = bank.read(500, 1440)
+    whole = bank.read(0, CONTROL_MAP.end)
     try:
         bank.write(address, data)
     except RefusedAccessError:
-        assert bank.read(500, 1440) == whole
+        assert bank.read(0, CONTROL_MAP.end) == whole
     else:
         assert bank.read(address, len(data) // 2) == data
 
@@ -89,10 +89,22 @@ def test_a_row_is_written_where_it_stands(control: RegisterBank, row: int) -> No
     assert control.read(500 + 6 * row, 6) == struct.pack(">3f", 1.0, 2.0, 3.0)
 
 
-@pytest.mark.parametrize(("address", "count"), [(13, 1), (12, 2), (0xFFFF, 1), (0xFFFF, 2), (29, 2), (1940, 1)])
-def test_registers_that_are_not_declared_are_not_read(control: RegisterBank, address: int, count: int) -> None:
-    with pytest.raises(IllegalAddressError):
+@pytest.mark.parametrize(("address", "count"), [(CONTROL_MAP.end, 1), (CONTROL_MAP.end - 1, 2), (0xFFFF, 2)])
+def test_nothing_is_read_beyond_the_end_of_the_map(control: RegisterBank, address: int, count: int) -> None:
+    with pytest.raises(IllegalAddressError, match=f"the map ends at {CONTROL_MAP.end - 1}"):
         control.read(address, count)
+
+
+@given(address=st.integers(0, CONTROL_MAP.end - 1), count=st.integers(1, 125))
+def test_a_block_read_may_cross_the_gaps_of_a_map_which_are_zero(address: int, count: int) -> None:
+    bank = BANKS[WordOrder.HIGH_FIRST][CONTROL_MAP]
+    assume(address + count <= CONTROL_MAP.end)
+    words = bank.read(address, count)
+    assert len(words) == 2 * count
+    declared = {each for block in CONTROL_MAP.blocks for each in range(block.address, block.end)}
+    for place in range(count):
+        if address + place not in declared:
+            assert words[2 * place : 2 * place + 2] == b"\0\0"
 
 
 @pytest.mark.parametrize(("address", "count"), [(0, 2), (13, 1), (406, 2), (400, 8), (0xFFFF, 1), (0xFFFF, 2)])

@@ -5,7 +5,7 @@ import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -17,7 +17,6 @@ import control_plc.runtime
 import optimizer_plc.runtime
 import plant.runtime
 from coldloop.config import PREFIX, to_environment
-from coldloop.endpoints import Endpoint
 from coldloop.model_file import read_header
 from coldloop.registers.codec import WordOrder
 from control_plc.settings import ControlSettings
@@ -32,13 +31,13 @@ from rig.recording import Recorder, Recording
 from rig.rig_endpoints import RigEndpoints
 from rig.scenario import Scenario
 from rig.settings import Settings
+from rig.testing import up
+from rig.wiring import SERVICES, endpoints_on, wired
 
 PATIENCE_S = 120.0
 """A test on the bus has failed when it takes longer; the first one may have to compile the kernels."""
 
 S = TypeVar("S", bound=BaseModel)
-
-SERVICES = ("plant", "control_plc", "optimizer_plc")
 
 
 # -- scenarios and the rig in one process ------------------------------------------------------------------------------
@@ -81,21 +80,6 @@ def simulate() -> Simulate:
 
 
 # -- rigs on the bus ---------------------------------------------------------------------------------------------------
-
-
-def wired(
-    settings: Settings, ports: Sequence[int], order: WordOrder = WordOrder.HIGH_FIRST
-) -> tuple[Settings, RigEndpoints]:
-    """Return the settings with each server on its port and each client pointed at it; and where they are."""
-    ends = RigEndpoints(*(Endpoint(port=port, word_order=order) for port in ports))
-    sections: dict[str, BaseModel] = {}
-    for name, end in zip(SERVICES, ends, strict=True):
-        section = getattr(settings, name)
-        server = section.server.model_copy(update={"port": end.port})
-        sections[name] = section.model_copy(update={"server": server, "word_order": order})
-    sections["control_plc"] = sections["control_plc"].model_copy(update={"plant": ends.plant})
-    sections["optimizer_plc"] = sections["optimizer_plc"].model_copy(update={"control_plc": ends.control_plc})
-    return settings.model_copy(update=sections), ends
 
 
 def part(kind: type[S], settings: Settings) -> S:
@@ -141,7 +125,12 @@ async def services_in_this_loop(
 ) -> AsyncIterator[Bus]:
     """Serve on free ports; a service that ends by an error fails the test."""
     reserved = ReservedPorts(len(SERVICES))
-    settings, endpoints = wired(settings or Settings(), reserved.numbers, order)
+    chosen = settings or Settings()
+    ordered = chosen.model_copy(
+        update={name: getattr(chosen, name).model_copy(update={"word_order": order}) for name in SERVICES}
+    )
+    endpoints = endpoints_on(reserved.numbers, ordered)
+    settings = wired(ordered, endpoints)
     serving: dict[str, Callable[[], Awaitable[None]]] = {
         "plant": lambda: plant.runtime.serve(part(PlantSettings, settings)),
         "control_plc": lambda: control_plc.runtime.serve(part(ControlSettings, settings)),
@@ -201,11 +190,8 @@ def start_service() -> Iterator[Start]:
 @pytest.fixture(scope="session")
 def three_processes() -> Iterator[Bus]:
     """One rig of three processes for all tests; each test runs sessions of its own on it."""
-    with ReservedPorts(len(SERVICES)) as reserved, processes() as start:
-        settings, endpoints = wired(Settings(), reserved.numbers)
-        for service in SERVICES:
-            start(service, settings)
-        yield Bus(endpoints, settings)
+    with up() as rig:
+        yield Bus(rig.endpoints, rig.settings)
 
 
 # -- the command line --------------------------------------------------------------------------------------------------

@@ -67,6 +67,12 @@ def test_status_shows_session_mode_load_outputs_and_alarms(coldloop: Coldloop, u
     assert rows["L1"].endswith("%")
 
 
+def test_a_rig_that_was_started_has_not_lost_anything_yet(coldloop: Coldloop, up: str) -> None:
+    outcome = coldloop("events", f"127.0.0.1:{int(up) + 1}", "--kind", "alarm raised")
+    assert outcome.code == 0, outcome.complaints
+    assert "plant" not in outcome.out, "its parts are powered up one after the other"
+
+
 def test_each_command_says_what_came_back(coldloop: Coldloop, up: str) -> None:
     def told(*words: str) -> str:
         outcome = coldloop("set", "--port-base", up, *words)

@@ -4,6 +4,7 @@ import asyncio
 import signal
 import socket
 import subprocess
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,23 +52,33 @@ async def test_a_control_plc_waits_for_a_rack_that_is_absent_at_power_up(
 ) -> None:
     """It says so in its registers, and goes on by itself when the rack comes."""
     alone = ("session.autostart=true", "session.mode=realtime", "session.factor=20")
-    process = start("control_plc", f"control_plc.plant.port={free_port}", *alone, level="info")
+    process = start(
+        "control_plc", f"control_plc.plant.port={free_port}", "control_plc.power_up_s=0.5", *alone, level="info"
+    )
     client = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=serving_port(process), timeout_s=5.0)
-    await becomes(client, PlantLinkState.SEARCHING)
-    assert (await client.read_rows(Alarm, AlarmKind.PLANT_LOST, 1))[0].active
+    await until(lambda: is_lost(client))
+    assert (await client.read(PlantLinkStatus)).state == PlantLinkState.SEARCHING
     assert process.poll() is None
     start("plant", f"plant.server.port={free_port}", *alone)
-    await becomes(client, PlantLinkState.IN_STEP)
+    await until(lambda: is_in_step(client))
     client.close()
 
 
-async def becomes(client: RegisterClient, state: PlantLinkState) -> None:
-    """Wait until the link to the rack is in a state."""
+async def until(holds: Callable[[], Awaitable[bool]]) -> None:
+    """Wait until something holds."""
     async with asyncio.timeout(PATIENCE_S):
-        while True:
-            if (await client.read(PlantLinkStatus)).state == state:
-                return
+        while not await holds():  # noqa: ASYNC110 it is another process that changes it
             await asyncio.sleep(0.02)
+
+
+async def is_lost(client: RegisterClient) -> bool:
+    """Tell whether the control PLC says that its rack is lost."""
+    return bool((await client.read_rows(Alarm, AlarmKind.PLANT_LOST, 1))[0].active)
+
+
+async def is_in_step(client: RegisterClient) -> bool:
+    """Tell whether the control PLC writes to its rack."""
+    return (await client.read(PlantLinkStatus)).state == PlantLinkState.IN_STEP
 
 
 def test_an_optimiser_refuses_a_control_plc_with_another_model(

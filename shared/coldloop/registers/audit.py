@@ -45,7 +45,7 @@ class EventKind(IntEnum):
     SENSOR_FAULT = 17
     """A fault was put into a sensor: subject the output, cause the kind."""
     LOAD = 18
-    """The load was written: subject the row of the table, value in W."""
+    """The load table was written: subject the last row that the request wrote, its value in W."""
     CERTIFICATE = 19
     """Subject 1 expires soon, 2 expired; value days left."""
     LOST = 20

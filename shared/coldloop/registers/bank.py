@@ -91,7 +91,6 @@ class RegisterBank:
         self.map = register_map
         self.order = order
         self._memory = bytearray(2 * 0x10000)
-        self._declared = bytearray(0x10000)
         self._writable = bytearray(0x10000)
         self._halves = bytearray(0x10000)
         self._places: dict[type[tuple[Any, ...]], tuple[Block, RecordCodec]] = {}
@@ -105,7 +104,6 @@ class RegisterBank:
 
     def _declare(self, block: Block) -> None:
         size = block.end - block.address
-        self._declared[block.address : block.end] = b"\1" * size
         self._places[block.record] = block, codec_of(block, self.order)
         if block.writer is not None:
             self._writable[block.address : block.end] = b"\1" * size
@@ -144,20 +142,21 @@ class RegisterBank:
         self._live.append((block.address, block.end, present))
 
     def check_readable(self, address: int, count: int) -> None:
-        """Check that `count` words from `address` on may be read.
+        """Check that `count` words from `address` on may be read: all up to the end of the map, gaps included.
 
         Raises:
-            IllegalAddressError: One of them is not declared.
+            IllegalAddressError: They reach beyond the end of the map.
         """
-        end = address + count
-        if end > 0x10000 or self._declared.find(0, address, end) >= 0:
-            raise IllegalAddressError(f"no register at some of {address}..{end - 1}")
+        if address + count > self.map.end:
+            raise IllegalAddressError(
+                f"no register at some of {address}..{address + count - 1}: the map ends at {self.map.end - 1}"
+            )
 
     def read(self, address: int, count: int) -> bytes:
-        """Return `count` words from `address` on.
+        """Return `count` words from `address` on; words in the gaps between blocks are 0.
 
         Raises:
-            IllegalAddressError: One of them is not declared.
+            IllegalAddressError: They reach beyond the end of the map.
         """
         self.check_readable(address, count)
         end = address + count

@@ -157,7 +157,10 @@ class Block:
 
 @dataclass(frozen=True)
 class RegisterMap:
-    """All blocks of one server. `version` rises when the meaning of a register changes."""
+    """All blocks of one server. `version` rises when the meaning of a register changes.
+
+    Addresses between two blocks are reserved: they read 0, so that a client may read across them, and take no writes.
+    """
 
     service: str
     version: int
@@ -169,6 +172,11 @@ class RegisterMap:
             if block.address < end or block.end > 0x10000:
                 raise ValueError(f"block {block.name} of {self.service} overlaps another one or the end of the map")
             end = block.end
+
+    @property
+    def end(self) -> int:
+        """First address behind the last block."""
+        return self.blocks[-1].end
 
     def block_of(self, record: type[tuple[object, ...]]) -> Block:
         """Return the block that holds `record`."""

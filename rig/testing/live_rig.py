@@ -1,0 +1,275 @@
+"""A rig for a test: three services on localhost behind proxies, and calls that wait for their result."""
+
+import asyncio
+import contextlib
+import tempfile
+import time
+from collections.abc import Callable, Coroutine, Iterator, Mapping
+from contextlib import AsyncExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Final, Literal, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError, UsageError
+from coldloop.modbus.client import RegisterClient
+from coldloop.process import TICK_S
+from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import CONTROL_MAP, Grant
+from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
+from coldloop.registers.plant import PLANT_MAP, SensorFault
+from rig.chaos.faults import AnyFault, WrongModel
+from rig.chaos.injection import Injector
+from rig.chaos.models import WRONG_MODEL, save_wrong_model
+from rig.chaos.proxied_services import ProxiedServices
+from rig.network import QUIET_S, NetworkRig
+from rig.python_settings import Period, configured
+from rig.rig_endpoints import RigEndpoints
+from rig.running import check_certificates, make_scenario
+from rig.settings import Settings
+from rig.testing.event_loop import BackgroundLoop
+from rig.testing.named_registers import NamedRegisters
+from rig.wiring import SERVICES, START_PATIENCE_S
+
+T = TypeVar("T")
+
+LOOK_S: Final = 0.01
+"""Between two looks at the tick of the plant, in real time."""
+FEED_S: Final = 0.5
+"""Between two looks at the load that the plant knows of, in a session in real time."""
+_MAPS: Final = (PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP)
+_FAULT: Final[TypeAdapter[AnyFault]] = TypeAdapter(AnyFault)
+
+
+class LiveRig:
+    """Three services with a session under way. `up` makes one.
+
+    A rig in lock-step moves only in `advance` and `wait_until`; one in real time moves by itself. All methods are to be
+    called from one thread. What the services refuse, and a service that has ended, raise `LinkError`.
+    """
+
+    def __init__(self, settings: Settings, folder: Path) -> None:
+        self.settings = settings
+        """Their configuration, but for the ports."""
+        self._scenario = make_scenario(settings)
+        self._folder = folder
+        self._proxied = ProxiedServices(settings, folder, str(settings.plant.seed))
+        self.endpoints: RigEndpoints = self._proxied.services.endpoints
+        """Where the services listen."""
+        self._loop = BackgroundLoop()
+        self._stack = AsyncExitStack()
+        self._driver = NetworkRig(self.endpoints, settings)
+        self._clients = {
+            service: RegisterClient.at(register_map, endpoint)
+            for service, register_map, endpoint in zip(SERVICES, _MAPS, self.endpoints, strict=True)
+        }
+        self.plant, self.control_plc, self.optimizer_plc = (
+            NamedRegisters(register_map, endpoint, self._clients[service], self._call)
+            for service, register_map, endpoint in zip(SERVICES, _MAPS, self.endpoints, strict=True)
+        )
+        self._injector = Injector(self._proxied.services, self._proxied.proxies, self, folder)
+
+    # -- time ----------------------------------------------------------------------------------------------------------
+
+    @property
+    def time_s(self) -> float:
+        """Plant time of the session, s."""
+        return float(self.plant.read("identity.tick")) * TICK_S
+
+    def advance(self, seconds: float) -> float:
+        """Let `seconds` of plant time pass (a multiple of 0.25); return the plant time at the end.
+
+        Raises:
+            LinkError: Plant time does not move for 20 s.
+        """
+        ticks = seconds / TICK_S
+        if not ticks > 0 or ticks != round(ticks):
+            raise UsageError(f"advance({seconds}): not a positive multiple of {TICK_S} s")
+        return float(self._call(self._advanced(round(ticks)))) * TICK_S
+
+    async def _advanced(self, ticks: int) -> int:
+        tick = (await self._clients["plant"].read(Identity)).tick
+        until, moved = tick + ticks, time.monotonic()
+        while tick < until:
+            if not self._scenario.realtime:
+                await self._grant(tick, until)
+            await asyncio.sleep(LOOK_S)
+            before, tick = tick, (await self._clients["plant"].read(Identity)).tick
+            if tick != before:
+                moved = time.monotonic()
+            elif time.monotonic() - moved > max(QUIET_S, 4 * TICK_S / self._scenario.factor):
+                raise LinkError(
+                    f"the plant is at {tick * TICK_S:g} s of plant time for {QUIET_S:g} s: see the logs in "
+                    f"{self._folder / 'logs'}"
+                )
+        return tick
+
+    async def _grant(self, tick: int, until: int) -> None:
+        load = self._driver.load
+        if load is not None:
+            await load.feed(tick)
+        known = None if load is None else load.known_until
+        await self._clients["control_plc"].write(Grant(until if known is None else min(until, known)))
+
+    def wait_until(self, condition: Callable[[], bool], within_s: float = 60.0) -> float:
+        """Wait until `condition()` is true, for at most `within_s` of plant time; return the plant time then.
+
+        The condition is looked at every 0.25 s of plant time in lock-step, and a hundred times a second in real time.
+        While plant time stands, as without the plant, real time counts.
+
+        Raises:
+            TimeoutError: It did not become true.
+        """
+        start, deadline = self._tick_or_none(), time.monotonic() + within_s / self._scenario.factor + QUIET_S
+        while not condition():
+            tick = self._tick_or_none()
+            start = tick if start is None else start
+            if tick is not None and start is not None and (tick - start) * TICK_S >= within_s:
+                raise TimeoutError(f"the condition was not true within {within_s:g} s of plant time")
+            if self._scenario.realtime or tick is None:
+                if time.monotonic() > deadline:
+                    raise TimeoutError(f"the condition was not true within {within_s:g} s, and plant time stands")
+                time.sleep(LOOK_S)
+            else:
+                self.advance(TICK_S)
+        return self.time_s
+
+    def _tick_or_none(self) -> int | None:
+        try:
+            return int(self.plant.read("identity.tick"))
+        except PeerUnreachableError:
+            return None
+
+    # -- faults --------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def fault(self, kind: str, **parameters: object) -> Iterator[None]:
+        """Have a fault for as long as the context lasts; at its end, wait until what was stopped answers again.
+
+        Args:
+            kind: One of those of a chaos plan, such as `kill`, `pause`, `drop` or `sensor`.
+            parameters: What belongs to it there, but for its times: `process="optimizer"`, `link="plant"`, ...
+
+        Raises:
+            UsageError: There is no such fault, or a parameter is missing or wrong.
+        """
+        fault = _parsed(kind, parameters)
+        if isinstance(fault, WrongModel):
+            save_wrong_model(self.settings.model.file, self._folder / WRONG_MODEL)
+        self._call(self._injector.begin(fault))
+        try:
+            yield
+        finally:
+            self._call(self._ended(fault))
+
+    async def _ended(self, fault: AnyFault) -> None:
+        service = await self._injector.end(fault)
+        if service is not None:
+            await self._clients[service].connect(START_PATIENCE_S)
+
+    async def set_sensor_fault(self, output: int, fault: SensorFault) -> bool:
+        """Write the fault of an output; for the injector."""
+        try:
+            await self._clients["plant"].write_rows([fault], output)
+        except (PeerUnreachableError, RequestRefusedError):
+            return False
+        return True
+
+    def log(self, service: str) -> Path:
+        """Return the log of `plant`, `control_plc` or `optimizer_plc`: one JSON object a line."""
+        if service not in SERVICES:
+            raise UsageError(f"no service '{service}'; there are {', '.join(SERVICES)}")
+        return self._proxied.services.log(service)
+
+    # -- start and end -------------------------------------------------------------------------------------------------
+
+    def _call(self, work: Coroutine[Any, Any, T]) -> T:
+        return self._loop.call(self._proxied.services.during(work))
+
+    def _start(self) -> None:
+        self._loop.call(self._started())
+
+    async def _started(self) -> None:
+        await self._stack.enter_async_context(self._proxied)
+        await self._proxied.services.during(self._driver.connect(START_PATIENCE_S))
+        await self._proxied.connect_links()
+        session = await self._proxied.services.during(self._driver.start(self._scenario))
+        if self._scenario.realtime:
+            task = asyncio.create_task(self._fed(session), name="load of the session")
+            self._stack.callback(task.cancel)
+
+    async def _fed(self, session: int) -> None:
+        while True:
+            with contextlib.suppress(LinkError):  # the plant is away on purpose: it is looked at again
+                await self._driver.hold(session, FEED_S)
+            await asyncio.sleep(FEED_S)
+
+    def _stop(self) -> None:
+        try:
+            self._loop.call(self._stopped())
+        finally:
+            self._loop.close()
+
+    async def _stopped(self) -> None:
+        for client in self._clients.values():
+            client.close()
+        self._driver.close()
+        await self._stack.aclose()
+
+
+def _parsed(kind: str, parameters: Mapping[str, object]) -> AnyFault:
+    for name in ("at_s", "duration_s", "offset_ms"):
+        if name in parameters:
+            raise UsageError(
+                f"fault '{kind}': {name} belongs to a plan; here the context decides when it begins and ends"
+            )
+    try:
+        return _FAULT.validate_python({"kind": kind, "duration_s": 1.0, **parameters})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"] if part != kind)
+        raise UsageError(f"fault '{kind}': {f'{where}: ' if where else ''}{first['msg']}") from None
+
+
+@contextmanager
+def up(
+    load: str | Path = "2h",
+    *,
+    mode: Literal["lockstep", "realtime"] = "lockstep",
+    factor: float = 1.0,
+    solver: str = "ode",
+    updating_period: Period = "adaptive",
+    seed: int = 1,
+    config: str | Path | None = None,
+    folder: str | Path | None = None,
+    **settings: Mapping[str, object],
+) -> Iterator[LiveRig]:
+    """Start plant, control PLC and optimiser PLC on free ports of localhost, and begin a session; stop them at the end.
+
+    Args:
+        load: Named load such as `a`, or a CSV file with the columns time_s and load_w; its last value is held.
+        mode: `lockstep`: plant time passes only in `advance` and `wait_until`; `realtime`: by the clock.
+        factor: In real time: seconds of plant time in a second.
+        solver: `ode`, `qpoases`, `osqp`, `fast-gradient` or `daqp`.
+        updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`.
+        seed: Seed of the sensors' noise, and of which frames a fault hits.
+        config: TOML file with further settings.
+        folder: Takes the logs; a temporary one if not given.
+        settings: Sections of the configuration, such as `control_plc={"driver": "classical"}`; they come before the
+            file. The environment has no influence.
+
+    Raises:
+        UsageError: An argument cannot be used.
+        LinkError: A service ended, or did not answer in time.
+    """
+    effective = configured(
+        load=load, solver=solver, updating_period=updating_period, seed=seed, config=config, sections=settings,
+        mode=mode, factor=factor,
+    )  # fmt: skip
+    check_certificates(effective.settings)
+    with contextlib.ExitStack() as stack:
+        place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="coldloop-")) if folder is None else folder)
+        rig = LiveRig(effective.settings, place)
+        stack.callback(rig._stop)  # noqa: SLF001 the two are one
+        rig._start()  # noqa: SLF001
+        yield rig
