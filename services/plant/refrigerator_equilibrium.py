@@ -37,7 +37,9 @@ V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2 = (
     STATE_NAMES.index(name) for name in ("V_l", "M_HP", "M_LP", "M_buffer", "M_lost", "M_N2")
 )
 CV956, CV167 = STATE_NAMES.index("CV956"), STATE_NAMES.index("CV167")
-GIVEN: Final = (V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2)
+AS_ASKED: Final = tuple(STATE_NAMES.index(name) for name in ("NC1", "NC2", "CV952", "CV953"))
+"""Compressors run, and both valves of the buffer are shut, to the bit."""
+GIVEN: Final = (V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2, *AS_ASKED)
 
 
 class Rest(NamedTuple):

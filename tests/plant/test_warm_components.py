@@ -162,7 +162,7 @@ def test_without_nitrogen_nothing_is_cooled_or_fed() -> None:
 
 def test_a_full_bath_takes_what_boils_off_and_no_more() -> None:
     done = boil(BATH, LIQUID_DENSITY * BATH.volume, 0.01, WARM_CP, 85.0, 100.0, 1.0)
-    assert done.feed == done.boil_off
+    assert done.feed == pytest.approx(done.boil_off, rel=1e-12)
 
 
 # -- the warm exchanger ------------------------------------------------------------------------------------------------
@@ -218,7 +218,7 @@ def test_high_pressure_helium_agrees_within_what_its_docstring_says(P: float, T:
     cp = properties("C", "P", P, "T", T, "Helium")
     warm = T > 80.0
     assert h == pytest.approx(properties("H", "P", P, "T", T, "Helium"), abs=(0.02 if T > 300.0 else 0.04) * cp)
-    assert rho == pytest.approx(properties("D", "P", P, "T", T, "Helium"), rel=1e-3 if warm else 0.04)
+    assert rho == pytest.approx(properties("D", "P", P, "T", T, "Helium"), rel=2e-3 if warm else 0.04)
 
 
 @given(P=st.floats(1e5, 1.5e5), T=st.floats(100.0, 320.0))

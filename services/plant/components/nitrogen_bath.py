@@ -68,10 +68,9 @@ def boil(
     capacity_flow = at_least(helium_flow, TRICKLE) * cp
     heat = capacity_flow * at_least(T_in - BOILING_POINT, 0.0) * (1.0 - np.exp(-bath.UA * wet / capacity_flow))
     feed = supply * effective_area(bath.feed, opening) * np.sqrt(2.0 * LIQUID_DENSITY * FEED_PRESSURE)
-    boil_off = (heat + feed * FEED_EXCESS) / LATENT_HEAT
     if mass.real >= LIQUID_DENSITY * bath.volume:
-        feed = at_most(feed, boil_off)
-    return Boiling(heat, boil_off, feed)
+        feed = at_most(feed, heat / (LATENT_HEAT - FEED_EXCESS))
+    return Boiling(heat, (heat + feed * FEED_EXCESS) / LATENT_HEAT, feed)
 
 
 def check_nitrogen_bath(name: str, bath: NitrogenBath) -> None:

@@ -11,7 +11,7 @@ from coldloop.compiled import kernel
 from plant.components.heat_exchanger import TRICKLE, HeatExchanger, HighPressureFlow, LowPressureFlow
 from plant.components.parameters import require
 from plant.helium.properties import WARM_CP, Helium, supply_cell
-from plant.numeric import Array, at_least, at_most
+from plant.numeric import Array, at_least
 
 SMALL = 1e-3
 LARGEST_EXPONENT = 30.0
@@ -34,8 +34,10 @@ def exchanged_heat(UA: float, C_high: float, C_low: float, difference: float) ->
     balances, written so that it is smooth where both capacity flows are equal: Q = dT g/(1/UA + g/C_high), g = (1 -
     exp(-z))/z, z = UA (1/C_low - 1/C_high).
     """
-    z = at_most(at_least(UA * (1.0 / C_low - 1.0 / C_high), -LARGEST_EXPONENT), LARGEST_EXPONENT)
-    g = _decay(z)
+    unbalance = 1.0 / C_low - 1.0 / C_high
+    if abs(UA * unbalance.real) > LARGEST_EXPONENT:
+        UA = LARGEST_EXPONENT / abs(unbalance.real)  # a longer one exchanges no more
+    g = _decay(UA * unbalance)
     return difference * g / (1.0 / UA + g / C_high)
 
 

@@ -131,13 +131,14 @@ def supply_enthalpy_and_density(P: float, T: float, helium: Helium) -> tuple[flo
     table = helium.isobar
     i, t = locate(np.log(T), table.start, table.step, table.nodes.shape[0])
     weights = hermite_weights(t)
-    h, rho = read_curve(table.nodes, i, 0, weights), read_curve(table.nodes, i, 1, weights)
-    if T.real > WARMEST_ISOBAR:
-        h += WARM_CP * (T - WARMEST_ISOBAR)
-        rho *= WARMEST_ISOBAR / T
+    h = read_curve(table.nodes, i, 0, weights) + 0.0 * P
+    rho = read_curve(table.nodes, i, 1, weights) + 0.0 * P
     if P != ISOBAR_PRESSURE:
-        return h + _departure(P, 0, i, weights, helium), rho + _departure(P, 1, i, weights, helium)
-    return h + 0.0 * P, rho + 0.0 * P
+        h += _departure(P, 0, i, weights, helium)
+        rho += _departure(P, 1, i, weights, helium)
+    if T.real > WARMEST_ISOBAR:
+        return h + WARM_CP * (T - WARMEST_ISOBAR), rho * WARMEST_ISOBAR / T
+    return h, rho
 
 
 @kernel
@@ -150,14 +151,15 @@ def supply_cell(P: float, T: float, helium: Helium) -> tuple[float, float, float
     i, t = locate(np.log(T), table.start, table.step, table.nodes.shape[0])
     weights = hermite_weights(t)
     nodes = table.nodes
-    h, rho_cp = read_curve(nodes, i, 0, weights), read_curve(nodes, i, 2, weights)
+    h = read_curve(nodes, i, 0, weights) + 0.0 * P
+    rho_cp = read_curve(nodes, i, 2, weights) + 0.0 * P
     c_wall = read_curve(nodes, i, 3, weights)
-    if T.real > WARMEST_ISOBAR:
-        h += WARM_CP * (T - WARMEST_ISOBAR)
-        rho_cp *= WARMEST_ISOBAR / T
     if P != ISOBAR_PRESSURE:
-        return h + _departure(P, 0, i, weights, helium), rho_cp + _departure(P, 2, i, weights, helium), c_wall
-    return h + 0.0 * P, rho_cp + 0.0 * P, c_wall
+        h += _departure(P, 0, i, weights, helium)
+        rho_cp += _departure(P, 2, i, weights, helium)
+    if T.real > WARMEST_ISOBAR:
+        return h + WARM_CP * (T - WARMEST_ISOBAR), rho_cp * WARMEST_ISOBAR / T, c_wall
+    return h, rho_cp, c_wall
 
 
 @kernel
