@@ -83,7 +83,7 @@ class RunEvaluation(Sink):
         outside = (constrained < self._design.output_low) | (constrained > self._design.output_high)
         self._outside += outside.sum(axis=0)
         self._stage_costs += float(self._cost.of(block).sum())
-        self._digest.update(block.rows.tobytes())
+        self._digest.update(block.digested)
         self.ticks += len(block.load)
 
     def update(self, update: Optimization) -> None:
@@ -101,7 +101,7 @@ class RunEvaluation(Sink):
 
     @property
     def trace_sha256(self) -> str:
-        """SHA-256 over load, inputs, outputs and states of all ticks, as little-endian single precision."""
+        """SHA-256 over load, inputs, outputs, states and station of all ticks, as little-endian single precision."""
         return self._digest.hexdigest()
 
     @property

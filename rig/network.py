@@ -11,7 +11,7 @@ from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, Mode, Status
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, Optimization, OptimizerSession
-from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, PlantSample, PlantSession
+from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, PlantSample, PlantSession, StationSample
 from plant.runtime import own_header
 from rig.load_stream import LoadStream, write_table
 from rig.recording import LinkStatistics, Recorder
@@ -43,6 +43,7 @@ class NetworkRig:
         """The session that was started last; 0 is none."""
         self.load: LoadStream | None = None
         """The load of the session that was started last."""
+        self._has_station = False
 
     async def connect(self, patience_s: float) -> None:
         """Connect to all three, and make sure that all run the model of our configuration.
@@ -162,12 +163,22 @@ class NetworkRig:
             return 0
         for tick in range(first, last):
             (sample,) = await self.plant.read_rows(PlantSample, tick % HISTORY_ROWS, 1)
+            await self._read_station(tick, recorder)
             if sample.tick != tick:
                 raise LinkError(
                     f"{self.plant.peer} has overwritten tick {tick} before it was recorded: choose a lower --factor"
                 )
             recorder.sample(sample)
         return last - first
+
+    async def _read_station(self, tick: int, recorder: Recorder) -> None:
+        """Read what goes with a tick, if the plant is a whole refrigerator: its first row tells."""
+        if tick and not self._has_station:
+            return
+        (station,) = await self.plant.read_rows(StationSample, tick % HISTORY_ROWS, 1)
+        self._has_station = any(station.signals)
+        if self._has_station and station.tick == tick:
+            recorder.station(station)
 
 
 class _UpdateReader:

@@ -14,7 +14,7 @@ from typing import Final, Generic, TypeVar
 from coldloop.errors import ColdloopError
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import PlantSample
+from coldloop.registers.plant import PlantSample, StationSample
 from rig.driving import CONTROL
 from rig.recorded import LinkStatistics, Recording, SampleBlock, joined
 
@@ -98,7 +98,7 @@ class MemorySink(Sink):
     def recording(self, link: LinkStatistics) -> Recording:
         """Return what was kept."""
         block = joined(self._blocks)
-        return Recording(block.load, block.u, block.y, block.x, self._updates, link)
+        return Recording(block.load, block.u, block.y, block.x, self._updates, link, block.station)
 
 
 class Recorder:
@@ -118,6 +118,8 @@ class Recorder:
         self._memory = MemorySink()
         self._sinks = (self._memory,) if sinks is None else tuple(sinks)
         self._pending: list[PlantSample] = []
+        self._stations: dict[int, StationSample] = {}
+        """Of the ticks that are pending."""
         self._unsettled: deque[Optimization] = deque()
         self._stop: ColdloopError | None = None
         self._closed = False
@@ -159,6 +161,10 @@ class Recorder:
         if self._stop is not None:
             raise self._stop
 
+    def station(self, sample: StationSample) -> None:
+        """Take what goes with a tick that is about to come, where the plant is a whole refrigerator."""
+        self._stations[sample.tick] = sample
+
     def update(self, update: Optimization) -> None:
         """Take the next update."""
         self.updates.append(update)
@@ -195,8 +201,9 @@ class Recorder:
     def _pass_on(self) -> None:
         self._settle()
         if self._pending:
-            block = SampleBlock.of(self._pending)
+            block = SampleBlock.of(self._pending, self._stations)
             self._pending = []
+            self._stations = {}
             _all(*(partial(sink.block, block) for sink in self._sinks))
 
     def _settle(self) -> None:

@@ -33,8 +33,8 @@ from plant.refrigerator import (
     rates,
     read,
 )
-from plant.refrigerator_file import SHIPPED, read_refrigerator_file, refrigerator_digest
 from plant.refrigerator_equilibrium import Rest, find_refrigerator_equilibrium
+from plant.refrigerator_file import SHIPPED, read_refrigerator_file, refrigerator_digest
 from plant.refrigerator_linearisation import jacobian, rate_scales
 from plant.station_design import line_model, lq_gains
 

@@ -1,7 +1,6 @@
 """Each component of compression station and nitrogen pre-cooler: balances, signs, monotonicity, limits."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -109,7 +108,9 @@ def test_a_valve_passes_more_when_it_opens_and_less_against_pressure(P: float, s
 
 
 def test_the_flow_of_a_valve_is_continuous_where_it_chokes() -> None:
-    before, after = (gas_valve_flow(STATION.charge, 50.0, 6e5, (CRITICAL_RATIO + d) * 6e5, 300.0) for d in (-1e-9, 1e-9))
+    before, after = (
+        gas_valve_flow(STATION.charge, 50.0, 6e5, (CRITICAL_RATIO + d) * 6e5, 300.0) for d in (-1e-9, 1e-9)
+    )
     assert before == pytest.approx(after, rel=1e-9)
 
 
@@ -233,11 +234,11 @@ def test_low_pressure_helium_is_warm_gas_beyond_the_table(P: float, T: float) ->
 # -- parameters --------------------------------------------------------------------------------------------------------
 
 
-def with_station(**changed: Any) -> Refrigerator:
+def with_station(**changed: object) -> Refrigerator:
     return REFERENCE_REFRIGERATOR._replace(station=STATION._replace(**changed))
 
 
-def with_precooler(**changed: Any) -> Refrigerator:
+def with_precooler(**changed: object) -> Refrigerator:
     return REFERENCE_REFRIGERATOR._replace(precooler=PRECOOLER._replace(**changed))
 
 
