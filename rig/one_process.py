@@ -56,8 +56,8 @@ class OneProcessRig:
         measurement = as_transmitted(
             Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session)
         )
-        recorder.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
         if plant.station is not None:
             recorder.station(as_transmitted(plant.station))
+        recorder.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
         plant.advance()
         return self.control.end_scan(measurement)
