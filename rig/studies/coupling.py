@@ -1,4 +1,4 @@
-"""What it costs the predictive controller that pressures and inlet temperature move, which its model knows nothing of."""
+"""What it costs the predictive controller that pressures and inlet temperature move, constant in its model."""
 
 from typing import Final
 
@@ -15,6 +15,7 @@ CASES: Final = {
     "cold box alone": (),
     "refrigerator, LQ": (REFRIGERATOR,),
     "refrigerator, PI": (REFRIGERATOR, "plant.station.control=pi"),
+    "refrigerator, LQ, its model": (REFRIGERATOR, "model.file=refrigerator"),
 }
 TRACE_TICKS: Final = 4
 COLUMNS: Final = (
@@ -88,7 +89,7 @@ def _costs(result: StudyResult) -> Figure:
     with panels(1, 1, (9.0, 3.6)) as (figure, (place,)):
         for offset, (label, colour) in enumerate(zip(CASES, COLOURS, strict=False)):
             heights = [float(row[2]) for row in result.rows if row[1] == label]
-            place.bar(np.arange(len(names)) + 0.27 * (offset - 1), heights, 0.25, color=colour, label=label)
+            place.bar(np.arange(len(names)) + 0.21 * (offset - 1.5), heights, 0.19, color=colour, label=label)
         place.set_xticks(range(len(names)), names, rotation=0 if len(names) < 9 else 60)
         place.set_xlabel("load")
         place.set_ylabel("$J^{BF}$ (1)")

@@ -1,4 +1,4 @@
-"""What happens to a refrigerator besides its load: trips, nitrogen, leaks, weather, pulses; under MPC and under the loops."""
+"""What happens to a refrigerator besides its load: trips, nitrogen, leaks, weather, pulses; under MPC and the loops."""
 
 from typing import Final, NamedTuple
 

@@ -35,6 +35,10 @@ class EstimatorSettings(BaseModel):
     pressure_noise_pa: PositiveFloat = 50.0
     volume_noise_m3: PositiveFloat = 1e-5
     temperature_noise_k: PositiveFloat = 0.05
+    mass_noise_kg: PositiveFloat = 1e-4
+    """Of a line of the compression station, where the model has it, as the next two."""
+    flow_noise_kg_s: PositiveFloat = 1e-5
+    integral_noise_bar_s: PositiveFloat = 1e-5
     level_sensor: PositiveFloat = 0.01
     """Standard deviation of the sensors: %, Hz, K and bar."""
     speed_sensor: PositiveFloat = 1.0
@@ -130,8 +134,11 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
     """Return the gain of every updating period, in ticks, transposed: (n_y, n + 1); the load mismatch comes last."""
     nx = prediction.n_states
     C = np.ascontiguousarray(np.hstack([prediction.C, prediction.G]))
-    drift = np.full(nx + 1, settings.temperature_noise_k)
-    drift[0], drift[1], drift[nx] = settings.pressure_noise_pa, settings.volume_noise_m3, settings.load_walk_w
+    by_unit = {
+        "Pa": settings.pressure_noise_pa, "m3": settings.volume_noise_m3, "K": settings.temperature_noise_k,
+        "kg": settings.mass_noise_kg, "kg/s": settings.flow_noise_kg_s, "bar s": settings.integral_noise_bar_s,
+    }  # fmt: skip
+    drift = np.array([*(by_unit[unit] for unit in prediction.model.state_units), settings.load_walk_w])
     sensors = np.full(C.shape[0], settings.temperature_sensor)
     sensors[0], sensors[1], sensors[12:] = settings.level_sensor, settings.speed_sensor, settings.pressure_sensor
     P = np.diag(100.0 * drift**2)

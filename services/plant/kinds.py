@@ -2,8 +2,8 @@
 
 from functools import partial
 
-from coldloop.errors import ConfigurationError
-from coldloop.model_file import ModelHeader
+from coldloop.errors import ConfigurationError, ModelFileError
+from coldloop.model_file import COLD_BOX, ModelHeader
 from plant.cold_box import REFERENCE
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.rack import MakePlant
@@ -22,6 +22,8 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
         ConfigurationError: Its gains are not of the configured weights.
     """
     if section.kind is PlantKind.COLD_BOX:
+        if header.plant != COLD_BOX:
+            raise ModelFileError(f"model.file: a model of the {header.plant}; set plant.kind to that, or take another")
         return partial(make_program, header, section.sensors)
     path = section.refrigerator.file or SHIPPED
     file = read_refrigerator_file(path)

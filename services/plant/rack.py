@@ -25,6 +25,8 @@ from coldloop.registers.plant import (
     StationAlarm,
     StationMode,
     StationSample,
+    StationStatus,
+    Surroundings,
 )
 from coldloop.watchdog import Watchdog
 from plant.faults import SensorFaults
@@ -167,10 +169,43 @@ class Rack:
         program = self._program
         sample = PlantSample(program.tick, program.load, self.outputs.u, program.measure(), program.state)
         self.moving = self.session.pace.realtime
+        before = program.station
         program.advance()
+        if before is not None and program.station is not None:
+            self._note_station(before, program.station)
         if self.watchdog.check(program.tick):
             self._watchdog_expired()
         return sample
+
+    def _note_station(self, before: StationSample, now: StationSample) -> None:
+        """Tell changes of the station's mode and alarms."""
+        if now.mode != before.mode:
+            self.journal.note(self.tick, EventKind.STATION_MODE, now.mode)
+        for number, alarm in enumerate(StationAlarm):
+            if (now.alarms ^ before.alarms) & alarm:
+                self.journal.note(self.tick, EventKind.STATION_ALARM, number, int(bool(now.alarms & alarm)))
+
+    def give(self, asked: Surroundings, who: str) -> None:
+        """Change what a refrigerator is given, from the next tick on.
+
+        Raises:
+            ValueError: The plant is a cold box alone.
+        """
+        before = self._program.surroundings
+        self._program.give(asked)
+        for place, (old, new) in enumerate(zip(before or asked, asked, strict=True)):
+            if new != old:
+                self.journal.note(self.tick, EventKind.SURROUNDINGS, place, value=float(new), who=who)
+
+    @property
+    def station_status(self) -> StationStatus | None:
+        """What the registers show of the station; None for a cold box alone."""
+        return self._program.station_status
+
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """What a refrigerator is given now; None for a cold box alone."""
+        return self._program.surroundings
 
     def _watchdog_expired(self) -> None:
         """Bring the outputs into their safe state, where the configuration asks for that."""

@@ -50,7 +50,7 @@ STATION: Final = BOX_STATES + len(PRECOOLER_STATES)
 """Index of the station's first state."""
 STATE_NAMES: Final = (*process.STATE_NAMES, *PRECOOLER_STATES, *STATION_STATES)
 STATE_UNITS: Final = (*process.STATE_UNITS, *PRECOOLER_STATE_UNITS, *STATION_STATE_UNITS)
-COMMAND_NAMES: Final = ("CV956", "CV952", "CV953", "CV167")
+COMMAND_NAMES: Final = process.STATION_VALVE_NAMES
 DISTURBANCE_NAMES: Final = ("NCR22_HL", "T_ambient", "leak", "nitrogen", "NC1", "NC2")
 """Heat load (W), ambient temperature (K), leak at 16 bar (kg/s); 0 or 1: nitrogen in the tank, compressors to run."""
 

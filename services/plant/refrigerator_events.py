@@ -1,14 +1,15 @@
 """Events of a refrigerator over time: a compressor trips, nitrogen runs out, helium leaks, the weather changes."""
 
-from bisect import bisect_right
 from collections.abc import Sequence
 from enum import StrEnum
 from math import pi, sin
-from typing import Annotated, NamedTuple
+from operator import itemgetter
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from coldloop.process import TICK_S
+from coldloop.registers.plant import Surroundings
 
 
 class EventTarget(StrEnum):
@@ -32,6 +33,8 @@ RANGES = {
     EventTarget.LEAK: (0.0, 50.0),
     EventTarget.AMBIENT: (270.0, 320.0),
 }
+MEASURED = {EventTarget.LEAK, EventTarget.AMBIENT}
+"""What has a value; the others are there or not."""
 
 
 class RefrigeratorEvent(BaseModel):
@@ -49,7 +52,7 @@ class RefrigeratorEvent(BaseModel):
         low, high = RANGES[self.target]
         if not low <= self.value <= high:
             raise ValueError(f"{self.target} = {self.value:g} is outside {low:g} to {high:g}")
-        if self.target in {EventTarget.NC1, EventTarget.NC2, EventTarget.NITROGEN} and self.value not in {0.0, 1.0}:
+        if self.target not in MEASURED and self.value not in {0.0, 1.0}:
             raise ValueError(f"{self.target} = {self.value:g}: write 0 or 1")
         if self.at_s % TICK_S:
             raise ValueError(f"{self.at_s:g} s is not a multiple of {TICK_S} s")
@@ -59,18 +62,6 @@ class RefrigeratorEvent(BaseModel):
     def tick(self) -> int:
         """The first tick that it concerns."""
         return round(self.at_s / TICK_S)
-
-
-class Surroundings(NamedTuple):
-    """What is not the refrigerator's to decide, at one tick."""
-
-    ambient: float
-    """K."""
-    leak: float
-    """kg/s at 16 bar."""
-    nitrogen: bool
-    nc1: bool
-    nc2: bool
 
 
 class EventSchedule:
@@ -84,24 +75,30 @@ class EventSchedule:
 
     def __init__(self, events: Sequence[RefrigeratorEvent], ambient: float, daily_swing: float) -> None:
         self._swing = daily_swing
-        ordered = sorted(events, key=lambda event: event.tick)
-        values = {EventTarget.NC1: 1.0, EventTarget.NC2: 1.0, EventTarget.NITROGEN: 1.0, EventTarget.LEAK: 0.0}
-        values[EventTarget.AMBIENT] = ambient
-        self._ticks = [0]
-        self._held = [dict(values)]
-        for event in ordered:
-            values[event.target] = event.value
-            self._ticks.append(event.tick)
-            self._held.append(dict(values))
+        self._given = Surroundings(ambient=ambient)
+        self._changes = sorted(((event.tick, event.target, event.value) for event in events), key=itemgetter(0))
+        """Tick, what, and its value, in the order in which they are made."""
+        self._put: list[tuple[int, Surroundings]] = []
+
+    def put(self, tick: int, given: Surroundings) -> None:
+        """Let something hold from `tick` on, until an event that is planned for later."""
+        self._put.append((tick, given))
+
+    @property
+    def puts(self) -> list[tuple[int, Surroundings]]:
+        """What `put` has taken."""
+        return list(self._put)
 
     def at(self, tick: int) -> Surroundings:
-        """Return what holds from `tick` (0 or later) to the next."""
-        held = self._held[bisect_right(self._ticks, tick) - 1]
+        """Return what is given from `tick` (0 or later) to the next, the day's swing left out."""
+        since, given = next(((at, put) for at, put in reversed(self._put) if at <= tick), (-1, self._given))
+        for at, target, value in self._changes:
+            if since < at <= tick:
+                changed: dict[str, Any] = {target.value: value if target in MEASURED else int(value)}
+                given = given._replace(**changed)
+        return given
+
+    def ambient(self, tick: int) -> float:
+        """Return the temperature of the surroundings (K) with the day's swing."""
         swing = self._swing * sin(2.0 * pi * tick * TICK_S / 86_400.0) if self._swing else 0.0
-        return Surroundings(
-            held[EventTarget.AMBIENT] + swing,
-            1e-3 * held[EventTarget.LEAK],
-            held[EventTarget.NITROGEN] > 0.0,
-            held[EventTarget.NC1] > 0.0,
-            held[EventTarget.NC2] > 0.0,
-        )
+        return self.at(tick).ambient + swing

@@ -7,7 +7,7 @@ run, on any machine, begins with the same bits.
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from coldloop.errors import ModelFileError
 from coldloop.model_file import FORMAT, read_document, write_document
@@ -17,7 +17,7 @@ from plant.refrigerator import COMMAND_NAMES, REFERENCE_REFRIGERATOR, STATE_NAME
 from plant.station_control import StationReference
 from plant.station_settings import LqWeights
 
-KIND = "refrigerator"
+KIND: Final = "refrigerator"
 SHIPPED = Path(__file__).with_name("refrigerator.json")
 REMEDY = "make it anew with `python -m plant.refrigerator_model FILE`"
 
@@ -30,6 +30,8 @@ class RefrigeratorFile:
     """SHA-256 of the parameters and tables that it was made from."""
     x0: tuple[float, ...]
     """Shape (48,)."""
+    u0: tuple[float, ...]
+    """Inputs of the cold box, shape (3,)."""
     v0: tuple[float, ...]
     """Openings of the warm valves, shape (4,)."""
     w0: float
@@ -50,7 +52,12 @@ class RefrigeratorFile:
         document: dict[str, Any] = {"format": FORMAT, "plant": KIND, "state_names": list(STATE_NAMES)}
         document |= {"command_names": list(COMMAND_NAMES), "weights": self.weights.model_dump()}
         document |= {"parameters_digest": self.parameters_digest, "w0": self.w0}
-        document |= {"x0": list(self.x0), "v0": list(self.v0), "gains": [list(row) for row in self.gains]}
+        document |= {
+            "x0": list(self.x0),
+            "u0": list(self.u0),
+            "v0": list(self.v0),
+            "gains": [list(row) for row in self.gains],
+        }
         write_document(path, document)
 
 
@@ -68,6 +75,7 @@ def read_refrigerator_file(path: Path) -> RefrigeratorFile:
         file = RefrigeratorFile(
             parameters_digest=str(document["parameters_digest"]),
             x0=tuple(float(value) for value in document["x0"]),
+            u0=tuple(float(value) for value in document["u0"]),
             v0=tuple(float(value) for value in document["v0"]),
             w0=float(document["w0"]),
             gains=(first, second),
@@ -76,8 +84,8 @@ def read_refrigerator_file(path: Path) -> RefrigeratorFile:
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(f"{path}: {error!r} in the refrigerator's file; {REMEDY}") from error
     names = document.get("state_names"), document.get("command_names")
-    sizes = len(file.x0), len(file.v0), len(first), len(second)
-    if names != (list(STATE_NAMES), list(COMMAND_NAMES)) or sizes != (len(STATE_NAMES), len(COMMAND_NAMES), 6, 6):
+    sizes = len(file.x0), len(file.u0), len(file.v0), len(first), len(second)
+    if names != (list(STATE_NAMES), list(COMMAND_NAMES)) or sizes != (len(STATE_NAMES), 3, len(COMMAND_NAMES), 6, 6):
         raise ModelFileError(f"{path}: of a refrigerator with other states; {REMEDY}")
     if file.parameters_digest != refrigerator_digest(REFERENCE_REFRIGERATOR, load_helium()):
         raise ModelFileError(f"{path}: of a refrigerator with other parameters; {REMEDY}")

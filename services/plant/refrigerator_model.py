@@ -40,6 +40,7 @@ def make_refrigerator_file(
     return RefrigeratorFile(
         parameters_digest=refrigerator_digest(plant, helium),
         x0=tuple(rest.x.tolist()),
+        u0=tuple(rest.u.tolist()),
         v0=tuple(rest.v.tolist()),
         w0=float(rest.d[0]),
         gains=(tuple(first), tuple(second)),

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from coldloop.registers.plant import StationSample
+from coldloop.registers.plant import StationSample, StationStatus, Surroundings
 from plant.helium.properties import load_helium
 from plant.integrator import plain_tuples
 from plant.numeric import RealArray
@@ -19,7 +19,7 @@ from plant.refrigerator import (
     check_refrigerator,
     read,
 )
-from plant.refrigerator_events import EventSchedule, Surroundings
+from plant.refrigerator_events import EventSchedule
 from plant.refrigerator_file import RefrigeratorFile
 from plant.station_control import Commands, StationControl, StationMeasurement
 from plant.station_settings import StationSettings
@@ -67,7 +67,7 @@ class RefrigeratorProgram(PlantProgram):
         super().__init__(box=REFERENCE_REFRIGERATOR.box, x0=file.x0[:BOX_STATES], u0=u0, load=load, noise=noise)
 
     def _read_at(self, u: RealArray, v: RealArray, w: float) -> RealArray:
-        d = self._disturbances(self._events.at(0), w)
+        d = self._disturbances(0, w)
         _, signals = read(self._full, u, v, d, REFERENCE_REFRIGERATOR, load_helium())
         return signals
 
@@ -77,14 +77,28 @@ class RefrigeratorProgram(PlantProgram):
         return StationSample(self.tick, tuple(self._signals.tolist()), self._control.mode, self._control.alarms)
 
     @property
+    def station_status(self) -> StationStatus:
+        """The same for the registers, with what its controller asks for."""
+        sample = self.station
+        return StationStatus(sample.tick, sample.mode, sample.alarms, sample.signals, tuple(self._commands))
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """What is given at the current tick."""
+        return self._events.at(self.tick)
+
+    def give(self, surroundings: Surroundings) -> None:
+        """Change what is given, from the next tick on."""
+        self._events.put(self.tick + 1, surroundings)
+
+    @property
     def commands(self) -> Commands:
         """Openings that the station's controller asks for from the current tick on, %."""
         return self._commands
 
     def advance(self) -> None:
         """Go one tick forward."""
-        surroundings = self._events.at(self.tick)
-        d = self._disturbances(surroundings, self.load)
+        d = self._disturbances(self.tick, self.load)
         v = np.array(self._commands)
         self._full, y, self._signals = advance_and_read_refrigerator(
             self._full, self._u, v, d, self._tick_s, self._plant, self._tables
@@ -94,14 +108,9 @@ class RefrigeratorProgram(PlantProgram):
         self._commands = self._controlled()
         self._measured = self._sample(y)
 
-    @staticmethod
-    def _disturbances(surroundings: Surroundings, w: float) -> RealArray:
-        return np.array(
-            [
-                w, surroundings.ambient, surroundings.leak,
-                float(surroundings.nitrogen), float(surroundings.nc1), float(surroundings.nc2),
-            ]
-        )  # fmt: skip
+    def _disturbances(self, tick: int, w: float) -> RealArray:
+        given, ambient = self._events.at(tick), self._events.ambient(tick)
+        return np.array([w, ambient, 1e-3 * given.leak, given.nitrogen, given.nc1, given.nc2], dtype=np.float64)
 
     def _controlled(self) -> Commands:
         """Return what the station's controller asks for at the present tick."""
@@ -110,7 +119,7 @@ class RefrigeratorProgram(PlantProgram):
             StationMeasurement(
                 float(signals[HP]), float(signals[LP]), float(signals[BUFFER]),
                 float(x[CV956]), float(x[CV952]), float(x[CV953]),
-                float(signals[NITROGEN]), float(signals[LOST]), now.nc1, now.nc2,
+                float(signals[NITROGEN]), float(signals[LOST]), bool(now.nc1), bool(now.nc2),
             )
         )  # fmt: skip
 
@@ -131,6 +140,8 @@ class RefrigeratorProgram(PlantProgram):
             raise ValueError(f"expected {len(STATE_NAMES)} states and {len(SIGNAL_NAMES)} signals")
         super().resume(tick, x, u, y, noise_state)
         self._control.resume(list(warm["control"]))
+        for since, put in warm["given"]:
+            self._events.put(int(since), Surroundings(*put))
         self._full, self._signals, self._commands = full, signals, Commands(*warm["commands"])
 
     def retained(self) -> dict[str, Any]:
@@ -138,5 +149,6 @@ class RefrigeratorProgram(PlantProgram):
         warm = {
             "x": self._full.tolist(), "signals": self._signals.tolist(),
             "control": self._control.retained(), "commands": list(self._commands),
+            "given": [(tick, list(put)) for tick, put in self._events.puts],
         }  # fmt: skip
         return {**super().retained(), "warm": warm}

@@ -25,6 +25,8 @@ from plant.cold_box import REFERENCE
 from plant.helium.properties import load_helium
 from plant.kinds import plant_maker
 from plant.model import parameters_digest
+from plant.refrigerator import REFERENCE_REFRIGERATOR
+from plant.refrigerator_file import KIND, refrigerator_digest
 from plant.registers import RackRegisters
 from plant.settings import PlantSettings
 
@@ -32,20 +34,23 @@ log = logging.getLogger("coldloop.plant")
 
 
 def own_header(file: Path) -> ModelHeader:
-    """Return the header of a model file of this very plant.
+    """Return the header of a model file of this very plant: of the cold box alone, or of the refrigerator around it.
 
     Raises:
         ModelFileError: The file cannot be read, or the model was made from another plant.
     """
     header = read_header(file)
-    names = (header.state_names, header.input_names, header.output_names)
-    if header.parameters_digest != _own_parameters_digest() or names != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
+    names = (header.state_names[: len(STATE_NAMES)], header.input_names, header.output_names)
+    own = _own_parameters_digest(header.plant)
+    if header.parameters_digest != own or names != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
         raise ModelFileError(f"{file}: a model of another plant; make one with `coldloop model --out FILE`")
     return header
 
 
 @cache
-def _own_parameters_digest() -> str:
+def _own_parameters_digest(plant: str) -> str:
+    if plant == KIND:
+        return refrigerator_digest(REFERENCE_REFRIGERATOR, load_helium())
     return parameters_digest(REFERENCE, load_helium())
 
 

@@ -20,6 +20,8 @@ from plant.station_settings import StationControlKind, StationSettings
 PA_PER_BAR = 1e5
 DESIGN_TEMPERATURE = 300.0
 """K, at which the controller takes the valves' flows to be."""
+ROUNDING = 1e-9
+"""kg/s, by which flows that are the same may differ."""
 LEAST_PRESSURE = 0.5
 """bar, taken for the valves' flows when a line is emptier."""
 
@@ -199,7 +201,8 @@ class StationControl:
             return StationMode.ONE_COMPRESSOR
         if wanted.inventory > given.inventory and self._charge_room(measured.lp) < 1.0:
             return StationMode.CHARGE_STOPPED
-        return StationMode.AUTOMATIC if wanted == given else StationMode.LIMITED
+        limited = max(abs(asked - had) for asked, had in zip(wanted, given, strict=True)) > ROUNDING
+        return StationMode.LIMITED if limited else StationMode.AUTOMATIC
 
     def _judged(self, measured: StationMeasurement) -> StationAlarm:
         limits = self._settings.alarms

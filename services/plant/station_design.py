@@ -11,13 +11,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from coldloop.process import TICK_S
+from coldloop.process import OUTPUT_NAMES, TICK_S
 from plant.numeric import RealArray
 from plant.refrigerator import SIGNAL_NAMES, STATE_NAMES
 from plant.station_settings import LqWeights
 
 LINES = tuple(STATE_NAMES.index(name) for name in ("M_HP", "M_LP"))
-PRESSURES = tuple(SIGNAL_NAMES.index(name) for name in ("P12", "P11"))
+PRESSURE_ROWS = tuple(len(STATE_NAMES) + len(OUTPUT_NAMES) + SIGNAL_NAMES.index(name) for name in ("P12", "P11"))
+"""Rows of the refrigerator's Jacobian that are those of the two pressures."""
 
 
 class LineModel(NamedTuple):
@@ -31,9 +32,7 @@ class LineModel(NamedTuple):
 
 def line_model(jacobian: RealArray) -> LineModel:
     """Return the model of the lines from the refrigerator's Jacobian, with the cold box's states held."""
-    n = len(STATE_NAMES)
-    outputs = n + 22
-    scale = np.diag([jacobian[outputs + signal, line] for signal, line in zip(PRESSURES, LINES, strict=True)])
+    scale = np.diag([jacobian[row, line] for row, line in zip(PRESSURE_ROWS, LINES, strict=True)])
     A = scale @ jacobian[np.ix_(LINES, LINES)] @ np.linalg.inv(scale)
     return LineModel(A, scale @ np.array([[-1.0, 0.0], [1.0, 1.0]]))
 

@@ -14,6 +14,8 @@ from typing import Any
 from coldloop.errors import ModelFileError
 
 FORMAT = 1
+COLD_BOX = "cold-box"
+"""The plant of a model file that names none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +42,8 @@ class ModelHeader:
     """Load at the operating point, in `load_unit`."""
     y0: tuple[float, ...]
     """Outputs at the operating point, in `output_units`."""
+    plant: str = COLD_BOX
+    """Which plant the model was made of."""
 
     @property
     def short_digest(self) -> int:
@@ -62,7 +66,7 @@ def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
         described: dict[str, Any] = {name: str(document[name]) for name in TEXTS}
         described |= {name: tuple(str(text) for text in document[name]) for name in LISTS_OF_TEXT}
         described |= {name: tuple(float(number) for number in document[name]) for name in VECTORS}
-        header = ModelHeader(w0=float(document["w0"]), **described)
+        header = ModelHeader(w0=float(document["w0"]), plant=str(document.get("plant", COLD_BOX)), **described)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{path}: {error!r} in the model file; {REMEDY}") from error
     for kind, values in zip(KINDS, (header.x0, header.u0, header.y0), strict=True):

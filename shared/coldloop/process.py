@@ -28,6 +28,8 @@ STATE_UNITS: Final = ("Pa", "m3", *("K" for _ in range(26)))
 L1: Final = OUTPUT_NAMES.index("L1")
 T5: Final = OUTPUT_NAMES.index("T5")
 
+STATION_VALVE_NAMES: Final = ("CV956", "CV952", "CV953", "CV167")
+"""Bypass, discharge into the buffer, charge out of it, nitrogen feed."""
 STATION_SIGNAL_NAMES: Final = (
     "P11", "P12", "P13", "T11", "T13", "M12", "M_NC", "M_CV956", "M_CV952", "M_CV953", "M_out", "E_NC", "Q_NC",
     "L_N2", "CV167", "M_GN2", "helium", "lost", "T_ambient",

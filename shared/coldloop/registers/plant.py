@@ -13,6 +13,7 @@ from coldloop.process import (
     STATE_UNITS,
     STATION_SIGNAL_NAMES,
     STATION_SIGNAL_UNITS,
+    STATION_VALVE_NAMES,
 )
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
@@ -209,6 +210,30 @@ class StationSample(NamedTuple):
     ] = 0
 
 
+class StationStatus(NamedTuple):
+    """Compression station and nitrogen pre-cooler now; all 0 where the plant is a cold box alone."""
+
+    tick: Annotated[int, u32("Tick at which these values were read")] = 0
+    mode: Annotated[int, u16("As in the station history")] = StationMode.AUTOMATIC
+    alarms: Annotated[int, u16("As in the station history")] = 0
+    signals: Annotated[tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS)] = (
+        0.0,
+    ) * len(STATION_SIGNAL_NAMES)
+    commands: Annotated[tuple[float, ...], f32_array("Opening asked of valve", STATION_VALVE_NAMES, ("%",) * 4)] = (
+        0.0,
+    ) * len(STATION_VALVE_NAMES)
+
+
+class Surroundings(NamedTuple):
+    """What a refrigerator is given, from the next tick on; refused by a cold box alone."""
+
+    nc1: Annotated[int, u16("1: compressor NC1 runs, 0: it has tripped", high=1)] = 1
+    nc2: Annotated[int, u16("1: compressor NC2 runs, 0: it has tripped", high=1)] = 1
+    nitrogen: Annotated[int, u16("1: there is nitrogen in the tank, 0: there is none", high=1)] = 1
+    leak: Annotated[float, f32("Leak of the high-pressure line, as at 16 bar", unit="g/s", low=0, high=50)] = 0.0
+    ambient: Annotated[float, f32("Temperature of the surroundings", unit="K", low=270, high=320)] = 300.0
+
+
 PLANT_MAP: Final = RegisterMap(
     service="plant",
     version=3,
@@ -226,6 +251,14 @@ PLANT_MAP: Final = RegisterMap(
         Block("live load", 440, LiveLoad, "Heat load from a tick on", Role.OPERATOR, sealed=True),
         Block("sensor faults", 500, SensorFault, "Faults put into the outputs", Role.OPERATOR, len(OUTPUT_NAMES)),
         Block("load ahead", 600, LoadAhead, "Steps of the heat load to come", Role.OPERATOR, sealed=True),
+        Block("station", 700, StationStatus, "Compression station and nitrogen pre-cooler of a whole refrigerator"),
+        Block(
+            "surroundings",
+            760,
+            Surroundings,
+            "Trips, nitrogen, leak and weather of a whole refrigerator",
+            Role.OPERATOR,
+        ),
         Block("load table", 1000, LoadStep, "Heat load over the session", Role.OPERATOR, LOAD_ROWS),
         Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
         Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
