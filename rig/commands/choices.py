@@ -14,7 +14,7 @@ REGISTER_FORMATS: Final = ("csv", "json", "markdown", "table")
 FIGURE_FORMATS: Final = ("png", "pdf", "svg")
 STUDIES: Final = (
     "cholesky", "unlimited", "limited", "solver-comparison", "trajectories", "updating-period", "plc-2h", "adaptive-2h",
-    "trade-off", "classical", "single-precision",
+    "trade-off", "classical", "single-precision", "coupling", "disturbances",
 )  # fmt: skip
 
 
