@@ -18,6 +18,8 @@ CASES: Final = {
     "refrigerator, LQ, its model": (REFRIGERATOR, "model.file=refrigerator"),
 }
 TRACE_TICKS: Final = 4
+SHOWN_ANYWAY: Final = 24
+"""Rows of a table that each section of a report shows."""
 COLUMNS: Final = (
     "load", "plant", "J_BF", "L1 outside (%)", "T5 outside (%)", "tau_u mean (s)", "HP (bar)", "LP (bar)", "T9 (K)",
     "power (kW)", "nitrogen (g/s)",
@@ -50,7 +52,8 @@ class CouplingStudy:
             if "pressures" not in result.figures:
                 result.figures["pressures"] = _pressures(load, runs)
         result.figures["closed-loop cost"] = _costs(result)
-        result.remarks.append(_table(result))
+        if len(result.rows) > SHOWN_ANYWAY:
+            result.remarks.append(_table(result))
         return result
 
 

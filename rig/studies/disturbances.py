@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from coldloop.registers.plant import StationAlarm, StationMode
 from rig.plot import COLOURS
-from rig.studies.coupling import REFRIGERATOR, TRACE_TICKS
+from rig.studies.coupling import REFRIGERATOR, SHOWN_ANYWAY, TRACE_TICKS
 from rig.studies.drawing import legend_outside, panels
 from rig.studies.request import Outcome, RunRequest
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
@@ -66,7 +66,8 @@ class DisturbancesStudy:
                     lines.append("| " + " | ".join(f"{c:.4g}" if isinstance(c, float) else str(c) for c in row) + " |")
                 if load.draw == 1:
                     result.figures[name] = _courses(runs)
-        result.remarks.append("\n".join(lines))
+        if len(result.rows) > SHOWN_ANYWAY:
+            result.remarks.append("\n".join(lines))
         return result
 
 
