@@ -59,9 +59,9 @@ class Listener:
         self.heard.append(Recorded(problem, guess.copy()))
         self._solver.start(problem, guess)
 
-    def iterate(self, count: int) -> None:
+    def iterate(self, count: int) -> int:
         """Pass on."""
-        self._solver.iterate(count)
+        return self._solver.iterate(count)
 
     @property
     def solution(self) -> Array:

@@ -9,7 +9,7 @@ from coldloop.process import TICK_S
 from optimizer_plc import operations
 from optimizer_plc.arithmetic import Arithmetic
 from optimizer_plc.budget import PlcBudget
-from optimizer_plc.design import trivial_design
+from optimizer_plc.design import N_SLACKS, trivial_design
 from optimizer_plc.memory import Footprint, estimator_memory, footprint
 from optimizer_plc.operations import Operations
 from optimizer_plc.prediction import PredictionModel
@@ -88,6 +88,7 @@ def _operation_lines(problem: PredictiveProblem, prediction: PredictionModel, cu
         f"qpOASES, {WORKING_SET:g} constraints held": operations.qpoases(n, m, WORKING_SET),
         "OSQP": operations.osqp(n, m),
         f"fast gradient, {mean:g} rows active": operations.fast_gradient(n, m, mean),
+        "interior point": interior_point(problem),
         f"DAQP, {WORKING_SET:g} constraints held": operations.daqp(n, m, WORKING_SET),
         "preparation, once an updating period": operations.preparation(sizes, mean),
     }
@@ -101,6 +102,16 @@ def _operation_lines(problem: PredictiveProblem, prediction: PredictionModel, cu
     return _aligned(rows)
 
 
+def interior_point(problem: PredictiveProblem) -> Operations:
+    """Return the operations of an iteration of the interior-point method, its J included."""
+    n, m, inputs = problem.size, len(problem.Gamma), problem.n_inputs
+    k = np.count_nonzero(problem.Gamma, axis=1)
+    rows = operations.SparseRows(float(k.sum()), float((k * (k + 1) / 2).sum()))
+    factorisation = operations.slacks_first(n, n - inputs, N_SLACKS)
+    step = operations.interior_point(n, m, inputs, rows, factorisation)
+    return step.plus(operations.augmented_cost(n, m, ACTIVE_ROWS.mean))
+
+
 def _paper_qpoases_s(size: int) -> float:
     return QPOASES_ON_LAPTOP_S * slow_down(cholesky_times(), size)
 
@@ -112,6 +123,7 @@ def _iteration_lines(program: ProgramSettings, powers: Sequence[float], periods:
         "qpOASES": program.qpoases.tau_1_s,
         "OSQP": program.osqp.tau_1_s,
         "fast gradient": program.fast_gradient.tau_1_s,
+        "interior point": program.interior_point.tau_1_s,
         "DAQP": program.daqp.tau_1_s,
     }
     rows = [("iterations", "s", "P", *(f"tau_u {period:g} s" for period in periods))]

@@ -19,6 +19,7 @@ COMMANDS: Final = {
     "up": "keep the rig up, in real time, on fixed ports",
     "down": "end a rig that is up",
     "status": "what a rig that is up is doing",
+    "page": "the operator's page of a rig that is up, or of recorded runs",
     "set": "load, mode, setpoint, factor, pause, resume, acknowledge: commands to a rig that is up",
     "rerun": "repeat a recorded run and compare the traces",
     "plot": "draw a recorded run again, as PNG, PDF or SVG",

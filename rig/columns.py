@@ -76,7 +76,7 @@ HELD_COLUMNS: Final = (
 DRIVING_COLUMNS: Final = (
     Column("mode", pa.string(), "", "Mode of the fail-safe ladder: mpc, rest, hold, classical, manual"),
     Column("cause", pa.string(), "", "Why the control PLC is in this mode"),
-    Column("driver", pa.string(), "", "Whose inputs are applied: optimizer, loops, operator, or nobody: they are held"),
+    Column("driver", pa.string(), "", "Whose inputs are applied: optimizer, loops, operator, or nobody (held)"),
     Column("bad_sensors", pa.string(), "", "Outputs whose measurement the control PLC substitutes; empty when none"),
 )
 """What the control PLC was doing, by its events."""
@@ -121,7 +121,7 @@ EVENTS: Final = (
     Column("cause", pa.string(), "", "Why; empty when there is no cause"),
     Column("value", pa.float32(), "", "A value; null when the kind has none"),
     Column("unit", pa.string(), "", "Unit of the value; empty when it has none"),
-    Column("who", pa.string(), "", "Whose request it was: address, role, certificate; empty when nobody's"),
+    Column("who", pa.string(), "", "Client that made the request: address, role, certificate; empty if there is none"),
 )
 
 FILES: Final = {

@@ -17,7 +17,7 @@ class DiskReserve:
     """An invisible file of `RESERVED_BYTES`, which the system frees at the latest when the program ends.
 
     Raises:
-        UsageError: There is less room than that.
+        UsageError: There is less free space than that.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -33,12 +33,12 @@ class DiskReserve:
                 raise UsageError(f"{folder}: less than {RESERVED_BYTES >> 20} MB free; choose another --out") from None
 
     def release(self) -> None:
-        """Give the room free, for the disk is full otherwise."""
+        """Release the space: the disk is full otherwise."""
         self.released = True
         self.close()
 
     def close(self) -> None:
-        """Give the room free at the end of a run."""
+        """Release the space at the end of a run."""
         if self._file is not None:
             self._file.close()
             self._file = None

@@ -91,7 +91,7 @@ class LoadStream:
         return LoadAhead(self._session, self._times[first], length, watts, ticks)
 
     async def was_replaced(self) -> bool:
-        """Tell whether somebody else has written the load since: what is known last is not what was sent last."""
+        """Return whether another client has written the load since: the last step known is not the last one sent."""
         status = await self._plant.read(LoadStatus)
         last = self._times[self._sent - 1] if self._sent else 0
         return status.last_tick != last

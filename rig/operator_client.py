@@ -31,7 +31,7 @@ FIELDS: Final = dict(zip(("cv155", "ncr22", "cv156"), range(3), strict=True))
 HINTS: Final = {
     1: "the certificate or the address of this client has not the role of an operator",
     3: "a value is not possible now",
-    6: "somebody else is its writer",
+    6: "another client is its writer",
 }
 
 
@@ -90,7 +90,7 @@ class OperatorClient:
         return f"load {status.watts:g} W now"
 
     async def stream_load(self, load: "LoadProfile", at_s: float | None, say: Callable[[str], None]) -> str:
-        """Write a load of any length, as fast as the plant has room for it; return what came back."""
+        """Write a load of any length, as fast as the plant can store it; return what came back."""
         identity = await self.plant.read(Identity)
         if not identity.session:
             raise UsageError(f"{self.plant.peer} has no session")
@@ -162,7 +162,7 @@ class OperatorClient:
         return await self._set_pace(pace._replace(realtime=1, factor=factor))
 
     async def set_paused(self, *, paused: bool) -> str:
-        """Let plant time stand, or go on."""
+        """Pause or resume plant time."""
         pace = await self.plant.read(SessionPace)
         if not pace.realtime:
             raise UsageError("the session is in lock-step: it goes as far as it is granted")

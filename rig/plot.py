@@ -24,6 +24,8 @@ STYLE: Final[Any] = {
 }  # fmt: skip
 DRAWN: Final = ("load_w", "L1", "T5", *INPUT_NAMES, "tau_u_s", "stage_cost")
 """Columns of the trace that are drawn."""
+LEAST_COST: Final = 1e-6
+"""Stage costs below it are drawn as it: at rest the cost is rounding."""
 SMOOTHING_S: Final = 60.0
 """Window of the mean of tau_u: adaptive periods change at nearly every update."""
 LONGEST_TAU_U_S: Final = 5.0
@@ -110,16 +112,23 @@ def _curve(axes: Axes, time: Series, values: Series, label: str, name: str) -> N
 
 def limit(axes: Axes, values: Series, limits: tuple[float, float], label: str) -> None:
     """Draw a band or bounds; the values decide the scale, and an edge that is far from them stays outside."""
-    low, high = view(values)
-    span = high - low
-    low = min(low, limits[0] - 0.06 * span) if low - span < limits[0] else low
-    high = max(high, limits[1] + 0.06 * span) if high + span > limits[1] else high
+    low, high = view_with_limits(values, limits)
     out_of_view = [edge for edge in limits if not low <= edge <= high]
     note = " (edges outside the view)" if len(out_of_view) == 2 else ""
     axes.axhspan(*limits, color=BAND, alpha=0.3, linewidth=0, label=label + note)
     for edge in limits:
         axes.axhline(edge, color=ACCENT, linewidth=0.8, linestyle="--")
     axes.set_ylim(low, high)
+
+
+def view_with_limits(values: Series, limits: tuple[float, float]) -> tuple[float, float]:
+    """Return the scale that shows the values, and those of the limits that are not far from them."""
+    low, high = view(values)
+    span = high - low
+    return (
+        min(low, limits[0] - 0.06 * span) if low - span < limits[0] else low,
+        max(high, limits[1] + 0.06 * span) if high + span > limits[1] else high,
+    )
 
 
 def view(values: Series) -> tuple[float, float]:
@@ -165,11 +174,16 @@ def moving_mean(values: Series, window: int) -> Series:
 
 
 def _cost(axes: Axes, time: Series, cost: Series) -> None:
-    axes.plot(time, np.maximum(cost, 1e-6), color=INK, linewidth=1, label="stage cost")
+    axes.plot(time, np.maximum(cost, LEAST_COST), color=INK, linewidth=1, label="stage cost")
     axes.set_ylabel("stage cost (1)")
-    finite = cost[np.isfinite(cost)]
-    if len(finite) and float(finite.max()) > 10 * max(float(finite.min()), 1e-6):
+    if spans_a_decade(cost):
         axes.set_yscale("log")
+
+
+def spans_a_decade(cost: Series) -> bool:
+    """Return whether a cost is to be drawn on a logarithmic axis."""
+    finite = cost[np.isfinite(cost)]
+    return bool(len(finite)) and float(finite.max()) > 10 * max(float(finite.min()), LEAST_COST)
 
 
 def _ribbons(axes: Axes, events: Sequence[Mapping[str, Any]], scale_s: float, end: float) -> None:

@@ -7,7 +7,7 @@ from plant.load import HOUR_TICKS, named_families
 from plant.program import LoadProfile
 
 BEHIND_LAST_STEP = round(300 / TICK_S)
-"""How long a run goes on after the last step of a load file, unless told otherwise."""
+"""How long a run goes on after the last step of a load file, unless given otherwise."""
 
 
 @dataclass(frozen=True, slots=True)

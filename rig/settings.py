@@ -8,6 +8,7 @@ from coldloop.model_settings import ModelSettings
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
 from control_plc.settings import ControlSection
+from hmi.settings import HmiSection
 from optimizer_plc.settings import OptimizerSection
 from plant.settings import PlantSection
 
@@ -34,3 +35,4 @@ class Settings(BaseModel):
     optimizer_plc: OptimizerSection = OptimizerSection()
     telemetry: TelemetrySettings = TelemetrySettings()
     rig: RigSection = RigSection()
+    hmi: HmiSection = HmiSection()

@@ -3,11 +3,13 @@
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Final
 
 from rig.local_services import LocalServices
 from rig.network import NetworkRig
+from rig.page_process import PageProcess
 from rig.results import write_json
 from rig.running import make_scenario
 from rig.settings import Settings
@@ -21,8 +23,9 @@ LOOK_S: Final = 0.5
 class UpRig:
     """Starts the services, begins a session in real time, and follows it until it is cancelled."""
 
-    def __init__(self, settings: Settings, ports: Sequence[int], tls: Path | None) -> None:
+    def __init__(self, settings: Settings, ports: Sequence[int], tls: Path | None, *, page: bool = False) -> None:
         self._settings = settings
+        self._page = page
         self._ports = tuple(ports)
         self._tls = tls
         self.folder = state_folder(ports[0])
@@ -37,19 +40,24 @@ class UpRig:
         services = LocalServices(self._settings, self.folder / "logs", ports=self._ports)
         async with services:
             rig = NetworkRig(services.endpoints, self._settings)
+            page = PageProcess(self._settings.hmi, services.endpoints, self.folder) if self._page else None
             try:
-                await services.during(self._serve(rig, announce=announce))
+                async with page or nullcontext():
+                    await services.during(self._serve(rig, page, announce=announce))
             finally:
                 rig.close()
                 (self.folder / STATE_FILE).unlink(missing_ok=True)
 
-    async def _serve(self, rig: NetworkRig, *, announce: bool) -> None:
+    async def _serve(self, rig: NetworkRig, page: PageProcess | None, *, announce: bool) -> None:
         scenario = make_scenario(self._settings)
         await rig.connect(START_PATIENCE_S)
         session = await rig.start(scenario)
         tls = "" if self._tls is None else str(self._tls.resolve())
+        if page is not None:
+            await page.is_served()
         if announce:
             sys.stdout.write(whereabouts(self._settings, self._ports, self.folder))
+            sys.stdout.write(page.whereabouts if page is not None else "")
             sys.stdout.flush()
         write_json(self.folder / STATE_FILE, {"pid": os.getpid(), "ports": self._ports, "tls": tls})
         await rig.hold(session, LOOK_S)

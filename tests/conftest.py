@@ -18,12 +18,13 @@ from rig import cli
 from rig.ports import ReservedPorts
 
 settings.register_profile("quick", deadline=None, print_blob=True)
+settings.register_profile("fast", settings.get_profile("quick"), max_examples=20)
 settings.register_profile("ci", settings.get_profile("quick"), derandomize=True)
 settings.register_profile("thorough", settings.get_profile("quick"), max_examples=5000)
 settings.load_profile("ci" if "CI" in os.environ else "quick")
 """Quick looks elsewhere each time, and begins with what failed before; ci tries the same examples always. No example
-has a deadline: this machine may be busy with something else. `--hypothesis-profile=thorough` is for a night, of the
-tests that do not name a number of examples themselves."""
+has a deadline: this machine may be busy with something else. `--hypothesis-profile=thorough` is for a night, fast for
+the fast lane; both for tests that do not name a number of examples themselves."""
 
 PATIENCE_S = 120.0
 """A coroutine has failed when it takes longer; the first one on a bus may have to compile the kernels."""

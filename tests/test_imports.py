@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SERVICES = ("plant", "control_plc", "optimizer_plc")
+SERVICES = ("plant", "control_plc", "optimizer_plc", "hmi")
 PACKAGES = {"coldloop": ROOT / "shared", **dict.fromkeys(SERVICES, ROOT / "services"), "rig": ROOT}
 MAY_IMPORT = {
     "coldloop": {"coldloop"},

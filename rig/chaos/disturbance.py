@@ -85,7 +85,7 @@ class Mangler:
 
 
 def take_frames(buffer: bytearray) -> list[bytes]:
-    """Take all whole frames out of a buffer; what is no Modbus/TCP comes as one piece, as it stands."""
+    """Take all whole frames out of a buffer; what is not Modbus/TCP comes as one piece, unchanged."""
     frames, position = [], 0
     try:
         while (frame := next_frame(buffer, position)) is not None:

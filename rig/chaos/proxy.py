@@ -141,7 +141,7 @@ class LinkProxy:
 
 
 def _reset(writer: asyncio.StreamWriter) -> None:
-    """Close with RST: nothing is sent any more, and the peer is told at once."""
+    """Close with RST: nothing is sent any more, and the peer knows at once."""
     connection = writer.get_extra_info("socket")
     if connection is not None and not writer.is_closing():
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_NOT)

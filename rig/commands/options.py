@@ -25,6 +25,7 @@ KEYS = {
     "updating_period": ("optimizer_plc.program.updating_period_s", "--updating-period"),
     "mode": ("session.mode", "--mode"),
     "factor": ("session.factor", "--factor"),
+    "page_port": ("hmi.port", "--page-port"),
 }
 """Options that set one key of the configuration."""
 

@@ -1,15 +1,19 @@
-"""`coldloop registers`: the register maps, as a table, Markdown, CSV or JSON."""
+"""`coldloop registers`: the register maps, as a table, Markdown, CSV or JSON, or as tags of other programs."""
 
 import argparse
 import sys
 
-from rig.commands.choices import REGISTER_FORMATS, SERVICES
+from rig.commands.choices import REGISTER_FORMATS, SERVICES, TAG_FORMATS
+from rig.commands.options import HostPort, port_base
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--format", choices=REGISTER_FORMATS, default="table")
+    parser.add_argument("--format", choices=(*REGISTER_FORMATS, *TAG_FORMATS), default="table",
+                        help="fuxa, ignition, node-red and telegraf: what these programs import")  # fmt: skip
     parser.add_argument("--service", choices=SERVICES, help="default: all")
+    parser.add_argument("--host", default="127.0.0.1", help="where these programs find the rig (default: 127.0.0.1)")
+    parser.add_argument("--port-base", type=port_base, metavar="PORT", help="first of three ports in a row")
     parser.set_defaults(execute=execute)
 
 
@@ -18,5 +22,14 @@ def execute(options: argparse.Namespace) -> int:
     from rig.register_listing import FORMATS, MAPS
 
     maps = [MAPS[options.service]] if options.service else list(MAPS.values())
-    sys.stdout.write(FORMATS[options.format](maps))
+    if options.format in FORMATS:
+        sys.stdout.write(FORMATS[options.format](maps))
+        return 0
+    from rig.started_rigs import ports_from
+    from rig.tag_exports import EXPORTS
+    from rig.wiring import SERVICES as IN_ORDER
+
+    ports = ports_from(options.port_base)
+    places = {service: HostPort(options.host, port) for service, port in zip(IN_ORDER, ports, strict=True)}
+    sys.stdout.write(EXPORTS[options.format](maps, places))
     return 0

@@ -1,6 +1,6 @@
 """`coldloop set`: an operator's commands to a rig that is up.
 
-Each is a Modbus request with the operator's role, which any client with it can make; it says what came back.
+Each is a Modbus request that any client with the operator's role can make; the answer is read back and shown.
 """
 
 import argparse
@@ -40,9 +40,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     factor = what.add_parser("factor", help="seconds of plant time in a second; also changes over to real time")
     factor.add_argument("new_factor", type=float, metavar="FACTOR")
     factor.set_defaults(command=lambda client, options: client.set_factor(options.new_factor))
-    pause = what.add_parser("pause", help="let plant time stand")
+    pause = what.add_parser("pause", help="pause plant time")
     pause.set_defaults(command=lambda client, _: client.set_paused(paused=True))
-    resume = what.add_parser("resume", help="let plant time go on")
+    resume = what.add_parser("resume", help="resume plant time")
     resume.set_defaults(command=lambda client, _: client.set_paused(paused=False))
     acknowledge = what.add_parser("acknowledge", help="an alarm, or all")
     acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as t5-band (default: all)")

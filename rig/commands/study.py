@@ -53,7 +53,7 @@ def workers(options: argparse.Namespace) -> "Workers":
     """Return who does the runs.
 
     Raises:
-        UsageError: Both workers and a scheduler are asked for.
+        UsageError: Both workers and a scheduler are given.
     """
     from rig.studies.execution import Workers
 
@@ -63,7 +63,7 @@ def workers(options: argparse.Namespace) -> "Workers":
 
 
 def study_options(options: argparse.Namespace) -> "StudyOptions":
-    """Return how much is asked for."""
+    """Return the extent of the study."""
     from rig.studies.study import StudyOptions
 
     given = vars(options)

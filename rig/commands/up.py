@@ -24,6 +24,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         help="Modbus/TCP Security with what `coldloop certificates --out FOLDER` made")  # fmt: skip
     parser.add_argument("--port-base", type=port_base, metavar="PORT",
                         help="first of three ports in a row (default: 5020)")  # fmt: skip
+    parser.add_argument("--page", action="store_true", help="serve the operator's page, too")
+    parser.add_argument("--page-port", type=int, metavar="PORT", help="its port (default: 8020); implies --page")
     parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")
     parser.add_argument("--quiet", action="store_true", help="do not say where everything is")
     parser.set_defaults(execute=execute, mode="realtime")
@@ -40,11 +42,16 @@ def execute(options: argparse.Namespace) -> int:
     check_certificates(effective.settings)
     ports = ports_from(options.port_base)
     check_ports(ports)
+    page = options.page or options.page_port is not None
+    if page:
+        from rig.page_process import check_page
+
+        check_page(effective.settings.hmi)
     if options.detach:
         return detached(ports)
     from rig.until_interrupted import run_until_interrupted
     from rig.up import UpRig
 
-    rig = UpRig(effective.settings, ports, options.tls)
+    rig = UpRig(effective.settings, ports, options.tls, page=page)
     run_until_interrupted(lambda: rig.run(announce=not options.quiet))
     return 0

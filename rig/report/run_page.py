@@ -10,7 +10,21 @@ from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
 from coldloop.process import INPUT_NAMES, INPUT_UNITS
-from rig.plot import ACCENT, BAND, DRAWN, INK, Bounds, alarm_times, time_unit
+from rig.plot import (
+    ACCENT,
+    BAND,
+    DRAWN,
+    INK,
+    LEAST_COST,
+    LONGEST_TAU_U_S,
+    Bounds,
+    Series,
+    alarm_times,
+    spans_a_decade,
+    time_unit,
+    view,
+    view_with_limits,
+)
 from rig.run_folder import Curves, RunFolder
 from rig.run_plot import identity_of, title_of
 
@@ -53,6 +67,8 @@ def run_page(folder: Path) -> str:
 def _shown(value: object) -> str:
     if value is None:
         return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
@@ -64,15 +80,14 @@ def _plot(run: RunFolder) -> str:
     for row, (name, label) in enumerate(PANELS, start=1):
         _add_curve(figure, row, curves, name, scale_s)
         figure.update_yaxes(title_text=label, row=row, col=1)
-    _add_bounds(figure, Bounds.of(run.configuration))
+    _add_bounds(figure, curves, Bounds.of(run.configuration))
     if len(curves["time_s"]):
         for begin, end in alarm_times(run.events(), scale_s, float(curves["time_s"][-1]) / scale_s):
             figure.add_vrect(x0=begin, x1=end, fillcolor="#b3261e", opacity=0.12, line_width=0)
-    figure.update_yaxes(type="log", row=len(PANELS), col=1)
     figure.update_xaxes(title_text=f"plant time ({unit})", row=len(PANELS), col=1)
     figure.update_layout(
         height=190 * len(PANELS), template="plotly_white", hovermode="x", margin={"l": 70, "r": 20, "t": 20, "b": 50},
-        legend={"orientation": "h", "y": 1.01, "yanchor": "bottom"},
+        showlegend=False,
     )  # fmt: skip
     html: str = figure.to_html(full_html=False, include_plotlyjs=False, config={"displaylogo": False})
     return html
@@ -80,18 +95,25 @@ def _plot(run: RunFolder) -> str:
 
 def _add_curve(figure: Any, row: int, curves: Curves, name: str, scale_s: float) -> None:  # noqa: ANN401 plotly has no types
     shape = "hv" if name in ("load_w", "tau_u_s") else "linear"
-    line = {"color": INK if row % 2 else ACCENT, "width": 1.2, "shape": shape}
-    curve = go.Scattergl(
-        x=curves["time_s"] / scale_s, y=curves[name].astype("float32"), name=name, mode="lines", line=line
-    )
+    line = {"color": INK, "width": 1.2, "shape": shape}
+    values = curves[name].astype("float32")
+    if name == "stage_cost" and spans_a_decade(values):
+        values = values.clip(min=LEAST_COST)
+        figure.update_yaxes(type="log", exponentformat="power", dtick=2, row=row, col=1)
+    elif name == "tau_u_s":
+        figure.update_yaxes(range=(0, LONGEST_TAU_U_S + 0.3), row=row, col=1)
+    else:
+        figure.update_yaxes(range=view(values), row=row, col=1)
+    curve = go.Scattergl(x=curves["time_s"] / scale_s, y=values, name=name, mode="lines", line=line)
     figure.add_trace(curve, row=row, col=1)
 
 
-def _add_bounds(figure: Any, bounds: Bounds) -> None:  # noqa: ANN401 plotly has no types
-    """Draw bands and bounds, which do not change the scale."""
+def _add_bounds(figure: Any, curves: Mapping[str, Series], bounds: Bounds) -> None:  # noqa: ANN401 plotly has no types
+    """Draw bands and bounds; those that are far from the curve stay outside the view, until it is zoomed out."""
     rows = {name: row for row, (name, _) in enumerate(PANELS, start=1)}
     edges: Mapping[str, tuple[float, float]] = {**bounds.bands, **bounds.inputs}
     for name, (low, high) in edges.items():
         figure.add_hrect(y0=low, y1=high, fillcolor=BAND, opacity=0.2, line_width=0, row=rows[name], col=1)
         for edge in (low, high):
             figure.add_hline(y=edge, line={"color": ACCENT, "width": 1, "dash": "dash"}, row=rows[name], col=1)
+        figure.update_yaxes(range=view_with_limits(curves[name], (low, high)), row=rows[name], col=1)

@@ -35,6 +35,8 @@ T = TypeVar("T")
 
 LOOK_S: Final = 0.01
 """Between two looks at the tick of the plant, in real time."""
+END_S: Final = 1.0
+"""How long the end of a process may take to be known after its connections were closed."""
 FEED_S: Final = 0.5
 """Between two looks at the load that the plant knows of, in a session in real time."""
 _MAPS: Final = (PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP)
@@ -184,7 +186,13 @@ class LiveRig:
     # -- start and end -------------------------------------------------------------------------------------------------
 
     def _call(self, work: Coroutine[Any, Any, T]) -> T:
-        return self._loop.call(self._proxied.services.during(work))
+        services = self._proxied.services
+        try:
+            return self._loop.call(services.during(work))
+        except PeerUnreachableError:
+            if len(services.processes) == len(SERVICES):  # none was stopped on purpose: has one ended?
+                self._loop.call(services.during(asyncio.sleep(END_S)))
+            raise
 
     def _start(self) -> None:
         self._loop.call(self._started())

@@ -1,5 +1,6 @@
 """Registers of a server by their names in docs/registers.md."""
 
+import struct
 from collections.abc import Callable, Coroutine, Iterator
 from difflib import get_close_matches
 from typing import Any, NamedTuple
@@ -70,7 +71,11 @@ class NamedRegisters:
             record = where.record(**values, **({"crc": 0} if where.sealed else {}))
         else:
             record = self._record(where, row)._replace(**values)
-        self._call(self._client.write_rows([record], row))
+        try:
+            self._call(self._client.write_rows([record], row))
+        except (struct.error, OverflowError, TypeError) as error:
+            given = ", ".join(f"{name}={value!r}" for name, value in values.items())
+            raise UsageError(f"block '{block}' cannot hold {given}: {error}") from None
 
     def _record(self, block: Block, row: int) -> Any:  # noqa: ANN401 the record of that block
         if not 0 <= row < block.rows:

@@ -5,7 +5,7 @@ slot for the preparation of the problem, hence 4 tau_u - 1 iterations (section V
 """
 
 import math
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
@@ -27,6 +27,15 @@ class BudgetSettings(BaseModel):
     """Time that it takes at P = 1: 68,000 operations at 0.53 Mflop/s (`docs/budget.md`)."""
 
 
+class ComputingTimes(NamedTuple):
+    """Times of one solver on this PLC, s."""
+
+    slots: float
+    """Kept free in an updating period for the preparation."""
+    preparation: float
+    iteration: float
+
+
 class PlcBudget:
     """Converts between iterations and updating periods for one solver."""
 
@@ -34,6 +43,11 @@ class PlcBudget:
         self._settings = settings
         self._iteration_s = tau_1_s / settings.power
         self._slots_s = settings.preparation_slots * TICK_S / settings.power
+
+    @property
+    def times(self) -> ComputingTimes:
+        """What a period is made of."""
+        return ComputingTimes(self._slots_s, self._settings.preparation_s / self._settings.power, self._iteration_s)
 
     def iterations(self, ticks: int) -> int:
         """Return the iterations that fit into an updating period of `ticks` ticks; at least one is always done."""

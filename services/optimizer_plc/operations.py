@@ -100,6 +100,47 @@ def fast_gradient(n: float, m: float, active: float) -> Operations:
     return gradient(n, m, active).plus(Operations(5 * n))
 
 
+class SparseRows(NamedTuple):
+    """Elements of Gamma that are not zero: k_r in row r."""
+
+    elements: float
+    """Their number: the sum of k_r."""
+    pairs: float
+    """The sum of k_r (k_r + 1) / 2: elements of the upper triangle that the rows add to."""
+
+
+def slacks_first(n: float, slacks: int, chains: int) -> Operations:
+    """Return those of `linear_algebra.cholesky` where the first `slacks` variables are `chains` tridiagonal blocks.
+
+    Each is coupled with the next one of its chain, `chains` places on, and with all variables behind the slacks.
+    """
+    dense = n - slacks
+    flops = bytes_moved = 0.0
+    for k in range(slacks):
+        neighbour = 2 * (n - k - chains) if k + chains < slacks else 0.0
+        flops += n - k + 1 + neighbour + dense * (dense + 1)
+        bytes_moved += WORD * (2 * (n - k) + 1.5 * (neighbour + dense * (dense + 1)))
+    return Operations(flops, bytes_moved).plus(cholesky(dense))
+
+
+def interior_point(n: float, m: float, bounded: float, rows: SparseRows, factorisation: Operations) -> Operations:
+    """Return those of one predictor and corrector step; `bounded` variables have an upper bound, too.
+
+    With each step the augmented cost is computed, which is not part of this.
+    """
+    bounds = n + bounded
+    through = Operations(2 * rows.elements, WORD * rows.elements)  # Gamma z, or Gamma' lambda
+    away = through.plus(Operations(3 * m + 2 * n))
+    mean = Operations(2 * (m + bounds) + 1)
+    gradient = matrix_vector(n, n).plus(through, Operations(2 * n))
+    matrix = Operations(2 * bounds + 3 * m + rows.elements + 2 * rows.pairs, 2 * WORD * (rows.pairs + n * n / 2))
+    solve = through.times(2).plus(cholesky_solve(n), Operations(10 * m + 5 * bounds))
+    products = Operations(4 * (m + bounds) + 4)
+    reach = Operations(2 * (2 * m + 2 * n + n + bounded))
+    moves = Operations(2 * (3 * n + m)).plus(reach).times(2)
+    return away.times(2).plus(mean.times(2), gradient, matrix, factorisation, solve.times(2), products, moves)
+
+
 def daqp(n: float, m: float, active: float) -> Operations:
     """Return those of one working-set change of a dual active-set method with an LDL' factor of size `active`.
 

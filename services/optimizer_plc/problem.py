@@ -239,6 +239,14 @@ class PredictiveProblem:
         """
         return _inputs(self._knots_to_samples[:samples], z, self._input_scale, self._u0, self._rate)
 
+    def outputs(self, z: Array, situation: Situation) -> Array:
+        """Return L1 and T5 predicted for a profile at the end of each sampling period, shape (horizon, 2)."""
+        outputs = self.resting_outputs.copy()
+        apply(self.stacked_outputs_z, z, outputs)
+        apply(self.stacked_outputs_x, situation.x, outputs)
+        outputs += self.stacked_outputs_w * situation.w
+        return outputs.reshape(-1, len(self._model.constrained))
+
     def hold(self, u: Array) -> Array:
         """Return the profile that keeps the input deviation u, without slack."""
         return np.concatenate(

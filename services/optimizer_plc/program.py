@@ -15,23 +15,24 @@ from coldloop.lti_model import LtiModel
 from coldloop.process import STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
-from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.optimizer_plc import (
+    INPUT_SAMPLES,
+    PREDICTED_SAMPLES,
+    OperatingLimits,
+    Optimization,
+    Prediction,
+    UpdatingRuleStatus,
+)
 from coldloop.sequence import InputSequence, with_checksum
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.costs import augmented_cost, indicators
 from optimizer_plc.estimator import Estimate, Estimator, EstimatorKind, KalmanFilter, StateFeedback
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
-from optimizer_plc.settings import ProgramSettings, RuleName
+from optimizer_plc.rules import make_rule
+from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import make_solver
-from optimizer_plc.updating_period import (
-    Algorithm1,
-    Assessment,
-    ContractionRule,
-    FixedPeriod,
-    Observation,
-    UpdatingRule,
-)
+from optimizer_plc.updating_period import Assessment, Observation
 
 Array = NDArray[np.float64]
 
@@ -95,7 +96,7 @@ class OptimizerProgram:
     def restart(self, updating_period_s: float) -> None:
         """Forget everything and begin a session at the operating point; 0 s is the adaptive updating period."""
         self._fixed_ticks = round(updating_period_s / TICK_S)
-        self._rule = self._make_rule()
+        self._rule = make_rule(self.settings, self.budget, self._fixed_ticks)
         self._estimator.reset()
         self._solver.reset()
         at_rest = np.zeros(3, self._real)
@@ -104,14 +105,6 @@ class OptimizerProgram:
         self._sent: Delivery | None = None
         self._last: _Period | None = None
         self._sequences = 0
-
-    def _make_rule(self) -> UpdatingRule:
-        adaptive = self.settings.adaptive
-        if self._fixed_ticks:
-            return FixedPeriod(self.budget.iterations(self._fixed_ticks))
-        if adaptive.rule is RuleName.CONTRACTION:
-            return ContractionRule(**adaptive.contraction.model_dump())
-        return Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta)
 
     def _make_estimator(self) -> Estimator:
         if self.settings.estimator.kind is EstimatorKind.STATE_FEEDBACK:
@@ -280,6 +273,32 @@ class OptimizerProgram:
         return max(self._real(cost) + (qp.constant + floor), floor)
 
     # -- diagnostics --------------------------------------------------------------------------------------------------
+
+    def prediction(self) -> Prediction:
+        """Return what the last profile is expected to lead to."""
+        sent = self._sent
+        if sent is None or sent.sequence is None:
+            raise RuntimeError("prediction follows solve")
+        horizon = self._problem.design.horizon
+        outputs = self._problem.outputs(sent.z, sent.situation)
+        inputs = self._problem.inputs(sent.z, horizon)
+        shown = outputs[[min(sample, horizon) - 1 for sample in PREDICTED_SAMPLES]]
+        planned = inputs[[min(sample, horizon) - 1 for sample in INPUT_SAMPLES]]
+        header = sent.sequence.header
+        return Prediction(
+            header.update, header.first_tick, tuple(shown[:, 0].tolist()), tuple(shown[:, 1].tolist()),
+            tuple(planned.ravel().tolist()),
+        )  # fmt: skip
+
+    @property
+    def operating_limits(self) -> OperatingLimits:
+        """Bands, bounds and rates that profiles keep."""
+        design, limits = self.settings.design, self._problem.limits
+        return OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
+
+    def rule_status(self) -> UpdatingRuleStatus:
+        """Return what decides the updating period in this session."""
+        return self._rule.status._replace(**self.budget.times._asdict())
 
     def report(self, verdict: Verdict) -> Optimization:
         """Return what was done with the last update, once the control PLC has answered."""

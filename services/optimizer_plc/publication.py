@@ -11,7 +11,16 @@ from coldloop.registers.bank import Caller, IllegalValueError, RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity, ServiceState, SessionPace, pace_subject
 from coldloop.registers.declaration import Block
-from coldloop.registers.optimizer_plc import HISTORY_ROWS, OPTIMIZER_MAP, Optimization, OptimizerSession
+from coldloop.registers.optimizer_plc import (
+    HISTORY_ROWS,
+    OPTIMIZER_MAP,
+    OperatingLimits,
+    Optimization,
+    OptimizerSession,
+    Prediction,
+    UpdatingRuleStatus,
+)
+from coldloop.seal import sealed
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.control_link import ControlLink
 
@@ -24,12 +33,17 @@ class Publication:
     Args:
         order: Word order of the registers.
         budget: Decides which updating periods can be asked for in real time.
+        limits: Bands, bounds and rates of the problem.
         model_digest: Of our model.
         holder: Number that this optimiser gives itself.
     """
 
-    def __init__(self, order: WordOrder, budget: PlcBudget, model_digest: int, holder: int) -> None:
+    def __init__(
+        self, order: WordOrder, budget: PlcBudget, limits: OperatingLimits, model_digest: int, holder: int
+    ) -> None:
         self.bank = RegisterBank(OPTIMIZER_MAP, order)
+        self.bank.put(limits)
+        self.bank.put(sealed(Prediction()))
         self.bank.judged_by(self._judge, OptimizerSession)
         self.bank.judged_by(self._judge_pace, SessionPace)
         self.pace = Pace(realtime=False, factor=1.0)
@@ -86,13 +100,15 @@ class Publication:
 
     # -- what is shown -------------------------------------------------------------------------------------------------
 
-    def session_started(self, session: int, pace: Pace) -> None:
+    def session_started(self, session: int, pace: Pace, rule: UpdatingRuleStatus) -> None:
         """Show that a session has begun."""
         who = self._asked_by if self.asked_for(session) is not None else ""
         self._session, self._last = session, None
         self._journal.note(self.link.tick, EventKind.SESSION, int(pace.realtime), value=pace.factor, who=who)
         self.pace = pace
         self.bank.put(SessionPace.shown(session, pace))
+        self.bank.put(rule)
+        self.bank.put(sealed(Prediction()))
         self._shown.show()
         self._show_identity(0)
 
@@ -101,6 +117,10 @@ class Publication:
         self._last = done
         self.bank.put(done, done.update % HISTORY_ROWS)
         self._show_identity(tick)
+
+    def predicted(self, prediction: Prediction) -> None:
+        """Show what a delivered sequence is expected to lead to."""
+        self.bank.put(sealed(prediction))
 
     def _show_link(self) -> None:
         self.bank.put(self.link.registers())

@@ -71,7 +71,9 @@ class OptimizerPlc:
         self._settings = settings
         self._program = OptimizerProgram(load(settings.model.file), section.program, settings.limits)
         digest, holder = self._program.model_digest, 1 + secrets.randbelow(0xFFFFFFFF)
-        self.publication = Publication(section.word_order, self._program.budget, digest, holder)
+        self.publication = Publication(
+            section.word_order, self._program.budget, self._program.operating_limits, digest, holder
+        )
         self._link = self.publication.link
         self._control = ControlClient(section.control_plc, self._link, digest, str(settings.model.file))
         self._configured_pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
@@ -173,7 +175,7 @@ class OptimizerPlc:
             pace = Pace(bool(asked.realtime), asked.factor)
             period_s = asked.updating_period * TICK_S
         self._program.restart(period_s)
-        self.publication.session_started(session, pace)
+        self.publication.session_started(session, pace, self._program.rule_status())
         log.info("session started", extra={"session": session, "updating_period_s": period_s})
 
     async def _answer(self, update: Update, arrived_at: float) -> None:
@@ -207,6 +209,8 @@ class OptimizerPlc:
         if verdict not in (Verdict.NONE, Verdict.ACCEPTED):
             log.warning("sequence rejected", extra={"update": update.update, "verdict": verdict.name.lower()})
         self.publication.optimised(update.tick, self._program.report(verdict))
+        if verdict is Verdict.ACCEPTED:
+            self.publication.predicted(self._program.prediction())
         # a plan that came too late: this update leads to no other, unless a load step has led to one
         unplanned = verdict is Verdict.WRONG_UPDATE and not await self._is_superseded(update)
         # late once is late for ever with updates that have been waiting: begin again with a fresh one

@@ -20,6 +20,7 @@ from optimizer_plc.design import ControlDesign
 from optimizer_plc.estimator import EstimatorSettings
 from optimizer_plc.solvers.daqp import DaqpSettings
 from optimizer_plc.solvers.fast_gradient import FastGradientSettings
+from optimizer_plc.solvers.interior_point import InteriorPointSettings
 from optimizer_plc.solvers.ode import OdeSettings
 from optimizer_plc.solvers.osqp import OsqpSettings
 from optimizer_plc.solvers.qpoases import QpoasesSettings
@@ -34,10 +35,11 @@ class SolverName(StrEnum):
     QPOASES = "qpoases"
     OSQP = "osqp"
     FAST_GRADIENT = "fast-gradient"
+    INTERIOR_POINT = "interior-point"
     DAQP = "daqp"
 
 
-SINGLE_PRECISION_SOLVERS = (SolverName.ODE, SolverName.FAST_GRADIENT)
+SINGLE_PRECISION_SOLVERS = (SolverName.ODE, SolverName.FAST_GRADIENT, SolverName.INTERIOR_POINT)
 """Those that are kernels of our own."""
 
 
@@ -116,6 +118,7 @@ class ProgramSettings(BaseModel):
     qpoases: QpoasesSettings = QpoasesSettings()
     osqp: OsqpSettings = OsqpSettings()
     fast_gradient: FastGradientSettings = FastGradientSettings()
+    interior_point: InteriorPointSettings = InteriorPointSettings()
     daqp: DaqpSettings = DaqpSettings()
 
     @field_validator("updating_period_s")
@@ -128,7 +131,9 @@ class ProgramSettings(BaseModel):
     @model_validator(mode="after")
     def _own_arithmetic(self) -> Self:
         if self.arithmetic is Arithmetic.FLOAT32 and self.solver not in SINGLE_PRECISION_SOLVERS:
-            raise ValueError(f"{self.solver} computes in double precision; choose ode or fast-gradient")
+            raise ValueError(
+                f"{self.solver} computes in double precision; choose one of {', '.join(SINGLE_PRECISION_SOLVERS)}"
+            )
         return self
 
 

@@ -8,6 +8,8 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
+from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
+
 
 @dataclass(frozen=True, slots=True)
 class Observation:
@@ -72,6 +74,10 @@ class UpdatingRule(Protocol):
     def first(self) -> int:
         """Iterations of the first period, q(t_0)."""
 
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """The rule and its parameters, as registers show them."""
+
     def after_interruption(self) -> int:
         """Return the iterations of the period that begins with a load step."""
 
@@ -89,6 +95,11 @@ class FixedPeriod:
     def first(self) -> int:
         """The fixed number."""
         return self.iterations
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """The fixed number."""
+        return UpdatingRuleStatus(UpdatingRuleKind.FIXED, self.iterations, self.iterations, self.iterations)
 
     def after_interruption(self) -> int:
         """Return the fixed number."""
@@ -112,6 +123,11 @@ class Algorithm1:
     def first(self) -> int:
         """q(t_0)."""
         return self.q_first
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """Its four parameters."""
+        return UpdatingRuleStatus(UpdatingRuleKind.ALGORITHM_1, self.q_first, self.q_min, self.q_max, self.delta)
 
     def after_interruption(self) -> int:
         """Return q(t_0): what was learnt of the problem before the step says nothing of the one after."""
@@ -149,6 +165,11 @@ class ContractionRule:
     def first(self) -> int:
         """Iterations in quiet."""
         return self.q_quiet
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """The three numbers that q moves between; the first period has that of quiet."""
+        return UpdatingRuleStatus(UpdatingRuleKind.CONTRACTION, self.q_step, self.q_busy, self.q_step)
 
     def after_interruption(self) -> int:
         """Return what one long solve takes."""

@@ -86,6 +86,8 @@ class RackRegisters:
         self._connect()
         if resumed:
             self._show_session()
+        elif self.rack.session.number:
+            self._show_pace()
         self.bank.put(WatchdogTime(self.rack.watchdog.time))
         self.bank.put(self.rack.surroundings or Surroundings())
         self._show_applied()

@@ -21,7 +21,7 @@ S = TypeVar("S", bound=BaseModel)
 
 log = logging.getLogger("coldloop.service")
 
-SECTIONS = ("limits", "model", "session", "plant", "control_plc", "optimizer_plc", "telemetry", "rig")
+SECTIONS = ("limits", "model", "session", "plant", "control_plc", "optimizer_plc", "telemetry", "rig", "hmi")
 """Sections of a configuration file; each service reads those that concern it."""
 
 

@@ -4,14 +4,14 @@ import asyncio
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import aiomqtt
 import pytest
 
 from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
-from coldloop.registers.common import Identity
+from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.plant import PLANT_MAP, Actuators, LoadStep
 
 if TYPE_CHECKING:
@@ -22,16 +22,23 @@ if TYPE_CHECKING:
 SERVICES = ("plant", "control-plc", "optimizer-plc")
 
 
-def identity_of_plant(rig: "ComposedRig") -> Identity:
-    async def read() -> Identity:
+R = TypeVar("R", bound=tuple[Any, ...])
+
+
+def read_from_plant(rig: "ComposedRig", record: type[R]) -> R:
+    async def read() -> R:
         client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=rig.plant, timeout_s=5.0)
         try:
             await client.connect(5.0)
-            return await client.read(Identity)
+            return await client.read(record)
         finally:
             client.close()
 
     return asyncio.run(read())
+
+
+def identity_of_plant(rig: "ComposedRig") -> Identity:
+    return read_from_plant(rig, Identity)
 
 
 START_BROKER = ("sh", "/mosquitto/config/start.sh")
@@ -237,3 +244,4 @@ def test_an_hour_in_lock_step_is_that_of_one_process(
     assert composed["ticks"] == 4 * 3600
     assert composed["trace_sha256"] == one_process["trace_sha256"]
     assert identity_of_plant(rig).session == 2
+    assert read_from_plant(rig, SessionPace).realtime == 1, "it is given back as it was found"

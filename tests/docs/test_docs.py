@@ -2,9 +2,11 @@
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 from rig.cli import make_parser
 from rig.register_listing import FORMATS, MAPS
@@ -40,3 +42,15 @@ def test_every_mbpoll_line_in_the_readme_reads_declared_floats() -> None:
     for port, address in lines:
         registers = [register for block in MAPS[ports[port]].blocks for register in block.registers()]
         assert any(r.address == int(address) and r.kind.label == "float32" for r in registers), (port, address)
+
+
+def test_the_hosted_workflow_calls_scripts_that_exist_with_pinned_actions_on_each_python() -> None:
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text("utf-8"))
+    steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
+    scripts = [step["run"].split()[0] for step in steps if step.get("run", "").startswith("scripts/")]
+    assert {"scripts/check", "scripts/test"} <= set(scripts)
+    assert all((ROOT / script).is_file() for script in scripts)
+    assert all(re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40}", step["uses"]) for step in steps if "uses" in step)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    supported = [each.rpartition(" ")[2] for each in project["classifiers"] if "Python :: 3." in each]
+    assert workflow["jobs"]["tests"]["strategy"]["matrix"]["python"] == supported

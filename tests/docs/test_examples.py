@@ -29,13 +29,13 @@ TEST_SUITE = "executed: as a test suite"
 
 SHORTENED = {
     r"^coldloop run(?!.*--(attach|duration))": r"coldloop run --duration 10s",
-    r"^(coldloop run(?!.*--attach).*)--duration \S+": r"\1--duration 10s",
+    r"^(coldloop run(?!.*--attach|.*my_load).*)--duration \S+": r"\1--duration 10s",
     r"^coldloop chaos (kill|freeze)": r"coldloop chaos short_plan.toml",
     r"^(coldloop chaos .*)--duration \S+": r"\1--duration 20s",
     r"^scripts/run": r"scripts/run --duration 10s",
     r"^scripts/test": r"scripts/test tests/coldloop/test_seal.py",
 }
-"""What is executed instead of what the pages say, so that it takes seconds."""
+"""What is executed instead of what the pages say, so that it takes seconds; the tutorial's own load is run whole."""
 
 FOLLOWS = "--follow"
 """Commands with it are read until their first line, and then interrupted."""
@@ -211,6 +211,17 @@ def test_what_a_page_says_can_be_done(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("MPLBACKEND", "agg")
     Reader(tmp_path, coldloop, mbpoll).follow(page)
+
+
+@pytest.mark.parametrize(
+    "block",
+    ["```sh\ncoldloop run --in-process --load nowhere\n```", "```sh\nfalse\n```", "```python\nassert 1 == 2\n```"],
+)
+def test_a_page_that_says_what_cannot_be_done_fails(block: str, tmp_path: Path, coldloop: Coldloop) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(f"# Page\n\n{block}\n")
+    with pytest.raises(AssertionError):
+        Reader(tmp_path, coldloop, "mbpoll").follow(page)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

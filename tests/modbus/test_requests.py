@@ -5,12 +5,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.registers.plant import Actuators, PlantSession
+from coldloop.registers.plant import PLANT_MAP, Actuators, PlantSession
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Serve
 
 ACTUATORS = Actuators(tick=7, cv155=50.0, ncr22=100.0, cv156=60.0, session=1)
+LAST, BEYOND = f"{PLANT_MAP.end - 1:04x}", f"{PLANT_MAP.end:04x}"
+"""Address of the last register of the map, and of the one behind it."""
 SESSION = PlantSession(session=1, realtime=0, factor=1.0, seed=2, load_steps=3)
 
 
@@ -34,20 +36,20 @@ TABLE_OF_THE_SPECIFICATION = {
     "FC23 truncated": ("17 0000 0001 0064 0002", "97 03"),
     "FC5 with value 0x1234": ("05 0000 1234", "85 03"),
     "FC16 with a wrong byte count": ("10 0064 0002 03 00000000", "90 03"),
-    "FC23 whose read half is illegal": ("17 d590 0001 0064 0002 04 00000009", "97 02"),
+    "FC23 whose read half is illegal": (f"17 {BEYOND} 0001 0064 0002 04 00000009", "97 02"),
 }
 
 READS = {
     "FC3 with count 65535": ("03 0000 ffff", "83 03"),
     "FC3 of nothing but a function code": ("03", "83 03"),
     "FC3 with a byte too many": ("03 0000 0001 00", "83 03"),
-    "FC3 across the end of the map": ("03 d58f 0002", "83 02"),
-    "FC3 beyond the end of the map": ("03 d590 0001", "83 02"),
+    "FC3 across the end of the map": (f"03 {LAST} 0002", "83 02"),
+    "FC3 beyond the end of the map": (f"03 {BEYOND} 0001", "83 02"),
     "FC3 across the end of the address space": ("03 ffff 0002", "83 02"),
     "FC4 with count 0": ("04 0000 0000", "84 03"),
     "FC4 with count 126": ("04 0000 007e", "84 03"),
     "FC4 truncated": ("04 0000", "84 03"),
-    "FC4 beyond the end of the map": ("04 d590 0001", "84 02"),
+    "FC4 beyond the end of the map": (f"04 {BEYOND} 0001", "84 02"),
     "FC1 with 0 coils": ("01 0000 0000", "81 03"),
     "FC1 with 2000 coils": ("01 0000 07d0", "81 02"),
     "FC1 truncated": ("01 0000 00", "81 03"),
@@ -111,8 +113,8 @@ WRITES_WITH_READS = {
     "FC23 whose write half is undeclared": ("17 0000 0001 0032 0002 04 00000009", "97 02"),
     "FC23 whose value is out of range": ("17 0000 0001 0066 0002 04" + floats(101), "97 03"),
     "FC23 that writes half a float": ("17 0000 0001 0066 0001 02 0000", "97 03"),
-    "FC23 with an illegal quantity and an illegal address": ("17 d590 0000 0064 0002 04 00000009", "97 03"),
-    "FC23 with an illegal read address and an illegal value": ("17 d590 0001 0066 0002 04" + floats(101), "97 02"),
+    "FC23 with an illegal quantity and an illegal address": (f"17 {BEYOND} 0000 0064 0002 04 00000009", "97 03"),
+    "FC23 with an illegal read address and an illegal value": (f"17 {BEYOND} 0001 0066 0002 04" + floats(101), "97 02"),
     "FC23 with an illegal write address and an illegal value": ("17 0000 0001 00c8 0002 04" + floats(101), "97 02"),
 }
 
@@ -141,7 +143,7 @@ ACCEPTED = {
     "FC3 in a gap between blocks": ("03 0032 0001", "03 02 0000", []),
     "FC3 from a block into the gap behind it": ("03 006a 000c", "03 18" + floats(60) + "00000001" + "0000" * 8, []),
     "FC3 from a gap into the next block": ("03 018f 0003", "03 06 0000 00000001", []),
-    "FC3 of the last register": ("03 d58f 0001", "03 02 0000", []),
+    "FC3 of the last register": (f"03 {LAST} 0001", "03 02 0000", []),
     "FC4 in a gap between blocks": ("04 0032 0001", "04 02 0000", []),
     "FC4": ("04 0064 0008", "04 10 00000007" + floats(50, 100, 60), []),
     "FC6": ("06 0192 0001", "06 0192 0001", ["session"]),
@@ -200,7 +202,7 @@ async def test_an_unknown_unit_id_is_met_with_silence_where_so_configured(serve:
 async def test_errors_are_counted_by_kind(serve: "Serve") -> None:
     async with serve() as running:
         wire = await running.connect()
-        for pdu in ("41", "03 d590 0001", "04 d590 0001", "03 0000 0000"):
+        for pdu in ("41", f"03 {BEYOND} 0001", f"04 {BEYOND} 0001", "03 0000 0000"):
             await wire.ask(bytes.fromhex(pdu))
         counters = running.server.counters
         assert (counters.illegal_function, counters.illegal_address, counters.illegal_value) == (1, 2, 1)
@@ -212,7 +214,7 @@ async def test_refusals_are_logged_in_one_line_and_not_over_and_over(
     async with serve() as running:
         wire = await running.connect()
         for _ in range(50):
-            await wire.ask(bytes.fromhex("03 d590 0001"))
+            await wire.ask(bytes.fromhex(f"03 {BEYOND} 0001"))
         (line,) = caplog.messages
         assert "service=plant kind=illegal_address" in line
         assert "\n" not in line

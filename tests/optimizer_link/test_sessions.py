@@ -16,7 +16,7 @@ from coldloop.registers.audit import Event, EventKind, JournalAnswer, JournalPag
 from coldloop.registers.bank import Caller, IllegalValueError, RefusedAccessError
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.declaration import Role
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
+from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OperatingLimits, OptimizerSession
 from coldloop.registers.text import from_words
 from optimizer_plc.budget import BudgetSettings, PlcBudget
 from optimizer_plc.publication import Publication
@@ -30,7 +30,7 @@ UPDATING_PERIOD = BLOCK.end - 1
 
 
 def shown(power: float = 1.0, tau_1_s: float = 0.25) -> Publication:
-    return Publication(WordOrder.HIGH_FIRST, PlcBudget(BudgetSettings(power=power), tau_1_s), 1, 1)
+    return Publication(WordOrder.HIGH_FIRST, PlcBudget(BudgetSettings(power=power), tau_1_s), OperatingLimits(), 1, 1)
 
 
 @asynccontextmanager

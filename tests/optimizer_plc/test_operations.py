@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from optimizer_plc import costs, linear_algebra, operations, problem
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.reference_plc import ACTIVE_ROWS, QPOASES_ON_LAPTOP_S, cholesky_times, fitted, residuals, slow_down
-from optimizer_plc.solvers import ode
+from optimizer_plc.solvers import interior_point, ode
 from optimizer_plc.solvers.ode import OdeSettings, flow_in
 
 
@@ -88,7 +88,7 @@ def counted(array: NDArray[np.float64]) -> NDArray[Any]:
 @pytest.fixture
 def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let kernels call each other's Python code."""
-    for module in (ode, costs, problem, linear_algebra):
+    for module in (ode, interior_point, costs, problem, linear_algebra):
         for name, value in list(vars(module).items()):
             if hasattr(value, "py_func"):
                 monkeypatch.setattr(module, name, value.py_func)
@@ -124,6 +124,37 @@ def test_a_step_of_the_ode_solver_is_counted_right(n: int, m: int, active: int) 
     ode.step(qp, z, np.zeros(m), Counted(1e30), Counted(1e-6), flow)  # type: ignore[arg-type]
     assert [float(value) for value in z] != before, "the step was accepted"
     assert Counted.done == pytest.approx(operations.ode(n, m, active).flops)
+
+
+@pytest.mark.usefixtures("plain")
+@pytest.mark.parametrize(("knots", "chains", "inputs", "instants"), [(2, 1, 2, 3), (3, 2, 4, 5), (7, 4, 21, 14)])
+def test_a_step_of_the_interior_point_method_is_counted_right(
+    knots: int, chains: int, inputs: int, instants: int
+) -> None:
+    rng = np.random.default_rng(knots)
+    slacks, m = knots * chains, instants * chains
+    n = slacks + inputs
+    Gamma = np.zeros((m, n))
+    for row in range(m):  # an output row: all inputs, and two neighbours of one chain of slacks
+        knot, chain = row // chains % (knots - 1), row % chains
+        Gamma[row, [chains * knot + chain, chains * (knot + 1) + chain]] = -0.5
+        Gamma[row, slacks:] = rng.uniform(0.1, 1.0, size=inputs)
+    qp = QuadraticProblem(
+        np.diag(rng.uniform(1.0, 2.0, size=n)), rng.normal(size=n), Gamma, np.ones(m), np.full(n, -1.0),
+        np.where(np.arange(n) < slacks, np.inf, 1.0), 0.0,
+    )  # fmt: skip
+    _, constant = interior_point.structure_of(qp)
+    point = interior_point.begin(constant, qp.gamma, qp.low, qp.high, np.zeros(n), 1e-3, 1.0, 0.1)
+    counting = interior_point.Structure(counted(constant.hessian), counted(constant.Gamma), constant.columns)
+    vectors = counted(qp.phi), counted(qp.gamma), counted(qp.low), counted(qp.high)
+    begun = interior_point.Point(*map(counted, point))
+    Counted.done = 0
+    _, moved = interior_point.step(counting, *vectors, begun, Counted(1e-3), Counted(0.0))  # type: ignore[arg-type]
+    assert moved
+    k = np.count_nonzero(Gamma, axis=1)
+    sparse = operations.SparseRows(k.sum(), (k * (k + 1) // 2).sum())
+    expected = operations.interior_point(n, m, inputs, sparse, operations.slacks_first(n, slacks, chains))
+    assert Counted.done == pytest.approx(expected.flops, rel=0.02), "steps to the bounds are divided now and then"
 
 
 def test_the_curve_fits_the_cholesky_times_within_a_quarter_of_a_percent() -> None:

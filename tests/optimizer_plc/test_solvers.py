@@ -3,6 +3,7 @@
 import importlib
 import subprocess
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,7 @@ from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.settings import OptimizerSection, ProgramSettings, SolverName
 from optimizer_plc.solvers import Solver, make_solver, qpoases
 from optimizer_plc.solvers.fast_gradient import FastGradientSettings, FastGradientSolver, step_sizes, stiffest_hessian
+from optimizer_plc.solvers.interior_point import InteriorPointSettings, InteriorPointSolver
 from optimizer_plc.solvers.qpoases import QpoasesSettings, QpoasesSolver
 from plant.load import find_load
 from rig.one_process import OneProcessRig
@@ -36,7 +38,7 @@ repeatable = settings(max_examples=15, derandomize=True)
 
 EVERY = [name.value for name in SolverName]
 EXACT = ["qpoases", "osqp", "daqp"]
-CONVERGED = {"qpoases": 500, "osqp": 20_000, "daqp": 1, "ode": 400, "fast-gradient": 15_000}
+CONVERGED = {"qpoases": 500, "osqp": 20_000, "daqp": 1, "ode": 400, "fast-gradient": 15_000, "interior-point": 40}
 """Iterations after which nothing is truncated any more."""
 
 
@@ -72,7 +74,7 @@ def test_the_exact_ones_end_at_the_optimum(name: str, optimum: "Optimum", seed: 
     assert z == pytest.approx(optimum(qp), abs=1e-5)
 
 
-@pytest.mark.parametrize(("name", "accuracy"), [("ode", 5e-2), ("fast-gradient", 1e-4)])
+@pytest.mark.parametrize(("name", "accuracy"), [("ode", 5e-2), ("fast-gradient", 1e-4), ("interior-point", 1e-6)])
 @repeatable
 @given(seed=seeds)
 def test_the_penalised_ones_end_at_the_penalised_optimum(
@@ -258,6 +260,7 @@ def test_a_problem_without_solution_leaves_the_guess_and_the_next_one_is_solved(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_no_solver_prints() -> None:
     program = (
         "import numpy as np\n"
@@ -288,6 +291,7 @@ def test_without_casadi_qpoases_says_what_to_do(monkeypatch: pytest.MonkeyPatch)
     assert all(part in message for part in ("optimizer_plc.program.solver", "CasADi", "coldloop[qpoases]"))
 
 
+@pytest.mark.slow
 def test_casadi_is_not_imported_unless_it_is_needed() -> None:
     program = (
         "import sys\n"
@@ -325,16 +329,56 @@ def test_without_momentum_a_step_never_raises_the_cost(harsh_jumps: "list[Jump]"
         assert solver.cost <= before
 
 
-def test_single_precision_stays_single() -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: FastGradientSolver(FastGradientSettings(alpha=30.0)),
+        lambda: InteriorPointSolver(InteriorPointSettings(alpha=30.0)),
+    ],
+)
+def test_single_precision_stays_single(make: Callable[[], Solver]) -> None:
     rng = np.random.default_rng(26)
     qp = convex_problem(rng, 5, 7)
     single = QuadraticProblem(*(np.asarray(v, np.float32) for v in qp[:-1]), constant=0.0)
-    solver = FastGradientSolver(FastGradientSettings(alpha=30.0))
-    z = answer(solver, single, np.zeros(5, np.float32), 500)
+    z = answer(make(), single, np.zeros(5, np.float32), 500)
     assert z.dtype == np.float32
-    assert z == pytest.approx(
-        answer(FastGradientSolver(FastGradientSettings(alpha=30.0)), qp, np.zeros(5), 500), abs=1e-2
-    )
+    assert z == pytest.approx(answer(make(), qp, np.zeros(5), 500), abs=1e-2)
+
+
+# -- the interior-point method ----------------------------------------------------------------------------------------
+
+
+def test_the_answer_of_the_interior_point_method_never_gets_worse(harsh_jumps: "list[Jump]") -> None:
+    solver = InteriorPointSolver(InteriorPointSettings())
+    for qp, guess in harsh_jumps:
+        solver.start(qp, guess)
+        costs = [solver.cost]
+        while solver.iterate(1):
+            costs.append(solver.cost)
+            assert len(costs) < 60, "it ends by itself"
+        assert costs == sorted(costs, reverse=True)
+
+
+def test_after_eight_iterations_it_is_at_the_optimum_of_most_harsh_problems(
+    harsh_jumps: "list[Jump]", penalised_optimum: "PenalisedOptimum"
+) -> None:
+    ratios = []
+    for qp, guess in harsh_jumps:
+        solver, at_best = (InteriorPointSolver(InteriorPointSettings()) for _ in range(2))
+        answer(solver, qp, guess, 8)
+        at_best.start(qp, penalised_optimum(qp, solver.alpha))
+        ratios.append((solver.cost + qp.constant + 1.0) / (at_best.cost + qp.constant + 1.0))
+    assert min(ratios) > 1.0 - 1e-6, "nothing is below the optimum"
+    assert np.median(ratios) < 1.02
+
+
+def test_its_structure_changes_nothing_but_the_work(problem: PredictiveProblem, situations: "Situations") -> None:
+    """With upper bounds on the slacks, far away, other variables are eliminated first."""
+    qp = problem.at(situations(np.random.default_rng(27)))
+    far = qp._replace(high=np.minimum(qp.high, 1e4))
+    first, second = (answer(InteriorPointSolver(InteriorPointSettings()), each, np.zeros(49), 40) for each in (qp, far))
+    assert first == pytest.approx(second, abs=1e-3)
 
 
 # -- the loop ---------------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import pytest
 
 from coldloop.process import L1, T5
 from coldloop.registers.audit import EventKind
+from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import (
     Actuators,
     Measurement,
@@ -149,6 +150,11 @@ def test_a_session_that_begins_again_at_tick_0_is_a_break(switch_on: "SwitchOn")
     assert plc.send(*U, generation=2).verdict == OutputVerdict.CHANGED
     assert plc.send(*U, generation=3).verdict == OutputVerdict.TAKEN
     assert [event.value for event in rack.events(EventKind.SESSION)] == [1.0, 1.0]
+
+
+def test_a_session_that_begins_by_itself_shows_its_pace(switch_on: "SwitchOn") -> None:
+    rack = switch_on(session={"mode": "realtime", "factor": 2.0})
+    assert rack.operator.read(SessionPace) == SessionPace(1, 1, 2.0, 0)
 
 
 def test_without_a_session_no_outputs_are_taken(switch_on: "SwitchOn") -> None:

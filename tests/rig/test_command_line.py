@@ -16,6 +16,7 @@ from rig.cli import COMMANDS, make_parser
 from rig.commands import choices
 from rig.register_listing import FORMATS, MAPS
 from rig.studies import STUDIES
+from rig.tag_exports import EXPORTS
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -35,6 +36,7 @@ def test_the_names_that_are_offered_are_those_that_exist() -> None:
     assert tuple(NAMED) == choices.LOADS
     assert sorted(choices.SERVICES) == sorted(MAPS)
     assert sorted(choices.REGISTER_FORMATS) == sorted(FORMATS)
+    assert sorted(choices.TAG_FORMATS) == sorted(EXPORTS)
     assert tuple(STUDIES) == choices.STUDIES
     assert choices.plans() == [plan.name for plan in shipped_plans()]
 

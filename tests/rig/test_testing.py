@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from coldloop.errors import RequestRefusedError, UsageError
+from coldloop.errors import LinkError, RequestRefusedError, UsageError
 from coldloop.registers.control_plc import Mode, OperatorMode, PlantLinkState
 from rig.testing import LiveRig, Rigs, up
 
@@ -75,6 +75,8 @@ def test_a_refusal_has_its_exception_code(rig: LiveRig) -> None:
         (lambda rig: rig.plant.read_block("oven"), "no block 'oven'; there are identity"),
         (lambda rig: rig.plant.read("load table.watts", row=5000), "rows 0 to 2047"),
         (lambda rig: rig.control_plc.write_block("operator", speed=1), "no register 'speed'; it has mode"),
+        (lambda rig: rig.control_plc.write("operator.mode", "manual"), "block 'operator' cannot hold mode='manual'"),
+        (lambda rig: rig.control_plc.write("operator.mode", 70000), "cannot hold mode=70000"),
         (lambda rig: rig.advance(0.1), "multiple of 0.25"),
         (lambda rig: rig.log("boiler"), "no service 'boiler'"),
         (lambda rig: rig.fault("meteor").__enter__(), "fault 'meteor'"),
@@ -109,6 +111,13 @@ def test_the_links_of_a_rig_in_real_time_can_be_disturbed(tmp_path: Path) -> Non
             rig.wait_until(lambda: rig.control_plc.read("ladder.bad_sensors") != 0)
         assert rig.log("plant").is_file()
         assert rig.log("plant").is_relative_to(tmp_path)
+
+
+def test_a_service_that_ends_by_itself_is_named_with_its_log(tmp_path: Path) -> None:
+    with up(load="e", folder=tmp_path) as rig:
+        rig._proxied.services.processes["plant"].kill()  # noqa: SLF001 nobody ends a service by itself otherwise
+        with pytest.raises(LinkError, match=r"the plant service has ended: .*plant\.log"):
+            rig.advance(60)
 
 
 def test_waiting_for_what_does_not_come_ends_after_plant_time(rig: LiveRig) -> None:

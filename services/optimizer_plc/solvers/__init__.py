@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from optimizer_plc.solvers.daqp import DaqpSolver
 from optimizer_plc.solvers.fast_gradient import FastGradientSolver
 from optimizer_plc.solvers.interface import Solver
+from optimizer_plc.solvers.interior_point import InteriorPointSolver
 from optimizer_plc.solvers.ode import OdeSolver
 from optimizer_plc.solvers.osqp import OsqpSolver
 from optimizer_plc.solvers.qpoases import QpoasesSolver
@@ -20,6 +21,7 @@ _MAKERS: "dict[str, Callable[[ProgramSettings], Solver]]" = {
     "qpoases": lambda settings: QpoasesSolver(settings.qpoases),
     "osqp": lambda settings: OsqpSolver(settings.osqp),
     "fast-gradient": lambda settings: FastGradientSolver(settings.fast_gradient),
+    "interior-point": lambda settings: InteriorPointSolver(settings.interior_point),
     "daqp": lambda settings: DaqpSolver(settings.daqp),
 }
 

@@ -51,6 +51,8 @@ class Field:
     high: float | None = None
     elements: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
+    is_text: bool = False
+    """The elements are the words of a text (`registers.text`)."""
 
     @property
     def words(self) -> int:
@@ -75,7 +77,7 @@ def u16_array(description: str, elements: tuple[str, ...], *, unit: str = "") ->
 
 def text(description: str, words: int) -> Field:
     """Declare a text of two ASCII characters a word, padded with zeros; `registers.text` converts it."""
-    return Field(Kind.U16, description, elements=tuple(f"{word}" for word in range(words)))
+    return Field(Kind.U16, description, elements=tuple(f"{word}" for word in range(words)), is_text=True)
 
 
 def f32(description: str, *, unit: str = "", low: float | None = None, high: float | None = None) -> Field:

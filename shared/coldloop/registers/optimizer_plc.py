@@ -3,11 +3,23 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
+from coldloop.process import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
-from coldloop.registers.declaration import Block, RegisterMap, Role, f32, u16, u32
+from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
 
 HISTORY_ROWS: Final = 256
+PREDICTED_SAMPLES: Final = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 80, 100)
+"""Sampling periods ahead at which predicted outputs are shown."""
+INPUT_SAMPLES: Final = (1, 2, 4, 8, 16, 50, 100)
+"""Sampling periods ahead at which planned inputs are shown."""
+
+BANDED_OUTPUTS: Final = ("L1", "T5")
+BAND_UNITS: Final = ("%", "K")
+
+
+def _ahead(samples: tuple[int, ...]) -> tuple[str, ...]:
+    return tuple(f"{sample * SAMPLING_PERIOD_S:g}s" for sample in samples)
 
 
 class OptimizerSession(NamedTuple):
@@ -71,6 +83,68 @@ class Optimization(NamedTuple):
     load_mismatch: Annotated[float, f32("Estimated load mismatch", unit="W")]
 
 
+class UpdatingRuleKind(IntEnum):
+    """What decides the updating period."""
+
+    FIXED = 0
+    """It is always the same."""
+    ALGORITHM_1 = 1
+    """The rule of the paper."""
+    CONTRACTION = 2
+    """The rule of this project."""
+
+
+class UpdatingRuleStatus(NamedTuple):
+    """The rule that decides the updating period in this session, and the time that the computation takes."""
+
+    rule: Annotated[int, u16("0 fixed period, 1 Algorithm 1, 2 contraction rule", high=2)] = UpdatingRuleKind.FIXED
+    q_first: Annotated[int, u16("Iterations of the first period, and of one that follows an interruption")] = 0
+    q_min: Annotated[int, u16("Fewest iterations that the rule chooses")] = 0
+    q_max: Annotated[int, u16("Most iterations that the rule chooses")] = 0
+    delta: Annotated[int, u16("Step of Algorithm 1 in iterations; 0 for other rules")] = 0
+    slots: Annotated[float, f32("Time that a period keeps free for the preparation", unit="s")] = 0.0
+    preparation: Annotated[float, f32("Time that the preparation takes", unit="s")] = 0.0
+    iteration: Annotated[float, f32("Time that an iteration takes", unit="s")] = 0.0
+
+
+class OperatingLimits(NamedTuple):
+    """What the optimiser keeps the process within: bands of the constrained outputs, bounds and rates of the inputs."""
+
+    output_low: Annotated[tuple[float, ...], f32_array("Low end of the band", BANDED_OUTPUTS, BAND_UNITS)] = (0.0, 0.0)
+    output_high: Annotated[tuple[float, ...], f32_array("High end of the band", BANDED_OUTPUTS, BAND_UNITS)] = (
+        0.0, 0.0,
+    )  # fmt: skip
+    input_low: Annotated[tuple[float, ...], f32_array("Lowest value", INPUT_NAMES, INPUT_UNITS)] = (0.0, 0.0, 0.0)
+    input_high: Annotated[tuple[float, ...], f32_array("Highest value", INPUT_NAMES, INPUT_UNITS)] = (0.0, 0.0, 0.0)
+    input_rate: Annotated[
+        tuple[float, ...], f32_array("Largest change in a sampling period of 5 s", INPUT_NAMES, INPUT_UNITS)
+    ] = (0.0, 0.0, 0.0)
+
+
+class Prediction(NamedTuple):
+    """What the last delivered sequence is expected to lead to. Behind the horizon: the value at its end."""
+
+    update: Annotated[int, u32("Update that the prediction belongs to")] = 0
+    tick: Annotated[int, u32('Tick at which its sequence begins, t_{i+1}; element "5s" is 5 s later')] = 0
+    l1: Annotated[
+        tuple[float, ...],
+        f32_array("Predicted L1", _ahead(PREDICTED_SAMPLES), ("%",) * len(PREDICTED_SAMPLES)),
+    ] = (0.0,) * len(PREDICTED_SAMPLES)
+    t5: Annotated[
+        tuple[float, ...],
+        f32_array("Predicted T5", _ahead(PREDICTED_SAMPLES), ("K",) * len(PREDICTED_SAMPLES)),
+    ] = (0.0,) * len(PREDICTED_SAMPLES)
+    u: Annotated[
+        tuple[float, ...],
+        f32_array(
+            "Planned input",
+            tuple(f"{name}.{time}" for time in _ahead(INPUT_SAMPLES) for name in INPUT_NAMES),
+            INPUT_UNITS * len(INPUT_SAMPLES),
+        ),
+    ] = (0.0,) * (len(INPUT_NAMES) * len(INPUT_SAMPLES))
+    crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
+
+
 OPTIMIZER_MAP: Final = RegisterMap(
     service="optimizer_plc",
     version=3,
@@ -80,6 +154,9 @@ OPTIMIZER_MAP: Final = RegisterMap(
         Block("control link", 40, ControlLinkStatus, "Link to the control PLC"),
         STATISTICS_BLOCK,
         Block("pace", 100, SessionPace, "Time base of the session under way", Role.OPERATOR),
+        Block("updating rule", 120, UpdatingRuleStatus, "What decides the updating period"),
+        Block("operating limits", 140, OperatingLimits, "Bands of the outputs, bounds and rates of the inputs"),
+        Block("prediction", 200, Prediction, "What the last sequence is expected to lead to", sealed=True),
         Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
         Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
         Block("journal page", 45010, JournalPage, "State of the journal"),

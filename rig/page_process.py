@@ -1,0 +1,144 @@
+"""The operator's page as a process beside the services of a rig that is up."""
+
+import asyncio
+import os
+import secrets
+import signal
+import socket
+import sys
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final, NamedTuple, Self
+
+from coldloop.config import PREFIX, to_environment
+from coldloop.errors import LinkError, UsageError
+from hmi.settings import HmiSection, HmiSettings
+from hmi.users import PageRole, write_user
+from rig.rig_endpoints import RigEndpoints
+
+GRACE_S: Final = 5.0
+LOOK_S: Final = 0.05
+OPERATOR: Final = "operator"
+
+
+def check_page(section: HmiSection) -> None:
+    """Refuse a page that cannot be served, before anything that takes time.
+
+    Raises:
+        UsageError: Its extra is not installed, or its port is in use.
+    """
+    if find_spec("aiohttp") is None:
+        raise UsageError("--page needs aiohttp: pip install 'coldloop[hmi]'")
+    with socket.socket(socket.AF_INET6 if ":" in section.host else socket.AF_INET) as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            one.bind((section.host, section.port))
+        except OSError as error:
+            raise UsageError(
+                f"port {section.port} of the page: {error.strerror}; give another one with --page-port"
+            ) from None
+
+
+def pointed_at(section: HmiSection, endpoints: RigEndpoints) -> HmiSection:
+    """Return the settings of a page of the services at these endpoints."""
+    return section.model_copy(
+        update={
+            service: getattr(section, service).model_copy(
+                update={"host": end.host, "port": end.port, "word_order": end.word_order, "tls": end.tls}
+            )
+            for service, end in endpoints._asdict().items()
+        }
+    )
+
+
+class FirstLogin(NamedTuple):
+    """The operator of a rig whose configuration names no users."""
+
+    file: Path
+    password: str
+
+    @classmethod
+    def made_in(cls, folder: Path) -> Self:
+        """Write a user with a password of chance into a folder."""
+        login = cls(folder / "page-users", secrets.token_urlsafe(9))
+        login.file.unlink(missing_ok=True)
+        write_user(login.file, OPERATOR, PageRole.OPERATE, login.password)
+        return login
+
+
+class PageProcess:
+    """The page; an async context in which it lives.
+
+    Args:
+        section: Its settings.
+        endpoints: Where the services are, with the operator's certificate.
+        folder: Where it logs to, and keeps the first login and the audit.
+    """
+
+    def __init__(self, section: HmiSection, endpoints: RigEndpoints, folder: Path) -> None:
+        self._log = folder / "logs" / "hmi.log"
+        self._login = None if section.login.users else FirstLogin.made_in(folder)
+        section = pointed_at(section, endpoints)
+        update: dict[str, object] = {}
+        if self._login is not None:
+            update["login"] = section.login.model_copy(update={"users": self._login.file})
+        if section.audit is None:
+            update["audit"] = folder / "page-audit.jsonl"
+        self._section = section.model_copy(update=update)
+        self._process: asyncio.subprocess.Process | None = None
+
+    async def __aenter__(self) -> Self:
+        """Start it."""
+        environment: Mapping[str, str] = {
+            **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
+            **to_environment(HmiSettings(hmi=self._section)),
+        }
+        self._log.parent.mkdir(parents=True, exist_ok=True)
+        with self._log.open("wb") as log:
+            self._process = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "hmi", "--with-parent", env=environment, start_new_session=True,
+                stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
+            )  # fmt: skip
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """End it."""
+        process = self._process
+        if process is None or process.returncode is not None:
+            return
+        process.send_signal(signal.SIGTERM)
+        process.send_signal(signal.SIGCONT)
+        try:
+            async with asyncio.timeout(GRACE_S):
+                await process.wait()
+        except TimeoutError:
+            process.kill()
+            await process.wait()
+
+    async def is_served(self) -> None:
+        """Wait until the page answers.
+
+        Raises:
+            LinkError: It has ended.
+        """
+        while True:
+            if self._process is not None and self._process.returncode is not None:
+                lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+                raise LinkError(f"the page has ended: {lines[-1] if lines else 'no reason given'} (log: {self._log})")
+            try:
+                _, writer = await asyncio.open_connection(self._section.host, self._section.port)
+            except OSError:
+                await asyncio.sleep(LOOK_S)
+                continue
+            writer.close()
+            return
+
+    @property
+    def whereabouts(self) -> str:
+        """Where it is, and who may operate."""
+        scheme = "https" if self._section.https else "http"
+        text = f"  page           {scheme}://{self._section.host}:{self._section.port}/\n"
+        if self._login is not None:
+            text += f"  to operate     user {OPERATOR}, password {self._login.password} (of this run)\n"
+        return text

@@ -1,0 +1,132 @@
+"""Who is asking: sessions, the rate of requests, and where a request comes from. No sockets, no clock of its own."""
+
+import hashlib
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import urlsplit
+
+from hmi.users import PageRole, User
+
+MOST_SESSIONS: Final = 200
+MOST_ADDRESSES: Final = 1000
+LOGINS_A_MINUTE: Final = 6.0
+LOGIN_BURST: Final = 6.0
+REQUESTS_A_SECOND: Final = 30.0
+REQUEST_BURST: Final = 150.0
+LOCAL_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+
+
+@dataclass
+class LoginSession:
+    """A user who has logged in."""
+
+    user: User
+    began: float
+    seen: float
+
+    @property
+    def may_operate(self) -> bool:
+        """Whether commands are allowed."""
+        return self.user.role is PageRole.OPERATE
+
+
+class Sessions:
+    """Sessions by their tokens, of which only digests are kept.
+
+    Args:
+        now: Monotonic clock, s.
+        idle_s: A session without a request for so long ends.
+        longest_s: Every session ends after this time.
+    """
+
+    def __init__(self, now: Callable[[], float], idle_s: float, longest_s: float) -> None:
+        self._now = now
+        self._idle_s = idle_s
+        self._longest_s = longest_s
+        self._sessions: OrderedDict[str, LoginSession] = OrderedDict()
+
+    def begin(self, user: User) -> str:
+        """Begin a session; return its token. The oldest session ends when there are too many."""
+        token = secrets.token_urlsafe(32)
+        now = self._now()
+        self._sessions[_digest(token)] = LoginSession(user, now, now)
+        while len(self._sessions) > MOST_SESSIONS:
+            self._sessions.popitem(last=False)
+        return token
+
+    def find(self, token: str | None, *, is_use: bool = True) -> LoginSession | None:
+        """Return the session of a token; None when there is none, or it has ended.
+
+        Args:
+            token: What the browser sent.
+            is_use: The request counts as a sign of life; what a page asks for by itself does not.
+        """
+        key = _digest(token) if token else ""
+        session = self._sessions.get(key)
+        if session is None:
+            return None
+        now = self._now()
+        if now - session.seen > self._idle_s or now - session.began > self._longest_s:
+            del self._sessions[key]
+            return None
+        if is_use:
+            session.seen = now
+        return session
+
+    def end(self, token: str | None) -> None:
+        """End a session."""
+        if token:
+            self._sessions.pop(_digest(token), None)
+
+
+def _digest(token: str) -> str:
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+class RateLimit:
+    """A bucket of requests for each address.
+
+    Args:
+        now: Monotonic clock, s.
+        per_second: Rate at which it fills.
+        burst: What it holds.
+    """
+
+    def __init__(self, now: Callable[[], float], per_second: float, burst: float) -> None:
+        self._now = now
+        self._per_second = per_second
+        self._burst = burst
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def allows(self, address: str) -> bool:
+        """Take a request of an address, or refuse it."""
+        now = self._now()
+        level, since = self._buckets.pop(address, (self._burst, now))
+        level = min(self._burst, level + (now - since) * self._per_second)
+        allowed = level >= 1.0
+        self._buckets[address] = (level - 1.0 if allowed else level, now)
+        while len(self._buckets) > MOST_ADDRESSES:
+            self._buckets.popitem(last=False)
+        return allowed
+
+    def give_back(self, address: str) -> None:
+        """Give a request back that shall not count."""
+        if address in self._buckets:
+            level, since = self._buckets[address]
+            self._buckets[address] = (min(self._burst, level + 1.0), since)
+
+
+def host_of(header: str) -> str:
+    """Return the name in a Host header, without its port."""
+    return urlsplit(f"//{header}").hostname or ""
+
+
+def is_own_origin(origin: str | None, host: str) -> bool:
+    """Tell whether a request that changes something comes from the page itself: `Origin` names the address asked for.
+
+    A request without `Origin` is not: browsers send it with every POST. A proxy in front may add HTTPS.
+    """
+    return origin in {f"http://{host}", f"https://{host}"}

@@ -1,0 +1,162 @@
+"""Requests that change something: login, logout, and commands in two steps."""
+
+import asyncio
+import json
+from typing import Any, Final
+
+from aiohttp import web
+
+from coldloop.errors import LinkError, UsageError
+from hmi.access import LoginSession
+from hmi.audit import Audit
+from hmi.commands import read_command
+from hmi.documents import encoded
+from hmi.guard import COOKIE, Guard, refusal
+from hmi.operator_desk import OperatorDesk
+from hmi.reading import json_answer
+from hmi.settings import HmiSection
+from hmi.users import Users
+
+LONGEST_REQUEST: Final = 2_000_000
+"""Bytes of a request: a load file fits."""
+
+
+class Commanding:
+    """Answers requests that change something.
+
+    Args:
+        settings: Of the page.
+        guard: Knows who is asking.
+        users: Who may log in.
+        desk: Carries out commands; None where there are none, as in a replay.
+        audit: Where everything is noted.
+    """
+
+    def __init__(
+        self, settings: HmiSection, guard: Guard, users: Users, desk: OperatorDesk | None, audit: Audit
+    ) -> None:
+        self._settings = settings
+        self._guard = guard
+        self._users = users
+        self._desk = desk
+        self._audit = audit
+
+    def routes(self) -> list[web.AbstractRouteDef]:
+        """Return what is served."""
+        return [
+            web.get("/api/me", self.me),
+            web.post("/api/login", self.login),
+            web.post("/api/logout", self.logout),
+            web.get("/api/audit", self.audit),
+            web.post("/api/commands", self.prepare),
+            web.post("/api/commands/{token}", self.confirm),
+        ]
+
+    async def me(self, request: web.Request) -> web.Response:
+        """Answer with who is asking."""
+        session = self._guard.session(request)
+        return web.json_response(
+            {
+                "user": session.user.name if session else "",
+                "role": session.user.role.value if session else ("view" if self._settings.login.anonymous_view else ""),
+                "operates": bool(session and session.may_operate and self._desk),
+                "can_log_in": len(self._users) > 0,
+            }
+        )
+
+    async def login(self, request: web.Request) -> web.Response:
+        """Begin a session."""
+        address = request.remote or ""
+        if not self._guard.logins.allows(address):
+            self._note(request, "login", "refused", "too many attempts")
+            return refusal(429, "too many attempts to log in: wait a minute")
+        asked = await _document(request)
+        name, password = asked.get("user"), asked.get("password")
+        if not isinstance(name, str) or not isinstance(password, str):
+            return refusal(400, "user and password are texts")
+        user = await asyncio.to_thread(self._users.check, name, password)
+        if user is None:
+            self._audit.note(
+                "login", who=name[:40], address=address, outcome="refused", detail="wrong name or password"
+            )
+            return refusal(401, "wrong name or password")
+        self._guard.logins.give_back(address)
+        answer = web.json_response({"user": user.name, "role": user.role.value})
+        answer.set_cookie(
+            COOKIE, self._guard.sessions.begin(user), httponly=True, samesite="Strict", path="/",
+            secure=self._settings.https is not None,
+        )  # fmt: skip
+        self._audit.note("login", who=user.name, address=address, outcome="done", detail=user.role.value)
+        return answer
+
+    async def logout(self, request: web.Request) -> web.Response:
+        """End the session."""
+        self._note(request, "logout", "done", "")
+        self._guard.sessions.end(request.cookies.get(COOKIE))
+        answer = web.json_response({})
+        answer.del_cookie(COOKIE, path="/")
+        return answer
+
+    async def audit(self, request: web.Request) -> web.Response:
+        """Answer with the last entries of the audit, for operators."""
+        operator = self._operator(request)
+        if isinstance(operator, web.Response):
+            return operator
+        return json_answer(encoded({"entries": list(self._audit.entries)[::-1]}))
+
+    async def prepare(self, request: web.Request) -> web.Response:
+        """Take a command: answer with what it would do and the token that confirms it."""
+        operator = self._operator(request)
+        if isinstance(operator, web.Response) or self._desk is None:
+            return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
+        try:
+            command = read_command(await _document(request))
+            token = await self._desk.prepare(command, operator.user.name)
+        except (UsageError, LinkError) as error:
+            self._note(request, "command", "refused", str(error))
+            return refusal(422, str(error))
+        return web.json_response({"token": token, "text": command.text})
+
+    async def confirm(self, request: web.Request) -> web.Response:
+        """Carry out a command that was prepared; answer with what was asked and what came of it."""
+        operator = self._operator(request)
+        if isinstance(operator, web.Response) or self._desk is None:
+            return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
+        try:
+            outcome = await self._desk.confirm(request.match_info["token"], operator.user.name)
+        except UsageError as error:
+            return refusal(409, str(error))
+        refused = bool(outcome.refused_because)
+        detail = f"{outcome.asked}: {outcome.refused_because or outcome.applied}"
+        self._note(request, "command", "refused" if refused else "done", detail)
+        return json_answer(encoded(outcome._asdict()))
+
+    def _operator(self, request: web.Request) -> LoginSession | web.Response:
+        """Return the session of an operator, or the refusal."""
+        session = self._guard.session(request)
+        if session is None:
+            self._note(request, "command", "refused", "nobody has logged in, or the session has ended")
+            return refusal(401, "log in first: the session has ended, or there was none")
+        if not session.may_operate:
+            self._note(request, "command", "refused", "the user may only look")
+            return refusal(403, f"{session.user.name} may look, and not operate")
+        return session
+
+    def _note(self, request: web.Request, what: str, outcome: str, detail: str) -> None:
+        who = self._guard.who(request)
+        self._audit.note(what, who=who, address=request.remote or "", outcome=outcome, detail=detail)
+
+
+async def _document(request: web.Request) -> dict[str, Any]:
+    """Return the JSON object of a request.
+
+    Raises:
+        HTTPBadRequest: It has none.
+    """
+    try:
+        document = await request.json()
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        document = None
+    if not isinstance(document, dict):
+        raise web.HTTPBadRequest(reason="the request is not a JSON object")
+    return document

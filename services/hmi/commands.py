@@ -1,0 +1,202 @@
+"""What operators can ask for, as the page sends it: checked here, described in words, and carried out elsewhere."""
+
+import csv
+import io
+from typing import Annotated, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
+
+from coldloop.errors import UsageError
+from coldloop.event_text import word
+from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
+from coldloop.registers.plant import MAX_LOAD_W, SensorFaultKind
+from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
+
+LONGEST_FILE: Final = 1_000_000
+"""Characters of a load file."""
+MOST_STEPS: Final = 4000
+"""Steps of a load that are sent at once; the plant keeps 4096."""
+
+
+class _Command(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class SetMode(_Command):
+    """Who drives. Manual is taken over without a bump: the setpoints are what is applied at that moment."""
+
+    kind: Literal["mode"]
+    mode: Literal["auto", "classical", "manual"]
+
+    @property
+    def text(self) -> str:
+        """The command in words."""
+        return {
+            "auto": "Hand over to automatic: MPC, and the fail-safe ladder when it is not there",
+            "classical": "Switch to the classical loops",
+            "manual": "Take over in manual: the inputs stay where they are until a setpoint is written",
+        }[self.mode]
+
+
+class SetSetpoint(_Command):
+    """An input in manual mode."""
+
+    kind: Literal["setpoint"]
+    input: Literal["CV155", "NCR22_A", "CV156"]
+    value: float
+
+    @property
+    def text(self) -> str:
+        """The command in words."""
+        return f"Move the setpoint of {self.input} to {self.value:g} {INPUT_UNITS[INPUT_NAMES.index(self.input)]}"
+
+
+class SetLoad(_Command):
+    """The heat load from now on."""
+
+    kind: Literal["load"]
+    watts: Annotated[float, Field(ge=0, le=MAX_LOAD_W)]
+
+    @property
+    def text(self) -> str:
+        """The command in words."""
+        return f"Change the heat load to {self.watts:g} W from the next tick on"
+
+
+class PlayLoad(_Command):
+    """A load file `time_s,load_w` that begins now."""
+
+    kind: Literal["load_file"]
+    content: Annotated[str, Field(max_length=LONGEST_FILE)]
+
+    @field_validator("content")
+    @classmethod
+    def _readable(cls, content: str) -> str:
+        read_load(content)
+        return content
+
+    @property
+    def text(self) -> str:
+        """The command in words."""
+        steps = read_load(self.content)
+        return (
+            f"Play a load of {len(steps)} steps, {steps[-1][0] * TICK_S:g} s long, from now on; its last value is held"
+        )
+
+
+class SetFactor(_Command):
+    """How fast plant time goes."""
+
+    kind: Literal["factor"]
+    factor: Annotated[float, Field(ge=0.01, le=10_000)]
+
+    @property
+    def text(self) -> str:
+        """The command in words."""
+        return f"Let plant time go {self.factor:g} times as fast as real time"
+
+
+class SetPaused(_Command):
+    """Plant time stands still, or goes on."""
+
+    kind: Literal["pause"]
+    paused: bool
+
+    @property
+    def text(self) -> str:
+        """The command in words."""
+        return "Let plant time stand still" if self.paused else "Let plant time go on"
+
+
+class TreatAlarm(_Command):
+    """What is done with an alarm, or with all."""
+
+    kind: Literal["alarm"]
+    alarm: int
+    action: Annotated[int, Field(ge=1, le=5)]
+    time_s: Annotated[int, Field(ge=0, le=0xFFFF)] = 0
+    """How long it is shelved; 0 is the time of the configuration."""
+
+    @field_validator("alarm")
+    @classmethod
+    def _known(cls, alarm: int) -> int:
+        if alarm != ALL_ALARMS and alarm not in AlarmKind.__members__.values():
+            raise ValueError(f"there is no alarm {alarm}")
+        return alarm
+
+    @property
+    def text(self) -> str:
+        """The command in words."""
+        name = "all alarms" if self.alarm == ALL_ALARMS else f"alarm {word(AlarmKind(self.alarm))}"
+        time = f" for {self.time_s} s" if self.action == AlarmAction.SHELVE and self.time_s else ""
+        return f"{word(AlarmAction(self.action)).capitalize()}: {name}{time}"
+
+
+class FaultSensor(_Command):
+    """Puts a fault into a sensor, for training."""
+
+    kind: Literal["sensor_fault"]
+    output: str
+    fault: Annotated[int, Field(ge=0, le=3)]
+    value: float = 0.0
+
+    @field_validator("output")
+    @classmethod
+    def _known(cls, output: str) -> str:
+        if output not in OUTPUT_NAMES:
+            raise ValueError(f"there is no output {output}")
+        return output
+
+    @property
+    def text(self) -> str:
+        """The command in words."""
+        value = f" ({self.value:g})" if self.fault == SensorFaultKind.VALUE else ""
+        return f"Training: sensor of {self.output}: {word(SensorFaultKind(self.fault))}{value}"
+
+
+Command = SetMode | SetSetpoint | SetLoad | PlayLoad | SetFactor | SetPaused | TreatAlarm | FaultSensor
+_COMMAND: Final[TypeAdapter[Command]] = TypeAdapter(Annotated[Command, Field(discriminator="kind")])
+
+
+def read_command(document: object) -> Command:
+    """Return a command as it was sent.
+
+    Raises:
+        UsageError: It is none; one line that says what is wrong with it.
+    """
+    try:
+        return _COMMAND.validate_python(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"][1:]) or "command"
+        message = first["msg"].removeprefix("Value error, ")
+        raise UsageError(f"{place}: {message[0].lower()}{message[1:]}") from None
+
+
+def read_load(content: str) -> list[tuple[int, float]]:
+    """Return the steps of a load file as (ticks since its beginning, W).
+
+    Raises:
+        ValueError: One line that names the row.
+    """
+    steps: list[tuple[int, float]] = []
+    for number, row in enumerate(csv.reader(io.StringIO(content)), 1):
+        if not row or (number == 1 and row[0].strip() == "time_s"):
+            continue
+        try:
+            time_s, watts = float(row[0]), float(row[1])
+        except (ValueError, IndexError):
+            raise ValueError(f"row {number}: not time_s,load_w") from None
+        if not 0 <= watts <= MAX_LOAD_W:
+            raise ValueError(f"row {number}: load {watts:g} W is not from 0 to {MAX_LOAD_W:g} W")
+        if not 0 <= time_s < 1e8 or time_s % TICK_S:
+            raise ValueError(f"row {number}: time {time_s:g} s is not a multiple of {TICK_S} s from 0 on")
+        tick = round(time_s / TICK_S)
+        if steps and tick <= steps[-1][0]:
+            raise ValueError(f"row {number}: time {time_s:g} s does not follow the row before")
+        steps.append((tick, watts))
+    if not steps:
+        raise ValueError("the load file has no rows")
+    if len(steps) > MOST_STEPS:
+        raise ValueError(f"the load file has {len(steps)} steps, more than {MOST_STEPS}: use `coldloop set load FILE`")
+    return steps

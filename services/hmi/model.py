@@ -1,0 +1,230 @@
+"""What the page knows: the newest record of each block, trends, updates, predictions and events.
+
+Whoever reads a rig, or a recorded run, writes into it; the pages are made from it. Nothing here uses a socket.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple, TypeVar, cast
+
+from coldloop.event_text import EventText, describe, utc_text
+from coldloop.process import TICK_S
+from coldloop.registers.audit import Event
+from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.control_plc import LadderStatus, Process
+from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
+from coldloop.registers.safety import Alarm, AlarmKind
+from hmi.signals import MAPS, values_of
+from hmi.trends import TrendStore
+
+R = TypeVar("R", bound=tuple[Any, ...])
+
+UPDATES_KEPT: Final = 20_000
+PREDICTIONS_KEPT: Final = 1000
+EVENTS_KEPT: Final = 10_000
+STALE_S: Final = 1.5
+"""A value whose source has been silent for this long is crossed out."""
+
+
+class Told(NamedTuple):
+    """An event in words, and the service whose journal it is from."""
+
+    service: str
+    number: int
+    boot: int
+    utc: str
+    tick: int
+    text: EventText
+
+    @classmethod
+    def of(cls, service: str, event: Event) -> "Told":
+        """Return an event of a journal."""
+        return cls(service, event.number, event.boot, utc_text(event), event.tick, describe(event))
+
+
+@dataclass
+class Source:
+    """One service, as far as it has been heard."""
+
+    heard: float | None = None
+    """When it answered last, on the monotonic clock, s."""
+    reason: str = "not found yet"
+    """Why it is silent; empty while it answers."""
+    records: dict[str, tuple[Any, ...]] = field(default_factory=dict)
+    """Newest record by block."""
+    tick: int = -1
+    moved: float = 0.0
+    """When its tick moved last."""
+
+
+class Model:
+    """What the page knows of one rig.
+
+    Args:
+        now: Monotonic clock, s.
+        kept_s: How much of the trends is kept, s of plant time.
+    """
+
+    def __init__(self, now: Callable[[], float], kept_s: float) -> None:
+        self.now = now
+        self.sources = {service: Source() for service in MAPS}
+        self.trends = TrendStore(kept_s)
+        self.updates: deque[Optimization] = deque(maxlen=UPDATES_KEPT)
+        self.predictions: deque[Prediction] = deque(maxlen=PREDICTIONS_KEPT)
+        self.alarms: list[Alarm] = []
+        self.events: deque[Told] = deque(maxlen=EVENTS_KEPT)
+        self.events_told = 0
+        """Events so far; the last ones are in `events`."""
+        self.changed: set[str] = set()
+        """Names of signals, `alarms`, `updates`, `prediction`: what changed since it was last looked at."""
+        self._values: dict[str, float | int | str] = {}
+        self._session = 0
+        self.replay: dict[str, object] | None = None
+        """State of the replay; None on a rig that is up."""
+        self.on_change: Callable[[], None] = lambda: None
+
+    # -- what readers write --------------------------------------------------------------------------------------------
+
+    def put(self, service: str, record: tuple[Any, ...]) -> None:
+        """Take a record of a service."""
+        block = MAPS[service].block_of(type(record))
+        source = self.sources[service]
+        if source.records.get(block.name) == record:
+            return
+        source.records[block.name] = record
+        for name, value in values_of(service, block, record).items():
+            if self._values.get(name) != value:
+                self._values[name] = value
+                self.changed.add(name)
+        if isinstance(record, Identity):
+            self._identity(service, record)
+        elif isinstance(record, Process):
+            self._moved(source, record.tick)
+            self.trends.add(record, self.mode)
+        elif isinstance(record, Prediction):
+            self._predicted(record)
+
+    def _identity(self, service: str, identity: Identity) -> None:
+        source = self.sources[service]
+        if service == "control_plc":
+            if identity.session != self._session or identity.tick + STEP_BACK < self.trends.last_tick:
+                self._session = identity.session
+                self._begin()
+        elif service == "plant":
+            self._moved(source, identity.tick)
+
+    def _begin(self) -> None:
+        """Another session: nothing that was drawn belongs to it."""
+        self.trends.clear()
+        self.updates.clear()
+        self.predictions.clear()
+        self.changed |= {"updates", "prediction"}
+
+    def _moved(self, source: Source, tick: int) -> None:
+        if tick != source.tick:
+            source.tick, source.moved = tick, self.now()
+
+    def _predicted(self, prediction: Prediction) -> None:
+        if prediction.tick and (not self.predictions or self.predictions[-1].update != prediction.update):
+            self.predictions.append(prediction)
+            self.changed.add("prediction")
+
+    def put_alarms(self, rows: list[Alarm]) -> None:
+        """Take the rows of the alarms."""
+        if rows != self.alarms:
+            self.alarms = rows
+            self.changed.add("alarms")
+
+    def put_updates(self, updates: Iterable[Optimization]) -> None:
+        """Take updates that are new, oldest first."""
+        for update in updates:
+            if self.updates and update.tick < self.updates[-1].tick:
+                self.updates.clear()
+            self.updates.append(update)
+            self.changed.add("updates")
+
+    def put_events(self, events: Iterable[Told]) -> None:
+        """Take events that are new, oldest first."""
+        for told in events:
+            self.events.append(told)
+            self.events_told += 1
+
+    def heard(self, service: str) -> None:
+        """Note that a service has answered."""
+        source = self.sources[service]
+        source.heard, source.reason = self.now(), ""
+        self.on_change()
+
+    def silent(self, service: str, reason: str) -> None:
+        """Note that a service does not answer."""
+        self.sources[service].reason = reason
+        self.on_change()
+
+    # -- what pages read -----------------------------------------------------------------------------------------------
+
+    def record(self, service: str, kind: type[R]) -> R | None:
+        """Return the newest record of a kind; None when none has been read."""
+        return cast("R | None", self.sources[service].records.get(MAPS[service].block_of(kind).name))
+
+    @property
+    def values(self) -> Mapping[str, float | int | str]:
+        """All values by the names of their signals."""
+        return self._values
+
+    @property
+    def mode(self) -> int:
+        """Mode of the ladder."""
+        ladder = self.record("control_plc", LadderStatus)
+        return ladder.mode if ladder else 0
+
+    @property
+    def rule(self) -> UpdatingRuleStatus:
+        """What decides the updating period."""
+        return self.record("optimizer_plc", UpdatingRuleStatus) or UpdatingRuleStatus()
+
+    @property
+    def limits(self) -> OperatingLimits:
+        """Bands, bounds and rates."""
+        return self.record("optimizer_plc", OperatingLimits) or OperatingLimits()
+
+    @property
+    def tick(self) -> int:
+        """Tick of the process that is shown."""
+        process = self.record("control_plc", Process)
+        return process.tick if process else 0
+
+    def age_s(self, service: str) -> float | None:
+        """Return how long ago a service answered; None when it never has."""
+        heard = self.sources[service].heard
+        return None if heard is None else max(0.0, self.now() - heard)
+
+    def is_live(self, service: str) -> bool:
+        """Tell whether a service answers."""
+        age = self.age_s(service)
+        return age is not None and age < STALE_S
+
+    def stands_still(self, service: str) -> bool:
+        """Tell whether the tick of a service does not move although its session goes on by the clock."""
+        pace = self.record("plant", SessionPace)
+        if pace is None or not pace.realtime or pace.paused or not pace.session:
+            return False
+        patience = max(STALE_S, 3 * TICK_S / pace.factor)
+        return self.now() - self.sources[service].moved > patience
+
+    def stale_prefixes(self) -> list[str]:
+        """Return the beginnings of the names of signals that are not current."""
+        stale = [f"{service}." for service in MAPS if not self.is_live(service)]
+        if self.is_live("control_plc") and self.stands_still("control_plc"):
+            stale.append("control_plc.process.")
+        if self.is_live("plant") and self.stands_still("plant"):
+            stale.append("plant.measurement.")
+        return stale
+
+    def alarm_rows(self) -> list[tuple[AlarmKind, Alarm]]:
+        """Return the alarms with their kinds."""
+        return list(zip(AlarmKind, self.alarms, strict=False))
+
+
+STEP_BACK: Final = 20
+"""A tick that goes back by more than this many begins another stretch of time."""

@@ -1,0 +1,56 @@
+"""What the page tells Prometheus: all registers that it reads, alarms, the last update, and the page itself."""
+
+from collections.abc import Iterator
+
+from coldloop.event_text import word
+from coldloop.metrics import Family, Sample, block_families, build_family
+from coldloop.registers.declaration import fields_of
+from coldloop.registers.optimizer_plc import Optimization
+from hmi.model import Model
+from hmi.signals import MAPS
+
+
+def page_families(model: Model, browsers: int) -> Iterator[Family]:
+    """Yield everything; of a service that is silent only that it is."""
+    yield build_family()
+    live = [service for service in MAPS if model.is_live(service)]
+    yield Family(
+        "coldloop_up", "1 while a service answers the page",
+        tuple(Sample(float(service in live), (("service", service),)) for service in MAPS),
+    )  # fmt: skip
+    ages = [(service, model.age_s(service)) for service in MAPS]
+    yield Family(
+        "coldloop_age_seconds", "Time since a service answered last",
+        tuple(Sample(age, (("service", service),)) for service, age in ages if age is not None),
+    )  # fmt: skip
+    yield Family("coldloop_page_browsers", "Streams to browsers", (Sample(float(browsers)),))
+    for service in live:
+        for block in MAPS[service].blocks:
+            record = model.sources[service].records.get(block.name)
+            if record is not None and block.writer is None:
+                yield from block_families(service, block, record)
+    if "control_plc" in live:
+        yield from _alarms(model)
+    if "optimizer_plc" in live and model.updates:
+        yield from _update(model.updates[-1])
+
+
+def _alarms(model: Model) -> Iterator[Family]:
+    rows = [(word(kind), alarm) for kind, alarm in model.alarm_rows()]
+    for name, description, values in (
+        ("coldloop_alarm_active", "1 while the condition of an alarm holds", [row.active for _, row in rows]),
+        ("coldloop_alarm_state",
+         "0 normal, 1 unacknowledged, 2 acknowledged, 3 returned unacknowledged, 4 shelved, 5 out of service",
+         [row.state for _, row in rows]),
+        ("coldloop_alarm_raised", "Times that an alarm was raised", [row.times for _, row in rows]),
+    ):  # fmt: skip
+        samples = tuple(
+            Sample(float(value), (("alarm", alarm),)) for (alarm, _), value in zip(rows, values, strict=True)
+        )
+        yield Family(name, description, samples)
+
+
+def _update(update: Optimization) -> Iterator[Family]:
+    for (name, field), value in zip(fields_of(Optimization).items(), update, strict=True):
+        unit = f" ({field.unit})" if field.unit else ""
+        yield Family(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", (Sample(float(value)),))

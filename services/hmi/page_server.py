@@ -1,0 +1,149 @@
+"""The web server of one page: requests, the stream of changes, and its start and end."""
+
+import asyncio
+import ssl
+import time
+from contextlib import suppress
+from typing import Final, NamedTuple
+
+from aiohttp import web
+
+from coldloop.errors import ConfigurationError, PortInUseError
+from hmi.audit import Audit
+from hmi.broadcast import Broadcast
+from hmi.commanding import LONGEST_REQUEST, Commanding
+from hmi.documents import encoded, state_document
+from hmi.guard import Guard
+from hmi.model import Model
+from hmi.operator_desk import OperatorDesk
+from hmi.reading import STATIC, Reading
+from hmi.settings import HmiSection
+from hmi.users import Users
+
+SHORTEST_S: Final = 0.1
+"""Between two messages of the stream."""
+LONGEST_S: Final = 0.4
+"""Without news the stream says that the page lives, and how old everything is."""
+SHUTDOWN_S: Final = 0.5
+
+
+class Exhibit(NamedTuple):
+    """One rig, or one recorded run, and what can be done with it."""
+
+    model: Model
+    desk: OperatorDesk | None = None
+    """Carries out commands; None where there are none."""
+    routes: tuple[web.AbstractRouteDef, ...] = ()
+    """Further requests that are served."""
+
+
+class PageServer:
+    """Serves one exhibit to browsers, or several side by side.
+
+    Args:
+        settings: Of the page.
+        exhibits: What is shown.
+
+    Raises:
+        ConfigurationError: A file of the settings cannot be used.
+    """
+
+    def __init__(self, settings: HmiSection, *exhibits: Exhibit) -> None:
+        self._settings = settings
+        self._audit = Audit(settings.audit)
+        self._guard = Guard(settings, self._audit)
+        self._users = Users(settings.login.users)
+        self._streams: list[tuple[Model, Broadcast, asyncio.Event]] = []
+        app = web.Application(middlewares=[self._guard.middleware], client_max_size=LONGEST_REQUEST)
+        if len(exhibits) == 1:
+            app.add_routes(self._routes(exhibits[0]))
+        else:
+            app.add_routes([web.get("/", _side_by_side), web.static("/static", STATIC)])
+            for number, exhibit in enumerate(exhibits, 1):
+                part = web.Application()
+                part.add_routes(self._routes(exhibit))
+                app.add_subapp(f"/run/{number}/", part)
+        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S)
+        self.port = 0
+
+    def _routes(self, exhibit: Exhibit) -> list[web.AbstractRouteDef]:
+        model, desk, extra = exhibit
+        broadcast = Broadcast(lambda: message(state_document(model)), self._settings.browsers)
+        news = asyncio.Event()
+        model.on_change = news.set
+        self._streams.append((model, broadcast, news))
+        reading = Reading(self._settings, model, broadcast, self._guard, self._users, replay=desk is None)
+        commanding = Commanding(self._settings, self._guard, self._users, desk, self._audit)
+        return [*reading.routes(), *commanding.routes(), *extra]
+
+    async def start(self) -> None:
+        """Listen.
+
+        Raises:
+            PortInUseError: Somebody else does already.
+            ConfigurationError: The files for HTTPS cannot be used.
+        """
+        settings = self._settings
+        await self._runner.setup()
+        site = web.TCPSite(self._runner, settings.host, settings.port, ssl_context=_https(settings))
+        try:
+            await site.start()
+        except OSError as error:
+            await self._runner.cleanup()
+            raise PortInUseError(
+                f"{settings.host}:{settings.port}: {error.strerror}; give another port with hmi.port"
+            ) from None
+        self.port = self._runner.addresses[0][1]
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds the page."""
+        name = "127.0.0.1" if self._settings.host in {"0.0.0.0", "::"} else self._settings.host  # noqa: S104
+        host = f"[{name}]" if ":" in name else name
+        return f"{'https' if self._settings.https else 'http'}://{host}:{self.port}/"
+
+    async def run(self) -> None:
+        """Send what changes to all browsers until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            for stream in self._streams:
+                tasks.create_task(_send_changes(*stream), name="stream")
+
+    async def close(self) -> None:
+        """End all streams and stop listening."""
+        await self._runner.cleanup()
+
+
+async def _send_changes(model: Model, broadcast: Broadcast, news: asyncio.Event) -> None:
+    sent = 0.0
+    while True:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(LONGEST_S):
+                await news.wait()
+        await asyncio.sleep(max(0.0, sent + SHORTEST_S - time.monotonic()))
+        news.clear()
+        sent = time.monotonic()
+        changed, model.changed = model.changed, set()
+        if len(broadcast):
+            broadcast.send(message(state_document(model, changed)))
+
+
+async def _side_by_side(_request: web.Request) -> web.StreamResponse:
+    return web.FileResponse(STATIC / "two-runs.html")
+
+
+def message(document: dict[str, object]) -> bytes:
+    """Return a document as a server-sent event."""
+    return b"data: " + encoded(document) + b"\n\n"
+
+
+def _https(settings: HmiSection) -> ssl.SSLContext | None:
+    if settings.https is None:
+        return None
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(settings.https.certificate, settings.https.key)
+    except (OSError, ssl.SSLError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ConfigurationError(f"hmi.https: {settings.https.certificate}, {settings.https.key}: {reason}") from None
+    return context

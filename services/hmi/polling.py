@@ -1,0 +1,152 @@
+"""Reads the three services over Modbus, once for all browsers, and goes on looking when one is silent."""
+
+import asyncio
+import logging
+import time
+from typing import Any, Final
+
+from coldloop.endpoints import Endpoint
+from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
+from coldloop.modbus.client import RegisterClient
+from coldloop.registers.audit import EVENT_ROWS, Event, JournalPage
+from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStatus, Process, Status
+from coldloop.registers.optimizer_plc import HISTORY_ROWS, ControlLinkStatus, Optimization, Prediction
+from coldloop.registers.plant import LoadStatus
+from coldloop.registers.safety import Alarm, AlarmKind
+from hmi.model import Model, Told
+from hmi.signals import MAPS, shown_blocks
+
+log = logging.getLogger("coldloop.hmi")
+
+FAST: Final[dict[str, tuple[type[tuple[Any, ...]], ...]]] = {
+    "plant": (Identity, SessionPace, LoadStatus),
+    "control_plc": (LadderStatus, Process, Status, PlantLinkStatus, Operator),
+    "optimizer_plc": (ControlLinkStatus,),
+}
+"""Records that are read in each look; the mode is read before the process that is drawn with it."""
+SLOW_S: Final = 1.0
+"""Time between two looks at a record that is not among these."""
+ALARMS_S: Final = 0.25
+RETRY_S: Final = 0.25
+UPDATES_AT_ONCE: Final = 64
+"""When there are more new updates, as with a high factor, only the newest are read."""
+EVENTS_AT_ONCE: Final = 64
+
+
+class Poller:
+    """Reads one service until cancelled.
+
+    Args:
+        service: Which one.
+        endpoint: Where it is.
+        model: What is told of it.
+        poll_s: Time between two looks.
+    """
+
+    def __init__(self, service: str, endpoint: Endpoint, model: Model, poll_s: float) -> None:
+        self._service = service
+        self._model = model
+        self._poll_s = poll_s
+        self._client = RegisterClient.at(MAPS[service], endpoint)
+        self._slow = [block.record for block in shown_blocks(MAPS[service]) if block.record not in FAST[service]]
+        self._slow_at = 0.0
+        self._alarms_at = 0.0
+        self._next_event = 0
+        self._next_update = 0
+        self._checked = False
+        self._told = ""
+
+    async def run(self) -> None:
+        """Read on and on."""
+        try:
+            while True:
+                begun = time.monotonic()
+                try:
+                    await self._look()
+                except LinkError as error:
+                    self._lose(error)
+                    await asyncio.sleep(RETRY_S)
+                else:
+                    self._found()
+                    await asyncio.sleep(max(0.005, begun + self._poll_s - time.monotonic()))
+        finally:
+            self._client.close()
+
+    def _lose(self, error: LinkError) -> None:
+        self._client.close()
+        self._checked = False
+        self._model.silent(self._service, str(error))
+        if str(error) != self._told:
+            self._told = str(error)
+            log.warning("silent", extra={"peer": self._service, "reason": self._told})
+
+    def _found(self) -> None:
+        self._model.heard(self._service)
+        if self._told:
+            self._told = ""
+            log.info("answers", extra={"peer": self._service})
+
+    async def _look(self) -> None:
+        if not self._checked:
+            await self._client.connect(0.0)
+            self._checked = True
+            self._slow_at = 0.0
+        model, service = self._model, self._service
+        model.put(service, await self._client.read(Identity))
+        for record in FAST[service]:
+            model.put(service, await self._client.read(record))
+        if service == "optimizer_plc":
+            await self._read_updates()
+        now = time.monotonic()
+        if service == "control_plc" and now - self._alarms_at >= ALARMS_S:
+            self._alarms_at = now
+            model.put_alarms(await self._client.read_rows(Alarm, 0, len(AlarmKind)))
+        if now - self._slow_at >= SLOW_S:
+            self._slow_at = now
+            await self._read_slow()
+        else:
+            model.put(service, await self._client.read(JournalPage))
+        await self._read_events()
+
+    async def _read_slow(self) -> None:
+        for record in self._slow:
+            try:
+                self._model.put(self._service, await self._client.read(record))
+            except (DamagedAnswerError, RequestRefusedError):  # not sealed: nobody has written it yet
+                continue
+
+    async def _read_updates(self) -> None:
+        identity = self._model.record("optimizer_plc", Identity)
+        if identity is None or not identity.heartbeat:
+            self._next_update = 0
+            return
+        (newest,) = await self._client.read_rows(Optimization, (identity.heartbeat - 1) % HISTORY_ROWS, 1)
+        if newest.update + 1 < self._next_update:
+            self._next_update = 0
+        first = max(self._next_update, newest.update + 1 - UPDATES_AT_ONCE)
+        if first > newest.update:
+            return
+        rows = await self._rows(Optimization, first, newest.update, HISTORY_ROWS)
+        self._model.put_updates(sorted(row for row in rows if first <= row.update <= newest.update and row.tau_u))
+        self._next_update = newest.update + 1
+        self._model.put("optimizer_plc", await self._client.read(Prediction))
+
+    async def _read_events(self) -> None:
+        page = self._model.record(self._service, JournalPage)
+        if page is None or page.newest + 1 == self._next_event:
+            return
+        if page.newest < self._next_event:  # it counts anew
+            self._next_event = 0
+        first = max(self._next_event, page.newest - EVENTS_AT_ONCE + 1, 1)
+        rows = await self._rows(Event, first, page.newest, EVENT_ROWS)
+        news = sorted(row for row in rows if first <= row.number <= page.newest)
+        self._model.put_events(Told.of(self._service, row) for row in news)
+        self._next_event = page.newest + 1
+
+    async def _rows(self, record: type[Any], first: int, last: int, ring: int) -> list[Any]:
+        """Return rows `first` to `last` of a ring of rows."""
+        start, count = first % ring, max(0, last - first + 1)
+        behind = min(count, ring - start)
+        rows = await self._client.read_rows(record, start, behind)
+        return rows + await self._client.read_rows(record, 0, count - behind)

@@ -1,0 +1,210 @@
+"""Replays a recorded run into a model, at any speed: the page is the same as that of a rig that is up."""
+
+import asyncio
+import math
+import time
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple, Protocol
+
+from aiohttp import web
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from coldloop.process import TICK_S
+from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.control_plc import LadderStatus, Process
+from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
+from coldloop.registers.plant import LoadStatus
+from hmi.guard import refusal
+from hmi.model import Model, Told
+from hmi.page_server import Exhibit, PageServer
+from hmi.settings import HmiSection
+from hmi.signals import MAPS
+
+STEP_S: Final = 0.1
+MOST_AT_ONCE: Final = 400
+"""Ticks that one step of a fast replay draws; of more some are left out."""
+
+
+class Frame(NamedTuple):
+    """One tick of a run."""
+
+    process: Process
+    mode: int
+    cause: int
+
+
+class RecordedRun(Protocol):
+    """What a replay needs of a run."""
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+
+    @property
+    def ticks(self) -> int:
+        """Ticks that were recorded, from 0 on."""
+
+    @property
+    def updates(self) -> Sequence[Optimization]:
+        """Updates in their order."""
+
+    @property
+    def events(self) -> Sequence[Told]:
+        """Events in the order of their ticks."""
+
+    @property
+    def rule(self) -> UpdatingRuleStatus:
+        """What decided the updating period."""
+
+    @property
+    def limits(self) -> OperatingLimits:
+        """Bands, bounds and rates."""
+
+    def frame(self, tick: int) -> Frame:
+        """Return one tick."""
+
+
+class Wish(BaseModel):
+    """What a browser asks of a replay."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    playing: bool | None = None
+    speed: float | None = Field(default=None, gt=0, le=10_000)
+    tick: int | None = Field(default=None, ge=0)
+
+
+class Replay:
+    """Plays a run.
+
+    Args:
+        run: What is played.
+        model: What it is shown in.
+        kept_s: How much of it the trends have, s.
+    """
+
+    def __init__(self, run: RecordedRun, model: Model, kept_s: float) -> None:
+        self._run = run
+        self._model = model
+        self._kept_ticks = round(kept_s / TICK_S)
+        self._playing = False
+        self._speed = 20.0
+        self._tick = -1
+        self._begin()
+        self._go_to(min(run.ticks - 1, round(600 / TICK_S)))
+
+    def routes(self) -> tuple[web.AbstractRouteDef, ...]:
+        """Return what is served."""
+        return (web.get("/api/replay", self.state), web.post("/api/replay", self.steer))
+
+    async def state(self, _request: web.Request) -> web.Response:
+        """Answer with where the replay is."""
+        return web.json_response(self._model.replay)
+
+    async def steer(self, request: web.Request) -> web.Response:
+        """Play, stand still, go elsewhere."""
+        try:
+            wish = Wish.model_validate_json(await request.text())
+        except ValidationError as error:
+            first = error.errors()[0]
+            return refusal(422, f"{'.'.join(map(str, first['loc'])) or 'request'}: {first['msg']}")
+        if wish.speed is not None:
+            self._speed = wish.speed
+        if wish.tick is not None:
+            self._go_to(min(wish.tick, self._run.ticks - 1))
+        if wish.playing is not None:
+            self._playing = wish.playing
+            if self._playing and self._tick >= self._run.ticks - 1:
+                self._go_to(0)
+        self._show()
+        return web.json_response(self._model.replay)
+
+    async def run(self) -> None:
+        """Play until cancelled."""
+        position, last = float(self._tick), time.monotonic()
+        while True:
+            self._show()
+            await asyncio.sleep(STEP_S)
+            now = time.monotonic()
+            if int(position) != self._tick:  # somebody went elsewhere
+                position = float(self._tick)
+            if self._playing:
+                position = min(self._run.ticks - 1.0, position + (now - last) * self._speed / TICK_S)
+                self._advance(int(position))
+                self._playing = self._tick < self._run.ticks - 1
+            last = now
+
+    # -- what the model is told ----------------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        model = self._model
+        model.put("control_plc", Identity(session=1))
+        model.put("optimizer_plc", self._run.rule)
+        model.put("optimizer_plc", self._run.limits)
+
+    def _go_to(self, tick: int) -> None:
+        """Show the run up to a tick as if it had just been played until there."""
+        model = self._model
+        model.trends.clear()
+        model.updates.clear()
+        model.events.clear()
+        self._tick = max(-1, tick - self._kept_ticks) - 1
+        started = self._tick
+        updates, events = self._run.updates, self._run.events
+        model.put_updates(updates[: bisect_right(updates, started, key=lambda update: update.tick)])
+        model.put_events(events[: bisect_right(events, started, key=lambda told: told.tick)])
+        self._advance(tick, tick - started)
+
+    def _advance(self, tick: int, points: int = MOST_AT_ONCE) -> None:
+        if tick <= self._tick:
+            return
+        run, model, before = self._run, self._model, self._tick
+        every = max(1, math.ceil((tick - before) / points))
+        for each in range(before + 1, tick, every):
+            frame = run.frame(each)
+            model.trends.add(frame.process, frame.mode)
+        self._tick = tick
+        self._put(run.frame(tick))
+        updates, events = run.updates, run.events
+        first, last = (bisect_right(updates, one, key=lambda update: update.tick) for one in (before, tick))
+        model.put_updates(updates[first:last])
+        first, last = (bisect_right(events, one, key=lambda told: told.tick) for one in (before, tick))
+        model.put_events(events[first:last])
+
+    def _put(self, frame: Frame) -> None:
+        model, process = self._model, frame.process
+        model.put("control_plc", LadderStatus(frame.mode, frame.cause, 0, 1, 0, 0))
+        model.put("control_plc", process)
+        model.put("plant", LoadStatus(watts=process.load))
+
+    def _show(self) -> None:
+        for service in MAPS:
+            self._model.put(service, Identity(session=1, tick=self._tick))
+            self._model.heard(service)
+        self._model.put("plant", SessionPace(1, 1, self._speed, int(not self._playing)))
+        self._model.replay = {
+            "name": self._run.name, "playing": self._playing, "speed": self._speed, "tick": self._tick,
+            "last_tick": self._run.ticks - 1,
+        }  # fmt: skip
+
+
+async def serve_replays(runs: Sequence[RecordedRun], settings: HmiSection, announce: Callable[[str], None]) -> None:
+    """Serve one run, or several side by side, until cancelled.
+
+    Raises:
+        PortInUseError: Somebody else listens there.
+        ConfigurationError: A file of the settings cannot be used.
+    """
+    models = [Model(time.monotonic, settings.kept_s) for _ in runs]
+    replays = [Replay(run, model, settings.kept_s) for run, model in zip(runs, models, strict=True)]
+    server = PageServer(settings, *(Exhibit(m, None, r.routes()) for m, r in zip(models, replays, strict=True)))
+    await server.start()
+    announce(server.address)
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(server.run(), name="streams")
+            for replay in replays:
+                tasks.create_task(replay.run(), name="replay")
+    finally:
+        await server.close()

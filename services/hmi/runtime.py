@@ -1,0 +1,46 @@
+"""The page of a rig that is up: pollers, server and operator's desk in one event loop."""
+
+import asyncio
+import logging
+import time
+
+from coldloop.endpoints import Endpoint
+from hmi.model import Model
+from hmi.operator_desk import OperatorDesk
+from hmi.page_server import Exhibit, PageServer
+from hmi.polling import Poller
+from hmi.settings import HmiSection, HmiSettings
+from hmi.signals import MAPS
+
+log = logging.getLogger("coldloop.hmi")
+
+
+async def serve(settings: HmiSettings) -> None:
+    """Serve the page until cancelled.
+
+    Raises:
+        ConfigurationError: A file of the settings cannot be used.
+        PortInUseError: Somebody else listens there.
+    """
+    hmi = settings.hmi
+    model = Model(time.monotonic, hmi.kept_s)
+    desk = OperatorDesk(operator_endpoints(hmi), model, time.monotonic, training=hmi.training)
+    server = PageServer(hmi, Exhibit(model, desk))
+    pollers = [Poller(service, getattr(hmi, service), model, hmi.poll_s) for service in MAPS]
+    await server.start()
+    log.info("serving", extra={"host": hmi.host, "port": server.port, "address": server.address})
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(server.run(), name="stream")
+            for service, poller in zip(MAPS, pollers, strict=True):
+                tasks.create_task(poller.run(), name=f"poll {service}")
+    finally:
+        await server.close()
+
+
+def operator_endpoints(hmi: HmiSection) -> dict[str, Endpoint]:
+    """Return where the services are for commands: with the operator's certificate, if there is one."""
+    ends: dict[str, Endpoint] = {service: getattr(hmi, service) for service in MAPS}
+    if hmi.operator_tls is None:
+        return ends
+    return {service: end.model_copy(update={"tls": hmi.operator_tls}) for service, end in ends.items()}

@@ -1,0 +1,118 @@
+"""One sentence that says why an updating period is as long as it is."""
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from coldloop.event_text import word
+from coldloop.process import TICK_S
+from coldloop.registers.control_plc import Verdict
+from coldloop.registers.optimizer_plc import UpdatingRuleStatus
+from hmi.explanation import Branch, Explanation
+
+AT_REST: Final = 1e-9
+"""A Gamma that is smaller is rounding: the cost is at its floor."""
+
+
+def sentence(found: Explanation, rule: UpdatingRuleStatus) -> str:
+    """Return why the period is as long as it is, in one sentence or two."""
+    return _WORDS[found.branch](found, rule)
+
+
+def _change(found: Explanation) -> str:
+    now, then = found.period_s, found.period_before_s
+    if then is None:
+        return f"tau_u is {now:g} s"
+    if now == then:
+        return f"tau_u stays at {now:g} s"
+    return f"tau_u {'rises' if now > then else 'falls'} from {then:g} s to {now:g} s"
+
+
+def _fixed(found: Explanation, _rule: UpdatingRuleStatus) -> str:
+    return (
+        f"tau_u is {found.period_s:g} s because the session has a fixed updating period; q = {found.iterations} "
+        "iterations fit into it."
+    )
+
+
+def _first(found: Explanation, rule: UpdatingRuleStatus) -> str:
+    return f"tau_u is {found.period_s:g} s because this is the first update: q starts at {rule.q_first}."
+
+
+def _begun_again(found: Explanation, rule: UpdatingRuleStatus) -> str:
+    return (
+        f"{_change(found)} because the optimiser had to begin again (a restart, or somebody else moved the inputs): "
+        f"q starts at {rule.q_first}."
+    )
+
+
+def _unknown(found: Explanation, _rule: UpdatingRuleStatus) -> str:
+    return (
+        f"tau_u is {found.period_s:g} s; the update before was not played or is not recorded, so there was nothing to "
+        "learn from (a load step that interrupts, a late sequence, or a restart)."
+    )
+
+
+def _interrupted(found: Explanation, rule: UpdatingRuleStatus) -> str:
+    elapsed = (found.update.tick - found.before.tick) * TICK_S if found.before else 0.0
+    return (
+        f"{_change(found)} because a load step ended the period before after {elapsed:g} s of "
+        f"{found.period_before_s:g} s: what was learnt is void and q starts at {rule.q_first}."
+    )
+
+
+def _late(found: Explanation, _rule: UpdatingRuleStatus) -> str:
+    verdict = found.before.verdict if found.before else Verdict.NONE
+    text = word(Verdict(verdict)) if verdict in Verdict.__members__.values() else str(verdict)
+    return (
+        f"{_change(found)} because the sequence before did not take effect at its instant (verdict: {text}): there was "
+        f"nothing to learn from, and q stays at {found.iterations}."
+    )
+
+
+def _algorithm_1(found: Explanation, _rule: UpdatingRuleStatus) -> str:
+    K, gamma = found.update.contraction, found.update.gamma
+    if K >= 1.0:
+        looks = f"K = {K:.6g} is not below 1 (the cost does not fall), so K itself is to fall: dK/dq"
+    else:
+        looks = f"K = {K:.6g} is below 1 (the cost falls), so the response time is to fall: dt_r/dq"
+    if found.branch is Branch.LEVEL:
+        return f"{_change(found)} because {looks} = 0 says that q makes no difference."
+    fewer = found.branch is Branch.DOWN
+    asks = f"{looks} = {gamma:.3g} {'>' if fewer else '<'} 0 asks for {'fewer' if fewer else 'more'} iterations"
+    rest = " (at rest: the cost is at its floor, and rounding decides)" if abs(gamma) < AT_REST else ""
+    return f"{_change(found)} because {asks}{rest}; {_step(found, fewer=fewer)}."
+
+
+def _step(found: Explanation, *, fewer: bool) -> str:
+    q = found.iterations
+    if found.iterations_before is None:
+        return f"q becomes {q}"
+    if q != found.iterations_before:
+        return f"q goes from {found.iterations_before} to {q}"
+    return f"q stays at {q}, as q_{'min' if fewer else 'max'} allows no {'fewer' if fewer else 'more'}"
+
+
+def _contraction(found: Explanation, rule: UpdatingRuleStatus) -> str:
+    q, before = found.iterations, found.before
+    if q == rule.q_max and before is not None and found.update.j_effective > before.j_delivered:
+        ratio = found.update.j_effective / before.j_delivered
+        return (
+            f"{_change(found)} because the cost that was reached is {ratio:.3g} times the one predicted: a surprise is "
+            f"answered by one long solve of q = {q}."
+        )
+    return (
+        f"{_change(found)} because of how much successive profiles have improved lately: the contraction rule goes "
+        f"from q = {rule.q_min} while they do to more in quiet; here q = {q}."
+    )
+
+
+_WORDS: Final[Mapping[Branch, Callable[[Explanation, UpdatingRuleStatus], str]]] = {
+    Branch.FIXED: _fixed,
+    Branch.FIRST: _first,
+    Branch.BEGUN_AGAIN: _begun_again,
+    Branch.UNKNOWN: _unknown,
+    Branch.INTERRUPTED: _interrupted,
+    Branch.LATE: _late,
+    Branch.CONTRACTION: _contraction,
+    **dict.fromkeys((Branch.DOWN, Branch.UP, Branch.LEVEL), _algorithm_1),
+}

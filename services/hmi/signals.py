@@ -1,0 +1,91 @@
+"""The signals of the page, derived from the register declarations: a new register or alarm appears by itself.
+
+A signal is a register of a block with one row; its name is `service.block.register`, such as `plant.measurement.y.T5`.
+"""
+
+import re
+from collections.abc import Mapping
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+from coldloop.registers.control_plc import CONTROL_MAP
+from coldloop.registers.declaration import Block, Kind, RegisterMap, fields_of
+from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
+from coldloop.registers.plant import PLANT_MAP
+from coldloop.registers.text import from_words
+
+MAPS: Final[Mapping[str, RegisterMap]] = {one.service: one for one in (PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP)}
+DECIMALS: Final = {"%": 2, "K": 3, "bar": 3, "W": 1, "Hz": 1, "s": 3, "ms": 2, "ppm": 1, "Pa": 0, "m3": 5}
+_WORD: Final = re.compile(r"(\d+) ([^,;:()]+?)(?: \([^)]*\))?(?=[,;:]|$)")
+
+
+class Signal(NamedTuple):
+    """One value that the page can show."""
+
+    name: str
+    block: str
+    label: str
+    unit: str
+    decimals: int | None
+    """None for whole numbers."""
+    words: dict[int, str]
+    """Meaning of the numbers of an enumeration; empty for other signals."""
+    description: str
+    address: int
+    writer: str
+
+
+def words_in(description: str) -> dict[int, str]:
+    """Return what a description such as "0 auto, 1 classical loops" says of each number; empty when it says nothing."""
+    found = {int(number): text.strip() for number, text in _WORD.findall(description)}
+    return found if len(found) > 1 and re.match(r"\d+ ", description) else {}
+
+
+def shown_blocks(register_map: RegisterMap) -> list[Block]:
+    """Return the blocks that the page shows value by value: those with one row."""
+    return [block for block in register_map.blocks if block.rows == 1]
+
+
+def _texts(block: Block) -> set[str]:
+    return {name for name, field in fields_of(block.record).items() if field.is_text}
+
+
+@cache
+def signals_of(service: str) -> tuple[Signal, ...]:
+    """Return the signals of a service, in the order of their registers."""
+    found: list[Signal] = []
+    for block in shown_blocks(MAPS[service]):
+        texts, seen = _texts(block), set[str]()
+        for register in block.registers():
+            field = register.name.partition(".")[0]
+            label = field if field in texts else register.name
+            if label in seen:
+                continue
+            seen.add(label)
+            floating = register.kind is Kind.F32
+            found.append(
+                Signal(
+                    name=f"{service}.{block.name}.{label}", block=block.name, label=label, unit=register.unit,
+                    decimals=DECIMALS.get(register.unit, 4) if floating else None,
+                    words={} if floating else words_in(register.description), description=register.description,
+                    address=register.address, writer=register.writer.value if register.writer else "",
+                )
+            )  # fmt: skip
+    return tuple(found)
+
+
+def values_of(service: str, block: Block, record: tuple[Any, ...]) -> dict[str, float | int | str]:
+    """Return the values of a record by the names of their signals; texts are decoded."""
+    values: dict[str, float | int | str] = {}
+    texts = _texts(block)
+    prefix = f"{service}.{block.name}."
+    for (name, field), value in zip(fields_of(block.record).items(), record, strict=True):
+        if name in texts:
+            values[prefix + name] = from_words(value)
+        elif field.elements:
+            values.update(
+                (f"{prefix}{name}.{element}", one) for element, one in zip(field.elements, value, strict=True)
+            )
+        else:
+            values[prefix + name] = value
+    return values

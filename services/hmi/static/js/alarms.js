@@ -1,0 +1,92 @@
+// The alarm line that is always in sight, the list of alarms, the history, the audit.
+import { ask, element, isStale, onChange, state, timeText } from "./store.js";
+import { command } from "./commands.js";
+
+const LETTERS = { 4: "C", 3: "H", 2: "M", 1: "L" };
+const WAITING = ["unacknowledged", "returned"];
+const STATES = { returned: "returned unacknowledged", acknowledged: "acknowledged", unacknowledged: "unacknowledged" };
+const byId = (id) => document.getElementById(id);
+
+function badge(alarm) {
+  const quiet = !["unacknowledged", "acknowledged", "returned"].includes(alarm.state);
+  return element("span", { class: `shape ${quiet ? "idle" : `p${alarm.priority}`}`, "aria-hidden": "true", text: LETTERS[alarm.priority] || "" });
+}
+
+function line() {
+  const holder = byId("alarm-line"), told = state.alarms.filter((one) => ["unacknowledged", "acknowledged", "returned"].includes(one.state));
+  const waiting = told.filter((one) => WAITING.includes(one.state)).length;
+  const hidden = state.alarms.filter((one) => ["shelved", "out of service"].includes(one.state)).length;
+  const parts = told.slice(0, 4).map((one) => element("a", { class: `alarm ${WAITING.includes(one.state) ? "unacknowledged" : ""}`, href: "#alarms" }, badge(one), `${one.name}${one.cause ? ` (${one.cause})` : ""}, ${STATES[one.state]}`));
+  if (!parts.length) parts.push(element("span", { class: "minor", text: state.catalog.replay ? "A recorded run: its alarms are in the history" : "No alarms" }));
+  const counts = `${told.length} alarms, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}`;
+  holder.replaceChildren(element("span", { class: "told" }, ...parts), element("span", { class: "count", text: counts }));
+  if (waiting) holder.append(element("button", { type: "button", class: "quiet operate-only", text: "Acknowledge all", hidden: !state.me.operates, onclick: () => command({ kind: "alarm", alarm: 65535, action: 1 }, true) }));
+}
+
+function actions(alarm) {
+  const does = state.catalog.alarm_actions, act = (name, time = 0, now = false) => () => command({ kind: "alarm", alarm: alarm.number, action: does[name], time_s: time }, now);
+  const button = (text, onclick) => element("button", { type: "button", text, onclick, "aria-label": `${text}: ${alarm.name}` });
+  const box = element("div", { class: "buttons" });
+  if (WAITING.includes(alarm.state)) box.append(button("Acknowledge", act("acknowledge", 0, true)));
+  if (alarm.state === "shelved") box.append(button("Unshelve", act("unshelve")));
+  else if (alarm.state !== "out of service") {
+    const time = element("select", { "aria-label": `Shelve ${alarm.name} for` }, ...[["15 min", 900], ["1 h", 3600], ["8 h", 28800]].map(([text, value]) => element("option", { value, text })));
+    box.append(button("Shelve", () => act("shelve", Number(time.value))()), time);
+  }
+  box.append(alarm.state === "out of service" ? button("In service", act("in service")) : button("Out of service", act("out of service")));
+  return box;
+}
+
+function row(one) {
+  return element("tr", { class: WAITING.includes(one.state) ? "unacknowledged" : "", "data-alarm": one.name },
+    element("td", {}, badge(one), ` ${one.priority_word}`), element("td", { text: one.name }),
+    element("td", { class: "alarm-state", text: `${STATES[one.state] || one.state}${one.active ? ", active" : ""}${one.state === "shelved" ? ` until ${timeText(one.shelved_until_s)}` : ""}` }),
+    element("td", { text: one.cause }), element("td", { class: "number", text: one.times ? timeText(one.raised_s) : "" }), element("td", { class: "number", text: one.times }),
+    element("td", {}, state.me.operates ? actions(one) : ""));
+}
+
+// Only rows that have changed are made anew: a button is not replaced under somebody's hand.
+const rows = new Map();
+function table() {
+  const body = byId("alarm-table").querySelector("tbody");
+  state.alarms.forEach((one, place) => {
+    const text = JSON.stringify([one, state.me.operates]), known = rows.get(one.number);
+    if (!known || known.text !== text) {
+      const made = row(one);
+      if (known) known.row.replaceWith(made);
+      rows.set(one.number, { row: made, text });
+    }
+    const own = rows.get(one.number).row;
+    if (body.children[place] !== own) body.insertBefore(own, body.children[place] || null);
+  });
+}
+
+async function history() {
+  if (byId("alarms").hidden) return;
+  const query = `search=${encodeURIComponent(byId("event-search").value)}&service=${encodeURIComponent(byId("event-service").value)}`;
+  byId("event-csv").href = `api/events.csv?${query}`;
+  try {
+    const { found, events } = await ask(`api/events?${query}`);
+    byId("event-count").textContent = `${found} events${found > events.length ? `, the newest ${events.length} shown` : ""}`;
+    byId("event-table").querySelector("tbody").replaceChildren(...events.map((one) => element("tr", {}, element("td", { text: timeText(one.time_s) }), element("td", { text: one.utc.replace("T", " ").replace("Z", "") }), element("td", { text: one.service }), element("td", { text: one.sentence }))));
+  } catch { /* the banner says it */ }
+  if (!state.me.operates) return;
+  try {
+    const { entries } = await ask("api/audit");
+    byId("audit-table").querySelector("tbody").replaceChildren(...entries.slice(0, 200).map((one) => element("tr", {}, element("td", { text: one.utc.replace("T", " ").replace("Z", "") }), element("td", { text: one.who || "nobody" }), element("td", { text: one.what }), element("td", { text: one.outcome, class: one.outcome === "done" ? "" : "refused" }), element("td", { text: one.detail }))));
+  } catch { /* logged out meanwhile */ }
+}
+
+export function initAlarms() {
+  for (const service of state.catalog.services) byId("event-service").append(element("option", { value: service, text: service }));
+  byId("event-search").addEventListener("input", history);
+  byId("event-service").addEventListener("change", history);
+  onChange(({ alarms, names }) => {
+    if (alarms || names === null) { line(); table(); }
+    byId("alarm-line").classList.toggle("stale", isStale("control_plc."));
+    byId("alarm-table").classList.toggle("stale", isStale("control_plc."));
+  });
+  setInterval(history, 1500);
+}
+
+export function redrawAlarms() { line(); table(); history(); }

@@ -1,0 +1,150 @@
+// Charts over plant time: lines, bands, predictions, marks and the ribbon of modes, drawn with uPlot.
+import uPlot from "../vendor/uPlot.js";
+import { timeText } from "./store.js";
+
+export function colour(name) { return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim(); }
+
+const MODE_SHADE = { mpc: null, rest: "medium-ground", hold: "high-ground", classical: "low-ground", manual: "ahead" };
+
+// lines: [{label, stroke, stepped, width}], options: {title, unit, decimals, log, band, sync, axis, small}
+export function makeChart(holder, lines, options) {
+  const extra = { band: null, predictions: [], marks: [], modes: [], now: null };
+  const axis = (side) => ({
+    stroke: colour("muted"), grid: { stroke: colour("line"), width: 0.5 }, ticks: { stroke: colour("line"), width: 0.5, size: 4 },
+    font: "11px system-ui, sans-serif", ...side,
+  });
+  const title = document.createElement("div");
+  title.className = "title";
+  title.append(...(lines.length > 1 ? lines.flatMap((line) => [swatch(line), line.name || line.label]) : []), ` ${options.title}`);
+  holder.append(title);
+  const size = () => ({ width: Math.max(80, holder.clientWidth), height: Math.max(40, holder.clientHeight) });
+  const chart = new uPlot({
+    ...size(),
+    padding: [4, 8, options.axis ? 0 : 4, 0],
+    legend: { show: false },
+    cursor: { sync: options.sync ? { key: options.sync, setSeries: false } : undefined, drag: { x: Boolean(options.onZoom), y: false, setScale: false }, points: { size: 5 }, y: false },
+    scales: { x: { time: false, range: (_u, low, high) => options.range ? options.range(low, high) : [low, high] },
+      y: options.log ? { distr: 3 } : { range: (_u, low, high) => spread(low, high, extra.band, options.spread) } },
+    axes: [
+      axis({ show: Boolean(options.axis), size: 24, values: (_u, ticks) => ticks.map(timeText), space: 90 }),
+      axis({ size: options.small ? 42 : 58, space: 22, ...(options.log ? { filter: decades, grid: { stroke: colour("line"), width: 0.5, filter: decades } } : {}), values: (_u, ticks) => ticks.map((tick) => (tick === null ? "" : short(tick))) }),
+    ],
+    series: [{}, ...lines.map((line) => ({
+      label: line.label, stroke: () => colour(line.stroke), width: line.width || 1.4, points: { show: false }, dash: line.dash,
+      paths: line.stepped ? uPlot.paths.stepped({ align: 1 }) : undefined, spanGaps: true,
+    }))],
+    hooks: {
+      drawClear: [(u) => drawGround(u, extra)],
+      draw: [(u) => drawAhead(u, extra, lines)],
+      setCursor: options.onCursor ? [(u) => options.onCursor(u)] : [],
+      setSelect: options.onZoom ? [(u) => { if (u.select.width > 4) options.onZoom(u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")); u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false); }] : [],
+    },
+  }, [[], ...lines.map(() => [])], holder);
+  if (options.onPick) chart.over.addEventListener("click", () => { if (chart.cursor.left >= 0) options.onPick(chart.posToVal(chart.cursor.left, "x")); });
+  new ResizeObserver(() => chart.setSize(size())).observe(holder);
+  return { chart, extra, show(data, more = {}) { Object.assign(extra, more); chart.setData(data); } };
+}
+
+function swatch(line) {
+  const made = document.createElement("span");
+  made.className = "swatch";
+  made.style.borderColor = `var(--${line.stroke})`;
+  if (line.dash) made.style.borderTopStyle = "dashed";
+  return made;
+}
+
+// Of a logarithmic axis only the decades are shown.
+const decades = (_u, splits) => splits.map((value) => (value > 0 && Math.abs(Math.log10(value) - Math.round(Math.log10(value))) < 1e-6 ? value : null));
+
+function short(value) {
+  const size = Math.abs(value);
+  if (size >= 1e5 || (size > 0 && size < 1e-3)) return value.toExponential(0);
+  return String(Number(value.toPrecision(6)));
+}
+
+// The range shows the whole band, and is never so narrow that noise looks like movement.
+function spread(low, high, band, least = 0.1) {
+  const all = [low, high, ...(band || [])].filter((value) => Number.isFinite(value));
+  if (!all.length) return [0, 1];
+  let [from, to] = [Math.min(...all), Math.max(...all)];
+  const missing = least - (to - from);
+  if (missing > 0) { from -= missing / 2; to += missing / 2; }
+  const margin = (to - from) * 0.08;
+  return [from - margin, to + margin];
+}
+
+function drawGround(u, extra) {
+  const { ctx, bbox } = u;
+  ctx.save();
+  ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip();
+  if (extra.band && extra.band[1] > extra.band[0] && u.scales.y.min !== null) {
+    const top = u.valToPos(extra.band[1], "y", true), bottom = u.valToPos(extra.band[0], "y", true);
+    ctx.fillStyle = colour("track"); ctx.globalAlpha = 0.55;
+    ctx.fillRect(bbox.left, top, bbox.width, bottom - top);
+    ctx.globalAlpha = 1; ctx.strokeStyle = colour("muted"); ctx.setLineDash([6, 4]); ctx.lineWidth = 1;
+    for (const y of [top, bottom]) { ctx.beginPath(); ctx.moveTo(bbox.left, y); ctx.lineTo(bbox.left + bbox.width, y); ctx.stroke(); }
+    ctx.setLineDash([]);
+  }
+  for (const stretch of extra.modes) {
+    const shade = MODE_SHADE[stretch.mode];
+    if (!shade) continue;
+    const from = u.valToPos(stretch.from, "x", true), to = u.valToPos(stretch.to, "x", true);
+    ctx.globalAlpha = 0.28; ctx.fillStyle = colour(shade);
+    ctx.fillRect(from, bbox.top, Math.max(1, to - from), bbox.height);
+    if (extra.ribbon && to - from > 46) { ctx.globalAlpha = 1; ctx.fillStyle = colour("ink"); ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`; ctx.fillText(stretch.mode, Math.max(from, bbox.left) + 4, bbox.top + bbox.height - 5); }
+  }
+  ctx.globalAlpha = 1;
+  for (const mark of extra.marks) {
+    const x = u.valToPos(mark.time, "x", true);
+    const size = 5 * devicePixelRatio;
+    ctx.fillStyle = ctx.strokeStyle = colour({ alarm: "high", fault: "critical" }[mark.kind] || "muted");
+    ctx.lineWidth = 1; ctx.setLineDash([2, 4]); ctx.globalAlpha = 0.7;
+    ctx.beginPath(); ctx.moveTo(x, bbox.top); ctx.lineTo(x, bbox.top + bbox.height); ctx.stroke();
+    ctx.globalAlpha = 1;
+    ctx.beginPath(); ctx.moveTo(x - size, bbox.top); ctx.lineTo(x + size, bbox.top); ctx.lineTo(x, bbox.top + 1.6 * size); ctx.fill();
+  }
+  ctx.setLineDash([]);
+  if (extra.now !== null) {
+    const x = u.valToPos(extra.now, "x", true);
+    ctx.strokeStyle = colour("ink"); ctx.lineWidth = 1;
+    ctx.beginPath(); ctx.moveTo(x, bbox.top); ctx.lineTo(x, bbox.top + bbox.height); ctx.stroke();
+  }
+  ctx.restore();
+}
+
+function drawAhead(u, extra, lines) {
+  if (!extra.predictions.length || u.scales.y.min === null) return;
+  const { ctx, bbox } = u;
+  ctx.save();
+  ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip();
+  extra.predictions.forEach((prediction, place) => {
+    const newest = place === extra.predictions.length - 1;
+    ctx.lineWidth = (newest ? 1.8 : 1) * devicePixelRatio; ctx.globalAlpha = newest ? 1 : 0.4;
+    ctx.setLineDash(newest ? [5, 4] : [2, 3]);
+    prediction.curves.forEach((curve, line) => {
+      ctx.strokeStyle = colour(newest ? lines[line].stroke : "ahead");
+      ctx.beginPath();
+      prediction.time.forEach((time, i) => { const x = u.valToPos(time, "x", true), y = u.valToPos(curve[i], "y", true); if (i) ctx.lineTo(x, y); else ctx.moveTo(x, y); });
+      ctx.stroke();
+    });
+  });
+  ctx.restore();
+}
+
+// Several holders of charts, one below the other, as one picture.
+export function asPicture(charts) {
+  const canvases = charts.map((one) => one.chart.ctx.canvas);
+  const picture = document.createElement("canvas");
+  picture.width = Math.max(...canvases.map((one) => one.width));
+  picture.height = canvases.reduce((sum, one) => sum + one.height + 18 * devicePixelRatio, 0);
+  const ctx = picture.getContext("2d");
+  ctx.fillStyle = colour("panel"); ctx.fillRect(0, 0, picture.width, picture.height);
+  let top = 0;
+  charts.forEach((one, i) => {
+    ctx.fillStyle = colour("ink"); ctx.font = `${12 * devicePixelRatio}px system-ui, sans-serif`;
+    ctx.fillText(one.title, 8, top + 13 * devicePixelRatio);
+    ctx.drawImage(canvases[i], 0, top + 18 * devicePixelRatio);
+    top += canvases[i].height + 18 * devicePixelRatio;
+  });
+  return picture;
+}

@@ -1,0 +1,92 @@
+// Starts the page: views, theme, links, the state of the stream.
+import { ask, connect, element, indexed, isStale, onChange, pageIsSilent, state, take } from "./store.js";
+import { bindAll } from "./values.js";
+import { hideTrends, initTrends, recolourStrips, recolourTrends, refreshStrips, showTrends } from "./trends.js";
+import { initWhy, pick, recolourWhy, showWhy } from "./why.js";
+import { initAlarms, redrawAlarms } from "./alarms.js";
+import { initCommands, refreshUser } from "./commands.js";
+import { initDetail } from "./detail.js";
+import { initReplay } from "./replay.js";
+
+const VIEWS = ["overview", "trends", "why", "alarms", "commands", "detail"];
+const NAMES = { plant: "plant", control_plc: "control", optimizer_plc: "optimiser" };
+const byId = (id) => document.getElementById(id);
+
+function theme(name) {
+  document.documentElement.dataset.theme = name;
+  recolourTrends(); recolourStrips(); recolourWhy();
+}
+
+function show() {
+  const view = VIEWS.includes(location.hash.slice(1)) ? location.hash.slice(1) : "overview";
+  for (const one of VIEWS) byId(one).hidden = one !== view;
+  for (const link of document.querySelectorAll("nav a")) { if (link.hash === `#${view}`) link.setAttribute("aria-current", "page"); else link.removeAttribute("aria-current"); }
+  if (view === "trends") showTrends(); else hideTrends();
+  if (view === "why") showWhy();
+  if (view === "alarms") redrawAlarms();
+  if (view === "overview") refreshStrips();
+}
+
+function links() {
+  const holder = byId("links");
+  for (const service of state.catalog.services) holder.append(element("span", { class: "link", "data-service": service }, element("i"), NAMES[service], element("span", { class: "age" })));
+  onChange(() => {
+    const silent = pageIsSilent(), dead = [];
+    for (const one of holder.children) {
+      const about = state.services[one.dataset.service] || { live: false, age_s: null, reason: "" };
+      const live = about.live && !silent;
+      one.classList.toggle("live", live); one.classList.toggle("dead", !live);
+      const age = about.age_s === null ? "never" : `${(about.age_s + (silent ? (performance.now() - state.heard) / 1000 : 0)).toFixed(1)} s`;
+      one.querySelector(".age").textContent = age;
+      one.title = live ? `${one.dataset.service} answers; age ${age}` : `${one.dataset.service}: ${about.reason || "silent"}`;
+      if (!live) dead.push(`${one.dataset.service} is silent (${about.reason || "no answer"})`);
+    }
+    const banner = byId("banner");
+    const text = silent ? "The page's own server does not answer: nothing here is current. Trying again." : dead.join("; ");
+    banner.hidden = !text;
+    if (banner.textContent !== text) banner.textContent = text;
+  });
+}
+
+function overview() {
+  const tau = byId("tau-u"), facts = byId("load-facts");
+  onChange(({ update, names }) => {
+    if (update || names === null) {
+      const found = state.update;
+      tau.textContent = found ? `${found.period_s.toFixed(2)} s` : "–";
+      byId("tau-u-q").textContent = found ? `q = ${found.iterations}, J = ${Number(found.update.j_effective.toPrecision(4))}` : "";
+      byId("tau-u-sentence").replaceChildren(...(found ? indexed(found.sentence) : ["No update yet."]));
+    }
+    const values = state.values, upcoming = values["plant.load status.upcoming"];
+    const rows = [["expected next", upcoming ? `${values["plant.load status.next_watts"]?.toFixed(1)} W in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now"],
+      ["estimated mismatch", state.update ? `${state.update.update.load_mismatch.toFixed(1)} W` : "–"]];
+    const text = JSON.stringify(rows);
+    if (facts.dataset.text !== text) { facts.dataset.text = text; facts.replaceChildren(...rows.flatMap(([name, value]) => [element("dt", { text: name }), element("dd", { class: "value", text: value })])); }
+    facts.classList.toggle("stale", isStale("plant."));
+    const mode = state.values["control_plc.ladder.mode"];
+    byId("drive-chip").classList.toggle("abnormal-mode", mode !== undefined && mode !== 1);
+    for (const one of document.querySelectorAll("#strips, #charts")) one.classList.toggle("stale", isStale("control_plc.process."));
+  });
+  setInterval(refreshStrips, 1000);
+}
+
+async function mimic() {
+  const text = await (await fetch("static/mimic.svg")).text();
+  byId("mimic").append(document.importNode(new DOMParser().parseFromString(text, "image/svg+xml").documentElement, true));
+}
+
+async function start() {
+  [state.catalog, state.me] = await Promise.all([ask("api/catalog"), ask("api/me"), mimic()]);
+  theme(localStorage.getItem("theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
+  byId("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; localStorage.setItem("theme", next); theme(next); });
+  initDetail(); for (const one of [document.querySelector("header"), byId("overview"), byId("commands")]) bindAll(one);
+  links(); overview();
+  initTrends((time) => { location.hash = "#why"; pick(`?at=${time}`); });
+  initWhy(); initCommands(redrawAlarms); initAlarms(); initReplay();
+  try { take(await ask("api/state")); } catch (error) { if (!state.me.role) byId("login-open").click(); }
+  await refreshUser();
+  connect(); show();
+  addEventListener("hashchange", () => { show(); byId("view").focus({ preventScroll: true }); });
+}
+
+start();

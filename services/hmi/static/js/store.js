@@ -1,0 +1,106 @@
+// What the server has sent, the clock that tells how old it is, and who wants to know of changes.
+
+export const state = { catalog: null, me: null, values: {}, services: {}, stale: [], alarms: [], update: null, tick: 0, heard: 0 };
+const listeners = [];
+const SILENT_MS = 1500;
+
+export function onChange(listener) { listeners.push(listener); }
+
+function tell(changed) { for (const listener of listeners) listener(changed); }
+
+export function take(message) {
+  const reset = message.whole;
+  if (reset) state.values = {};
+  Object.assign(state.values, message.values);
+  Object.assign(state, { services: message.services, stale: message.stale, tick: message.tick, heard: performance.now() });
+  if ("alarms" in message) state.alarms = message.alarms;
+  if ("update" in message) state.update = message.update;
+  if ("replay" in message) state.replay = message.replay;
+  document.body.dataset.tick = message.tick;
+  tell({ names: reset ? null : new Set(Object.keys(message.values)), alarms: "alarms" in message, update: "update" in message });
+}
+
+// The page itself is silent: nothing of what it shows is current.
+export function pageIsSilent() { return performance.now() - state.heard > SILENT_MS; }
+
+export function isStale(name) {
+  return pageIsSilent() || state.stale.some((prefix) => name.startsWith(prefix));
+}
+
+export function signal(name) { return state.catalog.signals[name] || null; }
+
+export function connect() {
+  let source = null;
+  const open = () => {
+    source = new EventSource("api/stream");
+    source.onmessage = (event) => take(JSON.parse(event.data));
+    source.onerror = () => { source.close(); setTimeout(open, 500); };
+  };
+  open();
+  setInterval(() => tell({ names: new Set(), alarms: false, update: false }), 250);
+}
+
+export function timeText(seconds) {
+  if (!Number.isFinite(seconds)) return "–";
+  const sign = seconds < 0 ? "-" : "", all = Math.abs(seconds);
+  const hours = Math.floor(all / 3600), minutes = Math.floor(all / 60) % 60, rest = all % 60;
+  const pad = (number) => String(number).padStart(2, "0");
+  const tail = Number.isInteger(all) ? pad(rest) : rest.toFixed(2).padStart(5, "0");
+  return `${sign}${hours}:${pad(minutes)}:${tail}`;
+}
+
+export function valueText(name, as) {
+  const value = state.values[name], about = signal(name);
+  if (value === undefined || value === null) return "–";
+  const tick = state.catalog.tick_s;
+  if (as === "time") return timeText(value * tick);
+  if (as === "ticks") return `${(value * tick).toFixed(2)} s`;
+  if (as === "pace") return paceText(value);
+  if (about && about.words[value] !== undefined) return as === "mode" ? about.words[value].toUpperCase() : about.words[value];
+  const text = about && about.decimals !== null && typeof value === "number" ? value.toFixed(about.decimals) : String(value);
+  return about && about.unit ? `${text} ${about.unit}` : text;
+}
+
+function paceText(factor) {
+  if (!state.values["plant.pace.session"]) return "no session";
+  if (!state.values["plant.pace.realtime"]) return "lock-step";
+  return state.values["plant.pace.paused"] ? `paused (× ${factor})` : `× ${factor}`;
+}
+
+export async function ask(path) {
+  const answer = await fetch(path);
+  const document_ = await answer.json();
+  if (!answer.ok) throw new Error(document_.error || answer.statusText);
+  return document_;
+}
+
+export async function send(path, body) {
+  const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+  const document_ = await answer.json();
+  if (!answer.ok) throw Object.assign(new Error(document_.error || answer.statusText), { status: answer.status });
+  return document_;
+}
+
+export function element(name, attributes = {}, ...children) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key === "text") made.textContent = value; else if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else if (value === true) made.setAttribute(key, ""); else if (value !== false && value !== undefined) made.setAttribute(key, value);
+  }
+  made.append(...children);
+  return made;
+}
+
+const SVG = "http://www.w3.org/2000/svg";
+export function shape(name, attributes = {}, text) {
+  const made = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  if (text !== undefined) made.textContent = text;
+  return made;
+}
+
+// Text in which "tau_u" and "q_min" are set with an index.
+export function indexed(text) {
+  return text.replaceAll("tau_u", "τ_u").split(/(_\{[^}]*\}|(?<=[A-Za-zτĴ⁺])_[A-Za-z]+)/).filter(Boolean).map((part) =>
+    part[0] === "_" ? element("sub", { text: part.slice(1).replace(/[{}]/g, "") }) : part);
+}

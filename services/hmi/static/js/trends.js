@@ -1,0 +1,117 @@
+// Trends: a window of plant time, the horizon ahead, zoom, values at the cursor, export.
+import { ask, element, state, timeText } from "./store.js";
+import { asPicture, makeChart } from "./charts.js";
+
+const WINDOWS = [[300, "5 min"], [900, "15 min"], [1800, "30 min"], [3600, "1 h"], [7200, "2 h"]];
+const NAMES = "L1,T5,CV155,NCR22_A,CV156,load";
+const LAYOUT = [
+  { id: "L1", title: "L1 %", lines: [{ label: "L1", stroke: "trend", from: "series" }], band: "L1", spread: 1, tall: true, ahead: ["L1"], ribbon: true },
+  { id: "T5", title: "T5 K", lines: [{ label: "T5", stroke: "trend", from: "series" }], band: "T5", spread: 1, tall: true, ahead: ["T5"] },
+  { id: "valves", title: "%", lines: [{ label: "CV155", stroke: "trend", from: "series", stepped: true }, { label: "CV156", stroke: "trend-2", from: "series", stepped: true }], bounds: "CV155", spread: 2, ahead: ["CV155", "CV156"] },
+  { id: "heat", title: "W", lines: [{ label: "load", stroke: "trend-3", from: "series", stepped: true }, { label: "NCR22_A", stroke: "trend", from: "series", stepped: true }], spread: 20 },
+  { id: "tau", title: "τu s, click to see why", lines: [{ label: "tau_u", stroke: "trend", from: "updates", stepped: true }], spread: 1 },
+  { id: "cost", title: "cost", tall: true, lines: [{ label: "J", name: "J reached", stroke: "trend", from: "updates" }, { label: "J_predicted", name: "J predicted", stroke: "trend-2", from: "updates", dash: [4, 3] }], log: true },
+];
+const REFRESH_MS = 500;
+
+let seconds = 300, zoom = null, held = false, newest = null, onPick = () => {};
+let charts = null, timer = null;
+
+function range() {
+  if (zoom) return zoom;
+  const now = newest ? newest.now_s : 0, ahead = Math.min(500, seconds / 4);
+  return [now - seconds, now + ahead];
+}
+
+function build() {
+  const holder = document.getElementById("charts");
+  holder.replaceChildren();
+  charts = LAYOUT.map((one, place) => {
+    const box = element("div", { class: `chart${one.tall ? " tall" : ""}`, id: `chart-${one.id}` });
+    holder.append(box);
+    const made = makeChart(box, one.lines, {
+      title: one.title, spread: one.spread, log: one.log, sync: "trends", axis: place === LAYOUT.length - 1, range,
+      onZoom: (from, to) => { zoom = [from, to]; document.getElementById("unzoom").hidden = false; refresh(); },
+      onCursor: readout, onPick: one.id === "tau" || one.id === "cost" ? (time) => onPick(time) : null,
+    });
+    return { ...one, ...made };
+  });
+}
+
+function readout(u) {
+  const time = u.cursor.left >= 0 ? u.posToVal(u.cursor.left, "x") : null;
+  const target = document.getElementById("readout");
+  if (time === null || !newest) { target.textContent = ""; return; }
+  const at = (times, values) => { let i = times.findIndex((one) => one > time); i = i < 0 ? times.length - 1 : i - 1; return i < 0 ? null : values[i]; };
+  const parts = Object.entries(newest.series).map(([name, values]) => [name, at(newest.time, values)]);
+  parts.push(["τu", at(newest.updates.time, newest.updates.tau_u)], ["q", at(newest.updates.time, newest.updates.q)]);
+  target.textContent = `${timeText(Math.round(time * 4) / 4)}  ${parts.filter((one) => one[1] !== null).map(([name, value]) => `${name} ${Number(value.toPrecision(5))}`).join("  ")}`;
+}
+
+function show(one) {
+  const source = (line) => (line.from === "updates" ? newest.updates : newest.series)[line.label] || [];
+  const times = one.lines[0].from === "updates" ? newest.updates.time : newest.time;
+  const predictions = one.ahead ? newest.predictions.map((each) => ({ time: one.ahead[0].startsWith("CV") ? each.input_time : each.time, curves: one.ahead.map((name) => each[name]) })) : [];
+  one.show([times, ...one.lines.map(source)], {
+    band: one.band ? newest.bands[one.band] : one.bounds ? newest.bounds[one.bounds] : null,
+    predictions, marks: newest.marks, modes: newest.modes, now: newest.now_s, ribbon: one.ribbon,
+  });
+}
+
+async function refresh() {
+  if (document.getElementById("trends").hidden) return;
+  const end = zoom ? Math.min(zoom[1], state.tick * state.catalog.tick_s) : null;
+  const span = zoom ? Math.max(1, end - zoom[0]) : seconds;
+  if (held && newest && !zoom) return;
+  const query = `names=${NAMES}&seconds=${span}&points=900${zoom ? `&end=${end}` : ""}`;
+  try { newest = await ask(`api/trend?${query}`); } catch { return; }
+  if (!charts) build();
+  charts.forEach(show);
+  document.getElementById("charts").dataset.now = newest.now_s;
+  document.getElementById("export-csv").href = `api/trend.csv?${query}`;
+}
+
+export function initTrends(pick) {
+  onPick = pick;
+  const holder = document.getElementById("windows");
+  for (const [length, label] of WINDOWS) {
+    holder.append(element("button", { type: "button", class: "quiet", text: label, "aria-pressed": String(length === seconds), onclick: (event) => {
+      seconds = length; zoom = null; document.getElementById("unzoom").hidden = true;
+      for (const other of holder.children) other.setAttribute("aria-pressed", String(other === event.target));
+      refresh();
+    } }));
+  }
+  document.getElementById("hold").addEventListener("click", (event) => { held = !held; event.target.setAttribute("aria-pressed", String(held)); refresh(); });
+  document.getElementById("unzoom").addEventListener("click", (event) => { zoom = null; event.target.hidden = true; refresh(); });
+  document.getElementById("export-png").addEventListener("click", () => {
+    asPicture(charts || []).toBlob((blob) => { const link = element("a", { href: URL.createObjectURL(blob), download: "coldloop-trends.png" }); link.click(); URL.revokeObjectURL(link.href); });
+  });
+  document.getElementById("trend-legend").textContent = "Band and bounds: dashed lines. Ahead of now: what the newest sequence is expected to lead to; faint: earlier predictions. Marks: load (dotted), alarms, commands, faults. Ground: modes other than MPC. Drag to zoom.";
+}
+
+export function showTrends() { refresh(); if (!timer) timer = setInterval(refresh, REFRESH_MS); }
+export function hideTrends() { clearInterval(timer); timer = null; }
+export function recolourTrends() { if (charts) { charts.forEach((one) => one.chart.destroy()); charts = null; refresh(); } }
+
+// The four small ones under the mimic.
+const STRIPS = [
+  { title: "L1 %", lines: [{ label: "L1", stroke: "trend" }], band: "L1", spread: 1 }, { title: "T5 K", lines: [{ label: "T5", stroke: "trend" }], band: "T5", spread: 1 },
+  { title: "load W", lines: [{ label: "load", stroke: "trend", stepped: true }], spread: 20 }, { title: "τu s", lines: [{ label: "tau_u", stroke: "trend", stepped: true }], spread: 1, updates: true },
+];
+let strips = null, stripsNow = 0;
+export async function refreshStrips() {
+  if (document.getElementById("overview").hidden) return;
+  let found;
+  try { found = await ask("api/trend?names=L1,T5,load&seconds=300&points=400"); } catch { return; }
+  const holder = document.getElementById("strips");
+  stripsNow = found.now_s;
+  if (!strips) {
+    holder.replaceChildren();
+    strips = STRIPS.map((one) => { const box = element("div", { class: "strip" }); holder.append(box); return { ...one, ...makeChart(box, one.lines, { title: one.title, spread: one.spread, small: true, axis: false, range: () => [stripsNow - 300, stripsNow] }) }; });
+  }
+  for (const one of strips) {
+    const times = one.updates ? found.updates.time : found.time;
+    one.show([times, one.updates ? found.updates.tau_u : found.series[one.lines[0].label]], { band: one.band ? found.bands[one.band] : null, modes: found.modes, marks: found.marks });
+  }
+}
+export function recolourStrips() { if (strips) { strips.forEach((one) => one.chart.destroy()); strips = null; refreshStrips(); } }

@@ -1,0 +1,103 @@
+// Values on the page: text, analogue bars and the tags of the mimic, all bound to a signal by data-signal.
+import { element, isStale, onChange, shape, signal, state, valueText } from "./store.js";
+
+const bound = new Map(); // signal -> functions that draw
+const watched = [];      // [element, signal or prefix]
+
+function bind(name, draw) {
+  if (!bound.has(name)) bound.set(name, []);
+  bound.get(name).push(draw);
+  draw();
+}
+
+const number = (name) => (typeof state.values[name] === "number" ? state.values[name] : NaN);
+const pair = (text) => (text ? text.match(/\S+ limits\.\S+/g) : null);
+
+export function bindAll(root) {
+  for (const one of root.querySelectorAll(".tag[data-signal]")) bindTag(one);
+  for (const one of root.querySelectorAll(".bar[data-signal]")) bindBar(one);
+  for (const one of root.querySelectorAll("[data-signal]:not(.tag):not(.bar)")) bindText(one);
+  for (const one of root.querySelectorAll("[data-source]")) watched.push([one, one.dataset.source]);
+}
+
+export function bindText(one) {
+  const name = one.dataset.signal, as = one.dataset.as;
+  bind(name, () => { const text = valueText(name, as); if (one.textContent !== text) one.textContent = text; });
+  if (as === "pace") for (const other of ["plant.pace.paused", "plant.pace.realtime"]) bind(other, () => { one.textContent = valueText(name, as); });
+  watched.push([one, name]);
+}
+
+// The scale of a bar: from data-low to data-high, wider when the value or its band is outside.
+function scale(one, value, ends) {
+  const all = [Number(one.dataset.low), Number(one.dataset.high), value, ...ends].filter(Number.isFinite);
+  const low = Math.min(...all), high = Math.max(...all);
+  return (x) => (x - low) / (high - low || 1);
+}
+
+function place(one, parts, width) {
+  const name = one.dataset.signal, value = number(name);
+  const band = pair(one.dataset.band), bounds = pair(one.dataset.bounds);
+  const ends = (band || bounds || []).map(number);
+  const known = ends.length === 2 && ends[1] > ends[0];
+  const at = scale(one, value, known ? ends : []);
+  if (known) {
+    parts.band.setAttribute("x", at(ends[0]) * width);
+    parts.band.setAttribute("width", Math.max(0, (at(ends[1]) - at(ends[0])) * width));
+  }
+  if (Number.isFinite(value)) parts.pointer.setAttribute("x", at(value) * width - 1.5);
+  const outside = known && (value < ends[0] || value > ends[1]);
+  one.classList.toggle("abnormal", Boolean(band) && outside);
+  one.classList.toggle("at-limit", Boolean(bounds) && known && (value <= ends[0] || value >= ends[1]));
+  return { value, known, ends, at };
+}
+
+function bindTag(tag) {
+  const name = tag.dataset.signal, width = 100;
+  const frame = shape("rect", { class: "frame", x: -3, y: -1, width: width + 6, height: 32, rx: 2 });
+  const ground = shape("rect", { class: "ground", x: -2, y: 0, width: width + 4, height: 30, rx: 2, opacity: 0.85 });
+  const label = shape("text", { class: "name", x: 0, y: 14 }, tag.dataset.name);
+  const letter = shape("text", { class: "letter", x: -14, y: 15 }, "!");
+  const text = shape("text", { x: width, y: 14, "text-anchor": "end", class: "reading" });
+  const parts = {
+    track: shape("rect", { class: "track", x: 0, y: 20, width, height: 6 }),
+    band: shape("rect", { class: "band", x: 0, y: 20, width: 0, height: 6 }),
+    pointer: shape("rect", { class: "pointer", x: 0, y: 18, width: 3, height: 10 }),
+  };
+  tag.append(ground, frame, label, letter, text, parts.track, parts.band, parts.pointer);
+  const draw = () => {
+    text.textContent = valueText(name);
+    const { value } = place(tag, parts, width);
+    if (tag.dataset.level && Number.isFinite(value)) {
+      const bath = document.getElementById(tag.dataset.level), height = 206 * Math.min(1, Math.max(0, value / 100));
+      bath.setAttribute("y", 384 - height);
+      bath.setAttribute("height", height);
+    }
+  };
+  for (const one of [name, ...(pair(tag.dataset.band) || []), ...(pair(tag.dataset.bounds) || [])]) bind(one, draw);
+  watched.push([tag, name]);
+}
+
+function bindBar(bar) {
+  const name = bar.dataset.signal, width = 100;
+  const drawing = shape("svg", { viewBox: `0 0 ${width} 20`, preserveAspectRatio: "none", "aria-hidden": "true" });
+  const parts = {
+    track: shape("rect", { class: "track", x: 0, y: 6, width, height: 9 }),
+    band: shape("rect", { class: "band", x: 0, y: 6, width: 0, height: 9 }),
+    pointer: shape("rect", { class: "pointer", x: 0, y: 2, width: 2.2, height: 17 }),
+  };
+  drawing.append(parts.track, parts.band, parts.pointer);
+  const about = signal(name);
+  const text = element("span", { class: "value reading", "data-reading": name });
+  bar.append(element("span", { class: "name", text: bar.dataset.name, title: about ? about.description : "" }), drawing, text);
+  const draw = () => { text.textContent = valueText(name); place(bar, parts, width); };
+  for (const one of [name, ...(pair(bar.dataset.band) || []), ...(pair(bar.dataset.bounds) || [])]) bind(one, draw);
+  watched.push([text, name], [drawing, name]);
+}
+
+onChange(({ names }) => {
+  const drawn = new Set();
+  for (const name of names === null ? bound.keys() : names) {
+    for (const draw of bound.get(name) || []) if (!drawn.has(draw)) { drawn.add(draw); draw(); }
+  }
+  for (const [one, name] of watched) one.classList.toggle("stale", isStale(name));
+});

@@ -1,0 +1,96 @@
+// Why the updating period of one update is as long as it is.
+import { ask, element, indexed, onChange, shape, timeText } from "./store.js";
+import { makeChart } from "./charts.js";
+
+let following = true, shown = null, charts = null, window_ = [0, 1], asked = 0;
+const byId = (id) => document.getElementById(id);
+const digits = (value, count = 4) => (value === null || value === undefined ? "–" : Number(value.toPrecision(count)).toString());
+
+function quantities(found) {
+  const u = found.update, before = found.before;
+  const rows = [
+    ["q", found.iterations_before === null ? `${found.iterations}` : `${found.iterations_before} → ${found.iterations}`, "iterations, the period before → this one"],
+    ["τ_u", found.period_before_s === null ? `${found.period_s} s` : `${found.period_before_s} → ${found.period_s} s`, "updating period"],
+    ["J_k", before ? digits(before.j_effective, 6) : "–", "cost reached at the instant before"],
+    ["J⁺_k", before ? digits(before.j_hot_start, 6) : "–", "shifted profile, at the predicted state"],
+    ["Ĵ_{k+1}", before ? digits(before.j_delivered, 6) : "–", "delivered profile, as predicted"],
+    ["J_{k+1}", digits(u.j_effective, 6), "the same profile, at the state that was reached"],
+    ["E", digits(u.efficiency, 6), "efficiency of the solver, Ĵ_{k+1} / J⁺_k"],
+    ["D", digits(u.mismatch, 6), "model mismatch"],
+    ["K", digits(u.contraction, 6), "contraction, E D"],
+    ["ΔE/Δq", found.increments ? digits(found.increments.efficiency) : "–", ""],
+    ["ΔD/Δq", found.increments ? digits(found.increments.mismatch) : "–", ""],
+    ["ΔK/Δq", found.increments ? digits(found.increments.contraction) : "–", ""],
+    ["Γ", digits(u.gamma), u.contraction >= 1 ? "= ΔK/Δq, as K ≥ 1" : "= Δt_r/Δq, as K < 1"],
+    ["branch", found.branch, "what decided"],
+  ];
+  byId("why-quantities").replaceChildren(...rows.map(([name, value, meaning]) => element("tr", {}, element("td", {}, ...indexed(name)), element("td", { class: "number", text: value }), element("td", { class: "minor" }, ...indexed(meaning)))));
+}
+
+function alternatives(found) {
+  const rows = found.alternatives.map((one) => element("tr", { class: one.iterations === found.iterations ? "chosen" : "" },
+    element("td", { class: "number", text: `${one.iterations}${one.iterations === found.iterations ? " (chosen)" : ""}` }), element("td", { class: "number", text: `${one.period_s} s` }),
+    element("td", { class: "number", text: digits(one.contraction) }), element("td", { class: "number", text: one.response_s === null ? "does not fall" : `${digits(one.response_s)} s` })));
+  byId("why-alternatives").replaceChildren(...(rows.length ? rows : [element("tr", {}, element("td", { colspan: "4", class: "minor", text: "Algorithm 1 did not decide here." }))]));
+}
+
+function budget(found) {
+  const { preparation, answer, period, iterations, iteration, slack } = found.budget;
+  const end = Math.max(period, answer), width = 600, at = (time) => 10 + ((width - 20) * time) / end;
+  const drawing = shape("svg", { viewBox: `0 0 ${width} 62`, role: "img", "aria-label": `Preparation until ${preparation} s, ${iterations} iterations until ${answer} s, period ${period} s` });
+  const block = (from, to, kind) => drawing.append(shape("rect", { class: kind, x: at(from), y: 16, width: Math.max(0, at(to) - at(from)), height: 20 }));
+  block(0, preparation, "preparation");
+  for (let i = 0; i < iterations; i += 1) block(preparation + i * iteration, preparation + (i + 1) * iteration, "iteration");
+  if (slack >= 0) block(answer, period, "slack"); else block(period, answer, "late");
+  const word = (time, text, y, anchor = "middle") => drawing.append(shape("text", { x: at(time), y, "text-anchor": anchor }, text));
+  word(0, "measured", 11, "start"); word(preparation, `prepared ${digits(preparation, 3)} s`, 50, "start");
+  word(answer, `answer ${digits(answer, 3)} s`, 11, "end"); word(end, slack >= 0 ? `slack ${digits(slack, 3)} s, takes effect at ${digits(period, 3)} s` : `late by ${digits(-slack, 3)} s`, 50, "end");
+  byId("why-budget").replaceChildren(drawing);
+}
+
+async function curves(found) {
+  const from = found.time_s - 30, to = found.time_s + (found.prediction ? 200 : 60);
+  let trend;
+  try { trend = await ask(`api/trend?names=L1,T5&seconds=${to - from}&end=${to}&points=400`); } catch { return; }
+  window_ = [from, to];
+  if (!charts) {
+    charts = ["L1", "T5"].map((name) => { const box = element("div", { class: "chart" }); byId("why-charts").append(box); return { name, ...makeChart(box, [{ label: name, stroke: "trend" }], { title: `${name} ${name === "L1" ? "%" : "K"}`, spread: 0.5, axis: true, range: () => window_ }) }; });
+  }
+  for (const one of charts) {
+    const predictions = found.prediction ? [{ time: found.prediction.time, curves: [found.prediction[one.name]] }] : [];
+    one.show([trend.time, trend.series[one.name]], { band: trend.bands[one.name], predictions, now: found.time_s });
+  }
+  const came = found.came === null ? "not known yet" : digits(found.came, 5);
+  byId("why-cost").textContent = `Cost at the end of this period: predicted ${digits(found.predicted, 5)}, came ${came}. ${found.prediction ? "Dashed: the trajectory that was predicted." : "The predicted trajectory of this update is not kept any more."} Vertical line: the updating instant.`;
+}
+
+export async function showUpdate(query) {
+  const mine = ++asked;
+  let found;
+  try { found = await ask(`api/explanation${query}`); } catch (error) { if (!shown) byId("why-sentence").textContent = error.message; return; }
+  if (mine !== asked) return;
+  shown = found;
+  byId("why-number").value = found.update.update;
+  byId("why-time").textContent = `updating instant ${timeText(found.time_s)}, tick ${found.update.tick}`;
+  byId("why-sentence").replaceChildren(...indexed(found.sentence));
+  byId("why-before").disabled = found.neighbours[0] === null;
+  byId("why-after").disabled = found.neighbours[1] === null;
+  quantities(found); alternatives(found); budget(found);
+  await curves(found);
+}
+
+function follow(on) { following = on; byId("why-follow").setAttribute("aria-pressed", String(on)); }
+
+export function pick(query) { follow(false); showUpdate(query); }
+
+export function initWhy() {
+  byId("why-before").addEventListener("click", () => pick(`?update=${shown.neighbours[0]}`));
+  byId("why-after").addEventListener("click", () => pick(`?update=${shown.neighbours[1]}`));
+  byId("why-number").addEventListener("change", (event) => pick(`?update=${event.target.value}`));
+  byId("why-follow").addEventListener("click", () => { follow(!following); if (following) showUpdate(""); });
+  let last = 0;
+  onChange(({ update }) => { if (update && following && !byId("why").hidden && performance.now() - last > 800) { last = performance.now(); showUpdate(""); } });
+}
+
+export function showWhy() { if (following || !shown) showUpdate(""); }
+export function recolourWhy() { if (charts) { charts.forEach((one) => one.chart.destroy()); byId("why-charts").replaceChildren(); charts = null; if (shown) curves(shown); } }

@@ -1,0 +1,131 @@
+"""What the trends are drawn from: samples by tick in a bounded store, thinned without losing an excursion."""
+
+from array import array
+from bisect import bisect_left, bisect_right
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.registers.control_plc import Mode, Process
+
+NAMES: Final = ("load", *INPUT_NAMES, *OUTPUT_NAMES, "mode")
+"""Columns of the store; `mode` is that of the fail-safe ladder."""
+MOST_ROWS: Final = 65_536
+SPARE_ROWS: Final = 4096
+"""Rows that are removed at a time, so that removing costs little."""
+
+
+class Stretch(NamedTuple):
+    """A stretch of plant time with one mode."""
+
+    start: float
+    end: float
+    mode: int
+
+
+class TrendStore:
+    """Samples of the process in the order of their ticks, at most `kept_s` of plant time of them."""
+
+    def __init__(self, kept_s: float) -> None:
+        self._kept_ticks = round(kept_s / TICK_S)
+        self.ticks = array("q")
+        self._columns: dict[str, array[float]] = {name: array("f") for name in NAMES}
+
+    def __len__(self) -> int:
+        return len(self.ticks)
+
+    @property
+    def last_tick(self) -> int:
+        """Tick of the newest sample; -1 when there is none."""
+        return self.ticks[-1] if self.ticks else -1
+
+    def clear(self) -> None:
+        """Forget everything."""
+        del self.ticks[:]
+        for column in self._columns.values():
+            del column[:]
+
+    def add(self, process: Process, mode: int) -> None:
+        """Add a sample; one that is not newer than the last one is left out."""
+        if process.tick <= self.last_tick:
+            return
+        self.ticks.append(process.tick)
+        for name, value in zip(NAMES, (process.load, *process.u, *process.y, float(mode)), strict=True):
+            self._columns[name].append(value)
+        self._trim()
+
+    def _trim(self) -> None:
+        excess = max(len(self.ticks) - MOST_ROWS, 0)
+        oldest = bisect_left(self.ticks, self.ticks[-1] - self._kept_ticks)
+        drop = max(excess, oldest)
+        if drop >= SPARE_ROWS or (drop and 2 * drop >= len(self.ticks)):
+            del self.ticks[:drop]
+            for column in self._columns.values():
+                del column[:drop]
+
+    def between(self, start: int, end: int) -> range:
+        """Return the rows from tick `start` to tick `end`."""
+        return range(bisect_left(self.ticks, start), bisect_right(self.ticks, end))
+
+    def column(self, name: str, rows: range) -> "array[float]":
+        """Return values of a column."""
+        return self._columns[name][rows.start : rows.stop]
+
+    def thinned(
+        self, names: Sequence[str], start: int, end: int, points: int
+    ) -> tuple[list[float], dict[str, list[float]]]:
+        """Return times (s) and columns from tick `start` to `end`, of about `points` points.
+
+        A longer stretch is reduced to the least and the largest value of each of `points / 2` intervals.
+        """
+        rows = self.between(start, end)
+        times = [tick * TICK_S for tick in self.ticks[rows.start : rows.stop]]
+        columns = {name: self.column(name, rows) for name in names}
+        return thin(times, columns, points)
+
+    def modes(self, start: int, end: int) -> list[Stretch]:
+        """Return the modes between two ticks, stretch by stretch."""
+        rows = self.between(start, end)
+        found: list[Stretch] = []
+        for tick, value in zip(self.ticks[rows.start : rows.stop], self.column("mode", rows), strict=True):
+            time, mode = tick * TICK_S, int(value)
+            if found and found[-1].mode == mode:
+                found[-1] = found[-1]._replace(end=time)
+            else:
+                if found:
+                    found[-1] = found[-1]._replace(end=time)
+                found.append(Stretch(time, time, mode))
+        return found
+
+
+def thin(
+    times: Sequence[float], columns: Mapping[str, Sequence[float]], points: int
+) -> tuple[list[float], dict[str, list[float]]]:
+    """Reduce columns to the least and the largest value of each of `points / 2` intervals, if they are longer."""
+    count = len(times)
+    if count <= points:
+        return list(times), {name: [rounded(value) for value in column] for name, column in columns.items()}
+    every = -(-count // max(1, points // 2))
+    starts = range(0, count, every)
+    thinned_times: list[float] = []
+    for first in starts:
+        thinned_times += [times[first], times[min(first + every, count) - 1]]
+    thinned: dict[str, list[float]] = {}
+    for name, column in columns.items():
+        values: list[float] = []
+        for first in starts:
+            part = column[first : first + every]
+            least, largest = rounded(min(part)), rounded(max(part))
+            values += [least, largest] if part[0] <= part[-1] else [largest, least]
+        thinned[name] = values
+    return thinned_times, thinned
+
+
+def rounded(value: float) -> float:
+    """Return a single-precision number with the digits that it has."""
+    return float(f"{value:.7g}")
+
+
+def mode_name(mode: int) -> str:
+    """Return the word for a mode of the ladder."""
+    return Mode(mode).name.lower() if mode in Mode.__members__.values() else str(mode)

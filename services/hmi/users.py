@@ -1,0 +1,154 @@
+"""Users of the page, their roles and the hashes of their passwords.
+
+`python -m hmi.users FILE NAME view|operate` asks for a password, or reads it from standard input, and writes a line.
+"""
+
+import argparse
+import base64
+import getpass
+import hashlib
+import hmac
+import secrets
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from coldloop.errors import ColdloopError, ConfigurationError, UsageError
+
+COST: Final = 2**14
+BLOCK_SIZE: Final = 8
+SALT_BYTES: Final = 16
+SHORTEST_PASSWORD: Final = 8
+HASH_FIELDS: Final = 5
+MOST_MEMORY: Final = 64 * 1024 * 1024
+
+
+class PageRole(StrEnum):
+    """What a user may do."""
+
+    VIEW = "view"
+    OPERATE = "operate"
+
+
+class User(NamedTuple):
+    """One line of the file."""
+
+    name: str
+    role: PageRole
+    hash: str
+
+
+def hash_password(password: str) -> str:
+    """Return `scrypt$cost$block size$salt$hash` of a password."""
+    salt = secrets.token_bytes(SALT_BYTES)
+    digest = _scrypt(password, salt, COST, BLOCK_SIZE)
+    return f"scrypt${COST}${BLOCK_SIZE}${_text(salt)}${_text(digest)}"
+
+
+def is_password(password: str, stored: str) -> bool:
+    """Tell whether a password has this hash."""
+    _, cost, block_size, salt, digest = stored.split("$")
+    found = _scrypt(password, base64.b64decode(salt), int(cost), int(block_size))
+    return hmac.compare_digest(found, base64.b64decode(digest))
+
+
+def _scrypt(password: str, salt: bytes, cost: int, block_size: int) -> bytes:
+    return hashlib.scrypt(password.encode(), salt=salt, n=cost, r=block_size, p=1, maxmem=MOST_MEMORY, dklen=32)
+
+
+def _text(raw: bytes) -> str:
+    return base64.b64encode(raw).decode("ascii")
+
+
+NOBODYS_HASH: Final = hash_password(secrets.token_urlsafe())
+"""Checked for a name that does not exist, so that the answer takes as long."""
+
+
+class Users:
+    """The users of a file; without a file there are none.
+
+    Raises:
+        ConfigurationError: The file cannot be read, or a line is wrong.
+    """
+
+    def __init__(self, file: Path | None) -> None:
+        self._users: dict[str, User] = {}
+        if file is None:
+            return
+        try:
+            lines = file.read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+            raise ConfigurationError(
+                f"hmi.login.users: {file}: {reason}; `python -m hmi.users {file} NAME operate` writes it"
+            ) from None
+        for number, line in enumerate(lines, 1):
+            if line.strip() and not line.startswith("#"):
+                user = _user(line, f"{file}:{number}")
+                self._users[user.name] = user
+
+    def __len__(self) -> int:
+        return len(self._users)
+
+    def check(self, name: str, password: str) -> User | None:
+        """Return the user with this password; None when there is none. Takes a twentieth of a second."""
+        user = self._users.get(name)
+        right = is_password(password, user.hash if user else NOBODYS_HASH)
+        return user if right else None
+
+
+def _user(line: str, place: str) -> User:
+    name, _, rest = line.partition(":")
+    role, _, stored = rest.partition(":")
+    fields = stored.split("$")
+    if not name or role not in set(PageRole) or len(fields) != HASH_FIELDS or fields[0] != "scrypt":
+        raise ConfigurationError(
+            f"hmi.login.users: {place}: not name:role:hash; "
+            "`python -m hmi.users FILE NAME view|operate` writes such lines"
+        )
+    return User(name, PageRole(role), stored.strip())
+
+
+def write_user(file: Path, name: str, role: PageRole, password: str) -> None:
+    """Write a user's line, in the place of an earlier one of the same name; the file is readable by its owner only.
+
+    Raises:
+        UsageError: The name or the password cannot be used, or the file cannot be written.
+    """
+    if not name or any(character in ":\n\r" or not character.isprintable() for character in name):
+        raise UsageError(f"user '{name}': a name is printable text without a colon")
+    if len(password) < SHORTEST_PASSWORD:
+        raise UsageError(f"user '{name}': a password has {SHORTEST_PASSWORD} characters or more")
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        kept = [line for line in lines if line.partition(":")[0] != name]
+        file.touch(mode=0o600)
+        file.chmod(0o600)
+        file.write_text("\n".join([*kept, f"{name}:{role.value}:{hash_password(password)}"]) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{file}: {error.strerror}") from None
+
+
+def main() -> int:
+    """Write a user's line; return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m hmi.users", description="Add a user of the operator's page.")
+    parser.add_argument("file", type=Path)
+    parser.add_argument("name")
+    parser.add_argument("role", choices=[role.value for role in PageRole])
+    options = parser.parse_args()
+    try:
+        if sys.stdin.isatty():
+            password = getpass.getpass(f"password of {options.name}: ")
+        else:
+            password = sys.stdin.readline().rstrip("\r\n")
+        write_user(options.file, options.name, PageRole(options.role), password)
+    except ColdloopError as error:
+        sys.stderr.write(f"hmi.users: {error}\n")
+        return error.exit_code
+    sys.stdout.write(f"{options.file}: user {options.name} may {options.role}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

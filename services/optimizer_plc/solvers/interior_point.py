@@ -1,0 +1,381 @@
+"""A throttled primal-dual interior-point method with soft rows (Mehrotra, 1992), cut off after q iterations.
+
+It minimises the same J = J_0 + alpha sum max(Gamma z - gamma, 0)^2 as the ODE-based solver. A row r has the distance
+w_r = gamma_r - (Gamma z)_r + lambda_r / (2 alpha) and the multiplier lambda_r; a bound of the box has its distance and
+its multiplier. An iteration drives all products of distance and multiplier towards one falling number mu:
+
+    (2 Phi + Gamma' D Gamma + B) dz = -dL/dz, ...    D = lambda / (w + lambda / (2 alpha)) <= 2 alpha
+
+with a predictor and a corrector that share one factorised matrix. Since D is bounded, the matrix is as well conditioned
+as that of the ODE-based solver, and single precision suffices.
+
+- Hot start: the guess, moved a little away from its bounds, and on each row the multiplier that puts it on the central
+  path for the first mu. So rows are never inconsistent, whatever the iteration after which it is cut off.
+- Structure: variables without an upper bound (the slacks) are eliminated first, where the matrix is nearly diagonal;
+  zeros of Gamma are left out.
+- A truncated answer is the point of lowest J so far, the guess included: it never rises (Definition 1 of the paper).
+"""
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+
+from coldloop.compiled import kernel
+from optimizer_plc.costs import augmented_cost
+from optimizer_plc.linear_algebra import cholesky, cholesky_solve
+from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.solution import Solution, judge
+from optimizer_plc.solvers.interface import PENALTY_WEIGHT
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+SHORT_OF = 0.99
+"""Share of the way to the first bound that a step goes."""
+FINEST = 100.0
+"""mu, in units of the rounding error of 1, below which there is nothing left to win."""
+
+
+class InteriorPointSettings(BaseModel):
+    """Settings of the interior-point method."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    alpha: PositiveFloat = PENALTY_WEIGHT
+    first_mu: PositiveFloat = 3.0
+    """mu that the guess is put on the central path for, as a share of its J over the number of rows and variables: a
+    guess that costs much is far from the optimum, and needs a path that begins far from the bounds."""
+    least_mu: PositiveFloat = 1.0
+    """It is never less than this."""
+    margin: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1
+    """Share of the box's width by which the guess is at least moved away from its bounds."""
+    tau_1_s: PositiveFloat = 0.17
+    """87,700 operations at 0.529 Mflop/s are 0.166 s (`docs/budget.md`)."""
+
+
+class Structure(NamedTuple):
+    """The constant matrices, variables in the order of elimination."""
+
+    hessian: Array
+    """2 Phi, shape (n, n)."""
+    Gamma: Array
+    """Shape (m, n)."""
+    columns: Indices
+    """Of each row of Gamma the columns that are not zero, rising, filled up with -1, shape (m, at most n)."""
+
+
+class Point(NamedTuple):
+    """Where the method is, in the order of elimination."""
+
+    z: Array
+    """Shape (n,)."""
+    rows: Array
+    """Multipliers of the rows, shape (m,)."""
+    low: Array
+    """Multipliers of the lower bounds, shape (n,)."""
+    high: Array
+    """Multipliers of the upper bounds, shape (n,); 0 where there is none."""
+
+
+class InteriorPointSolver:
+    """Predictor and corrector, one factorisation an iteration."""
+
+    def __init__(self, settings: InteriorPointSettings) -> None:
+        self.alpha = settings.alpha
+        self.tau_1_s = settings.tau_1_s
+        self._settings = settings
+        self._matrices: tuple[Array, Array] | None = None
+
+    def reset(self) -> None:
+        """Only the structure of the matrices is kept from one problem to the next."""
+
+    def start(self, problem: QuadraticProblem, guess: Array) -> None:
+        """Begin near `guess`, on the central path as far as its rows are concerned."""
+        self._problem = problem
+        if self._matrices is None or problem.Phi is not self._matrices[0] or problem.Gamma is not self._matrices[1]:
+            self._matrices = problem.Phi, problem.Gamma
+            self._order, self._structure = structure_of(problem)
+        real, order = problem.phi.dtype.type, self._order
+        self._softness = real(0.5 / self.alpha)
+        self._vectors = problem.phi[order], problem.gamma, problem.low[order], problem.high[order]
+        self._best = np.clip(guess, problem.low, problem.high)
+        self._cost = float(augmented_cost(problem, self._best, real(self.alpha)))
+        self._rows = np.zeros_like(problem.gamma)
+        share = self._settings.first_mu / (len(problem.phi) + len(problem.gamma))
+        mu = max(self._settings.least_mu, share * (self._cost + problem.constant))
+        self._point = begin(
+            self._structure, *self._vectors[1:], self._best[order],
+            self._softness, real(mu), real(self._settings.margin),
+        )  # fmt: skip
+
+    def iterate(self, count: int) -> int:
+        """Take `count` steps, or fewer once the products are as small as rounding."""
+        real = self._problem.phi.dtype.type
+        finest = real(FINEST * np.finfo(real).eps)
+        for done in range(count):
+            self._point, moved = step(self._structure, *self._vectors, self._point, self._softness, finest)
+            if not moved:
+                return done
+            z = np.empty_like(self._best)
+            z[self._order] = self._point.z
+            cost = float(augmented_cost(self._problem, z, real(self.alpha)))
+            if cost < self._cost:
+                self._cost, self._best, self._rows = cost, z, self._point.rows.copy()
+        return count
+
+    @property
+    def solution(self) -> Array:
+        """The best point so far, shape (n,)."""
+        return self._best.copy()
+
+    @property
+    def cost(self) -> float:
+        """Augmented cost of `solution`."""
+        return self._cost
+
+    def judged(self) -> Solution:
+        """Return `solution` with its residuals and the multipliers that belong to it."""
+        return judge(self._problem, self.solution, self.alpha, self._rows.copy())
+
+
+def structure_of(problem: QuadraticProblem) -> tuple[Indices, Structure]:
+    """Return the order of elimination (n,), which begins with the variables without upper bound, and the matrices."""
+    order = np.argsort(np.isfinite(problem.high), kind="stable")
+    Gamma = np.ascontiguousarray(problem.Gamma[:, order])
+    columns = np.full(Gamma.shape, -1)
+    for r, row in enumerate(Gamma):
+        found = np.flatnonzero(row)
+        columns[r, : len(found)] = found
+    two = problem.Phi.dtype.type(2.0)
+    return order, Structure(np.ascontiguousarray(two * problem.Phi[np.ix_(order, order)]), Gamma, columns)
+
+
+@kernel
+def multiply_rows(constant: Structure, z: Array, result: Array) -> None:
+    """Write Gamma z into `result` (m,)."""
+    for r in range(result.shape[0]):
+        total = z.dtype.type(0.0)
+        for j in constant.columns[r]:
+            if j < 0:
+                break
+            total += constant.Gamma[r, j] * z[j]
+        result[r] = total
+
+
+@kernel
+def add_columns(constant: Structure, weights: Array, result: Array) -> None:
+    """Add Gamma' weights to `result` (n,)."""
+    for r in range(weights.shape[0]):
+        for j in constant.columns[r]:
+            if j < 0:
+                break
+            result[j] += constant.Gamma[r, j] * weights[r]
+
+
+@kernel
+def begin(
+    constant: Structure, gamma: Array, low: Array, high: Array, guess: Array, softness: float, mu: float, margin: float
+) -> Point:  # fmt: skip
+    """Return a point near the guess: inside the box, and on each row on the central path for mu."""
+    real = guess.dtype.type
+    zero, one, two = real(0.0), real(1.0), real(2.0)
+    z, of_low, of_high, rows = np.empty_like(guess), np.empty_like(guess), np.zeros_like(guess), np.empty_like(gamma)
+    for i in range(z.shape[0]):
+        bounded = np.isfinite(high[i])
+        width = high[i] - low[i] if bounded else one
+        inside = max(margin * min(width, one), real(1e-6))
+        z[i] = max(guess[i], low[i] + inside)
+        if bounded:
+            z[i] = min(z[i], high[i] - inside) if width > two * inside else low[i] + width / two
+            of_high[i] = mu / max(high[i] - z[i], real(1e-6))
+        of_low[i] = mu / max(z[i] - low[i], real(1e-6))
+    multiply_rows(constant, z, rows)
+    for r in range(rows.shape[0]):
+        excess = rows[r] - gamma[r]  # w lambda = mu and w = lambda / (2 alpha) - excess
+        root = np.sqrt(excess * excess + two * two * softness * mu)
+        rows[r] = (excess + root) / (two * softness) if excess > zero else two * mu / (root - excess)
+    return Point(z, rows, of_low, of_high)
+
+
+class Distances(NamedTuple):
+    """How far a point is from what it must not cross; all positive. The softness of rows is 1 / (2 alpha)."""
+
+    rows: Array
+    """w, shape (m,)."""
+    low: Array
+    """Shape (n,)."""
+    high: Array
+    """Shape (n,); infinite where there is no bound."""
+
+
+@kernel
+def distances(constant: Structure, gamma: Array, low: Array, high: Array, point: Point, softness: float) -> Distances:
+    """Return the distances of a point."""
+    w = np.empty_like(gamma)
+    multiply_rows(constant, point.z, w)
+    for r in range(w.shape[0]):
+        w[r] = gamma[r] - w[r] + softness * point.rows[r]
+    return Distances(w, point.z - low, high - point.z)
+
+
+@kernel
+def newton_matrix(constant: Structure, point: Point, away: Distances, softness: float) -> Array:
+    """Return 2 Phi + Gamma' D Gamma + B, upper triangle."""
+    M = constant.hessian.copy()
+    for i in range(M.shape[0]):
+        M[i, i] += point.low[i] / away.low[i]
+        if point.high[i] > 0:
+            M[i, i] += point.high[i] / away.high[i]
+    for r in range(point.rows.shape[0]):
+        weight = point.rows[r] / (away.rows[r] + softness * point.rows[r])
+        columns = constant.columns[r]
+        for a in range(columns.shape[0]):
+            i = columns[a]
+            if i < 0:
+                break
+            factor = weight * constant.Gamma[r, i]
+            for b in range(a, columns.shape[0]):
+                j = columns[b]
+                if j < 0:
+                    break
+                M[i, j] += factor * constant.Gamma[r, j]
+    return M
+
+
+@kernel
+def room(value: Array, change: Array, share: float) -> float:
+    """Return the longest step up to `share` after which all positive values are still positive."""
+    for i in range(value.shape[0]):
+        if value[i] > 0 and value[i] + share * change[i] <= 0:
+            share = -value[i] / change[i]
+    return share
+
+
+@kernel
+def mean_product(point: Point, away: Distances) -> float:
+    """Return mu, the mean product of distance and multiplier."""
+    total, count = point.z.dtype.type(0.0), point.rows.shape[0] + point.z.shape[0]
+    for r in range(point.rows.shape[0]):
+        total += away.rows[r] * point.rows[r]
+    for i in range(point.z.shape[0]):
+        total += away.low[i] * point.low[i]
+        if point.high[i] > 0:
+            count += 1
+            total += away.high[i] * point.high[i]
+    return total / point.z.dtype.type(count)
+
+
+@kernel
+def moved_by(place: Array, change: Array, share: float) -> Array:
+    """Return what `place` is after `share` of a change."""
+    result = place.copy()
+    for i in range(place.shape[0]):
+        result[i] += share * change[i]
+    return result
+
+
+@kernel
+def after(point: Point, change: Point, share: float) -> Point:
+    """Return the point after `share` of a change."""
+    return Point(
+        moved_by(point.z, change.z, share), moved_by(point.rows, change.rows, share),
+        moved_by(point.low, change.low, share), moved_by(point.high, change.high, share),
+    )  # fmt: skip
+
+
+@kernel
+def solve(
+    constant: Structure, U: Array, slope: Array, point: Point, away: Distances, products: Distances, softness: float
+) -> tuple[Point, Distances]:
+    """Return the Newton step that changes the products by `products`, and how the distances change with it."""
+    dz, of_rows, d_low, d_high = -slope, products.rows.copy(), products.low.copy(), products.high.copy()
+    for r in range(of_rows.shape[0]):
+        of_rows[r] /= away.rows[r] + softness * point.rows[r]
+    add_columns(constant, -of_rows, dz)
+    for i in range(dz.shape[0]):
+        d_low[i] /= away.low[i]
+        dz[i] += d_low[i]
+        if point.high[i] > 0:
+            d_high[i] /= away.high[i]
+            dz[i] -= d_high[i]
+    cholesky_solve(U, dz)
+    d_away = np.empty_like(of_rows)
+    multiply_rows(constant, dz, d_away)
+    for r in range(of_rows.shape[0]):
+        of_rows[r] += point.rows[r] * d_away[r] / (away.rows[r] + softness * point.rows[r])
+        d_away[r] = softness * of_rows[r] - d_away[r]
+    for i in range(dz.shape[0]):
+        d_low[i] -= point.low[i] * dz[i] / away.low[i]
+        if point.high[i] > 0:
+            d_high[i] += point.high[i] * dz[i] / away.high[i]
+    return Point(dz, of_rows, d_low, d_high), Distances(d_away, dz, -dz)
+
+
+@kernel
+def towards_zero(point: Point, away: Distances) -> Distances:
+    """Return by how much the products are to change to vanish."""
+    rows, low, high = np.empty_like(point.rows), np.empty_like(point.z), np.zeros_like(point.z)
+    for r in range(rows.shape[0]):
+        rows[r] = -(away.rows[r] * point.rows[r])
+    for i in range(low.shape[0]):
+        low[i] = -(away.low[i] * point.low[i])
+        if point.high[i] > 0:
+            high[i] = -(away.high[i] * point.high[i])
+    return Distances(rows, low, high)
+
+
+@kernel
+def correct(products: Distances, mu: float, point: Point, change: Point, moved: Distances) -> None:
+    """Let the products become mu, and make up for what a change adds to them in second order."""
+    for r in range(products.rows.shape[0]):
+        products.rows[r] += mu - moved.rows[r] * change.rows[r]
+    for i in range(products.low.shape[0]):
+        products.low[i] += mu - moved.low[i] * change.low[i]
+        if point.high[i] > 0:
+            products.high[i] += mu - moved.high[i] * change.high[i]
+
+
+@kernel
+def longest(point: Point, away: Distances, change: Point, moved: Distances, share: float) -> float:
+    """Return the longest step up to `share` that crosses nothing."""
+    share = room(away.rows, moved.rows, room(point.rows, change.rows, share))
+    share = room(away.low, moved.low, room(point.low, change.low, share))
+    return room(away.high, moved.high, room(point.high, change.high, share))
+
+
+@kernel
+def gradient(constant: Structure, phi: Array, point: Point) -> Array:
+    """Return the gradient of the Lagrangian, shape (n,)."""
+    slope = phi - point.low + point.high
+    for i in range(slope.shape[0]):
+        for j in range(slope.shape[0]):
+            slope[j] += constant.hessian[i, j] * point.z[i]
+    add_columns(constant, point.rows, slope)
+    return slope
+
+
+@kernel
+def step(
+    constant: Structure, phi: Array, gamma: Array, low: Array, high: Array, point: Point, softness: float, finest: float
+) -> tuple[Point, bool]:
+    """Return the point after one iteration, and whether there was anything to be won."""
+    real = point.z.dtype.type
+    one = real(1.0)
+    away = distances(constant, gamma, low, high, point, softness)
+    mu = mean_product(point, away)
+    if not mu > finest:
+        return point, False
+    slope = gradient(constant, phi, point)
+    U = newton_matrix(constant, point, away, softness)
+    cholesky(U)
+    products = towards_zero(point, away)
+    change, moved = solve(constant, U, slope, point, away, products, softness)
+    share = longest(point, away, change, moved, one)
+    predicted = after(point, change, share)
+    centring = mean_product(predicted, distances(constant, gamma, low, high, predicted, softness)) / mu
+    correct(products, mu * centring * centring * centring, point, change, moved)
+    change, moved = solve(constant, U, slope, point, away, products, softness)
+    share = min(one, real(SHORT_OF) * longest(point, away, change, moved, one / real(SHORT_OF)))
+    return after(point, change, share), True

@@ -1,0 +1,48 @@
+"""Every view, dark and light, wide and narrow: no serious finding of axe-core, nothing that is cut off sideways."""
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.hmi.conftest import Site, eventually, log_in_by_clicks, opened
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+VIEWS = ("overview", "trends", "why", "alarms", "commands", "detail")
+SERIOUS = ("serious", "critical")
+
+
+def findings(page: "Page") -> list[dict[str, Any]]:
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    found = axe.Axe().run(page).response["violations"]
+    return [
+        {"rule": one["id"], "nodes": [node["html"][:160] for node in one["nodes"][:3]]}
+        for one in found
+        if one["impact"] in SERIOUS
+    ]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1280, 720), (390, 844)], ids=["wide", "phone"])
+def test_no_view_has_a_serious_finding(browser: "Browser", site: Site, scheme: str, size: tuple[int, int]) -> None:
+    with opened(
+        browser, site.address, viewport={"width": size[0], "height": size[1]}, color_scheme=scheme, bypass_csp=True
+    ) as page:  # axe is put into the page from outside, which the policy forbids
+        log_in_by_clicks(page)
+        for view in VIEWS:
+            page.click(f"nav a[href='#{view}']")
+            eventually(lambda: page.is_visible(f"#{view}"), view)  # noqa: B023 called at once
+            assert findings(page) == [], view
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), (
+                f"{view} is wider than the screen"
+            )
+
+
+def test_the_page_is_used_with_the_keyboard_alone(page: "Page") -> None:
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.className") == "skip"
+    for _ in range(3):
+        page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    eventually(lambda: page.is_visible("#why"), "the third link leads to its view")

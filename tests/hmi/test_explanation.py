@@ -1,0 +1,210 @@
+"""Why an updating period changed: the sentence and its figures against a computation by hand.
+
+The reference is the paper's Algorithm 1 with fractions and logarithms of many digits, written here a second time and
+tried on a case that was computed on paper.
+"""
+
+import math
+import random
+from collections.abc import Sequence
+from decimal import Decimal, getcontext
+from typing import NamedTuple
+
+import pytest
+
+from coldloop.registers.codec import as_transmitted
+from coldloop.registers.control_plc import Verdict
+from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
+from hmi.explanation import Branch, Explanation, explain, increments_of
+from hmi.sentences import sentence
+from optimizer_plc.updating_period import Algorithm1, Observation, assess
+
+getcontext().prec = 40
+
+RULE = UpdatingRuleStatus(UpdatingRuleKind.ALGORITHM_1, 9, 2, 19, 2, slots=0.25, preparation=0.13, iteration=0.25)
+FIXED = UpdatingRuleStatus(UpdatingRuleKind.FIXED, 9, 9, 9, 0, slots=0.25, preparation=0.13, iteration=0.25)
+UNDECIDED = {"efficiency": 1.0, "mismatch": 1.0, "contraction": 1.0, "gamma": 0.0}
+OF_EACH_KIND = 10
+
+
+class ByHand(NamedTuple):
+    """What Algorithm 1 says, in many digits."""
+
+    contraction: Decimal
+    slope: Decimal
+    """dK/dq."""
+    gamma: Decimal
+    q: int
+
+
+def by_hand(q: int, before: float, hot_start: float, last_but_one: float, delivered: float, effective: float) -> ByHand:
+    """Algorithm 1 of the paper, line by line."""
+    J_k, J_hot, J_last, J_hat, J_next = (
+        Decimal(value) for value in (before, hot_start, last_but_one, delivered, effective)
+    )
+    E, D = J_hat / J_hot, J_next / J_hat * J_hot / J_k
+    K = E * D
+    dK = E * (D - 1) / q + D * (J_hat - J_last) / J_hot
+    gamma = dK if K >= 1 else (-K.ln() + q / K * dK) / K.ln() ** 2
+    step = -2 if gamma > 0 else 2 if gamma < 0 else 0
+    return ByHand(K, dK, gamma, max(2, min(19, q + step)))
+
+
+def test_the_reference_is_right_on_a_case_computed_on_paper() -> None:
+    """E = 100 / 200, D = 90 * 200 / (100 * 160); (0.575364 - 0.048889) / 0.331044 = 1.590349."""
+    found = by_hand(4, 160.0, 200.0, 104.0, 100.0, 90.0)
+    assert found.contraction == Decimal("0.5625")
+    assert found.slope == Decimal("-0.006875")
+    assert float(found.gamma) == pytest.approx(1.590349, rel=1e-6)
+    assert found.q == 2
+
+
+class Case(NamedTuple):
+    """Two updates in a row, and what is known of them by hand."""
+
+    before: Optimization
+    update: Optimization
+    q_before: int
+    reference: ByHand
+
+
+def optimization(number: int, tick: int, q: int, **values: float) -> Optimization:
+    numbers = {
+        "j_effective": 10.0, "j_hot_start": 10.0, "j_delivered": 9.0, "j_dev": 1.0, "j_cst": 0.0, "violation": 0.0,
+        "load_mismatch": 0.0, **UNDECIDED, **values,
+    }  # fmt: skip
+    verdict = int(numbers.pop("verdict", Verdict.ACCEPTED))
+    return as_transmitted(Optimization(number, tick, tau_u=1 + q, iterations=q, verdict=verdict, **numbers))
+
+
+def decided_cases(wanted: int) -> list[Case]:
+    """Updates of chance that Algorithm 1 decided, of which the sign of Gamma is `wanted`."""
+    chance = random.Random(wanted)  # noqa: S311 not a secret
+    found: list[Case] = []
+    while len(found) < OF_EACH_KIND:
+        q = chance.randint(3, 18)
+        J_k, J_hot = chance.uniform(5, 50), chance.uniform(5, 50)
+        J_last = J_hot * chance.uniform(0.3, 1.0)
+        J_hat, J_next = J_last * chance.uniform(0.7, 1.0), J_k * chance.uniform(0.3, 1.4)
+        reference = by_hand(q, J_k, J_hot, J_last, J_hat, J_next)
+        if (reference.gamma > 0) - (reference.gamma < 0) != wanted or abs(reference.contraction - 1) < Decimal("0.01"):
+            continue
+        observed = Observation(q, 0.25 * (1 + q), J_k, J_hot, J_last, J_hat, J_next)
+        a = assess(observed)
+        assert Algorithm1(9, 2, 19, 2).next(observed)[0] == reference.q, "the program agrees with the reference"
+        before = optimization(7, 100, q, j_effective=J_k, j_hot_start=J_hot, j_delivered=J_hat)
+        update = optimization(
+            8, 101 + q, reference.q, j_effective=J_next, efficiency=a.efficiency, mismatch=a.mismatch,
+            contraction=a.contraction, gamma=a.gamma,
+        )  # fmt: skip
+        found.append(Case(before, update, q, reference))
+    return found
+
+
+@pytest.mark.parametrize(("wanted", "branch"), [(1, Branch.DOWN), (-1, Branch.UP)])
+def test_periods_that_algorithm_1_made_shorter_or_longer(wanted: int, branch: Branch) -> None:
+    for before, update, q, reference in decided_cases(wanted):
+        found = explain(update, before, None, RULE)
+        assert found.branch is branch
+        assert (found.iterations_before, found.iterations) == (q, reference.q)
+        assert found.increments is not None
+        assert found.increments.contraction == pytest.approx(float(reference.slope), rel=2e-3, abs=1e-6)
+        text = sentence(found, RULE)
+        assert ("fewer iterations" in text) is (wanted > 0)
+        assert ("is not below 1" in text) is (reference.contraction >= 1)
+        assert f"{float(reference.contraction):.4g}"[:4] in text
+        says = f"q goes from {q} to {reference.q}" if q != reference.q else f"q stays at {q}"
+        assert says in text
+        assert (
+            f"{'falls' if wanted > 0 else 'rises'} from {0.25 * (1 + q):g} s to {0.25 * (1 + reference.q):g} s" in text
+        )
+
+
+def test_what_other_numbers_of_iterations_would_have_meant() -> None:
+    """K +- 2 dK; the response time is q tau_1 / -ln K, and there is none where K is not below 1."""
+    for before, update, q, reference in decided_cases(1) + decided_cases(-1):
+        found = explain(update, before, None, RULE)
+        steps = [one.iterations - q for one in found.alternatives]
+        assert steps == [step for step in (-2, 0, 2) if q + step >= 1]
+        for one in found.alternatives:
+            K = reference.contraction + (one.iterations - q) * reference.slope
+            assert one.contraction == pytest.approx(float(K), rel=2e-3, abs=1e-5)
+            assert one.period_s == min(5.0, 0.25 + 0.25 * one.iterations)
+            if one.response_s is not None and 0.05 < K < Decimal("0.95"):
+                assert one.response_s == pytest.approx(-one.iterations * 0.25 / math.log(K), rel=2e-2)
+            assert (one.response_s is None) is not (0 < one.contraction < 1)
+
+
+def assert_all(cases: Sequence[Explanation], branch: Branch, rule: UpdatingRuleStatus, *parts: str) -> None:
+    assert len(cases) == OF_EACH_KIND
+    for found in cases:
+        assert found.branch is branch
+        assert found.increments is None
+        text = sentence(found, rule)
+        for part in parts:
+            assert part in text, text
+
+
+def test_periods_that_a_load_step_interrupted() -> None:
+    cases = []
+    for number in range(OF_EACH_KIND):
+        q = 10 + number % 5
+        before = optimization(number, 100, q, verdict=Verdict.WRONG_UPDATE if number % 2 else Verdict.NONE)
+        update = optimization(number + 1, 101 + number % 4, 9)
+        cases.append(explain(update, before, None, RULE))
+        elapsed, period = (1 + number % 4) * 0.25, (1 + q) * 0.25
+        assert f"after {elapsed:g} s of {period:g} s" in sentence(cases[-1], RULE)
+    assert_all(cases, Branch.INTERRUPTED, RULE, "a load step ended the period before", "q starts at 9")
+
+
+def test_periods_after_a_sequence_that_came_too_late() -> None:
+    cases = []
+    for number in range(OF_EACH_KIND):
+        q = 2 + number
+        before = optimization(number, 50, q, verdict=Verdict.LATE)
+        cases.append(explain(optimization(number + 1, 51 + q, q), before, None, RULE))
+        assert f"q stays at {q}" in sentence(cases[-1], RULE)
+    assert_all(cases, Branch.LATE, RULE, "verdict: late", "tau_u stays at")
+
+
+def test_periods_that_are_fixed() -> None:
+    cases = [
+        explain(optimization(number + 1, 10 * number + 10, 9), optimization(number, 10 * number, 9), None, FIXED)
+        for number in range(OF_EACH_KIND)
+    ]
+    assert_all(cases, Branch.FIXED, FIXED, "tau_u is 2.5 s because the session has a fixed updating period", "q = 9")
+
+
+def test_the_first_update_one_after_a_restart_and_one_whose_predecessor_is_unknown() -> None:
+    assert explain(optimization(0, 0, 9), None, None, RULE).branch is Branch.FIRST
+    again = explain(optimization(5, 300, 9), optimization(4, 100, 3), None, RULE)
+    assert again.branch is Branch.BEGUN_AGAIN
+    assert "had to begin again" in sentence(again, RULE)
+    unknown = explain(optimization(5, 300, 9), optimization(3, 100, 3), None, RULE)
+    assert unknown.branch is Branch.UNKNOWN
+    assert unknown.iterations_before is None
+
+
+def test_the_time_line_of_the_plc_and_what_was_predicted_and_came() -> None:
+    """0.13 s of preparation and 9 iterations of 0.25 s: an answer after 2.38 s of 2.5 s."""
+    update, after = optimization(3, 30, 9, j_delivered=8.0), optimization(4, 40, 9, j_effective=8.25)
+    found = explain(update, None, after, RULE)
+    assert found.budget.answer == pytest.approx(2.38)
+    assert found.budget.slack == pytest.approx(0.12)
+    assert (found.predicted, found.came) == (8.0, 8.25)
+    assert explain(update, None, optimization(5, 50, 9), RULE).came is None
+
+
+def test_iterations_that_would_have_changed_nothing_count_as_planned() -> None:
+    done = optimization(1, 10, 9)._replace(iterations=4)
+    assert explain(done, optimization(0, 0, 9), None, RULE).iterations == 9
+
+
+def test_increments_are_found_again_on_both_sides_of_one() -> None:
+    for effective in (80.0, 300.0):
+        a = assess(Observation(4, 1.25, 160.0, 200.0, 104.0, 100.0, effective))
+        values = {"efficiency": a.efficiency, "mismatch": a.mismatch, "contraction": a.contraction, "gamma": a.gamma}
+        found = increments_of(optimization(1, 5, 4, **values), 4)
+        assert found.efficiency == pytest.approx(a.efficiency_increment, rel=1e-4)
+        assert found.mismatch == pytest.approx(a.mismatch_increment, rel=1e-4)
+        assert found.contraction == pytest.approx(a.contraction_increment, rel=1e-4)

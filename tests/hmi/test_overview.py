@@ -1,0 +1,113 @@
+"""What the overview shows is what is in the registers, and what is not current is crossed out."""
+
+import re
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import pytest
+
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
+from tests.hmi.conftest import SERVICES, Site, Witness, eventually
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+TICKS = 200
+SHOWN = ("load", *(f"u.{name}" for name in INPUT_NAMES), *(f"y.{name}" for name in OUTPUT_NAMES))
+COLLECT = """() => {
+  window.seen = {};
+  const look = () => {
+    const values = {};
+    for (const one of document.querySelectorAll("#overview .tag[data-signal], #overview .bar[data-signal]"))
+      values[`${one.tagName} ${one.dataset.signal}`] = one.querySelector(".reading").textContent;
+    window.seen[document.body.dataset.tick] = values;
+  };
+  new MutationObserver(look).observe(document.body, { attributes: true, attributeFilter: ["data-tick"] });
+}"""
+
+
+def test_every_number_of_the_overview_is_that_of_an_independent_reading_of_the_same_tick(
+    page: "Page", site: Site
+) -> None:
+    with Witness(site.ports["control_plc"]) as witness:
+        page.evaluate(COLLECT)
+        eventually(lambda: page.evaluate("Object.keys(window.seen).length") >= TICKS + 20, f"{TICKS} ticks", 120)
+        shown = {int(tick): values for tick, values in page.evaluate("window.seen").items()}
+    both = sorted(set(shown) & set(witness.seen))
+    assert len(both) >= TICKS
+    compared = 0
+    for tick in both:
+        registers = dict(zip(SHOWN, witness.seen[tick], strict=True))
+        for name, text in shown[tick].items():
+            value = registers[name.partition("control_plc.process.")[2]]
+            number, _, unit = text.partition(" ")
+            step = 10.0 ** -len(number.partition(".")[2])
+            assert abs(float(number) - value) <= 0.501 * step + 1e-6 * abs(value), (tick, name, text, value)
+            assert unit
+            compared += 1
+    assert compared >= TICKS * (1 + len(INPUT_NAMES) + len(OUTPUT_NAMES)), "every output, input and the load"
+
+
+def tick_of(page: "Page") -> int:
+    return int(page.get_attribute("body", "data-tick") or 0)
+
+
+def crossed_out(page: "Page", prefix: str) -> bool:
+    """Tell whether every value of a service in the overview is crossed out, if there is any."""
+    return bool(
+        page.evaluate(
+            """(prefix) => {
+              const shown = "#overview [data-signal], header [data-signal], #overview .reading";
+              const own = [...document.querySelectorAll(shown)]
+                .map((one) => [one, one.dataset.signal || one.closest("[data-signal]").dataset.signal])
+                .filter(([one, name]) => name.startsWith(prefix) && !one.classList.contains("bar"));
+              return own.length > 0 && own.every(([one]) => one.closest(".stale"));
+            }""",
+            prefix,
+        )
+    )
+
+
+@pytest.mark.parametrize("service", SERVICES[:3])
+@pytest.mark.parametrize("how", ["killed", "frozen"])
+def test_values_of_a_service_that_is_dead_or_frozen_are_crossed_out_and_come_back(
+    page: "Page", site: Site, service: str, how: str, record_property: Callable[[str, object], None]
+) -> None:
+    assert not crossed_out(page, f"{service}.")
+    (site.kill if how == "killed" else site.freeze)(service)
+    begun = time.monotonic()
+    try:
+        eventually(lambda: crossed_out(page, f"{service}."), f"values of the {service} are crossed out")
+        record_property("crossed_out_after_s", round(time.monotonic() - begun, 2))
+        assert service in (page.text_content("#banner") or "")
+        assert "dead" in (page.get_attribute(f"[data-service={service}]", "class") or "")
+    finally:
+        (site.start if how == "killed" else site.thaw)(service)
+    eventually(lambda: page.is_hidden("#banner"), "the banner goes", 90)
+    eventually(lambda: not crossed_out(page, f"{service}."), "values come back")
+
+
+def test_when_the_page_itself_is_killed_the_browser_says_so_and_comes_back(page: "Page", site: Site) -> None:
+    site.kill("hmi")
+    eventually(lambda: all(crossed_out(page, f"{service}.") for service in SERVICES[:3]), "everything is crossed out")
+    assert "own server" in (page.text_content("#banner") or "")
+    before = tick_of(page)
+    site.start("hmi")
+    eventually(lambda: tick_of(page) > before, "ticks go on", 60)
+    eventually(lambda: page.is_hidden("#banner"), "the banner goes", 30)
+
+
+def test_the_alarm_line_is_on_every_view(page: "Page") -> None:
+    for view in ("overview", "trends", "why", "alarms", "commands", "detail"):
+        page.click(f"nav a[href='#{view}']")
+        assert page.is_visible(f"#{view}")
+        assert page.is_visible("#alarm-line")
+
+
+def test_a_register_of_every_block_is_in_the_detail_view(page: "Page") -> None:
+    page.click("nav a[href='#detail']")
+    page.fill("#detail-search", "magic")
+    assert page.locator("#detail tr:visible").count() == 3
+    texts = [page.locator("#detail tr:visible td.value").nth(place).text_content() for place in range(3)]
+    assert all(re.fullmatch(r"123\.4560", text) for text in texts)
