@@ -26,10 +26,10 @@ HAPPENINGS: Final = {
     "a compressor trips for 2 min": Event(
         "a", (f"{EVENTS}[{{at_s=600,target='nc1',value=0}},{{at_s=720,target='nc1',value=1}}]",)
     ),
-    "no nitrogen for 20 min": Event(
-        "a", (f"{EVENTS}[{{at_s=600,target='nitrogen',value=0}},{{at_s=1800,target='nitrogen',value=1}}]",)
+    "no nitrogen for 45 min": Event(
+        "a", (f"{EVENTS}[{{at_s=300,target='nitrogen',value=0}},{{at_s=3000,target='nitrogen',value=1}}]",)
     ),
-    "a leak of 1 g/s for 20 min": Event(
+    "a leak for 20 min": Event(
         "a", (f"{EVENTS}[{{at_s=600,target='leak',value=1}},{{at_s=1800,target='leak',value=0}}]",)
     ),
     "10 K warmer outside": Event("a", (f"{EVENTS}[{{at_s=600,target='ambient',value=310}}]",)),
