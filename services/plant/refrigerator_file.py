@@ -67,7 +67,7 @@ def read_refrigerator_file(path: Path) -> RefrigeratorFile:
     Raises:
         ModelFileError: The file cannot be read, is damaged, or was made from another plant.
     """
-    document = read_document(path)
+    document = read_document(path, REMEDY)
     if document.get("plant") != KIND:
         raise ModelFileError(f"{path}: not the file of a refrigerator; {REMEDY}")
     try:

@@ -1,10 +1,16 @@
-"""The maker of the refrigerator's file: `python -m plant.refrigerator_model FILE`."""
+"""The maker of the refrigerator's file: `python -m plant.refrigerator_model FILE`.
 
-import sys
+With `--config` or `--set plant.station.weights.lp_bar=0.02` its gains are of these weights.
+"""
+
+import argparse
 from pathlib import Path
 
 import numpy as np
 
+from coldloop.command_line import add_configuration_options
+from coldloop.config import load_configuration
+from coldloop.service import SECTIONS
 from plant.equilibrium import find_equilibrium
 from plant.helium.properties import load_helium
 from plant.model import OPERATING_INPUTS, OPERATING_LEVEL
@@ -12,6 +18,7 @@ from plant.refrigerator import REFERENCE_REFRIGERATOR, Refrigerator, check_refri
 from plant.refrigerator_equilibrium import Rest, find_refrigerator_equilibrium
 from plant.refrigerator_file import RefrigeratorFile, refrigerator_digest
 from plant.refrigerator_linearisation import jacobian
+from plant.settings import PlantSettings
 from plant.station_design import line_model, lq_gains
 from plant.station_settings import LqWeights
 
@@ -48,5 +55,17 @@ def make_refrigerator_file(
     )
 
 
+def main() -> None:
+    """Write the file that the command line asks for."""
+    parser = argparse.ArgumentParser(description="Make the file of the refrigerator.")
+    add_configuration_options(parser)
+    parser.add_argument("file", type=Path, help="what to write")
+    options = parser.parse_args()
+    station = load_configuration(
+        PlantSettings, file=options.config, assignments=options.assignments, others=SECTIONS
+    ).settings.plant.station
+    make_refrigerator_file(weights=station.weights).save(options.file)
+
+
 if __name__ == "__main__":
-    make_refrigerator_file().save(Path(sys.argv[1]))
+    main()
