@@ -15,8 +15,8 @@ from coldloop.service import run_event_loop
 from plant.load import find_load
 from plant.runtime import own_header
 from rig.local_services import LocalServices
-from rig.network import NetworkRig
 from rig.scenario import Scenario
+from rig.session_client import SessionClient
 from rig.settings import Settings
 from rig.wiring import START_PATIENCE_S
 
@@ -36,7 +36,7 @@ async def follow(ppm: float, factor: float, hours: float, folder: Path) -> Follo
     ticks = round(hours * 3600 / TICK_S)
     load = find_load("8h", own_header(settings.model.file).w0)
     async with LocalServices(settings, folder) as services:
-        rig = NetworkRig(services.endpoints, settings)
+        rig = SessionClient(services.endpoints, settings)
         client = RegisterClient.at(CONTROL_MAP, services.endpoints.control_plc)
 
         async def work() -> Followed:

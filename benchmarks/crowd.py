@@ -27,9 +27,9 @@ from coldloop.registers.plant import PLANT_MAP
 from coldloop.registers.safety import WatchdogStatus
 from plant.load import find_load
 from rig.local_services import LocalServices
-from rig.network import NetworkRig
 from rig.recording import LinkStatistics, Recorder
 from rig.scenario import Scenario
+from rig.session_client import SessionClient
 from rig.settings import Settings
 
 OURS = 4
@@ -101,7 +101,7 @@ async def measure(options: argparse.Namespace, clients: int, logs: Path) -> tupl
     scenario = Scenario(ticks, find_load("a", load_model(settings.model.file).w0), 0.0, 1, realtime=True)
     recorder = Recorder(ticks)
     async with LocalServices(settings, logs) as services:
-        rig = NetworkRig(services.endpoints, settings)
+        rig = SessionClient(services.endpoints, settings)
         await rig.connect(60.0)
         others = await start_crowd(options, services.endpoints.control_plc.port) if clients else None
         run = asyncio.create_task(rig.run(scenario, recorder))

@@ -5,7 +5,7 @@ import random
 import tempfile
 from pathlib import Path
 
-from coldloop.config import load_configuration
+from coldloop.config import Configuration, load_configuration
 from coldloop.process import TICK_S
 from coldloop.session import TimeMode
 from rig.chaos.evaluation import Evaluation
@@ -14,7 +14,7 @@ from rig.chaos.faults import Kill, Pause
 from rig.chaos.plan import Plan
 from rig.chaos.progress import ChaosProgress
 from rig.chaos.report import summary_lines, write_report
-from rig.results import prepare_folder
+from rig.results import claim_folder
 from rig.settings import Settings
 
 IN_FLIGHT_MS = 20.0
@@ -63,10 +63,10 @@ def tell(evaluation: Evaluation) -> None:
     print(f"back to MPC after at most {max(back, default=0.0):g} s; not before the next one in {len(rows) - len(back)}")
 
 
-def patient(patience_s: float) -> Settings:
+def patient(patience_s: float) -> Configuration[Settings]:
     """Return the default settings with another patience: with hundreds of instants, what lock-step waits adds up."""
     assignment = f"control_plc.ladder.optimizer_patience_s={patience_s}"
-    return load_configuration(Settings, environment={}, assignments=[assignment]).settings
+    return load_configuration(Settings, environment={}, assignments=[assignment])
 
 
 def main() -> int:
@@ -85,14 +85,14 @@ def main() -> int:
                         help="plant time from one instant to the next, about, s; in real time a process takes some "
                         "seconds to start, which at factor 20 is a hundred of plant time")  # fmt: skip
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="folder for chaos.json, chaos.md and logs (default: none are kept)")
+    parser.add_argument("--out", type=Path, help="folder for the results (default: none are kept)")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.out or Path(scratch)
-        prepare_folder(folder)
+        claim_folder(folder, force=False)
         plan = make_plan(options)
         with ChaosProgress(plan.ticks) as progress:
-            experiment = perform(plan, patient(options.patience), folder, progress)
+            experiment = perform(plan, patient(options.patience), folder, progress, arguments={}, formats=["png"])
         write_report(folder, plan, experiment.trace, experiment.evaluation, {}, experiment.failure)
     tell(experiment.evaluation)
     print(*summary_lines(experiment.trace, experiment.evaluation), sep="\n")

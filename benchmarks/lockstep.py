@@ -11,9 +11,9 @@ from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
 from coldloop.service import run_event_loop
 from plant.load import find_load
 from rig.local_services import LocalServices
-from rig.network import NetworkRig
 from rig.recording import Recorder
 from rig.scenario import Scenario
+from rig.session_client import SessionClient
 from rig.settings import Settings
 
 
@@ -37,7 +37,7 @@ async def measure(ticks: int, period_s: float) -> int:
     scenario = Scenario(ticks, find_load("2h", mean), period_s, seed=1)
     with tempfile.TemporaryDirectory() as folder:
         async with LocalServices(settings, Path(folder)) as services:
-            rig = NetworkRig(services.endpoints, settings)
+            rig = SessionClient(services.endpoints, settings)
 
             async def work() -> tuple[float, float]:
                 await rig.connect(90.0)

@@ -11,10 +11,11 @@ from scipy.linalg import lapack
 from coldloop.limits import InputLimits
 from coldloop.lti_model import load
 from coldloop.model_settings import DEFAULT_MODEL_FILE
+from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, Situation
-from optimizer_plc.solvers.ode import OdeSettings, OdeSolver
+from optimizer_plc.solvers.ode import OdeSolver
 
 
 def microseconds(work: Callable[[], object], rounds: int) -> float:

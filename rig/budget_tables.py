@@ -7,8 +7,9 @@ import numpy as np
 from coldloop.lti_model import load
 from coldloop.process import TICK_S
 from optimizer_plc import operations
-from optimizer_plc.arithmetic import Arithmetic
+from optimizer_plc.arithmetic import real_of
 from optimizer_plc.budget import PlcBudget
+from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.design import N_SLACKS, trivial_design
 from optimizer_plc.memory import Footprint, estimator_memory, footprint
 from optimizer_plc.operations import Operations
@@ -40,7 +41,7 @@ def budget_tables(settings: Settings, power: float | None, period_s: float | Non
     periods = PERIODS_S if period_s is None else (period_s,)
     program = settings.optimizer_plc.program
     prediction = PredictionModel(load(settings.model.file))
-    real = Arithmetic.FLOAT32.real
+    real = real_of(Arithmetic.FLOAT32)
     problem = PredictiveProblem(prediction, program.design, settings.limits, real)
     trivial = PredictiveProblem(prediction, trivial_design(program.design), settings.limits, real)
     curve = fitted(cholesky_times())

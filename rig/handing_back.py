@@ -11,8 +11,8 @@ from coldloop.registers.plant import LiveLoad, LoadStatus, LoadStep, PlantSessio
 from coldloop.seal import sealed
 from plant.program import LoadProfile
 from rig.load_stream import LoadStream
-from rig.network import NetworkRig
 from rig.operator_client import LEAD_TICKS, write_pace
+from rig.session_client import SessionClient
 
 log = logging.getLogger("coldloop.rig")
 
@@ -28,7 +28,7 @@ class Found(NamedTuple):
     """From the tick on at which we came."""
 
 
-async def look_around(rig: NetworkRig) -> Found | None:
+async def look_around(rig: SessionClient) -> Found | None:
     """Return what a rig does, if it does something in real time.
 
     Raises:
@@ -40,7 +40,7 @@ async def look_around(rig: NetworkRig) -> Found | None:
     return Found(pace, await rig.control.read(Operator), await _load_from(rig, identity.tick))
 
 
-async def _load_from(rig: NetworkRig, now: int) -> LoadProfile:
+async def _load_from(rig: SessionClient, now: int) -> LoadProfile:
     """Return the load from now on: of the session's table, unless somebody has written another one since."""
     status, asked = await rig.plant.read(LoadStatus), await rig.plant.read(PlantSession)
     steps: list[LoadStep] = []
@@ -53,7 +53,7 @@ async def _load_from(rig: NetworkRig, now: int) -> LoadProfile:
     return LoadProfile((0, *(step.tick - now for step in coming)), (status.watts, *(step.watts for step in coming)))
 
 
-async def give_back(rig: NetworkRig, found: Found | None, session: int) -> None:
+async def give_back(rig: SessionClient, found: Found | None, session: int) -> None:
     """Let the session of our run go on as the rig was found: real time, factor, load, who drives.
 
     Nothing is done where the rig was in lock-step, or where somebody else has begun another session. What cannot be

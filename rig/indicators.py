@@ -66,7 +66,7 @@ class StageCost:
 
 
 class RunEvaluation(Sink):
-    """Sums the indicators of a run, and its digest, in constant memory."""
+    """Sums the indicators of a run, and its digest, in constant memory; ticks that are unknown add nothing."""
 
     def __init__(self, model: LtiModel, design: ControlDesign) -> None:
         self._cost = StageCost(model, design)
@@ -83,7 +83,7 @@ class RunEvaluation(Sink):
         constrained = block.y[:, [L1, T5]]
         outside = (constrained < self._design.output_low) | (constrained > self._design.output_high)
         self._outside += outside.sum(axis=0)
-        self._stage_costs += float(self._cost.of(block).sum())
+        self._stage_costs += float(np.nansum(self._cost.of(block)))
         self._digest.update(block.digested)
         self.ticks += len(block.load)
 

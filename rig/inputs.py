@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from coldloop.errors import UsageError
-from coldloop.lti_model import load as load_model
 from coldloop.model_settings import DEFAULT_MODEL_FILE
-from plant.load import find_load, named_families
+from plant.load import named_families
 from plant.program import LoadProfile
 from rig.settings import Settings
 
@@ -18,16 +17,20 @@ LOAD_COPY: Final = f"{FOLDER}/load.csv"
 MODEL_COPY: Final = f"{FOLDER}/model.json"
 
 
-def copy_inputs(settings: Settings, folder: Path) -> dict[str, Any]:
+def copy_inputs(settings: Settings, profile: LoadProfile, folder: Path) -> dict[str, Any]:
     """Copy the files that a run reads into its folder; return their description for the manifest.
+
+    Args:
+        settings: Name the files.
+        profile: The load.
+        folder: Of the run.
 
     A load that has a name is described by the digest of its steps, the model that is shipped by its own digest.
     """
     (folder / FOLDER).mkdir(exist_ok=True)
     name, model_file = settings.plant.load, settings.model.file
-    profile = find_load(name, load_model(model_file).w0)
     load: dict[str, Any] = {"source": name, "file": None, "profile_sha256": profile_digest(profile)}
-    if named_families(name) is None:
+    if Path(name).is_file() and named_families(name) is None:
         load |= _copied(Path(name), folder, LOAD_COPY)
     shipped = model_file == DEFAULT_MODEL_FILE
     model = {"source": "shipped" if shipped else str(model_file), **_copied(model_file, folder, MODEL_COPY)}

@@ -11,10 +11,10 @@ from typing import Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
 from coldloop.errors import LinkError
-from rig.network import NetworkRig
 from rig.ports import ReservedPorts
 from rig.recording import Recorder
 from rig.scenario import Scenario
+from rig.session_client import SessionClient
 from rig.settings import Settings
 from rig.wiring import SERVICES, START_PATIENCE_S, Detours, endpoints_on, wired
 
@@ -175,7 +175,7 @@ async def run_on_localhost(settings: Settings, scenario: Scenario, recorder: Rec
         LinkError: A service ended, or one could not be reached.
     """
     async with LocalServices(settings, log_folder) as services:
-        rig = NetworkRig(services.endpoints, settings)
+        rig = SessionClient(services.endpoints, settings)
 
         async def work() -> None:
             await rig.connect(START_PATIENCE_S)

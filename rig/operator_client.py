@@ -102,6 +102,8 @@ class OperatorClient:
             await stream.feed((await self.plant.read(Identity)).tick)
             if stream.done:
                 break
+            if await stream.was_replaced():
+                raise LinkError("somebody else has written the load meanwhile: the rest of the file is not written")
             if not told:
                 told = True
                 say(f"the plant keeps {free} steps of {stream.steps}: this goes on until it has all of them")

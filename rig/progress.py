@@ -80,7 +80,7 @@ class RunProgress(PlantTimeBar, Sink):
 
     def sample(self, sample: PlantSample) -> None:
         """Show where the run is, a few times a second."""
-        self._done += 1
+        self._done = sample.tick + 1
         last = self._done == self._ticks
         if self._done % 8 and not last:
             return

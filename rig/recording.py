@@ -4,14 +4,16 @@ A rig calls the `Recorder`; the recorder passes samples on in blocks, and update
 its sinks. Sinks write files, evaluate, show a line, or keep all in memory.
 """
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import islice
-from typing import Final, Generic, TypeVar
+from typing import Final
 
-from coldloop.errors import ColdloopError
+from coldloop.errors import ColdloopError, LinkError
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample
@@ -25,29 +27,8 @@ BLOCK_TICKS: Final = 512
 SETTLED_TICKS: Final = 512
 """An update that nothing has followed for so long after its period was not cut off. In a networked run samples are
 read up to 256 ticks before the updates that go with them."""
-
-T = TypeVar("T")
-
-
-class Tail(Generic[T]):
-    """The number of items so far, and the last one: `len(tail)`, `tail[-1]`."""
-
-    def __init__(self) -> None:
-        self._count = 0
-        self._last: T | None = None
-
-    def append(self, item: T) -> None:
-        """Take the next item."""
-        self._count += 1
-        self._last = item
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, index: int) -> T:
-        if index != -1 or self._last is None:
-            raise IndexError(index)
-        return self._last
+KEPT_TICKS: Final = BLOCK_TICKS
+"""So many of the last ticks are not passed on yet: a plant that was restarted may do some of them again."""
 
 
 class Sink:
@@ -111,9 +92,10 @@ class Recorder:
 
     def __init__(self, ticks: int, sinks: Sequence[Sink] | None = None) -> None:
         self.ticks = ticks
-        self.samples: Tail[PlantSample] = Tail()
-        self.updates: Tail[Optimization] = Tail()
-        """All updates, those that a load step has cut off included."""
+        self.next_tick = 0
+        """First tick that is still to come."""
+        self.missing_ticks = 0
+        """Ticks before it of which nothing is known."""
         self.link = LinkStatistics()
         self._memory = MemorySink()
         self._sinks = (self._memory,) if sinks is None else tuple(sinks)
@@ -136,27 +118,26 @@ class Recorder:
         """Real time from the beginning to the last sample."""
         return self._last - self._began
 
-    @property
-    def complete(self) -> bool:
-        """Whether all ticks were recorded."""
-        return len(self.samples) == self.ticks
-
     def stop(self, reason: ColdloopError) -> None:
         """Let the next sample raise `reason`: a signal handler calls this."""
         self._stop = reason
 
     def sample(self, sample: PlantSample) -> None:
-        """Take the next tick.
+        """Take the next tick; or a later one, and those before it are unknown; or one of the last ones that came again.
 
         Raises:
+            LinkError: A tick came again that is older than `KEPT_TICKS`.
             ColdloopError: The run is to stop; the tick is recorded.
         """
-        self.samples.append(sample)
-        self._pending.append(sample)
+        if sample.tick == self.next_tick:
+            self._pending.append(sample)
+            self.next_tick += 1
+        else:
+            self._put(sample)
         self._last = time.monotonic()
         for sink in self._sinks:
             sink.sample(sample)
-        if len(self._pending) >= BLOCK_TICKS:
+        if len(self._pending) >= BLOCK_TICKS + KEPT_TICKS:
             self._pass_on()
         if self._stop is not None:
             raise self._stop
@@ -165,9 +146,24 @@ class Recorder:
         """Take what goes with a tick that is about to come, where the plant is a whole refrigerator."""
         self._stations[sample.tick] = sample
 
+    def _put(self, sample: PlantSample) -> None:
+        """Put a tick that is not the next one where it belongs."""
+        if sample.tick > self.next_tick:
+            gap = range(self.next_tick, sample.tick)
+            self._pending += [*map(unknown_sample, gap), sample]
+            self.missing_ticks += len(gap)
+            self.next_tick = sample.tick + 1
+            return
+        place = len(self._pending) + sample.tick - self.next_tick
+        if place < 0:
+            raise LinkError(
+                f"tick {sample.tick} came again after tick {self.next_tick - 1}: the plant went back too far"
+            )
+        self.missing_ticks -= is_unknown(self._pending[place])
+        self._pending[place] = sample
+
     def update(self, update: Optimization) -> None:
-        """Take the next update."""
-        self.updates.append(update)
+        """Take the next update, also one that a load step will cut off."""
         self._unsettled.append(update)
         for sink in self._sinks:
             sink.reported(update)
@@ -199,12 +195,17 @@ class Recorder:
         return self._memory.recording(self.link)
 
     def _pass_on(self) -> None:
+        """Pass on all blocks that are whole and old enough; at the end all that is left."""
         self._settle()
-        if self._pending:
-            block = SampleBlock.of(self._pending, self._stations)
-            self._pending = []
-            self._stations = {}
-            _all(*(partial(sink.block, block) for sink in self._sinks))
+        kept = 0 if self._closed else KEPT_TICKS
+        calls = []
+        while len(self._pending) > kept and (self._closed or len(self._pending) >= BLOCK_TICKS + kept):
+            block = SampleBlock.of(self._pending[:BLOCK_TICKS], self._stations)
+            for sample in self._pending[:BLOCK_TICKS]:
+                self._stations.pop(sample.tick, None)
+            del self._pending[:BLOCK_TICKS]
+            calls += [partial(sink.block, block) for sink in self._sinks]
+        _all(*calls)
 
     def _settle(self) -> None:
         """Pass on the updates of which it is known that their sequence was played."""
@@ -212,7 +213,7 @@ class Recorder:
             _all(*(partial(sink.update, update) for sink in self._sinks))
 
     def _settled(self) -> Iterator[Optimization]:
-        done = len(self.samples)
+        done = self.next_tick
         while self._unsettled:
             update, *following = tuple(islice(self._unsettled, 2))
             end = update.tick + update.tau_u
@@ -223,6 +224,17 @@ class Recorder:
             self._unsettled.popleft()
             if not cut_off:
                 yield update
+
+
+def unknown_sample(tick: int) -> PlantSample:
+    """Return the sample of a tick of which nothing is known."""
+    nan = math.nan
+    return PlantSample(tick, nan, (nan,) * len(INPUT_NAMES), (nan,) * len(OUTPUT_NAMES), (nan,) * len(STATE_NAMES))
+
+
+def is_unknown(sample: PlantSample) -> bool:
+    """Tell whether nothing is known of a tick."""
+    return math.isnan(sample.load)
 
 
 def _all(*calls: Callable[[], None]) -> None:

@@ -8,6 +8,7 @@ from itertools import groupby
 from typing import Final
 
 from coldloop.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
+from coldloop.event_text import word
 from coldloop.modbus.requests import MAX_READ_WORDS
 from coldloop.registers.control_plc import CONTROL_MAP
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap
@@ -19,7 +20,7 @@ PORTS: Final = {"plant": PLANT_PORT, "control_plc": CONTROL_PORT, "optimizer_plc
 
 COLUMNS: Final = (
     "service", "block", "name", "address", "modicon", "rows", "row_words", "type", "unit", "low", "high", "writer",
-    "description",
+    "description", "values",
 )  # fmt: skip
 
 
@@ -28,7 +29,7 @@ def modicon(address: int) -> str:
     return f"{40001 + address}" if address < 9999 else f"{400001 + address}"
 
 
-Entry = dict[str, str | int | float | None]
+Entry = dict[str, str | int | float | dict[str, str] | None]
 
 
 def _entries(maps: Sequence[RegisterMap]) -> Iterator[Entry]:
@@ -43,19 +44,28 @@ def _entry(service: str, block: Block, register: Register) -> Entry:
     values = (
         service, block.name, register.name, register.address, modicon(register.address), block.rows,
         block.row_words, register.kind.label, register.unit, register.low, register.high,
-        register.writer.value if register.writer else "read-only", register.description,
+        register.writer.value if register.writer else "read-only", register.description, _meanings(register),
     )  # fmt: skip
     return dict(zip(COLUMNS, values, strict=True))
 
 
-def _text(value: str | float | None) -> str:
+def _meanings(register: Register) -> dict[str, str] | None:
+    """Return the meaning of an enumeration's numbers."""
+    if register.values is None:
+        return None
+    return {str(value.value): word(value) for value in register.values}
+
+
+def _text(value: str | float | dict[str, str] | None) -> str:
     if value is None:
         return ""
+    if isinstance(value, dict):
+        return " ".join(f"{number}={name}" for number, name in value.items())
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def as_json(maps: Sequence[RegisterMap]) -> str:
-    """Return an array of objects; a bound that does not exist is null."""
+    """Return an array of objects; a bound that does not exist is null, `values` has the meaning of enumerations."""
     return json.dumps(list(_entries(maps)), indent=1, ensure_ascii=False) + "\n"
 
 

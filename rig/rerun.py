@@ -35,6 +35,10 @@ def repeat(folder: Path, out: Path | None, *, force: bool) -> tuple[bool, str]:
     """
     run = RunFolder(folder)
     manifest = run.manifest
+    if manifest["way"] == Way.CHAOS:
+        raise UsageError(
+            f"{folder}: a run with faults, which depend on the machine; `coldloop chaos` runs the plan again"
+        )
     if not manifest["recorded_ticks"]:
         raise UsageError(f"{folder}: the run has no ticks: {manifest['reason']}")
     changed = changed_inputs(manifest, folder)

@@ -25,7 +25,11 @@ from rig.run_plot import plot_run
 from rig.scenario import Scenario
 from rig.settings import Settings
 
-NAMES: Final = ("manifest.json", "summary.json", "schema.json", *ALL_FILES, "run.png", "run.pdf", "run.svg")
+NAMES: Final = (
+    "manifest.json", "summary.json", "schema.json", *ALL_FILES, "run.png", "run.pdf", "run.svg",
+    "chaos.json", "chaos.md", "chaos.png",
+)  # fmt: skip
+"""Files of an earlier run that a new one in the same folder replaces."""
 
 
 class RunFiles:
@@ -54,7 +58,9 @@ class RunFiles:
         self._discard()
         self._reserve = DiskReserve(folder)
         self._realtime = scenario.realtime
-        self._manifest = first_manifest(effective, scenario, copy_inputs(settings, folder), way, arguments)
+        self._manifest = first_manifest(
+            effective, scenario, copy_inputs(settings, scenario.load, folder), way, arguments
+        )
         write_json(folder / "manifest.json", self._manifest)
         write_json(folder / "schema.json", schema_document(station=settings.plant.kind is PlantKind.REFRIGERATOR))
         self._evaluation = RunEvaluation(model, design)
@@ -82,7 +88,7 @@ class RunFiles:
             error = error or of_files
         finally:
             self._reserve.close()
-        recorded = len(self.recorder.samples)
+        recorded = self.recorder.next_tick
         if error is not None and not recorded:
             self._discard()
             with contextlib.suppress(OSError):
@@ -118,6 +124,7 @@ def summary_of(evaluation: RunEvaluation, recorder: Recorder, *, realtime: bool,
         "complete": reason is None,
         "reason": reason,
         "ticks": evaluation.ticks,
+        "missing_ticks": recorder.missing_ticks,
         "updates": evaluation.updates,
         "trace_sha256": evaluation.trace_sha256,
         **evaluation.indicators._asdict(),

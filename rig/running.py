@@ -18,12 +18,13 @@ from plant.load import find_load
 from rig.handing_back import give_back, look_around
 from rig.interruption import INTERRUPTION
 from rig.local_services import run_on_localhost
-from rig.network import NetworkRig
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder, Sink
+from rig.rig_configuration import attached, running_configuration
 from rig.rig_endpoints import RigEndpoints
 from rig.run_files import RunFiles
 from rig.scenario import Scenario, natural_ticks
+from rig.session_client import SessionClient
 from rig.settings import Settings
 
 ATTACH_PATIENCE_S: Final = 5.0
@@ -35,6 +36,12 @@ class Way(StrEnum):
     IN_PROCESS = "in-process"
     LOCALHOST = "localhost"
     ATTACHED = "attached"
+    CHAOS = "chaos"
+    """On localhost, with faults on purpose."""
+
+
+Conduct = Callable[[Recorder, Path], Awaitable[None]]
+"""Does a run: takes its recorder and the folder of its results."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +53,8 @@ class Job:
     way: Way
     endpoints: tuple[Endpoint, ...] = ()
     """Of a rig that is up, to attach to."""
+    conduct: Conduct | None = None
+    """How it is done, in a way that the others do not describe."""
 
 
 def make_scenario(settings: Settings, ticks: int | None = None) -> Scenario:
@@ -60,6 +69,23 @@ def make_scenario(settings: Settings, ticks: int | None = None) -> Scenario:
         realtime=settings.session.mode is TimeMode.REALTIME,
         factor=settings.session.factor,
     )
+
+
+def as_attached(effective: Configuration[Settings], endpoints: Sequence[Endpoint]) -> Configuration[Settings]:
+    """Return a configuration with what a rig that is up really runs.
+
+    Raises:
+        UsageError: The user asks for something else, which a client cannot change.
+        LinkError: A service does not answer.
+    """
+    running: dict[str, Any] = {}
+
+    async def read() -> int:
+        running.update(await running_configuration(RigEndpoints(*endpoints), effective.settings, ATTACH_PATIENCE_S))
+        return 0
+
+    run_event_loop(read)
+    return attached(effective, running)
 
 
 def check_certificates(settings: Settings) -> None:
@@ -110,7 +136,7 @@ def run_into(
         error: BaseException | None = stop.error
         try:
             if error is None:
-                _drive(job, files.recorder, folder / "logs", stop)
+                _drive(job, files.recorder, folder, stop)
         except asyncio.CancelledError as cancelled:
             error = stop.error or cancelled
         except BaseException as of_run:  # noqa: BLE001 raised again by `finish`, after the files are closed
@@ -121,14 +147,20 @@ def run_into(
     return summary
 
 
-def _drive(job: Job, recorder: Recorder, logs: Path, stop: _StopRequest) -> None:
-    settings, scenario = job.effective.settings, job.scenario
+def _drive(job: Job, recorder: Recorder, folder: Path, stop: _StopRequest) -> None:
     if job.way is Way.IN_PROCESS:
-        OneProcessRig(settings).run(scenario, recorder)
-    elif job.way is Way.ATTACHED:
-        run_event_loop(lambda: _stoppable(_attached(RigEndpoints(*job.endpoints), settings, scenario, recorder), stop))
+        OneProcessRig(job.effective.settings).run(job.scenario, recorder)
     else:
-        run_event_loop(lambda: _stoppable(run_on_localhost(settings, scenario, recorder, logs), stop))
+        run_event_loop(lambda: _stoppable(_networked(job, recorder, folder), stop))
+
+
+def _networked(job: Job, recorder: Recorder, folder: Path) -> Awaitable[None]:
+    settings, scenario = job.effective.settings, job.scenario
+    if job.conduct is not None:
+        return job.conduct(recorder, folder)
+    if job.way is Way.ATTACHED:
+        return _attached(RigEndpoints(*job.endpoints), settings, scenario, recorder)
+    return run_on_localhost(settings, scenario, recorder, folder / "logs")
 
 
 async def _stoppable(run: Awaitable[None], stop: _StopRequest) -> int:
@@ -145,7 +177,7 @@ async def _stoppable(run: Awaitable[None], stop: _StopRequest) -> int:
 
 
 async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scenario, recorder: Recorder) -> None:
-    rig = NetworkRig(endpoints, settings)
+    rig = SessionClient(endpoints, settings)
     try:
         await rig.connect(ATTACH_PATIENCE_S)
         found = await look_around(rig)

@@ -37,16 +37,26 @@ class SessionEvents:
             readers[service] = JournalReader(client, newest + 1)
         return cls(readers, recorder)
 
-    async def look(self, *, now: bool = False) -> None:
-        """Read new events, if the last look was long ago, or `now`.
+    async def look(self, *services: str) -> None:
+        """Read new events of these services, if the last look was long ago.
 
         Raises:
-            LinkError: One of the two does not answer.
+            LinkError: One of them does not answer.
         """
-        ticks = len(self._recorder.samples)
-        if not now and time.monotonic() - self._looked_at < LOOK_S and ticks - self._tick < LOOK_TICKS:
+        ticks = self._recorder.next_tick
+        if time.monotonic() - self._looked_at < LOOK_S and ticks - self._tick < LOOK_TICKS:
             return
         self._looked_at, self._tick = time.monotonic(), ticks
-        for service, reader in self._readers.items():
-            for event in await reader.read_on():
-                self._recorder.event(event, service)
+        for service in services:
+            await self.read(service)
+
+    async def read(self, service: str) -> int:
+        """Read new events of a service; return how many there were.
+
+        Raises:
+            LinkError: It does not answer.
+        """
+        events = await self._readers[service].read_on()
+        for event in events:
+            self._recorder.event(event, service)
+        return len(events)

@@ -3,7 +3,6 @@
 from pydantic import BaseModel, ConfigDict
 
 from coldloop.limits import InputLimits
-from coldloop.modbus.settings import TlsSettings
 from coldloop.model_settings import ModelSettings
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
@@ -11,15 +10,7 @@ from control_plc.settings import ControlSection
 from hmi.settings import HmiSection
 from optimizer_plc.settings import OptimizerSection
 from plant.settings import PlantSection
-
-
-class RigSection(BaseModel):
-    """Section `rig` of the configuration."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    tls: TlsSettings | None = None
-    """The operator's certificate, for servers with TLS."""
+from rig.operator_settings import RigSection
 
 
 class Settings(BaseModel):

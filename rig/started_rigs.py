@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from coldloop.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
 from coldloop.errors import ColdloopError, UsageError
-from rig.wiring import SERVICES
+from rig.rig_endpoints import RigEndpoints
 
 DEFAULT_PORTS: Final = (PLANT_PORT, CONTROL_PORT, OPTIMIZER_PORT)
 STATE_FILE: Final = "rig.json"
@@ -75,7 +75,7 @@ def check_ports(ports: Sequence[int]) -> None:
     Raises:
         UsageError: One is, and who could hold it.
     """
-    for service, port in zip(SERVICES, ports, strict=True):
+    for service, port in zip(RigEndpoints._fields, ports, strict=True):
         with socket.socket() as one:
             one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Final
 
 from rig.local_services import LocalServices
-from rig.network import NetworkRig
 from rig.page_process import PageProcess
 from rig.results import write_json
 from rig.running import make_scenario
+from rig.session_client import SessionClient
 from rig.settings import Settings
 from rig.started_rigs import DEFAULT_PORTS, STATE_FILE, state_folder
 from rig.wiring import SERVICES, START_PATIENCE_S
@@ -39,7 +39,7 @@ class UpRig:
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         services = LocalServices(self._settings, self.folder / "logs", ports=self._ports)
         async with services:
-            rig = NetworkRig(services.endpoints, self._settings)
+            rig = SessionClient(services.endpoints, self._settings)
             page = PageProcess(self._settings.hmi, services.endpoints, self.folder) if self._page else None
             try:
                 async with page or nullcontext():
@@ -48,7 +48,7 @@ class UpRig:
                 rig.close()
                 (self.folder / STATE_FILE).unlink(missing_ok=True)
 
-    async def _serve(self, rig: NetworkRig, page: PageProcess | None, *, announce: bool) -> None:
+    async def _serve(self, rig: SessionClient, page: PageProcess | None, *, announce: bool) -> None:
         scenario = make_scenario(self._settings)
         await rig.connect(START_PATIENCE_S)
         session = await rig.start(scenario)

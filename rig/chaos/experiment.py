@@ -1,11 +1,12 @@
-"""One plan from beginning to end: run it, run the same without faults, evaluate."""
+"""One plan from beginning to end: run and record it, run the same without faults, evaluate."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from coldloop.config import Configuration
 from coldloop.errors import LinkError
 from coldloop.lti_model import load as load_model
-from coldloop.service import run_event_loop
 from rig.chaos.evaluation import Evaluation, evaluate
 from rig.chaos.plan import Plan
 from rig.chaos.runner import conduct
@@ -13,6 +14,7 @@ from rig.chaos.sequencer import Progress
 from rig.chaos.trace import ChaosTrace
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder, Recording
+from rig.running import Job, Way, run_into
 from rig.scenario import Scenario
 from rig.settings import Settings
 
@@ -27,28 +29,46 @@ class Experiment(NamedTuple):
     """Why the run ended early, if it did."""
 
 
-def perform(plan: Plan, settings: Settings, folder: Path, progress: Progress) -> Experiment:
-    """Run a plan; a run that fails is evaluated as far as it went.
+def perform(
+    plan: Plan,
+    effective: Configuration[Settings],
+    folder: Path,
+    progress: Progress,
+    *,
+    arguments: Mapping[str, Any],
+    formats: Sequence[str],
+) -> Experiment:
+    """Run a plan into a folder that is claimed; a run that fails is evaluated as far as it went.
+
+    Args:
+        plan: What goes wrong in it.
+        effective: Configuration of the services; what the plan has too is recorded with the plan's values.
+        folder: Gets the files of an ordinary run.
+        progress: Takes where the run is.
+        arguments: Options of the command.
+        formats: Of the run's figure.
 
     Raises:
         LoadFileError: The load of the plan cannot be had.
+        ColdloopError: The run was interrupted, or failed before its first tick.
     """
+    settings = effective.settings
     scenario = plan.scenario(load_model(settings.model.file).w0)
     trace = ChaosTrace(scenario.ticks)
     failure = None
+
+    async def conducted(recorder: Recorder, results: Path) -> None:
+        await conduct(plan, scenario, settings, results, recorder, trace, progress)
+
     try:
-        run_event_loop(lambda: _conducted(plan, scenario, settings, folder, trace, progress))
+        job = Job(plan.configured(effective), scenario, Way.CHAOS, conduct=conducted)
+        run_into(folder, job, arguments, formats, [trace])
     except LinkError as error:
+        if trace.missing == trace.ticks:
+            raise
         failure = str(error)
     reference = undisturbed(settings, scenario)
     return Experiment(trace, reference, evaluate(trace, reference, settings.limits.rate), failure)
-
-
-async def _conducted(
-    plan: Plan, scenario: Scenario, settings: Settings, folder: Path, trace: ChaosTrace, progress: Progress
-) -> int:
-    await conduct(plan, scenario, settings, folder, trace, progress)
-    return 0
 
 
 def undisturbed(settings: Settings, scenario: Scenario) -> Recording:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from coldloop.config import Configuration
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.process import TICK_S
 from coldloop.session import TimeMode
@@ -15,8 +16,15 @@ from plant.load import concatenated, find_load, named_families, telegraph
 from plant.program import LoadProfile
 from rig.chaos.faults import AnyFault
 from rig.scenario import Scenario
+from rig.settings import Settings
 
 SHIPPED: Final = files("rig.chaos") / "plans"
+
+OF_PLAN: Final = {
+    "plant.load": "--load", "plant.seed": "--seed", "session.mode": "--mode", "session.factor": "--factor",
+    "optimizer_plc.program.updating_period_s": "updating_period_s of the plan",
+}  # fmt: skip
+"""Keys of the configuration whose values a plan has, and what changes them there."""
 
 SPREAD_S: Final = 20.0
 """Drawn faults begin up to so much after their multiple of `every_s`: anywhere in an updating period."""
@@ -80,6 +88,21 @@ class Plan(BaseModel):
                 if at + fault.duration_s < self.duration_s:
                     drawn.append(fault.model_copy(update={"at_s": at}))
         return sorted([*self.faults, *drawn], key=lambda fault: fault.tick)
+
+    def configured(self, effective: Configuration[Settings]) -> Configuration[Settings]:
+        """Return a configuration with the values of the plan, as a manifest records it."""
+        settings = effective.settings
+        optimizer, session = settings.optimizer_plc, settings.session
+        program = optimizer.program.model_copy(update={"updating_period_s": self.updating_period_s})
+        load = self.load if isinstance(self.load, str) else ", ".join(self.load)
+        planned = settings.model_copy(
+            update={
+                "plant": settings.plant.model_copy(update={"load": load, "seed": self.seed}),
+                "session": session.model_copy(update={"mode": self.mode, "factor": self.factor}),
+                "optimizer_plc": optimizer.model_copy(update={"program": program}),
+            }
+        )
+        return Configuration(planned, {**effective.sources, **dict.fromkeys(OF_PLAN, f"plan {self.name}")})
 
     def scenario(self, mean_w: float) -> Scenario:
         """Return the run without its faults; `mean_w` is the load of the operating point."""

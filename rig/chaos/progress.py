@@ -3,13 +3,11 @@
 import time
 from typing import Final
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from coldloop.process import TICK_S
-from coldloop.registers.control_plc import Mode
-from rig.chaos.observer import Sight
-from rig.progress import PlantTimeBar, clock
+from coldloop.registers.control_plc import LadderStatus, Mode
+from rig.progress import PlantTimeBar, clock, make_console
 
 REFRESH_S: Final = 0.2
 
@@ -20,19 +18,20 @@ class ChaosProgress(PlantTimeBar):
     def __init__(self, ticks: int) -> None:
         self._bar = Progress(
             TextColumn("{task.fields[clock]}"), BarColumn(bar_width=24), TaskProgressColumn(),
-            TextColumn("{task.fields[line]}"), console=Console(stderr=True), auto_refresh=False,
+            TextColumn("{task.fields[line]}"), console=make_console(), auto_refresh=False,
         )  # fmt: skip
         self._task = self._bar.add_task("", total=ticks, clock="0:00:00", line="")
+        self._ticks = ticks
         self._shown = time.monotonic()
 
-    def __call__(self, tick: int, sight: Sight, faults: list[str]) -> None:
-        """Show where the run is, a few times a second."""
+    def __call__(self, tick: int, ladder: LadderStatus | None, faults: list[str]) -> None:
+        """Show where the run is, a few times a second, and its end."""
         now = time.monotonic()
-        if now - self._shown < REFRESH_S:
+        if now - self._shown < REFRESH_S and tick < self._ticks:
             return
         self._shown = now
         self._bar.start()
-        mode = Mode(sight.ladder.mode).name if sight.ladder is not None else "control PLC away"
+        mode = Mode(ladder.mode).name if ladder is not None else "control PLC away"
         self._bar.update(
             self._task, completed=tick, clock=clock(tick * TICK_S),
             line="  ".join([mode, *faults]),

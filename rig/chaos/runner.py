@@ -10,13 +10,13 @@ from coldloop.process import TICK_S
 from rig.chaos.faults import WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
-from rig.chaos.observer import Observer
 from rig.chaos.plan import Plan
 from rig.chaos.proxied_services import ProxiedServices
 from rig.chaos.sequencer import FaultSequencer, Progress
 from rig.chaos.trace import ChaosTrace
-from rig.network import NetworkRig
+from rig.recording import Recorder
 from rig.scenario import Scenario
+from rig.session_client import SessionClient
 from rig.settings import Settings
 from rig.wiring import START_PATIENCE_S
 
@@ -25,9 +25,15 @@ SLOWEST: Final = 20.0
 
 
 async def conduct(
-    plan: Plan, scenario: Scenario, settings: Settings, folder: Path, trace: ChaosTrace, progress: Progress
+    plan: Plan,
+    scenario: Scenario,
+    settings: Settings,
+    folder: Path,
+    recorder: Recorder,
+    trace: ChaosTrace,
+    progress: Progress,
 ) -> None:
-    """Run a plan on three services started for it; `trace` holds what there was even when it fails.
+    """Run a plan on three services started for it; `trace`, a sink of the recorder, has what there was.
 
     Raises:
         LinkError: A service ended by itself, the rig stood still, or it all took too long.
@@ -37,15 +43,13 @@ async def conduct(
     async with AsyncExitStack() as stack:
         proxied = await stack.enter_async_context(ProxiedServices(settings, folder, str(plan.seed)))
         services = proxied.services
-        rig = NetworkRig(services.endpoints, settings)
-        stack.callback(rig.close)
-        await services.during(rig.connect(START_PATIENCE_S))
+        client = SessionClient(services.endpoints, settings, tolerant=True)
+        stack.callback(client.close)
+        await services.during(client.connect(START_PATIENCE_S))
         await proxied.connect_links()
-        session = await services.during(rig.start(scenario))
-        observer = Observer(services.endpoints, trace, session)
-        stack.callback(observer.close)
-        injector = Injector(services, proxied.proxies, observer, folder)
-        driver = FaultSequencer(plan, services, observer, injector, trace, progress)
+        await services.during(client.begin(scenario, recorder))
+        injector = Injector(services, proxied.proxies, client, folder)
+        driver = FaultSequencer(plan, services, client, injector, trace, progress)
         try:
             async with asyncio.timeout(_patience_s(plan)):
                 await services.during(driver.run())
@@ -56,6 +60,7 @@ async def conduct(
             ) from None
         finally:
             driver.finish()
+            await client.last_look()
 
 
 def _patience_s(plan: Plan) -> float:

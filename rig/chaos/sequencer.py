@@ -8,17 +8,20 @@ from typing import Final
 
 from coldloop.errors import LinkError
 from coldloop.process import TICK_S
+from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import LadderStatus
+from coldloop.registers.safety import Alarm, AlarmKind
 from rig.chaos.faults import AnyFault, ProcessFault, WrongModel
 from rig.chaos.injection import Injector
-from rig.chaos.observer import Observer, Sight
 from rig.chaos.plan import Plan
 from rig.chaos.resources import log_lines, resident_mb
 from rig.chaos.timeline import Moment, Timeline
 from rig.chaos.trace import ChaosTrace, Mark, Resources
 from rig.local_services import LocalServices
+from rig.session_client import SessionClient
 
-Progress = Callable[[int, Sight, list[str]], None]
-"""Told of the plant's tick, what was seen, and the faults that are on."""
+Progress = Callable[[int, LadderStatus | None, list[str]], None]
+"""Takes the plant's tick, the state of the control PLC (None while it does not answer), and the faults that are on."""
 
 STANDSTILL_PATIENCE_S: Final = 60.0
 """A rig that does not move for so long without a fault is given up."""
@@ -36,20 +39,20 @@ class FaultSequencer:
         self,
         plan: Plan,
         services: LocalServices,
-        observer: Observer,
+        client: SessionClient,
         injector: Injector,
         trace: ChaosTrace,
         progress: Progress,
     ) -> None:
         self._plan = plan
         self._services = services
-        self._observer = observer
+        self._client = client
         self._injector = injector
         self._trace = trace
         self._progress = progress
         self._timeline = Timeline(plan.schedule(), factor=plan.factor if plan.realtime else None)
         self._marks: dict[int, Mark] = {}
-        self._began = time.monotonic()
+        self._began = self._standing_since = time.monotonic()
         self.tick = 0
 
     async def run(self) -> None:
@@ -59,13 +62,16 @@ class FaultSequencer:
                 await self._begin(moment)
             else:
                 await self._end(moment)
-            self._observer.moved()
-        await self._observer.read_alarms()
+            self._standing_since = time.monotonic()
+        alarms = await self._client.contact(self._client.control.read_rows(Alarm, 0, len(AlarmKind)))
+        self._trace.alarms = alarms or []
+        await self._client.conclude()
 
     def finish(self) -> None:
         """Record what is known at the end, whatever the end was."""
         self._trace.seconds = self._seconds
         self._trace.log_lines = log_lines(self._services)
+        self._trace.lost_contacts = self._client.lost_contacts
 
     @property
     def _seconds(self) -> float:
@@ -87,17 +93,20 @@ class FaultSequencer:
 
     async def _go_on(self, until: int) -> None:
         if not self._plan.realtime:
-            await self._observer.grant(min(until, self._plan.ticks))
+            await self._client.grant(min(until, self._plan.ticks))
 
-    async def _look(self) -> Sight:
-        sight = await self._observer.look()
-        if sight.tick is not None:
-            self.tick = sight.tick
+    async def _look(self) -> LadderStatus | None:
+        """Record what has happened; return the state of the control PLC, None while it does not answer."""
+        tick = await self._client.look()
+        ladder = await self._client.ladder()
+        if tick is not None and tick != self.tick:
+            self.tick, self._standing_since = tick, time.monotonic()
+        self._trace.ladder = ladder or self._trace.ladder
         resources = self._trace.resources
         if not resources or self.tick - resources[-1].tick >= RESOURCE_TICKS:
             resources.append(Resources(self.tick, self._seconds, resident_mb(self._services)))
-        self._progress(self.tick, sight, [moment.fault.label for moment in self._timeline.on])
-        return sight
+        self._progress(self.tick, ladder, [moment.fault.label for moment in self._timeline.on])
+        return ladder
 
     def _cut_short(self) -> Moment | None:
         """Return the end of a fault under which plant time stands still.
@@ -105,7 +114,7 @@ class FaultSequencer:
         Raises:
             LinkError: It stands still without a fault.
         """
-        standing = self._observer.standing_s
+        standing = time.monotonic() - self._standing_since
         for end in self._timeline.on:
             fault = end.fault
             bearable = self._plan.standstill_s
@@ -149,7 +158,7 @@ class FaultSequencer:
     async def _until_up(self, service: str, fault: AnyFault) -> None:
         """Wait until a service that was started again answers."""
         since = time.monotonic()
-        while not await self._observer.answers(service):
+        while await self._client.contact(self._client.clients[service].read(Identity)) is None:
             if time.monotonic() - since > RESTART_PATIENCE_S:
                 raise LinkError(f"after '{fault.label}' the {service} service does not answer: see its log")
             if self._plan.realtime:
@@ -170,7 +179,7 @@ class FaultSequencer:
         """
         since = time.monotonic()
         while time.monotonic() - since < PRESENCE_S:
-            sight = await self._look()
-            if sight.ladder is not None and sight.ladder.optimizer:
+            ladder = await self._look()
+            if ladder is not None and ladder.optimizer:
                 return
             await asyncio.sleep(LOOK_S)

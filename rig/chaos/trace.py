@@ -1,4 +1,4 @@
-"""What a run under chaos leaves behind: the physical trace with its gaps, events, alarms, and its faults."""
+"""What is kept of a run under chaos to judge it: the physical trace with its gaps, events, alarms, and its faults."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -11,7 +11,8 @@ from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.plant import PlantSample
 from coldloop.registers.safety import Alarm
 from rig.chaos.faults import AnyFault
-from rig.recording import LinkStatistics, Recording
+from rig.driving import CONTROL
+from rig.recording import LinkStatistics, Recording, Sink
 
 
 @dataclass
@@ -41,12 +42,12 @@ class Resources(NamedTuple):
 
 
 @dataclass
-class ChaosTrace:
+class ChaosTrace(Sink):
     """Collects while a run goes on; ticks that nobody saw stay NaN."""
 
     ticks: int
     events: list[Event] = field(default_factory=list)
-    """As they came."""
+    """Of the control PLC, as they came."""
     alarms: list[Alarm] = field(default_factory=list)
     ladder: LadderStatus | None = None
     marks: list[Mark] = field(default_factory=list)
@@ -65,6 +66,11 @@ class ChaosTrace:
         """Take a tick; a tick that is done again replaces what was there."""
         for rows, values in zip(self._rows, ((sample.load,), sample.u, sample.y, sample.x), strict=True):
             rows[sample.tick] = np.array(values)
+
+    def event(self, service: str, event: Event) -> None:
+        """Take an event of a journal."""
+        if service == CONTROL:
+            self.events.append(event)
 
     def modes(self, first: int = 0, last: int | None = None) -> list[Event]:
         """Return the changes of mode among the events from one index to before another."""

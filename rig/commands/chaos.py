@@ -4,25 +4,19 @@ import argparse
 import sys
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from coldloop.command_line import add_configuration_options
 from coldloop.errors import LinkError, ResultsError, UsageError
 from coldloop.process import TICK_S
-from rig.commands.choices import MODES, plans
-from rig.commands.options import check_load, configuration, duration
+from rig.commands.choices import FIGURE_FORMATS, MODES, plans
+from rig.commands.options import OWN_PORTS, PLACES, check_load, configuration, duration, refuse_ineffective
 
 if TYPE_CHECKING:
     from coldloop.config import Configuration
     from rig.chaos.experiment import Experiment
     from rig.chaos.plan import Plan
     from rig.settings import Settings
-
-OF_PLAN: Final = {
-    "plant.load": "--load", "plant.seed": "--seed", "session.mode": "--mode", "session.factor": "--factor",
-    "optimizer_plc.program.updating_period_s": "updating_period_s of the plan",
-}  # fmt: skip
-"""Keys whose values a plan has, and what changes them there."""
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -40,6 +34,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mode", choices=MODES, dest="plan_mode",
                         help="instead of the plan's")  # fmt: skip
     parser.add_argument("--factor", type=float, dest="plan_factor", help="instead of the plan's")
+    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
+                        help="of the run's picture: png, pdf, svg (default: png)")  # fmt: skip
     parser.set_defaults(execute=execute)
 
 
@@ -60,16 +56,19 @@ def execute(options: argparse.Namespace) -> int:
     from rig.chaos.experiment import perform
     from rig.chaos.plan import find_plan
     from rig.chaos.progress import ChaosProgress
+    from rig.manifest import plain_arguments
     from rig.results import claim_folder
 
     plan = find_plan(options.plan, _changes(options))
     effective = configuration(options)
-    _refuse_what_the_plan_has(effective)
+    _refuse_what_has_no_effect(effective)
     out = options.out or Path("chaos") / f"{plan.name}-{datetime.now():%Y%m%d-%H%M%S}"  # noqa: DTZ005
     claim_folder(out, force=options.force)
     with ChaosProgress(plan.ticks) as progress:
-        experiment = perform(plan, effective.settings, out, progress)
-    _report(out, plan, experiment, effective.settings)
+        experiment = perform(
+            plan, effective, out, progress, arguments=plain_arguments(options), formats=options.figures
+        )
+    _report(out, plan, experiment)
     if experiment.failure is not None:
         raise LinkError(experiment.failure)
     return 0
@@ -82,19 +81,27 @@ def _list_plans() -> None:
         sys.stdout.write(f"{plan.name:20} {plan.description}\n")
 
 
-def _refuse_what_the_plan_has(effective: "Configuration[Settings]") -> None:
-    """Refuse a value from the command line that the plan's own would replace."""
-    for key, option in OF_PLAN.items():
-        source = effective.sources.get(key, "")
-        if source.startswith("--set"):
-            raise UsageError(f"{source}: the plan has its own value of {key}; change it with {option}")
+def _refuse_what_has_no_effect(effective: "Configuration[Settings]") -> None:
+    """Refuse a value from the command line that the plan's own, or that of the command, would replace."""
+    from rig.chaos.plan import OF_PLAN
+
+    refuse_ineffective(
+        effective,
+        {
+            **{key: f"the plan has its own value; change it with {option}" for key, option in OF_PLAN.items()},
+            **dict.fromkeys(PLACES, OWN_PORTS),
+            "session.autostart": "it begins a session",
+            "plant.retain.file": "the states are retained in the folder of the results",
+            "control_plc.retain.file": "the states are retained in the folder of the results",
+        },
+    )
 
 
-def _report(out: Path, plan: "Plan", experiment: "Experiment", settings: "Settings") -> None:
+def _report(out: Path, plan: "Plan", experiment: "Experiment") -> None:
     from rig.chaos.report import as_text, summary_lines, table
 
     try:
-        _write(out, plan, experiment, settings)
+        _write(out, plan, experiment)
     except OSError as error:
         raise ResultsError(f"{out}: {error.strerror}; no report was written, choose another --out") from None
     sys.stdout.write(as_text(table(experiment.evaluation.rows)))
@@ -113,12 +120,9 @@ def _changes(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
 
 
-def _write(out: Path, plan: "Plan", experiment: "Experiment", settings: "Settings") -> None:
-    from coldloop.lti_model import load as load_model
+def _write(out: Path, plan: "Plan", experiment: "Experiment") -> None:
     from rig.chaos.figure import plot_chaos
     from rig.chaos.report import write_report
-    from rig.chaos.tables import write_tables
-    from rig.indicators import StageCost
 
     trace, undisturbed = experiment.trace, experiment.undisturbed
     hashes = {
@@ -126,6 +130,4 @@ def _write(out: Path, plan: "Plan", experiment: "Experiment", settings: "Setting
         "undisturbed_trace_sha256": undisturbed.trace_sha256,
     }
     write_report(out, plan, trace, experiment.evaluation, hashes, experiment.failure)
-    cost = StageCost(load_model(settings.model.file), settings.optimizer_plc.program.design)
-    write_tables(out, trace, cost)
     plot_chaos(out / "chaos.png", trace, undisturbed, f"{plan.name}: {plan.description}")

@@ -13,6 +13,7 @@ from rig.commands.choices import LOADS
 
 if TYPE_CHECKING:
     from coldloop.config import Configuration
+    from rig.operator_settings import OperatorSettings
     from rig.rig_endpoints import RigEndpoints
     from rig.settings import Settings
 
@@ -98,16 +99,18 @@ def port_base(text: str) -> int:
     return int(text)
 
 
-def add_rig_options(parser: argparse.ArgumentParser) -> None:
-    """Declare where a rig that is up is found."""
-    parser.add_argument("--rig", nargs=3, type=endpoint, metavar="HOST:PORT",
+def add_rig_options(parser: argparse.ArgumentParser, *, again: bool = False) -> None:
+    """Declare where a rig that is up is found; `again` for a subcommand, as `add_configuration_options` has it."""
+    default = argparse.SUPPRESS if again else None
+    parser.add_argument("--rig", nargs=3, type=endpoint, default=default, metavar="HOST:PORT",
                         help="plant, control PLC, optimiser PLC (default: ports 5020 to 5022 here)")  # fmt: skip
-    parser.add_argument("--port-base", type=port_base, metavar="PORT", help="first of three ports in a row here")
-    parser.add_argument("--tls", type=Path, metavar="FOLDER",
+    parser.add_argument("--port-base", type=port_base, default=default, metavar="PORT",
+                        help="first of three ports in a row here")  # fmt: skip
+    parser.add_argument("--tls", type=Path, default=default, metavar="FOLDER",
                         help="folder with the operator's certificate; a rig that is up here tells its own")  # fmt: skip
 
 
-def rig_endpoints(options: argparse.Namespace, settings: "Settings") -> "RigEndpoints":
+def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Settings") -> "RigEndpoints":
     """Return where a rig that is up is found.
 
     Raises:
@@ -117,7 +120,6 @@ def rig_endpoints(options: argparse.Namespace, settings: "Settings") -> "RigEndp
     from coldloop.modbus.settings import TlsSettings
     from rig.rig_endpoints import RigEndpoints
     from rig.started_rigs import ports_from, running_rig
-    from rig.wiring import SERVICES
 
     if options.rig and options.port_base:
         raise UsageError("--rig and --port-base: give one of them")
@@ -132,7 +134,7 @@ def rig_endpoints(options: argparse.Namespace, settings: "Settings") -> "RigEndp
     places = options.rig or [HostPort("127.0.0.1", port) for port in ports]
     return RigEndpoints(*(
         Endpoint(host=place.host, port=place.port, tls=tls, word_order=getattr(settings, service).word_order)
-        for service, place in zip(SERVICES, places, strict=True)
+        for service, place in zip(RigEndpoints._fields, places, strict=True)
     ))  # fmt: skip
 
 
@@ -165,6 +167,51 @@ def configuration(options: argparse.Namespace) -> "Configuration[Settings]":
     return load_configuration(
         Settings,
         file=options.config,
-        assignments=options.assignments,
+        assignments=[*options.assignments, *given.get("further_assignments", ())],
         options=site | {key: (given[name], flag) for name, (key, flag) in KEYS.items() if given.get(name) is not None},
     )
+
+
+def operator_settings(options: argparse.Namespace) -> "OperatorSettings":
+    """Return what a command of an operator reads of the configuration.
+
+    Raises:
+        UsageError: A key was set that has no effect on it.
+    """
+    from coldloop.config import load_configuration
+    from rig.operator_settings import OTHERS, OperatorSettings
+
+    assignments = [*options.assignments, *vars(options).get("further_assignments", ())]
+    site = _tls_site(options.tls) if options.tls is not None else {}
+    effective = load_configuration(
+        OperatorSettings, file=options.config, assignments=assignments, options=site, others=OTHERS
+    )
+    for key, source in effective.sources.items():
+        if source.startswith("--set") and not (key.startswith(("limits", "rig")) or key.endswith(".word_order")):
+            raise UsageError(f"{source}: has no effect on this command, which asks a rig that has its own; drop it")
+    return effective.settings
+
+
+def refuse_ineffective(effective: "Configuration[Settings]", keys: Mapping[str, str]) -> None:
+    """Refuse values from the command line that the command replaces by its own.
+
+    Args:
+        effective: The configuration.
+        keys: Dotted keys, and what to do instead.
+
+    Raises:
+        UsageError: One of them was set.
+    """
+    for key, remedy in keys.items():
+        source = effective.sources.get(key, "")
+        if source.startswith("--"):
+            raise UsageError(f"{source}: has no effect on this command: {remedy}")
+
+
+OWN_PORTS = "services that it starts get ports of their own; `coldloop up --port-base` has fixed ones"
+PLACES = (
+    "plant.server.port", "plant.server.host", "control_plc.server.port", "control_plc.server.host",
+    "optimizer_plc.server.port", "optimizer_plc.server.host", "control_plc.plant.port", "control_plc.plant.host",
+    "optimizer_plc.control_plc.port", "optimizer_plc.control_plc.host",
+)  # fmt: skip
+"""Keys that say where services are."""

@@ -4,23 +4,24 @@ import argparse
 import sys
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from coldloop.command_line import add_configuration_options
 from coldloop.errors import UsageError
 from rig.commands.choices import FIGURE_FORMATS, LOADS, MODES, SOLVERS
-from rig.commands.options import check_load, configuration, duration, endpoint, updating_period
+from rig.commands.options import (
+    OWN_PORTS,
+    PLACES,
+    check_load,
+    configuration,
+    duration,
+    endpoint,
+    refuse_ineffective,
+    updating_period,
+)
 
 if TYPE_CHECKING:
-    from coldloop.config import Configuration
     from rig.running import Job
-    from rig.settings import Settings
-
-OF_SESSION: Final = (
-    "session.mode", "session.factor", "plant.load", "plant.seed", "optimizer_plc.program.updating_period_s", "model.",
-    "rig.",
-)  # fmt: skip
-"""Keys that a rig takes from whoever attaches to it, or that concern the rig's client."""
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -70,7 +71,7 @@ def execute(options: argparse.Namespace) -> int:
 def _job(options: argparse.Namespace) -> "Job":
     """Return the run that the options and the configuration ask for."""
     from coldloop.endpoints import Endpoint
-    from rig.running import Job, Way, check_certificates, make_scenario
+    from rig.running import Job, Way, as_attached, check_certificates, make_scenario
 
     effective = configuration(options)
     settings = effective.settings
@@ -82,20 +83,13 @@ def _job(options: argparse.Namespace) -> "Job":
         raise UsageError(f"{source}: a factor has no effect in lock-step; add --mode realtime")
     scenario = make_scenario(settings, options.duration)
     if options.attach:
-        _refuse_what_a_rig_has(effective)
         ends = [Endpoint(host=end.host, port=end.port, tls=settings.rig.tls) for end in options.attach]
-        return Job(effective, scenario, Way.ATTACHED, tuple(ends))
+        return Job(as_attached(effective, ends), scenario, Way.ATTACHED, tuple(ends))
+    refuse_ineffective(effective, {**dict.fromkeys(PLACES, OWN_PORTS), "session.autostart": "it begins a session"})
     if options.in_process:
         return Job(effective, scenario, Way.IN_PROCESS)
     check_certificates(settings)
     return Job(effective, scenario, Way.LOCALHOST)
-
-
-def _refuse_what_a_rig_has(effective: "Configuration[Settings]") -> None:
-    """Refuse settings from the command line that a rig which is up does not take from its client."""
-    for key, source in effective.sources.items():
-        if source.startswith("--") and not key.startswith(OF_SESSION):
-            raise UsageError(f"{source}: a rig that is up has its own {key}, which --attach does not change; drop it")
 
 
 def _tell(out: Path, summary: dict[str, Any]) -> None:

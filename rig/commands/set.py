@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from coldloop.command_line import add_configuration_options
 from coldloop.errors import UsageError
-from rig.commands.options import add_rig_options, configuration, rig_endpoints
+from rig.commands.options import add_rig_options, operator_settings, rig_endpoints
 
 if TYPE_CHECKING:
     from rig.operator_client import OperatorClient
@@ -47,6 +47,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     acknowledge = what.add_parser("acknowledge", help="an alarm, or all")
     acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as t5-band (default: all)")
     acknowledge.set_defaults(command=lambda client, options: client.acknowledge(options.alarm))
+    for subcommand in what.choices.values():  # options are taken before and behind what is to be done
+        add_configuration_options(subcommand, again=True)
+        add_rig_options(subcommand, again=True)
     parser.set_defaults(execute=execute)
 
 
@@ -70,7 +73,7 @@ def execute(options: argparse.Namespace) -> int:
 async def _do(options: argparse.Namespace) -> None:
     from rig.operator_client import OperatorClient
 
-    settings = configuration(options).settings
+    settings = operator_settings(options)
     command: Callable[[OperatorClient, argparse.Namespace], Done] = options.command
     async with OperatorClient(rig_endpoints(options, settings), settings.limits) as client:
         sys.stdout.write(f"{await command(client, options)}\n")

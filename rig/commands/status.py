@@ -6,7 +6,7 @@ import sys
 from typing import Final
 
 from coldloop.command_line import add_configuration_options
-from rig.commands.options import add_rig_options, configuration, rig_endpoints
+from rig.commands.options import add_rig_options, operator_settings, rig_endpoints
 
 LOOK_S: Final = 1.0
 
@@ -31,7 +31,7 @@ async def _show(options: argparse.Namespace) -> None:
     from rig.operator_client import OperatorClient
     from rig.rig_status import line, page, read_status
 
-    settings = configuration(options).settings
+    settings = operator_settings(options)
     async with OperatorClient(rig_endpoints(options, settings), settings.limits) as client:
         if not options.follow:
             sys.stdout.write(page(await read_status(client)))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from coldloop.command_line import add_configuration_options
 from rig.commands.choices import LOADS, SOLVERS
-from rig.commands.options import check_load, port_base, updating_period
+from rig.commands.options import PLACES, check_load, port_base, refuse_ineffective, updating_period
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -39,6 +39,9 @@ def execute(options: argparse.Namespace) -> int:
     from rig.started_rigs import check_ports, detached, ports_from
 
     effective = configuration(options)
+    refuse_ineffective(
+        effective, {**dict.fromkeys(PLACES, "give --port-base"), "session.autostart": "it begins a session"}
+    )
     check_certificates(effective.settings)
     ports = ports_from(options.port_base)
     check_ports(ports)

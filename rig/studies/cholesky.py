@@ -15,9 +15,9 @@ from coldloop.limits import InputLimits
 from coldloop.lti_model import load as load_model
 from coldloop.model_settings import DEFAULT_MODEL_FILE
 from optimizer_plc import linear_algebra, operations
-from optimizer_plc.arithmetic import Arithmetic
+from optimizer_plc.arithmetic import real_of
+from optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
 from optimizer_plc.design import ControlDesign, trivial_design
-from optimizer_plc.estimator import EstimatorSettings
 from optimizer_plc.memory import Footprint, estimator_memory, footprint
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem
@@ -104,7 +104,7 @@ def _counted_s(curve: SpeedCurve, count: operations.Operations) -> float:
 
 def _footprints() -> tuple[Footprint, Footprint]:
     prediction = PredictionModel(load_model(DEFAULT_MODEL_FILE))
-    design, limits, real = ControlDesign(), InputLimits(), Arithmetic.FLOAT32.real
+    design, limits, real = ControlDesign(), InputLimits(), real_of(Arithmetic.FLOAT32)
     estimator = estimator_memory(prediction, EstimatorSettings())
     reduced, trivial = (
         footprint(PredictiveProblem(prediction, one, limits, real), estimator)

@@ -30,7 +30,14 @@ from rig.settings import Settings
 Series = NDArray[np.float64]
 
 PROGRAM_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc")
-RIG_MODULES = ("rig.indicators", "rig.network", "rig.one_process", "rig.recording", "rig.studies.request")
+RIG_MODULES = (
+    "rig.indicators",
+    "rig.session_client",
+    "rig.session_reader",
+    "rig.one_process",
+    "rig.recording",
+    "rig.studies.request",
+)
 SUFFIXES = (".py", ".json", ".npz", ".csv")
 T9 = OUTPUT_NAMES.index("T9")
 LIBRARIES = ("casadi", "daqp", "numba", "numpy", "osqp")

@@ -22,10 +22,10 @@ from rig.chaos.faults import AnyFault, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
 from rig.chaos.proxied_services import ProxiedServices
-from rig.network import QUIET_S, NetworkRig
 from rig.python_settings import Period, configured
 from rig.rig_endpoints import RigEndpoints
 from rig.running import check_certificates, make_scenario
+from rig.session_client import QUIET_S, SessionClient
 from rig.settings import Settings
 from rig.testing.event_loop import BackgroundLoop
 from rig.testing.named_registers import NamedRegisters
@@ -60,7 +60,7 @@ class LiveRig:
         """Where the services listen."""
         self._loop = BackgroundLoop()
         self._stack = AsyncExitStack()
-        self._driver = NetworkRig(self.endpoints, settings)
+        self._driver = SessionClient(self.endpoints, settings)
         self._clients = {
             service: RegisterClient.at(register_map, endpoint)
             for service, register_map, endpoint in zip(SERVICES, _MAPS, self.endpoints, strict=True)

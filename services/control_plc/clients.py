@@ -17,7 +17,6 @@ from coldloop.registers.control_plc import (
     Heartbeat,
     LatchedUpdate,
     Operator,
-    OperatorMode,
     Plan,
     SequenceHeader,
     SequenceRow,
@@ -104,8 +103,6 @@ class Clients:
             raise IllegalValueError("a plan without CRC: it decides when inputs change, so it is sealed")
 
     def _judge_operator(self, record: Operator, _row: int, _caller: Caller) -> None:
-        if record.mode != OperatorMode.MANUAL:
-            return
         for name, value, low, high in zip(INPUT_NAMES, record[1:], self._limits.low, self._limits.high, strict=True):
             if not low <= value <= high:
                 raise IllegalValueError(f"setpoint of {name} = {value:g} is outside {low:g}..{high:g}")

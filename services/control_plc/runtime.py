@@ -13,6 +13,7 @@ import time
 from typing import Final
 
 from coldloop import __version__
+from coldloop.config import selected
 from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.limits import InputLimits
 from coldloop.logs import dropped
@@ -24,6 +25,7 @@ from coldloop.process import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import SessionPace
+from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.registers.safety import AlarmKind, WatchdogTime
@@ -38,7 +40,7 @@ from control_plc.rack_finder import RackFinder
 from control_plc.retained_state import Memory
 from control_plc.scan_cycle import ScanCycle
 from control_plc.sessions import Sessions
-from control_plc.settings import ControlSection, ControlSettings
+from control_plc.settings import SHOWN, ControlSection, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
 
@@ -80,6 +82,7 @@ class ControlPlc:
             self._clock.synchronise(self.sessions.kept.tick + PHASE, time.monotonic())
         self._finder = RackFinder(self._plant, self._link, self._cycle, self._clock, power_up_s=section.power_up_s)
         self.bank = RegisterBank(CONTROL_MAP, section.word_order)
+        publish_configuration(self.bank, selected(settings, SHOWN))
         self.publication = Publication(program, self.sessions, self._link, self.bank, header.short_digest, self._keep)
         self.clients = Clients(program, settings.limits, self.bank, self.publication, self.sessions)
         certificates = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]

@@ -1,7 +1,7 @@
 """Configuration of the control PLC, checked when it is made and immutable after."""
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -17,6 +17,12 @@ from coldloop.telemetry import TelemetrySettings
 from control_plc.alarm_settings import AlarmSettings
 from control_plc.classical import ClassicalSettings
 from control_plc.sensors import SensorCheckSettings
+
+SHOWN: Final = (
+    "limits", "control_plc.scan_tolerance_ms", "control_plc.skew_alarm_ppm", "control_plc.driver",
+    "control_plc.classical", "control_plc.ladder", "control_plc.sensors", "control_plc.alarms",
+)  # fmt: skip
+"""What of the configuration decides results: shown in the registers."""
 
 
 class ControlServer(ServerSettings):

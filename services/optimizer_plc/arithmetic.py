@@ -4,10 +4,11 @@ The PLC of the paper has single precision only. What is computed off line (maps,
 double precision and rounded once; everything that depends on a measurement is computed in the chosen type.
 """
 
-from enum import StrEnum
 from typing import TypeAlias, cast
 
 import numpy as np
+
+from optimizer_plc.computing_settings import Arithmetic
 
 Real: TypeAlias = type[np.float64]
 """The scalar type in use. Annotations say double for either type: kernels are compiled for the type they are given."""
@@ -15,13 +16,6 @@ Real: TypeAlias = type[np.float64]
 DOUBLE: Real = np.float64
 
 
-class Arithmetic(StrEnum):
-    """Floating-point types to choose from."""
-
-    FLOAT64 = "float64"
-    FLOAT32 = "float32"
-
-    @property
-    def real(self) -> Real:
-        """The scalar type."""
-        return cast("Real", np.float32) if self is Arithmetic.FLOAT32 else DOUBLE
+def real_of(arithmetic: Arithmetic) -> Real:
+    """Return the scalar type of an arithmetic."""
+    return cast("Real", np.float32) if arithmetic is Arithmetic.FLOAT32 else DOUBLE

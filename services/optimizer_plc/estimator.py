@@ -1,51 +1,19 @@
 """What the optimiser believes of the plant's state at an updating instant."""
 
-from enum import StrEnum
-from typing import Annotated, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
 from coldloop.compiled import kernel
 from coldloop.process import SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.control_plc import Update
 from optimizer_plc.arithmetic import DOUBLE, Real
+from optimizer_plc.computing_settings import EstimatorSettings
 from optimizer_plc.linear_algebra import apply, multiply
 from optimizer_plc.prediction import PredictionModel
 
 Array = NDArray[np.float64]
-
-
-class EstimatorKind(StrEnum):
-    """Which estimator."""
-
-    KALMAN = "kalman"
-    STATE_FEEDBACK = "state-feedback"
-
-
-class EstimatorSettings(BaseModel):
-    """Settings of the estimator; standard deviations are per square root of a sampling period of 5 s."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    kind: EstimatorKind = EstimatorKind.KALMAN
-    load_walk_w: PositiveFloat = 3.0
-    """Random walk of the load mismatch, W."""
-    pressure_noise_pa: PositiveFloat = 50.0
-    volume_noise_m3: PositiveFloat = 1e-5
-    temperature_noise_k: PositiveFloat = 0.05
-    mass_noise_kg: PositiveFloat = 1e-4
-    """Of a line of the compression station, where the model has it, as the next two."""
-    flow_noise_kg_s: PositiveFloat = 1e-5
-    integral_noise_bar_s: PositiveFloat = 1e-5
-    level_sensor: PositiveFloat = 0.01
-    """Standard deviation of the sensors: %, Hz, K and bar."""
-    speed_sensor: PositiveFloat = 1.0
-    temperature_sensor: PositiveFloat = 0.02
-    pressure_sensor: PositiveFloat = 1e-3
-    longest_riccati: Annotated[int, Field(ge=1)] = 2000
-    """Longest run of the Riccati recursion for a stationary gain, in periods."""
 
 
 class Estimate(NamedTuple):

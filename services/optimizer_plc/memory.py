@@ -5,9 +5,10 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.registers.control_plc import SEQUENCE_ROWS
-from optimizer_plc.arithmetic import Arithmetic
+from optimizer_plc.arithmetic import real_of
+from optimizer_plc.computing_settings import Arithmetic, EstimatorSettings
 from optimizer_plc.design import N_INPUTS
-from optimizer_plc.estimator import EstimatorSettings, stationary_gains
+from optimizer_plc.estimator import stationary_gains
 from optimizer_plc.operations import WORD
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem
@@ -40,7 +41,7 @@ class Footprint(NamedTuple):
 
 def estimator_memory(prediction: PredictionModel, settings: EstimatorSettings) -> int:
     """Return the bytes of the estimator."""
-    real = Arithmetic.FLOAT32.real
+    real = real_of(Arithmetic.FLOAT32)
     single = prediction.rounded(real)
     gains = (gain.astype(real) for gain in stationary_gains(prediction, settings).values())
     transitions = (M for step in single.transitions.values() for M in step)

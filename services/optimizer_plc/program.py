@@ -24,9 +24,11 @@ from coldloop.registers.optimizer_plc import (
     UpdatingRuleStatus,
 )
 from coldloop.sequence import InputSequence, with_checksum
+from optimizer_plc.arithmetic import real_of
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
+from optimizer_plc.computing_settings import EstimatorKind
 from optimizer_plc.costs import augmented_cost, indicators
-from optimizer_plc.estimator import Estimate, Estimator, EstimatorKind, KalmanFilter, StateFeedback
+from optimizer_plc.estimator import Estimate, Estimator, KalmanFilter, StateFeedback
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.rules import make_rule
@@ -75,7 +77,7 @@ class OptimizerProgram:
     def __init__(self, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
         self.settings = settings
         self.model_digest = model.short_digest
-        self._real = settings.arithmetic.real
+        self._real = real_of(settings.arithmetic)
         self._prediction = PredictionModel(model)
         self._problem = PredictiveProblem(self._prediction, settings.design, limits, self._real)
         self._solver = make_solver(settings)
@@ -105,6 +107,8 @@ class OptimizerProgram:
         self._sent: Delivery | None = None
         self._last: _Period | None = None
         self._sequences = 0
+        self._allowance = 0
+        """Ticks that adaptive periods are longer than the budget says: answers have been late by the clock."""
 
     def _make_estimator(self) -> Estimator:
         if self.settings.estimator.kind is EstimatorKind.STATE_FEEDBACK:
@@ -132,7 +136,7 @@ class OptimizerProgram:
         effective = self._cost(self._problem.at(here), played.z)
         wanted, assessment = self._decide(effective, update, interrupted=interrupted)
         iterations = min(wanted, self.budget.iterations(MAX_PERIOD_TICKS))
-        ticks = self._fixed_ticks or self.budget.period(iterations)
+        ticks = self._fixed_ticks or min(self.budget.period(iterations) + self._allowance, MAX_PERIOD_TICKS)
         self._last = _Period(update, estimate, iterations, ticks, effective, assessment)
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
@@ -271,6 +275,17 @@ class OptimizerProgram:
         """Return J with its constant and its floor; rounding, in single precision, must not take it below the floor."""
         floor = self._real(self.settings.adaptive.cost_floor)
         return max(self._real(cost) + (qp.constant + floor), floor)
+
+    def answered(self, *, late: bool) -> None:
+        """Note how an answer came: after a late one adaptive periods get longer, after one in time shorter again.
+
+        The budget is what the PLC should need; this is what machine and link really take. Each late answer doubles
+        what is allowed for them, each one in time takes a tick off.
+        """
+        if late:
+            self._allowance = min(max(1, 2 * self._allowance), MAX_PERIOD_TICKS)
+        else:
+            self._allowance = max(0, self._allowance - 1)
 
     # -- diagnostics --------------------------------------------------------------------------------------------------
 

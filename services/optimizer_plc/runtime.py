@@ -11,11 +11,13 @@ import time
 from typing import Final, NamedTuple
 
 from coldloop import __version__
+from coldloop.config import selected
 from coldloop.errors import ColdloopError, ConfigurationError, LinkError, ModelFileError
 from coldloop.lti_model import load
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.pace import Pace
 from coldloop.process import TICK_S
+from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import AwaitUpdate, Update, Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState
 from coldloop.sequence import InputSequence
@@ -24,7 +26,7 @@ from coldloop.telemetry import Telemetry
 from optimizer_plc.control_client import ControlClient
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.publication import Publication
-from optimizer_plc.settings import OptimizerSettings
+from optimizer_plc.settings import SHOWN, OptimizerSettings
 
 log = logging.getLogger("coldloop.optimizer_plc")
 
@@ -74,6 +76,7 @@ class OptimizerPlc:
         self.publication = Publication(
             section.word_order, self._program.budget, self._program.operating_limits, digest, holder
         )
+        publish_configuration(self.publication.bank, selected(settings, SHOWN))
         self._link = self.publication.link
         self._control = ControlClient(section.control_plc, self._link, digest, str(settings.model.file))
         self._configured_pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
@@ -215,6 +218,8 @@ class OptimizerPlc:
         unplanned = verdict is Verdict.WRONG_UPDATE and not await self._is_superseded(update)
         # late once is late for ever with updates that have been waiting: begin again with a fresh one
         begin_again = unplanned or verdict is Verdict.LATE
+        if begin_again or verdict is Verdict.ACCEPTED:
+            self._program.answered(late=begin_again)
         self._wanted = FRESH_UPDATE if begin_again else AwaitUpdate(update.session, update.update + 1)
 
     async def _is_computed(self, answer: _Answer) -> bool:

@@ -1,7 +1,7 @@
 """Configuration of the optimiser PLC, checked when it is made and immutable after."""
 
 from enum import StrEnum
-from typing import Annotated, Self
+from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -14,17 +14,21 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
-from optimizer_plc.arithmetic import Arithmetic
 from optimizer_plc.budget import MAX_PERIOD_TICKS, BudgetSettings
+from optimizer_plc.computing_settings import (
+    Arithmetic,
+    DaqpSettings,
+    EstimatorSettings,
+    FastGradientSettings,
+    InteriorPointSettings,
+    OdeSettings,
+    OsqpSettings,
+    QpoasesSettings,
+)
 from optimizer_plc.design import ControlDesign
-from optimizer_plc.estimator import EstimatorSettings
-from optimizer_plc.solvers.daqp import DaqpSettings
-from optimizer_plc.solvers.fast_gradient import FastGradientSettings
-from optimizer_plc.solvers.interior_point import InteriorPointSettings
-from optimizer_plc.solvers.ode import OdeSettings
-from optimizer_plc.solvers.osqp import OsqpSettings
-from optimizer_plc.solvers.qpoases import QpoasesSettings
 
+SHOWN: Final = ("limits", "optimizer_plc.program")
+"""What of the configuration decides results: shown in the registers."""
 ADAPTIVE = 0
 
 

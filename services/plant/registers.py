@@ -5,6 +5,7 @@ import secrets
 import time
 from collections.abc import Callable
 
+from coldloop.config import selected
 from coldloop.journal import Journal, JournalPublication
 from coldloop.model_file import ModelHeader
 from coldloop.pace import Pace
@@ -12,11 +13,13 @@ from coldloop.process import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
 from coldloop.registers.common import Identity, ServiceState, SessionPace
+from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import (
     HISTORY_ROWS,
     LOAD_ROWS,
     PLANT_MAP,
+    STATION_ROWS,
     Actuators,
     LiveLoad,
     LoadAhead,
@@ -40,7 +43,7 @@ from plant.outputs import next_generation
 from plant.program import LoadProfile
 from plant.rack import MakePlant, Rack, Session
 from plant.retained_state import Memory, refused
-from plant.settings import PlantSettings
+from plant.settings import SHOWN, PlantSettings
 
 log = logging.getLogger("coldloop.plant")
 
@@ -73,6 +76,7 @@ class RackRegisters:
         self._model_digest = header.short_digest
         self._age = age
         self.bank = RegisterBank(PLANT_MAP, settings.plant.word_order)
+        publish_configuration(self.bank, selected(settings, SHOWN))
         self._memory = Memory(settings.plant.retain.file, header.short_digest)
         self.rack, resumed = self._switched_on(
             settings, header, make_plant, utc, first_generation or secrets.randbelow(2**31) + 1
@@ -275,7 +279,7 @@ class RackRegisters:
         generation = self.rack.outputs.generation
         station = self.rack.station
         if station is not None:
-            self.bank.put(station, station.tick % HISTORY_ROWS)
+            self.bank.put(station, station.tick % STATION_ROWS)
         sample = self.rack.advance()
         self.bank.put(sample, sample.tick % HISTORY_ROWS)
         self._outdated = True

@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -16,6 +16,11 @@ from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
 from plant.refrigerator_events import RANGES, EventTarget, RefrigeratorEvent
 from plant.station_settings import StationSettings
+
+SHOWN: Final = (
+    "plant.kind", "plant.station", "plant.refrigerator", "plant.sensors", "plant.clock_error_ppm", "plant.watchdog",
+)  # fmt: skip
+"""What of the configuration decides results: shown in the registers. Load and seed are those of a session."""
 
 Deviation = Annotated[float, Field(ge=0)]
 Percent = Annotated[float, Field(ge=0, le=100)]

@@ -4,10 +4,17 @@ import argparse
 from pathlib import Path
 
 
-def add_configuration_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that set the configuration."""
-    parser.add_argument("--config", type=Path, metavar="FILE", help="configuration file (TOML)")
+def add_configuration_options(parser: argparse.ArgumentParser, *, again: bool = False) -> None:
+    """Add the options that set the configuration.
+
+    Args:
+        parser: Of a command, or of one of its subcommands.
+        again: For a subcommand: what is not given there leaves what was given before it, `--set` adds to it.
+    """
+    default = argparse.SUPPRESS if again else None
+    parser.add_argument("--config", type=Path, default=default, metavar="FILE", help="configuration file (TOML)")
     parser.add_argument(
-        "--set", dest="assignments", action="append", default=[], metavar="KEY=VALUE",
+        "--set", dest="further_assignments" if again else "assignments", action="append",
+        default=argparse.SUPPRESS if again else [], metavar="KEY=VALUE",
         help="set one key, such as control_plc.server.port=5021; may be repeated",
     )  # fmt: skip

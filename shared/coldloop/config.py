@@ -31,7 +31,7 @@ class Configuration(Generic[M]):
 
     def effective(self) -> list[tuple[str, Any, str]]:
         """Return (dotted key, value, source) of every value."""
-        rows = _flattened(self.settings.model_dump(mode="json"))
+        rows = flattened(self.settings.model_dump(mode="json"))
         return [(key, value, self.sources.get(key, DEFAULT)) for key, value in rows.items()]
 
 
@@ -97,7 +97,7 @@ Entry = tuple[str, object, str]
 
 
 def _from_file(file: Path | None) -> list[Entry]:
-    return [] if file is None else [(key, value, str(file)) for key, value in _flattened(_read_toml(file)).items()]
+    return [] if file is None else [(key, value, str(file)) for key, value in flattened(_read_toml(file)).items()]
 
 
 def _from_environment(environment: Mapping[str, str]) -> list[Entry]:
@@ -117,7 +117,7 @@ def _assigned(assignment: str) -> Entry:
 
 def to_environment(settings: BaseModel) -> dict[str, str]:
     """Return the variables that make a process load these settings."""
-    flat = _flattened(settings.model_dump(mode="json"))
+    flat = flattened(settings.model_dump(mode="json"))
     return {
         PREFIX + key.upper().replace(".", "__"): _as_toml(value) for key, value in flat.items() if value is not None
     }
@@ -150,14 +150,22 @@ def _parsed(value: str) -> object:
         return value
 
 
-def _flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values of nested sections by dotted key."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping) and value:
-            flat.update(_flattened(value, f"{prefix}{key}."))
+            flat.update(flattened(value, f"{prefix}{key}."))
         else:
             flat[f"{prefix}{key}"] = value
     return flat
+
+
+def selected(settings: BaseModel, keys: Iterable[str]) -> dict[str, Any]:
+    """Return the values of some keys, and of all that is in some sections, by dotted key."""
+    wanted = tuple(f"{key}." for key in keys)
+    values = flattened(settings.model_dump(mode="json"))
+    return {key: value for key, value in values.items() if f"{key}.".startswith(wanted)}
 
 
 def _explained(error: ValidationError, sources: Mapping[str, str]) -> str:

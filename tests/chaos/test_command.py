@@ -1,8 +1,16 @@
 """`coldloop chaos`."""
 
+import contextlib
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import pandas as pd
+import pyarrow.parquet as pq
 
 from rig.chaos.plan import shipped_plans
 
@@ -55,6 +63,58 @@ def test_faults_that_only_cost_time_leave_the_trace_as_it_is(coldloop: "Coldloop
     assert [fault["fault"] for fault in result["faults"]] == ["pause optimizer", "delay link plant"]
     assert result["missing_ticks"] == 0
     assert {"chaos.md", "chaos.png", "logs"} <= {path.name for path in out.iterdir()}
+    assert_recorded_as_an_ordinary_run(coldloop, out, tmp_path / "ordinary", result["trace_sha256"])
+
+
+def assert_recorded_as_an_ordinary_run(coldloop: "Coldloop", out: Path, ordinary: Path, trace: str) -> None:
+    """Compare the files of a run whose trace is undisturbed with those of the same run without faults."""
+    run = ("run", "--in-process", "--load", "a", "--duration", "7min", "--figures", "png", "--out", ordinary)
+    assert coldloop(*run).code == 0
+    summary, manifest = (json.loads((out / name).read_text()) for name in ("summary.json", "manifest.json"))
+    assert (summary["trace_sha256"], manifest["hashes"]["trace_sha256"]) == (trace, trace)
+    assert (summary["complete"], summary["missing_ticks"], manifest["way"]) == (True, 0, "chaos")
+    assert manifest["configuration"]["plant.load"] == "a"
+    columns = pq.read_schema(ordinary / "trace.parquet").names
+    ours, theirs = (pd.read_parquet(folder / "trace.parquet") for folder in (out, ordinary))
+    assert list(ours.columns) == columns
+    pd.testing.assert_frame_equal(ours[["L1", "T5", "CV155", "x_P1"]], theirs[["L1", "T5", "CV155", "x_P1"]])
+    updates = [pd.read_parquet(folder / "updates.parquet")["tick"].tolist() for folder in (out, ordinary)]
+    assert updates[0] == updates[1]
+    assert "mode" in set(pd.read_parquet(out / "events.parquet")["kind"])
+    for command in (
+        ("plot", out),
+        ("report", out),
+        ("export", out, "--csv"),
+        ("compare", out, ordinary, "--out", out / "c.png"),
+    ):
+        assert coldloop(*command).code == 0, command
+    again = coldloop("rerun", out / "manifest.json")
+    assert (again.code, len(again.complaints)) == (2, 1)
+    assert "coldloop chaos" in again.complaints[0]
+
+
+def test_ctrl_c_in_the_middle_of_a_plan_leaves_what_was_recorded(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "rig.cli", "chaos", "undisturbed", "--duration", "10h", "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while (
+        not (out / "logs" / "optimizer_plc.log").exists()
+        or "session" not in (out / "logs" / "optimizer_plc.log").read_text()
+    ):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(0.05)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(3)
+    process.send_signal(signal.SIGINT)
+    _, complaints = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "Traceback" not in complaints
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["complete"], summary["reason"]) == (False, "interrupted by SIGINT")
+    assert len(pd.read_parquet(out / "trace.parquet")) == summary["ticks"] > 0
 
 
 KILLS = """

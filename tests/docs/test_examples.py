@@ -33,7 +33,6 @@ SHORTENED = {
     r"^coldloop chaos (kill|freeze)": r"coldloop chaos short_plan.toml",
     r"^(coldloop chaos .*)--duration \S+": r"\1--duration 20s",
     r"^scripts/run": r"scripts/run --duration 10s",
-    r"^scripts/test": r"scripts/test tests/coldloop/test_seal.py",
 }
 """What is executed instead of what the pages say, so that it takes seconds; the tutorial's own load is run whole."""
 

@@ -16,20 +16,20 @@ import optimizer_plc
 from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel
 from coldloop.registers.control_plc import Update, Verdict
-from optimizer_plc.arithmetic import Arithmetic
+from optimizer_plc.arithmetic import real_of
+from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings, OdeSettings
 from optimizer_plc.costs import augmented_cost
-from optimizer_plc.estimator import EstimatorKind, EstimatorSettings
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.settings import ProgramSettings
-from optimizer_plc.solvers.ode import OdeSettings, OdeSolver
+from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings, SolverName
+from optimizer_plc.solvers.ode import OdeSolver
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Jump, PenalisedOptimum
 
 Array = NDArray[np.float64]
 
-SINGLE = Arithmetic.FLOAT32.real
+SINGLE = real_of(Arithmetic.FLOAT32)
 
 ON_LINE = {
     "apply", "augmented_cost", "begin", "cholesky", "cholesky_solve", "deviation_cost", "hold_at_bounds", "_inputs",
@@ -66,8 +66,10 @@ def compiled_in_single() -> set[tuple[str, str]]:
     }
 
 
-def single_program(model: LtiModel, kind: EstimatorKind = EstimatorKind.KALMAN) -> OptimizerProgram:
-    chosen = ProgramSettings(arithmetic=Arithmetic.FLOAT32, estimator=EstimatorSettings(kind=kind))
+def single_program(
+    model: LtiModel, kind: EstimatorKind = EstimatorKind.KALMAN, solver: SolverName = SolverName.ODE
+) -> OptimizerProgram:
+    chosen = ProgramSettings(arithmetic=Arithmetic.FLOAT32, estimator=EstimatorSettings(kind=kind), solver=solver)
     return OptimizerProgram(model, chosen, InputLimits())
 
 
@@ -85,6 +87,8 @@ def update_twice(program: OptimizerProgram, model: LtiModel) -> None:
 def test_no_kernel_computes_with_a_double_in_single_precision(model: LtiModel) -> None:
     for kind in EstimatorKind:
         update_twice(single_program(model, kind), model)
+    for solver in SINGLE_PRECISION_SOLVERS:
+        update_twice(single_program(model, solver=solver), model)
     checked: set[tuple[str, str]] = set()
     while unchecked := compiled_in_single() - checked:  # compiling a kernel afresh brings up those it calls
         for name, types in unchecked:

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from optimizer_plc.budget import MAX_PERIOD_TICKS, BudgetSettings, PlcBudget
-from optimizer_plc.solvers.ode import OdeSettings
+from optimizer_plc.computing_settings import OdeSettings
 
 TAU_1_S = OdeSettings().tau_1_s
 powers = st.floats(0.05, 20.0)

@@ -5,7 +5,8 @@ from numpy.typing import NDArray
 
 from coldloop.lti_model import LtiModel
 from coldloop.registers.control_plc import Update
-from optimizer_plc.estimator import EstimatorSettings, KalmanFilter, StateFeedback
+from optimizer_plc.computing_settings import EstimatorSettings
+from optimizer_plc.estimator import KalmanFilter, StateFeedback
 from optimizer_plc.prediction import PredictionModel
 
 Array = NDArray[np.float64]

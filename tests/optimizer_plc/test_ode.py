@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
-from optimizer_plc.solvers.ode import OdeSettings, OdeSolver
+from optimizer_plc.solvers.ode import OdeSolver
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Jump, PenalisedOptimum, Situations

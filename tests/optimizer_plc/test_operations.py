@@ -8,10 +8,11 @@ import pytest
 from numpy.typing import NDArray
 
 from optimizer_plc import costs, linear_algebra, operations, problem
+from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.reference_plc import ACTIVE_ROWS, QPOASES_ON_LAPTOP_S, cholesky_times, fitted, residuals, slow_down
 from optimizer_plc.solvers import interior_point, ode
-from optimizer_plc.solvers.ode import OdeSettings, flow_in
+from optimizer_plc.solvers.ode import flow_in
 
 
 class Counted:

@@ -16,12 +16,13 @@ from coldloop.errors import ConfigurationError
 from coldloop.lti_model import LtiModel
 from coldloop.registers.control_plc import Verdict
 from optimizer_plc.budget import PlcBudget
+from optimizer_plc.computing_settings import FastGradientSettings, InteriorPointSettings, QpoasesSettings
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.settings import OptimizerSection, ProgramSettings, SolverName
 from optimizer_plc.solvers import Solver, make_solver, qpoases
-from optimizer_plc.solvers.fast_gradient import FastGradientSettings, FastGradientSolver, step_sizes, stiffest_hessian
-from optimizer_plc.solvers.interior_point import InteriorPointSettings, InteriorPointSolver
-from optimizer_plc.solvers.qpoases import QpoasesSettings, QpoasesSolver
+from optimizer_plc.solvers.fast_gradient import FastGradientSolver, step_sizes, stiffest_hessian
+from optimizer_plc.solvers.interior_point import InteriorPointSolver
+from optimizer_plc.solvers.qpoases import QpoasesSolver
 from plant.load import find_load
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder

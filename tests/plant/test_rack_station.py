@@ -7,7 +7,7 @@ import pytest
 from coldloop.event_text import describe
 from coldloop.registers.audit import EventKind
 from coldloop.registers.plant import (
-    HISTORY_ROWS,
+    STATION_ROWS,
     PlantSession,
     StationAlarm,
     StationMode,
@@ -76,4 +76,4 @@ def test_a_cold_box_alone_has_no_station_and_refuses_surroundings(switch_on: "ty
     rack.client("control").send(*REST)
     assert rack.operator.write(Surroundings(nc1=0)) is not None
     assert rack.operator.read(StationStatus) == StationStatus()
-    assert not any(any(rack.operator.read(StationSample, row).signals) for row in (0, 1, HISTORY_ROWS - 1))
+    assert not any(any(rack.operator.read(StationSample, row).signals) for row in (0, 1, STATION_ROWS - 1))

@@ -24,12 +24,12 @@ from optimizer_plc.settings import OptimizerSettings
 from plant.load import find_load
 from plant.program import LoadProfile
 from plant.settings import PlantSettings
-from rig.network import NetworkRig
 from rig.one_process import OneProcessRig
 from rig.ports import ReservedPorts
 from rig.recording import Recorder, Recording
 from rig.rig_endpoints import RigEndpoints
 from rig.scenario import Scenario
+from rig.session_client import SessionClient
 from rig.settings import Settings
 from rig.testing import up
 from rig.wiring import SERVICES, endpoints_on, wired
@@ -95,7 +95,7 @@ class Bus(NamedTuple):
 
     async def ready(self) -> None:
         """Wait until all three serve."""
-        rig = NetworkRig(self.endpoints, self.settings)
+        rig = SessionClient(self.endpoints, self.settings)
         try:
             await rig.connect(PATIENCE_S)
         finally:
@@ -104,7 +104,7 @@ class Bus(NamedTuple):
     async def record(self, scenario: Scenario, patience_s: float = PATIENCE_S) -> Recording:
         """Run a session; return what was recorded."""
         recorder = Recorder(scenario.ticks)
-        rig = NetworkRig(self.endpoints, self.settings)
+        rig = SessionClient(self.endpoints, self.settings)
         try:
             await rig.connect(patience_s)
             await rig.run(scenario, recorder)

@@ -76,6 +76,35 @@ def test_a_typo_is_told_before_anything_that_takes_time_is_imported(words: list[
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.parametrize("words", [["status"], ["set", "load", "400"], ["set", "mode", "manual"], ["down"]])
+def test_commands_to_a_rig_import_nothing_that_takes_time(words: list[str], free_port: int) -> None:
+    program = (
+        "import sys\n"
+        "from rig.cli import main\n"
+        "main(sys.argv[1:])\n"
+        "print(*sorted({name.partition('.')[0] for name in sys.modules}))\n"
+    )
+    done = python("-c", program, *words, "--port-base", str(free_port))
+    assert "nobody listens" in done.stderr or "no rig was started" in done.stderr
+    loaded = set(done.stdout.split())
+    assert "coldloop" in loaded
+    assert not loaded & (HEAVY - {"pydantic"} | {"plant", "control_plc", "optimizer_plc"})
+
+
+@pytest.mark.parametrize("key", ["plant.seed=3", "optimizer_plc.program.solver=osqp", "plat.seed=3"])
+def test_a_setting_without_effect_on_a_rig_that_is_up_is_refused(key: str, coldloop: "Coldloop") -> None:
+    outcome = coldloop("status", "--set", key)
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+
+
+def test_options_are_taken_before_and_behind_what_is_to_be_done() -> None:
+    parser = make_parser("set")
+    before = parser.parse_args(["set", "--port-base", "6020", "--set", "a=1", "load", "-1"])
+    behind = parser.parse_args(["set", "load", "-1", "--port-base", "6020"])
+    assert before.port_base == behind.port_base == 6020
+    assert (before.new_load, before.assignments) == ("-1", ["a=1"])
+
+
 def test_version_is_an_option_and_a_command(coldloop: "Coldloop") -> None:
     option, command = coldloop("--version"), coldloop("version")
     assert option.code == command.code == 0
@@ -127,11 +156,14 @@ def test_a_full_standard_output_is_one_line(command: str) -> None:
     ("words", "part"),
     [
         (["run", "--factor", "3"], "--mode realtime"),
-        (["run", "--attach", "a:1", "b:2", "c:3", "--solver", "osqp"], "optimizer_plc.program.solver"),
-        (["run", "--attach", "a:1", "b:2", "c:3", "--set", "plant.sensors.level=5"], "plant.sensors.level"),
+        (["run", "--set", "plant.server.port=6020"], "--set plant.server.port: has no effect"),
+        (["run", "--set", "session.autostart=true"], "--set session.autostart: has no effect"),
         (["study", "cholesky", "--load", "a"], "--load would have no effect"),
         (["study", "limited", "--quick", "--seeds", "2"], "not allowed with"),
         (["chaos", "kill", "--set", "session.factor=3"], "--factor"),
+        (["chaos", "kill", "--set", "optimizer_plc.program.updating_period_s=1"], "of the plan"),
+        (["chaos", "kill", "--set", "control_plc.server.port=6020"], "control_plc.server.port"),
+        (["chaos", "kill", "--set", "plant.retain.file=x"], "in the folder of the results"),
         (["run", "--log-level", "debug"], "--log-level"),
     ],
 )

@@ -47,6 +47,18 @@ def test_json_and_csv_say_the_same(coldloop: "Coldloop", listed: list[dict[str, 
     assert list(reader) == [{name: text(value) for name, value in row.items()} for row in listed]
 
 
+def test_enumerations_have_their_meaning_in_json(listed: list[dict[str, Any]]) -> None:
+    meanings = {(row["service"], row["block"], row["name"]): row["values"] for row in listed}
+    assert meanings["control_plc", "ladder", "mode"] == {
+        "0": "hold", "1": "mpc", "2": "classical", "3": "rest", "4": "manual",
+    }  # fmt: skip
+    assert meanings["plant", "sensor faults", "kind"]["2"] == "frozen"
+    assert meanings["plant", "identity", "tick"] is None
+    for row in listed:
+        for number in row["values"] or ():
+            assert row["low"] <= int(number) <= row["high"], row
+
+
 def test_numbers_are_numbers_in_json(listed: list[dict[str, Any]]) -> None:
     for row in listed:
         assert all(isinstance(row[name], int) for name in ("address", "rows", "row_words"))

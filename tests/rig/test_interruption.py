@@ -19,7 +19,7 @@ import rig.file_sinks
 from coldloop.errors import LinkError
 from coldloop.registers.plant import PlantSample
 from rig.one_process import OneProcessRig
-from rig.recording import Recorder, SampleBlock, Sink
+from rig.recording import BLOCK_TICKS, KEPT_TICKS, Recorder, SampleBlock, Sink
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -161,10 +161,10 @@ class Counter(Sink):
 
 def test_a_sink_that_fails_does_not_keep_blocks_from_the_others() -> None:
     sinks = [Counter(fails=True), Counter(fails=False)]
-    recorder = Recorder(600, sinks)
+    recorder = Recorder(2000, sinks)
     sample = PlantSample(0, 0.0, (0.0,) * 3, (0.0,) * 22, (0.0,) * 28)
-    for tick in range(511):
+    for tick in range(BLOCK_TICKS + KEPT_TICKS - 1):
         recorder.sample(sample._replace(tick=tick))
     with pytest.raises(OSError, match="broken"):
-        recorder.sample(sample._replace(tick=511))
-    assert [sink.ticks for sink in sinks] == [512, 512]
+        recorder.sample(sample._replace(tick=BLOCK_TICKS + KEPT_TICKS - 1))
+    assert [sink.ticks for sink in sinks] == [BLOCK_TICKS, BLOCK_TICKS]

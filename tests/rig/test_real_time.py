@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import pytest
 
-import rig.network
+import rig.session_client
 from coldloop.limits import InputLimits
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
@@ -171,7 +171,7 @@ async def test_a_plan_that_comes_too_late_costs_an_update_and_not_the_session(
 async def test_a_slow_run_is_not_given_up_while_it_moves(
     load_a: LoadProfile, on_the_bus: "OnTheBus", monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rig.network, "QUIET_S", 1.0)  # factor 10 and 1 s for factor 0.5 and 20 s
+    monkeypatch.setattr(rig.session_client, "QUIET_S", 1.0)  # factor 10 and 1 s for factor 0.5 and 20 s
     async with on_the_bus() as bus:
         recording = await bus.record(Scenario(ticks=80, load=load_a, updating_period_s=0.0, seed=1, realtime=True,
                                               factor=10.0))  # fmt: skip

@@ -1,5 +1,7 @@
 """`coldloop up`, `down`, `status`, `set` and `run --attach`: a rig that stays up, and what is done with it."""
 
+import asyncio
+import json
 import os
 import signal
 import socket
@@ -11,6 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from coldloop.errors import RequestRefusedError
+from coldloop.modbus.client import RegisterClient
+from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
 from rig import cli
 from rig.ports import ReservedPorts
 from rig.started_rigs import check_ports, running_rig
@@ -25,6 +30,7 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     os.environ["XDG_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
     base = str(_three_free_ports())
     command = [sys.executable, "-m", "rig.cli", "up", "--port-base", base, "--load", "e", "--factor", FACTOR]
+    command += ["--set", "plant.sensors.level=0.01"]
     try:
         subprocess.run([*command, "--detach"], check=True, timeout=120, stdout=subprocess.DEVNULL)
         yield base
@@ -109,6 +115,20 @@ def test_what_cannot_be_done_is_one_line(coldloop: Coldloop, up: str, words: tup
     assert part in outcome.complaints[0]
 
 
+@pytest.mark.parametrize("mode", list(OperatorMode))
+def test_a_setpoint_beyond_the_bounds_is_refused_by_the_control_plc_itself(up: str, mode: OperatorMode) -> None:
+    async def write() -> None:
+        control = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=int(up) + 1, timeout_s=10.0)
+        before = await control.read(Operator)
+        with pytest.raises(RequestRefusedError) as refusal:
+            await control.write(Operator(mode, 80.0, before.ncr22, before.cv156))
+        assert refusal.value.exception_code == 3
+        assert (await control.read(Operator)).mode == before.mode
+        control.close()
+
+    asyncio.run(write())
+
+
 def test_a_load_file_begins_now(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
     file = tmp_path / "load.csv"
     file.write_text("time_s,load_w\n" + "".join(f"{second},{400 + second % 2}\n" for second in range(3000)))
@@ -145,6 +165,46 @@ def test_a_rig_that_was_attached_to_runs_on_in_real_time(coldloop: Coldloop, up:
     before, deadline = shown(coldloop, up)["session"], time.monotonic() + 30
     while shown(coldloop, up)["session"] == before:
         assert time.monotonic() < deadline, "plant time goes on"
+
+
+def attach(up: str) -> tuple[str, ...]:
+    return ("run", "--attach", *(f"127.0.0.1:{int(up) + place}" for place in range(3)))
+
+
+def test_the_manifest_of_an_attached_run_says_what_the_rig_runs(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
+    asked = ("--load", "e", "--duration", "30s", "--figures", "png", "--seed", "7", "--updating-period", "2.5")
+    outcome = coldloop(*attach(up), *asked, "--out", tmp_path / "run")
+    assert outcome.code == 0, outcome.complaints
+    configuration = json.loads((tmp_path / "run" / "manifest.json").read_text())["configuration"]
+    assert configuration["plant.sensors.level"] == 0.01, "of the rig, not of this command"
+    assert (configuration["plant.seed"], configuration["optimizer_plc.program.updating_period_s"]) == (7, 2.5)
+    again = coldloop("rerun", tmp_path / "run" / "manifest.json")
+    assert again.code == 0, again.out
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (("--solver", "osqp"), "--solver: the rig runs optimizer_plc.program.solver = ode"),
+        (("--set", "plant.sensors.level=5"), "the rig runs plant.sensors.level = 0.01"),
+        (("--set", "plant.sensors={level=5}"), "the rig runs plant.sensors.level = 0.01"),
+        (("--set", "limits.high=[50,100,50]"), "the rig runs limits.high = [60.0, 150.0, 60.0]"),
+        (("--set", "plant.server.port=1"), "has its own plant.server.port"),
+    ],
+)
+def test_what_attach_cannot_set_is_refused(
+    coldloop: Coldloop, up: str, words: tuple[str, ...], part: str, results: Path
+) -> None:
+    outcome = coldloop(*attach(up), "--load", "e", "--duration", "30s", *words, "--out", results)
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+    assert part in outcome.complaints[0]
+    assert not results.exists()
+
+
+def test_what_a_rig_runs_may_be_named_again(coldloop: Coldloop, up: str, results: Path) -> None:
+    same = ("--solver", "ode", "--set", "plant.sensors.level=0.01")
+    run = (*attach(up), "--load", "e", "--duration", "5s", "--figures", "png", *same, "--out", results)
+    assert coldloop(*run).code == 0
 
 
 def test_ctrl_c_gives_an_attached_rig_back_too(coldloop: Coldloop, up: str, tmp_path: Path) -> None:

@@ -9,28 +9,15 @@
 import daqp
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, PositiveFloat
 
+from optimizer_plc.computing_settings import DaqpSettings
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.solution import Solution, judge
-from optimizer_plc.solvers.interface import PENALTY_WEIGHT
 
 Array = NDArray[np.float64]
 
 UNBOUNDED = 1e30
-
-
-class DaqpSettings(BaseModel):
-    """Settings of DAQP."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    alpha: PositiveFloat = PENALTY_WEIGHT
-    """Weight that its answers are judged with; DAQP itself knows no penalty."""
-    primal_tolerance: PositiveFloat = 1e-9
-    tau_1_s: PositiveFloat = 4.75
-    """One solve in an updating period of 5 s at P = 1: an oracle's time, not a measured one."""
 
 
 class DaqpSolver:

@@ -14,31 +14,18 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, PositiveFloat
 
 from coldloop.compiled import kernel
+from optimizer_plc.computing_settings import FastGradientSettings
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.solution import Solution, judge, penalty_multipliers
-from optimizer_plc.solvers.interface import PENALTY_WEIGHT
 
 Array = NDArray[np.float64]
 
 POWER_ITERATIONS = 200
 BOUND_MARGIN = 1.02
 """On the largest eigenvalue, which power iteration approaches from below."""
-
-
-class FastGradientSettings(BaseModel):
-    """Settings of the fast gradient method."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    alpha: PositiveFloat = PENALTY_WEIGHT
-    adaptive_restart: bool = True
-    """Whether the momentum is dropped when it points uphill."""
-    tau_1_s: PositiveFloat = 0.03
-    """14,656 operations at 0.529 Mflop/s are 0.028 s (`docs/budget.md`)."""
 
 
 class Momentum(NamedTuple):
@@ -65,15 +52,16 @@ class FastGradientSolver:
     def start(self, problem: QuadraticProblem, guess: Array) -> None:
         """Begin with `guess` projected into the box, without momentum."""
         self._problem = problem
+        self._alpha = problem.phi.dtype.type(self.alpha)
         if self._matrices is None or problem.Phi is not self._matrices[0] or problem.Gamma is not self._matrices[1]:
             self._matrices = problem.Phi, problem.Gamma
-            self._steps = step_sizes(problem.Phi, problem.Gamma, self.alpha)
+            self._steps = step_sizes(problem.Phi, problem.Gamma, self._alpha)
         self._z = np.clip(guess, problem.low, problem.high)
         self._momentum = Momentum(self._z.copy(), np.ones_like(self._z[:1]))
 
     def iterate(self, count: int) -> int:
         """Take `count` steps."""
-        descend(self._problem, self._z, self._momentum, self._steps, self.alpha, self._adaptive_restart, count)
+        descend(self._problem, self._z, self._momentum, self._steps, self._alpha, self._adaptive_restart, count)
         return count
 
     @property
@@ -84,7 +72,7 @@ class FastGradientSolver:
     @property
     def cost(self) -> float:
         """Augmented cost at the present point."""
-        return float(augmented_cost(self._problem, self._z, self.alpha))
+        return float(augmented_cost(self._problem, self._z, self._alpha))
 
     def judged(self) -> Solution:
         """Return `solution` with its residuals; its multipliers are the slopes of the penalties."""
@@ -95,10 +83,11 @@ class FastGradientSolver:
 @kernel
 def stiffest_hessian(Phi: Array, Gamma: Array, alpha: float) -> Array:
     """Return 2 Phi + 2 alpha Gamma' Gamma, shape (n, n): the Hessian of J where all rows push."""
-    H = 2 * Phi
+    two = Phi.dtype.type(2)
+    H = two * Phi
     for r in range(Gamma.shape[0]):
         for i in range(H.shape[0]):
-            factor = 2 * Phi.dtype.type(alpha) * Gamma[r, i]
+            factor = two * alpha * Gamma[r, i]
             if factor != 0:
                 for j in range(H.shape[0]):
                     H[i, j] += factor * Gamma[r, j]
@@ -110,7 +99,7 @@ def step_sizes(Phi: Array, Gamma: Array, alpha: float) -> Array:
     """Return 1 / (L d), shape (n,): d is the stiffest Hessian's diagonal, L bounds its eigenvalues once scaled."""
     H = stiffest_hessian(Phi, Gamma, alpha)
     n = H.shape[0]
-    tiny = Phi.dtype.type(1e-12)
+    one, tiny = Phi.dtype.type(1), Phi.dtype.type(1e-12)
     d = np.empty(n, Phi.dtype)
     for i in range(n):
         d[i] = max(H[i, i], tiny)
@@ -128,25 +117,25 @@ def step_sizes(Phi: Array, Gamma: Array, alpha: float) -> Array:
             v[i] = image[i] / largest
     result = np.empty_like(d)
     for i in range(n):
-        result[i] = 1 / (Phi.dtype.type(BOUND_MARGIN) * largest * d[i])
+        result[i] = one / (Phi.dtype.type(BOUND_MARGIN) * largest * d[i])
     return result
 
 
 @kernel
 def gradient(qp: QuadraticProblem, z: Array, alpha: float, result: Array) -> None:
     """Write the gradient of J at z into `result` (n,)."""
-    n = z.shape[0]
+    n, two = z.shape[0], z.dtype.type(2)
     for i in range(n):
         slope = qp.phi[i]
         for j in range(n):
-            slope += 2 * qp.Phi[i, j] * z[j]
+            slope += two * qp.Phi[i, j] * z[j]
         result[i] = slope
     for r in range(qp.Gamma.shape[0]):
         excess = -qp.gamma[r]
         for j in range(n):
             excess += qp.Gamma[r, j] * z[j]
         if excess > 0:
-            factor = 2 * z.dtype.type(alpha) * excess
+            factor = two * alpha * excess
             for j in range(n):
                 result[j] += factor * qp.Gamma[r, j]
 
@@ -162,7 +151,7 @@ def descend(
     count: int,
 ) -> None:
     """Move z and its momentum by `count` iterations."""
-    n, half = z.shape[0], z.dtype.type(0.5)
+    n, half, one, four = z.shape[0], z.dtype.type(0.5), z.dtype.type(1), z.dtype.type(4)
     ahead, t, slope, moved = momentum.ahead, momentum.t, np.empty_like(z), np.empty_like(z)
     for _ in range(count):
         gradient(qp, ahead, alpha, slope)
@@ -174,8 +163,8 @@ def descend(
             z[i] = reached
         if adaptive_restart and uphill > 0:
             t[0] = 1
-        t_next = half * (1 + np.sqrt(1 + 4 * t[0] * t[0]))
-        weight = (t[0] - 1) / t_next
+        t_next = half * (one + np.sqrt(one + four * t[0] * t[0]))
+        weight = (t[0] - one) / t_next
         t[0] = t_next
         for i in range(n):
             ahead[i] = z[i] + weight * moved[i]

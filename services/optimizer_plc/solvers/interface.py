@@ -10,9 +10,6 @@ from optimizer_plc.solution import Solution
 
 Array = NDArray[np.float64]
 
-PENALTY_WEIGHT = 3000.0
-"""alpha that all solvers are judged by unless told otherwise: 30 times the weight of a band violation."""
-
 
 class Solver(Protocol):
     """An iterative solver whose iterations can be counted and cut off anywhere.

@@ -16,18 +16,17 @@ as that of the ODE-based solver, and single precision suffices.
 - A truncated answer is the point of lowest J so far, the guess included: it never rises (Definition 1 of the paper).
 """
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
 from coldloop.compiled import kernel
+from optimizer_plc.computing_settings import InteriorPointSettings
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.linear_algebra import cholesky, cholesky_solve
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.solution import Solution, judge
-from optimizer_plc.solvers.interface import PENALTY_WEIGHT
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -36,23 +35,6 @@ SHORT_OF = 0.99
 """Share of the way to the first bound that a step goes."""
 FINEST = 100.0
 """mu, in units of the rounding error of 1, below which there is nothing left to win."""
-
-
-class InteriorPointSettings(BaseModel):
-    """Settings of the interior-point method."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    alpha: PositiveFloat = PENALTY_WEIGHT
-    first_mu: PositiveFloat = 3.0
-    """mu that the guess is put on the central path for, as a share of its J over the number of rows and variables: a
-    guess that costs much is far from the optimum, and needs a path that begins far from the bounds."""
-    least_mu: PositiveFloat = 1.0
-    """It is never less than this."""
-    margin: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1
-    """Share of the box's width by which the guess is at least moved away from its bounds."""
-    tau_1_s: PositiveFloat = 0.17
-    """87,700 operations at 0.529 Mflop/s are 0.166 s (`docs/budget.md`)."""
 
 
 class Structure(NamedTuple):

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, PositiveFloat
 
 from coldloop.compiled import kernel
 from optimizer_plc.arithmetic import Real
+from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.linear_algebra import cholesky, cholesky_solve
 from optimizer_plc.problem import QuadraticProblem
@@ -33,24 +33,6 @@ STALLED = 20
 """Steps in a row that hardly lower J after which there is nothing left to win."""
 HARDLY = 1e-6
 """Of |J|."""
-
-
-class OdeSettings(BaseModel):
-    """Settings of the ODE-based solver."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    alpha: PositiveFloat = 3000.0
-    """Penalty weight: 30 times the weight of a band violation."""
-    cost_scale: PositiveFloat = 1e-4
-    """The flow is that of cost_scale * J: the rule for the first step size is not scale invariant."""
-    tolerance: PositiveFloat = 1.0
-    """Local error accepted in one step, in scaled variables."""
-    growth: PositiveFloat = 5.0
-    """Largest growth of the step size from one iteration to the next."""
-    rejection: PositiveFloat = 0.5
-    """Factor on the step size after a rejected step."""
-    tau_1_s: PositiveFloat = 0.25
 
 
 class Flow(NamedTuple):

@@ -8,16 +8,15 @@ The matrices are scaled and factorised once, with a fixed rho; from problem to p
   J is not monotonic (Definition 1 of the paper): see `docs/solvers.md`.
 """
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
+from optimizer_plc.computing_settings import OsqpSettings
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.solution import Solution, judge
-from optimizer_plc.solvers.interface import PENALTY_WEIGHT
 
 if TYPE_CHECKING:
     from osqp import OSQP
@@ -26,21 +25,6 @@ Array = NDArray[np.float64]
 
 NEVER = 1e-15
 """Tolerance that does not end the iterations: they are counted."""
-
-
-class OsqpSettings(BaseModel):
-    """Settings of OSQP."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    alpha: PositiveFloat = PENALTY_WEIGHT
-    """Weight that its answers are judged with; not OSQP's relaxation."""
-    rho: PositiveFloat = 10.0
-    """Step size of the multipliers: with less, truncated answers are worse, with more, convergence is slower."""
-    relaxation: Annotated[float, Field(gt=0.0, lt=2.0)] = 1.6
-    """What OSQP calls alpha."""
-    tau_1_s: PositiveFloat = 0.05
-    """25,763 operations at 0.529 Mflop/s (`docs/budget.md`)."""
 
 
 class OsqpSolver:

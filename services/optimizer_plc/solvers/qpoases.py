@@ -23,31 +23,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, PositiveFloat
 
 from coldloop.errors import ConfigurationError
+from optimizer_plc.computing_settings import QpoasesSettings
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.solution import Solution, judge
-from optimizer_plc.solvers.interface import PENALTY_WEIGHT
 
 Array = NDArray[np.float64]
 
 SOLVED, ON_THE_WAY = "SOLVER_RET_SUCCESS", "SOLVER_RET_LIMITED"
 FIRST_SOLVE_LIMIT = 10_000
 """Steps after which the first problem of a chain is given up; it takes some tens."""
-
-
-class QpoasesSettings(BaseModel):
-    """Settings of throttled qpOASES."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    alpha: PositiveFloat = PENALTY_WEIGHT
-    """Weight that its answers are judged with; qpOASES itself knows no penalty."""
-    tau_1_s: PositiveFloat = 0.475
-    """120 us a recalculation, slowed down by 4000 (paper, section VI), are 0.48 s; with a slot of 0.25 s for the
-    preparation the paper's 10 iterations in 5 s at P = 1 need this."""
 
 
 class QpoasesSolver:

@@ -22,7 +22,7 @@ class Identity(NamedTuple):
     magic: Annotated[float, f32("Always 123.456: reads right only with the right word order")] = MAGIC
     map_digest: Annotated[int, u32("Digest of this register map")] = 0
     map_version: Annotated[int, u16("Version of this register map")] = 0
-    state: Annotated[int, u16("0 ready, 1 running")] = ServiceState.READY
+    state: Annotated[int, u16("0 ready, 1 running", values=ServiceState)] = ServiceState.READY
     model_digest: Annotated[int, u32("First 32 bits of the digest of the prediction model in use")] = 0
     session: Annotated[int, u32("Session being run")] = 0
     tick: Annotated[int, u32("Present tick of plant time, counted from the start of the session", unit="0.25 s")] = 0

@@ -6,6 +6,7 @@ from typing import Annotated, Final, NamedTuple
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
+from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
 from coldloop.registers.safety import Alarm, AlarmCommand, AlarmKind, LeaseStatus, WatchdogStatus, WatchdogTime
 
@@ -129,7 +130,7 @@ class Process(NamedTuple):
 class Status(NamedTuple):
     """State of the sequence player and of the scan cycle."""
 
-    mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops, 3 rest of a sequence, 4 manual")]
+    mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops, 3 rest of a sequence, 4 manual", values=Mode)]
     update: Annotated[int, u32("Last update latched")]
     next_update_tick: Annotated[
         int, u32("Tick of the next updating instant; the latest possible one until it is planned")
@@ -147,12 +148,13 @@ class Status(NamedTuple):
 class LadderStatus(NamedTuple):
     """Where the fail-safe ladder stands, and what it knows of those it depends on."""
 
-    mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops, 3 rest of a sequence, 4 manual")]
+    mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops, 3 rest of a sequence, 4 manual", values=Mode)]
     cause: Annotated[
         int,
         u16(
             "0 none, 1 session started, 2 sequence began, 3 sequence late, 4 sequence exhausted, 5 hold expired, "
-            "6 operator, 7 sensor bad, 8 restarted"
+            "6 operator, 7 sensor bad, 8 restarted",
+            values=Cause,
         ),
     ]
     since: Annotated[int, u32("Tick at which this mode began")]
@@ -204,7 +206,8 @@ class Acknowledgement(NamedTuple):
         int,
         u16(
             "0 none, 1 accepted, 2 late, 3 wrong update, 4 wrong tick, 5 wrong length, 6 wrong model, 7 bad CRC, "
-            "8 out of range, 9 rate exceeded, 10 repeated, 11 not invited, 12 plant lost"
+            "8 out of range, 9 rate exceeded, 10 repeated, 11 not invited, 12 plant lost",
+            values=Verdict,
         ),
     ]
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
@@ -231,7 +234,7 @@ class LatchedUpdate(NamedTuple):
 class Operator(NamedTuple):
     """What an operator wants. Setpoints count in manual mode; they are clamped and rate-limited."""
 
-    mode: Annotated[int, u16("0 auto, 1 classical loops, 2 manual", high=2)]
+    mode: Annotated[int, u16("0 auto, 1 classical loops, 2 manual", high=2, values=OperatorMode)]
     cv155: Annotated[float, f32("Setpoint of the Joule-Thomson valve", unit="%", low=0, high=100)]
     ncr22: Annotated[float, f32("Setpoint of the actuator part of the heater", unit="W", low=0, high=1000)]
     cv156: Annotated[float, f32("Setpoint of the turbine valve", unit="%", low=0, high=100)]
@@ -264,13 +267,19 @@ class PlantLinkStatus(NamedTuple):
     """The link to the rack: whether outputs are written, and how far the clocks agree."""
 
     state: Annotated[
-        int, u16("0 idle, 1 searching, 2 joining, 3 in step, 4 outputs not taken, 5 foreign, 6 frozen", high=6)
+        int,
+        u16(
+            "0 idle, 1 searching, 2 joining, 3 in step, 4 outputs not taken, 5 foreign, 6 frozen",
+            high=6,
+            values=PlantLinkState,
+        ),
     ] = PlantLinkState.IDLE
     cause: Annotated[
         int,
         u16(
             "0 none, 1 no answer, 2 damaged, 3 not finite, 4 wrong session, 5 untimely, 6 changed, 7 second master, "
-            "8 refused, 9 overslept, 10 leapt, 11 stands, 12 started, 13 pace"
+            "8 refused, 9 overslept, 10 leapt, 11 stands, 12 started, 13 pace",
+            values=LinkCause,
         ),
     ] = LinkCause.NONE
     since: Annotated[int, u32("Tick at which this state began")] = 0
@@ -331,5 +340,7 @@ CONTROL_MAP: Final = RegisterMap(
         Block("journal page", 45010, JournalPage, "State of the journal"),
         Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
         Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+        CONFIGURATION_BLOCK,
+        CONFIGURATION_LINES_BLOCK,
     ),
 )

@@ -10,7 +10,7 @@ import json
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import Enum, StrEnum
+from enum import Enum, IntEnum, StrEnum
 from functools import cache, cached_property
 from typing import NamedTuple, cast, get_type_hints
 
@@ -51,6 +51,8 @@ class Field:
     high: float | None = None
     elements: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
+    values: type[IntEnum] | None = None
+    """Meaning of the numbers of an enumeration."""
     is_text: bool = False
     """The elements are the words of a text (`registers.text`)."""
 
@@ -60,9 +62,11 @@ class Field:
         return self.kind.words * max(1, len(self.elements))
 
 
-def u16(description: str, *, unit: str = "", low: int = 0, high: int = 0xFFFF) -> Field:
-    """Declare an unsigned 16-bit register."""
-    return Field(Kind.U16, description, unit, low, high)
+def u16(
+    description: str, *, unit: str = "", low: int = 0, high: int = 0xFFFF, values: type[IntEnum] | None = None
+) -> Field:
+    """Declare an unsigned 16-bit register; `values` gives the numbers of an enumeration their meaning."""
+    return Field(Kind.U16, description, unit, low, high, values=values)
 
 
 def u32(description: str, *, unit: str = "", low: int | None = None) -> Field:
@@ -114,6 +118,8 @@ class Register(NamedTuple):
     high: float | None
     writer: Role | None
     description: str
+    values: type[IntEnum] | None = None
+    """Meaning of the numbers of an enumeration."""
 
 
 @dataclass(frozen=True)
@@ -152,8 +158,9 @@ class Block:
                 label = f"{name}.{element}" if element else name
                 unit = field.units[position] if field.units else field.unit
                 yield Register(
-                    self.name, label, address, field.kind, unit, field.low, field.high, self.writer, field.description
-                )
+                    self.name, label, address, field.kind, unit, field.low, field.high, self.writer, field.description,
+                    field.values,
+                )  # fmt: skip
                 address += field.kind.words
 
 

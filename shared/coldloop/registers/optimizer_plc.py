@@ -6,6 +6,8 @@ from typing import Annotated, Final, NamedTuple
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
+from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
+from coldloop.registers.control_plc import Verdict
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
 
 HISTORY_ROWS: Final = 256
@@ -53,7 +55,11 @@ class ControlLinkStatus(NamedTuple):
 
     state: Annotated[
         int,
-        u16("0 searching, 1 introducing, 2 waiting, 3 computing, 4 delivering, 5 foreign, 6 wrong model", high=6),
+        u16(
+            "0 searching, 1 introducing, 2 waiting, 3 computing, 4 delivering, 5 foreign, 6 wrong model",
+            high=6,
+            values=ControlLinkState,
+        ),
     ] = ControlLinkState.SEARCHING
     holder: Annotated[int, u32("Number that this optimiser has given itself")] = 0
     breaks: Annotated[int, u32("Times that the link was lost")] = 0
@@ -69,7 +75,7 @@ class Optimization(NamedTuple):
     tick: Annotated[int, u32("Tick of the updating instant t_i")]
     tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i", unit="0.25 s")]
     iterations: Annotated[int, u16("Iterations done: q(t_i), or fewer if more would have changed nothing")]
-    verdict: Annotated[int, u16("Verdict of the control PLC on the sequence")]
+    verdict: Annotated[int, u16("Verdict of the control PLC on the sequence", values=Verdict)]
     j_effective: Annotated[float, f32("J_i: the profile being played, at the state reached")]
     j_hot_start: Annotated[float, f32("J+_i: the shifted profile, at the predicted state")]
     j_delivered: Annotated[float, f32("Ĵ_{i+1}: the delivered profile, at the predicted state")]
@@ -162,5 +168,7 @@ OPTIMIZER_MAP: Final = RegisterMap(
         Block("journal page", 45010, JournalPage, "State of the journal"),
         Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
         Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+        CONFIGURATION_BLOCK,
+        CONFIGURATION_LINES_BLOCK,
     ),
 )

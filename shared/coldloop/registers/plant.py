@@ -17,10 +17,12 @@ from coldloop.process import (
 )
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
+from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u16_array, u32
 from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 
 HISTORY_ROWS: Final = 256
+STATION_ROWS: Final = 128
 LOAD_ROWS: Final = 2048
 MAX_LOAD_W: Final = 10_000.0
 AHEAD_STEPS: Final = 24
@@ -70,7 +72,11 @@ class Measurement(NamedTuple):
         int, u32("Rises when outputs change in another way than by their writer: safe state, session, new writer")
     ] = 0
     verdict: Annotated[
-        int, u16("Outputs sent last: 0 none, 1 taken, 2 wrong session, 3 untimely, 4 changed since they were read back")
+        int,
+        u16(
+            "Outputs sent last: 0 none, 1 taken, 2 wrong session, 3 untimely, 4 changed since they were read back",
+            values=OutputVerdict,
+        ),
     ] = OutputVerdict.NONE
     refused: Annotated[int, u16("Writes of others that were refused so far; wraps")] = 0
     age: Annotated[float, f32("Time since this tick began, by the rack's clock, in ticks; 0 in lock-step")] = 0.0
@@ -89,7 +95,10 @@ class SensorFaultKind(IntEnum):
 class SensorFault(NamedTuple):
     """A fault put into one output of the simulation. Row i is output i; the history keeps the true value."""
 
-    kind: Annotated[int, u16("0 none, 1 not a number, 2 frozen at its present value, 3 the value below", high=3)]
+    kind: Annotated[
+        int,
+        u16("0 none, 1 not a number, 2 frozen at its present value, 3 the value below", high=3, values=SensorFaultKind),
+    ]
     value: Annotated[float, f32("Value that the sensor shows with fault 3")]
 
 
@@ -260,11 +269,13 @@ PLANT_MAP: Final = RegisterMap(
             Role.OPERATOR,
         ),
         Block("load table", 1000, LoadStep, "Heat load over the session", Role.OPERATOR, LOAD_ROWS),
+        Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
         Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
         Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
         Block("journal page", 45010, JournalPage, "State of the journal"),
         Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
         Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
-        Block("station history", 54672, StationSample, "The last ticks of the warm part", rows=HISTORY_ROWS),
+        CONFIGURATION_BLOCK,
+        CONFIGURATION_LINES_BLOCK,
     ),
 )

@@ -19,7 +19,7 @@ class WatchdogStatus(NamedTuple):
     """A watchdog, in the manner of the WAGO 750's block of watchdog registers."""
 
     time: Annotated[int, u16("Time-out in use; 0 is off", unit="0.25 s")] = 0
-    state: Annotated[int, u16("0 off, 1 running, 2 expired")] = WatchdogState.OFF
+    state: Annotated[int, u16("0 off, 1 running, 2 expired", values=WatchdogState)] = WatchdogState.OFF
     remaining: Annotated[int, u16("Time until it expires", unit="0.25 s")] = 0
     lowest: Annotated[int, u16("Shortest remaining time since it was set", unit="0.25 s")] = 0
     trips: Annotated[int, u16("Times that it has expired")] = 0
@@ -43,7 +43,9 @@ class LeaseState(IntEnum):
 class LeaseStatus(NamedTuple):
     """The lease of a role: only one connection at a time writes in it."""
 
-    state: Annotated[int, u16("0 free, 1 held, 2 lingering: its connection has closed")] = LeaseState.FREE
+    state: Annotated[int, u16("0 free, 1 held, 2 lingering: its connection has closed", values=LeaseState)] = (
+        LeaseState.FREE
+    )
     holder: Annotated[int, u32("Number that the holder has given itself; 0 is a simple client")] = 0
     refused: Annotated[int, u32("Writes of others that were refused with exception 06")] = 0
     who: Annotated[tuple[int, ...], text("Address, role and certificate of the holder", WHO_WORDS)] = NOBODY
@@ -114,7 +116,9 @@ class Alarm(NamedTuple):
     state: Annotated[
         int,
         u16(
-            "0 normal, 1 unacknowledged, 2 acknowledged, 3 returned unacknowledged, 4 shelved, 5 out of service", high=5
+            "0 normal, 1 unacknowledged, 2 acknowledged, 3 returned unacknowledged, 4 shelved, 5 out of service",
+            high=5,
+            values=AlarmState,
         ),
     ] = 0
     active: Annotated[int, u16("1 while the condition holds, whatever the state", high=1)] = 0
@@ -124,7 +128,9 @@ class Alarm(NamedTuple):
     times: Annotated[int, u16("Times that it was raised")] = 0
     raised: Annotated[int, u32("Tick at which it was last raised")] = 0
     returned: Annotated[int, u32("Tick at which the condition last ended")] = 0
-    priority: Annotated[int, u16("1 low, 2 medium, 3 high, 4 critical", high=4)] = AlarmPriority.LOW
+    priority: Annotated[int, u16("1 low, 2 medium, 3 high, 4 critical", high=4, values=AlarmPriority)] = (
+        AlarmPriority.LOW
+    )
     shelved_until: Annotated[int, u32("Tick at which shelving ends; 0 is not shelved")] = 0
 
 
@@ -133,7 +139,13 @@ class AlarmCommand(NamedTuple):
 
     alarm: Annotated[int, u16("Number of the alarm; 65535 is all")]
     action: Annotated[
-        int, u16("1 acknowledge, 2 shelve, 3 unshelve, 4 out of service, 5 in service again", low=1, high=5)
+        int,
+        u16(
+            "1 acknowledge, 2 shelve, 3 unshelve, 4 out of service, 5 in service again",
+            low=1,
+            high=5,
+            values=AlarmAction,
+        ),
     ]
     time: Annotated[int, u16("How long to shelve it; 0 is the time of the configuration", unit="s")] = 0
 

@@ -1,0 +1,133 @@
+"""Settings of what the optimiser computes with: arithmetic, estimator, solvers. It imports nothing that takes time."""
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+
+PENALTY_WEIGHT = 3000.0
+"""alpha that all solvers are judged by unless told otherwise: 30 times the weight of a band violation."""
+
+
+class Arithmetic(StrEnum):
+    """Floating-point types to choose from."""
+
+    FLOAT64 = "float64"
+    FLOAT32 = "float32"
+
+
+class EstimatorKind(StrEnum):
+    """Which estimator."""
+
+    KALMAN = "kalman"
+    STATE_FEEDBACK = "state-feedback"
+
+
+class EstimatorSettings(BaseModel):
+    """Settings of the estimator; standard deviations are per square root of a sampling period of 5 s."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: EstimatorKind = EstimatorKind.KALMAN
+    load_walk_w: PositiveFloat = 3.0
+    """Random walk of the load mismatch, W."""
+    pressure_noise_pa: PositiveFloat = 50.0
+    volume_noise_m3: PositiveFloat = 1e-5
+    temperature_noise_k: PositiveFloat = 0.05
+    mass_noise_kg: PositiveFloat = 1e-4
+    """Of a line of the compression station, where the model has it, as the next two."""
+    flow_noise_kg_s: PositiveFloat = 1e-5
+    integral_noise_bar_s: PositiveFloat = 1e-5
+    level_sensor: PositiveFloat = 0.01
+    """Standard deviation of the sensors: %, Hz, K and bar."""
+    speed_sensor: PositiveFloat = 1.0
+    temperature_sensor: PositiveFloat = 0.02
+    pressure_sensor: PositiveFloat = 1e-3
+    longest_riccati: Annotated[int, Field(ge=1)] = 2000
+    """Longest run of the Riccati recursion for a stationary gain, in periods."""
+
+
+class OdeSettings(BaseModel):
+    """Settings of the ODE-based solver."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    alpha: PositiveFloat = 3000.0
+    """Penalty weight: 30 times the weight of a band violation."""
+    cost_scale: PositiveFloat = 1e-4
+    """The flow is that of cost_scale * J: the rule for the first step size is not scale invariant."""
+    tolerance: PositiveFloat = 1.0
+    """Local error accepted in one step, in scaled variables."""
+    growth: PositiveFloat = 5.0
+    """Largest growth of the step size from one iteration to the next."""
+    rejection: PositiveFloat = 0.5
+    """Factor on the step size after a rejected step."""
+    tau_1_s: PositiveFloat = 0.25
+
+
+class QpoasesSettings(BaseModel):
+    """Settings of throttled qpOASES."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    alpha: PositiveFloat = PENALTY_WEIGHT
+    """Weight that its answers are judged with; qpOASES itself knows no penalty."""
+    tau_1_s: PositiveFloat = 0.475
+    """120 us a recalculation, slowed down by 4000 (paper, section VI), are 0.48 s; with a slot of 0.25 s for the
+    preparation the paper's 10 iterations in 5 s at P = 1 need this."""
+
+
+class OsqpSettings(BaseModel):
+    """Settings of OSQP."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    alpha: PositiveFloat = PENALTY_WEIGHT
+    """Weight that its answers are judged with; not OSQP's relaxation."""
+    rho: PositiveFloat = 10.0
+    """Step size of the multipliers: with less, truncated answers are worse, with more, convergence is slower."""
+    relaxation: Annotated[float, Field(gt=0.0, lt=2.0)] = 1.6
+    """What OSQP calls alpha."""
+    tau_1_s: PositiveFloat = 0.05
+    """25,763 operations at 0.529 Mflop/s (`docs/budget.md`)."""
+
+
+class FastGradientSettings(BaseModel):
+    """Settings of the fast gradient method."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    alpha: PositiveFloat = PENALTY_WEIGHT
+    adaptive_restart: bool = True
+    """Whether the momentum is dropped when it points uphill."""
+    tau_1_s: PositiveFloat = 0.03
+    """14,656 operations at 0.529 Mflop/s are 0.028 s (`docs/budget.md`)."""
+
+
+class DaqpSettings(BaseModel):
+    """Settings of DAQP."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    alpha: PositiveFloat = PENALTY_WEIGHT
+    """Weight that its answers are judged with; DAQP itself knows no penalty."""
+    primal_tolerance: PositiveFloat = 1e-9
+    tau_1_s: PositiveFloat = 4.75
+    """One solve in an updating period of 5 s at P = 1: an oracle's time, not a measured one."""
+
+
+class InteriorPointSettings(BaseModel):
+    """Settings of the interior-point method."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    alpha: PositiveFloat = PENALTY_WEIGHT
+    first_mu: PositiveFloat = 3.0
+    """mu that the guess is put on the central path for, as a share of its J over the number of rows and variables: a
+    guess that costs much is far from the optimum, and needs a path that begins far from the bounds."""
+    least_mu: PositiveFloat = 1.0
+    """It is never less than this."""
+    margin: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1
+    """Share of the box's width by which the guess is at least moved away from its bounds."""
+    tau_1_s: PositiveFloat = 0.17
+    """87,700 operations at 0.529 Mflop/s are 0.166 s (`docs/budget.md`)."""
