@@ -13,6 +13,7 @@ from typing import Final, NamedTuple, Self
 
 from coldloop.config import PREFIX, to_environment
 from coldloop.errors import LinkError, UsageError
+from coldloop.modbus.settings import TlsSettings
 from hmi.settings import HmiSection, HmiSettings
 from hmi.users import PageRole, write_user
 from rig.rig_endpoints import RigEndpoints
@@ -41,15 +42,29 @@ def check_page(section: HmiSection) -> None:
 
 
 def pointed_at(section: HmiSection, endpoints: RigEndpoints) -> HmiSection:
-    """Return the settings of a page of the services at these endpoints."""
-    return section.model_copy(
-        update={
-            service: getattr(section, service).model_copy(
-                update={"host": end.host, "port": end.port, "word_order": end.word_order, "tls": end.tls}
-            )
-            for service, end in endpoints._asdict().items()
-        }
-    )
+    """Return the settings of a page of the services at these endpoints.
+
+    Their certificate is an operator's, for commands; to read, the page takes the reader's beside it, if there is one.
+    """
+    update: dict[str, object] = {
+        service: getattr(section, service).model_copy(
+            update={"host": end.host, "port": end.port, "word_order": end.word_order, "tls": readers(end.tls)}
+        )
+        for service, end in endpoints._asdict().items()
+    }
+    if endpoints.plant.tls is not None and section.operator_tls is None:
+        update["operator_tls"] = endpoints.plant.tls
+    return section.model_copy(update=update)
+
+
+def readers(tls: TlsSettings | None) -> TlsSettings | None:
+    """Return the reader's certificate beside another one, as `coldloop certificates` makes it; or that one."""
+    if tls is None:
+        return None
+    certificate, key = tls.certificate.with_name("reader.crt"), tls.key.with_name("reader.key")
+    if not (certificate.is_file() and key.is_file()):
+        return tls
+    return tls.model_copy(update={"certificate": certificate, "key": key})
 
 
 class FirstLogin(NamedTuple):

@@ -104,7 +104,7 @@ def detached(ports: Sequence[int]) -> int:
     output = folder / "up.log"
     with output.open("wb") as log:
         process = subprocess.Popen(  # noqa: S603 our own command
-            [sys.executable, "-m", "rig.cli", *words], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            [sys.executable, "-m", "rig", *words], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
             start_new_session=True,
         )  # fmt: skip
     while process.poll() is None and not (folder / STATE_FILE).exists():

@@ -103,7 +103,9 @@ def as_telegraf(maps: Sequence[RegisterMap], places: Places) -> str:
 
 
 _DECODER: Final = """\
-const buffer = msg.responseBuffer.buffer, tags = {tags};
+const words = msg.payload, tags = {tags};
+const buffer = Buffer.alloc(2 * words.length);
+words.forEach((word, place) => buffer.writeUInt16BE(word, 2 * place));
 msg.payload = {{}};
 for (const [name, type, word] of tags) {{
   if (type === "f") msg.payload[name] = buffer.readFloatBE(2 * word);
@@ -145,7 +147,7 @@ def as_node_red(maps: Sequence[RegisterMap], places: Places) -> str:
                     "dataType": "HoldingRegister", "adr": str(first.address),
                     "quantity": str(last.address + last.kind.words - first.address), "rate": str(POLL_S),
                     "rateUnit": "s", "delayOnStart": False, "server": client, "useIOFile": False, "ioFile": "",
-                    "useIOForPayload": False, "emptyMsgOnFail": False, "x": 160, "y": y, "wires": [[], [decoder]],
+                    "useIOForPayload": False, "emptyMsgOnFail": False, "x": 160, "y": y, "wires": [[decoder], []],
                 },
                 {
                     "id": decoder, "type": "function", "z": tab, "name": f"{run[0].block} by name", "func": code,

@@ -17,6 +17,7 @@ from coldloop.config import selected
 from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.limits import InputLimits
 from coldloop.logs import dropped
+from coldloop.metrics_server import MetricsServer
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import ModelHeader, read_header
@@ -353,6 +354,7 @@ async def serve(settings: ControlSettings) -> None:
     log.info("serving", extra={"host": settings.control_plc.server.host, "port": server.port})
     try:
         async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(MetricsServer(settings.control_plc.metrics, plc.bank).run(), name="metrics")
             tasks.create_task(plc.run(), name="scan cycle")
             tasks.create_task(plc.certificates.run(), name="certificates")
             telemetry = Telemetry(settings.telemetry, "control_plc", plc.publication.snapshot)

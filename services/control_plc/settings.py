@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
 from coldloop.limits import InputLimits
+from coldloop.metrics_server import MetricsSettings
 from coldloop.modbus.settings import ServerSettings
 from coldloop.model_settings import ModelSettings
 from coldloop.process import TICK_S
@@ -76,6 +77,7 @@ class ControlSection(BaseModel):
 
     server: ControlServer = ControlServer()
     word_order: WordOrder = WordOrder.HIGH_FIRST
+    metrics: MetricsSettings = MetricsSettings()
     plant: PlantEndpoint = PlantEndpoint()
     power_up_s: Annotated[float, Field(ge=0)] = 10.0
     """A rack that is powered up together with this PLC may take so long (real time) before it counts as lost."""

@@ -14,6 +14,8 @@ from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
 
 ROUNDING: Final = 1e-6
+RESOLUTION: Final = 2.0**-22
+"""A change of E that is smaller is lost in the single precision of the registers."""
 LONGEST_TICKS: Final = TICKS_PER_SAMPLE
 
 
@@ -97,6 +99,8 @@ class Explanation:
     branch: Branch
     iterations_before: int | None
     iterations: int
+    spare_s: float
+    """How much longer the period is than its iterations need: answers have been late, or more would change nothing."""
     period_before_s: float | None
     period_s: float
     increments: Increments | None
@@ -122,14 +126,15 @@ def explain(
     if before is not None and before.update + 1 != update.update:
         before = None
     branch = _branch(update, before, rule)
-    q_before = planned_iterations(before, rule) if before is not None else None
+    q_before = before.iterations if before is not None else None
     increments = increments_of(update, q_before) if branch in DECIDED and q_before else None
     return Explanation(
         update=update,
         before=before,
         branch=branch,
         iterations_before=q_before,
-        iterations=planned_iterations(update, rule),
+        iterations=update.iterations,
+        spare_s=max(0, update.tau_u - period_ticks(update.iterations, rule)) * TICK_S,
         period_before_s=before.tau_u * TICK_S if before is not None else None,
         period_s=update.tau_u * TICK_S,
         increments=increments,
@@ -138,14 +143,6 @@ def explain(
         predicted=update.j_delivered,
         came=after.j_effective if after is not None and after.update == update.update + 1 else None,
     )
-
-
-def planned_iterations(update: Optimization, rule: UpdatingRuleStatus) -> int:
-    """Return q(t_i): what was done, or more when more would have changed nothing."""
-    q = update.iterations
-    while q < rule.q_max and period_ticks(q, rule) < update.tau_u:
-        q += 1
-    return q if period_ticks(q, rule) == update.tau_u else update.iterations
 
 
 def period_ticks(iterations: int, rule: UpdatingRuleStatus) -> int:
@@ -163,14 +160,14 @@ def increments_of(update: Optimization, iterations_before: int) -> Increments:
     else:
         log_K = math.log(K)
         dK = (update.gamma * log_K**2 + log_K) * K / iterations_before
-    return Increments(dD, (dK - E * dD) / D, dK)
+    dE = (dK - E * dD) / D
+    return Increments(dD, dE if abs(dE) * iterations_before > RESOLUTION else 0.0, dK)
 
 
 def budget_of(update: Optimization, rule: UpdatingRuleStatus) -> Budget:
     """Return how the PLC spends the period."""
-    q = planned_iterations(update, rule)
-    answer = rule.preparation + q * rule.iteration
-    return Budget(rule.preparation, answer, update.tau_u * TICK_S, q, rule.iteration)
+    answer = rule.preparation + update.iterations * rule.iteration
+    return Budget(rule.preparation, answer, update.tau_u * TICK_S, update.iterations, rule.iteration)
 
 
 def _branch(update: Optimization, before: Optimization | None, rule: UpdatingRuleStatus) -> Branch:
@@ -202,7 +199,7 @@ def _why_not_played(update: Optimization, before: Optimization | None, rule: Upd
     elapsed = update.tick - before.tick
     if elapsed < before.tau_u and before.verdict in {Verdict.NONE, Verdict.WRONG_UPDATE}:
         return Branch.INTERRUPTED
-    if elapsed != before.tau_u and update.tau_u == period_ticks(rule.q_first, rule) != before.tau_u:
+    if elapsed != before.tau_u and update.iterations == rule.q_first != before.iterations:
         return Branch.BEGUN_AGAIN
     return Branch.LATE
 

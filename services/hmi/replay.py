@@ -149,7 +149,7 @@ class Replay:
         model.trends.clear()
         model.updates.clear()
         model.events.clear()
-        self._tick = max(-1, tick - self._kept_ticks) - 1
+        self._tick = max(0, tick - self._kept_ticks) - 1
         started = self._tick
         updates, events = self._run.updates, self._run.events
         model.put_updates(updates[: bisect_right(updates, started, key=lambda update: update.tick)])
@@ -165,7 +165,9 @@ class Replay:
             frame = run.frame(each)
             model.trends.add(frame.process, frame.mode)
         self._tick = tick
-        self._put(run.frame(tick))
+        newest = run.frame(tick)
+        model.trends.add(newest.process, newest.mode)  # after a step back the newest record may be the one known
+        self._put(newest)
         updates, events = run.updates, run.events
         first, last = (bisect_right(updates, one, key=lambda update: update.tick) for one in (before, tick))
         model.put_updates(updates[first:last])

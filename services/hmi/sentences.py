@@ -15,7 +15,13 @@ AT_REST: Final = 1e-9
 
 def sentence(found: Explanation, rule: UpdatingRuleStatus) -> str:
     """Return why the period is as long as it is, in one sentence or two."""
-    return _WORDS[found.branch](found, rule)
+    text = _WORDS[found.branch](found, rule)
+    if found.spare_s and found.branch is not Branch.FIXED:
+        text += (
+            f" The period is {found.spare_s:g} s longer than q = {found.iterations} needs: answers have been late, or "
+            "more iterations would have changed nothing."
+        )
+    return text
 
 
 def _change(found: Explanation) -> str:

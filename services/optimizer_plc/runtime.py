@@ -14,6 +14,7 @@ from coldloop import __version__
 from coldloop.config import selected
 from coldloop.errors import ColdloopError, ConfigurationError, LinkError, ModelFileError
 from coldloop.lti_model import load
+from coldloop.metrics_server import MetricsServer
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.pace import Pace
 from coldloop.process import TICK_S
@@ -256,6 +257,7 @@ async def serve(settings: OptimizerSettings) -> None:
     log.info("serving", extra={"host": settings.optimizer_plc.server.host, "port": server.port})
     try:
         async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(MetricsServer(settings.optimizer_plc.metrics, shown.bank).run(), name="metrics")
             tasks.create_task(plc.run(), name="optimiser")
             tasks.create_task(Telemetry(settings.telemetry, "optimizer_plc", shown.snapshot).run(), name="telemetry")
     finally:

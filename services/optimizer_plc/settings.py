@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from coldloop.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.limits import InputLimits
+from coldloop.metrics_server import MetricsSettings
 from coldloop.modbus.settings import ServerSettings
 from coldloop.model_settings import ModelSettings
 from coldloop.process import TICK_S
@@ -160,6 +161,7 @@ class OptimizerSection(BaseModel):
 
     server: OptimizerServer = OptimizerServer()
     word_order: WordOrder = WordOrder.HIGH_FIRST
+    metrics: MetricsSettings = MetricsSettings()
     control_plc: ControlEndpoint = ControlEndpoint()
     program: ProgramSettings = ProgramSettings()
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from coldloop import __version__
 from coldloop.clock import Pacer, Schedule
 from coldloop.errors import ColdloopError, ModelFileError
+from coldloop.metrics_server import MetricsServer
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.model_file import ModelHeader, read_header
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S
@@ -171,6 +172,7 @@ async def serve(settings: PlantSettings) -> None:
     log.info("serving", extra={"host": settings.plant.server.host, "port": server.port})
     try:
         async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(MetricsServer(settings.plant.metrics, registers.bank).run(), name="metrics")
             tasks.create_task(plant.run(), name="plant")
             tasks.create_task(Telemetry(settings.telemetry, "plant", registers.rack.snapshot).run(), name="telemetry")
     finally:

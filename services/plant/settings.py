@@ -7,6 +7,7 @@ from typing import Annotated, Final
 from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.endpoints import PLANT_PORT
+from coldloop.metrics_server import MetricsSettings
 from coldloop.modbus.settings import ServerSettings
 from coldloop.model_settings import ModelSettings
 from coldloop.process import TICK_S
@@ -114,6 +115,7 @@ class PlantSection(BaseModel):
     station: StationSettings = StationSettings()
     server: PlantServer = PlantServer()
     word_order: WordOrder = WordOrder.HIGH_FIRST
+    metrics: MetricsSettings = MetricsSettings()
     load: str = "2h"
     """Named load or CSV file."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1

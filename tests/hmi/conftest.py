@@ -35,6 +35,8 @@ PATIENCE_S = 120.0
 OPERATOR = ("anna", "cold as helium")
 VIEWER = ("lena", "only looks at it")
 FACTOR = 2.0
+RECORDED_S = 120
+"""Length of the run that is replayed."""
 
 
 def eventually(condition: Callable[[], T], what: str, patience_s: float = 30.0) -> T:
@@ -226,6 +228,48 @@ class Witness:
         while not self._end.wait(0.02):
             tick, values = process_now(self._port)
             self.seen[tick] = values
+
+
+# -- recorded runs -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "a run"
+    command = [sys.executable, "-m", "rig.cli", "run", "--in-process", "--load", "a", "--duration", f"{RECORDED_S}s"]
+    subprocess.run([*command, "--figures", "png", "--out", str(folder)], check=True, stderr=subprocess.DEVNULL)
+    return folder
+
+
+class Served:
+    """`coldloop page` with its arguments, as a process."""
+
+    def __init__(self, *arguments: str) -> None:
+        with ReservedPorts(1) as reserved:
+            self.port = reserved.numbers[0]
+        command = [sys.executable, "-m", "rig.cli", "page", *arguments, "--page-port", str(self.port)]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        self.address = self._process.stdout.readline().strip().rstrip("/")
+
+    def end(self) -> None:
+        self._process.terminate()
+        self._process.communicate(timeout=20)
+
+    def ask(self, path: str, body: object = None) -> Any:  # noqa: ANN401 JSON
+        request = urllib.request.Request(self.address + path)  # noqa: S310 our own page
+        if body is not None:
+            request.data = json.dumps(body).encode()
+            request.add_header("Origin", self.address)
+        with urllib.request.urlopen(request, timeout=20) as answer:  # noqa: S310
+            return json.loads(answer.read())
+
+
+@pytest.fixture(scope="module")
+def served(run: Path) -> Iterator[Served]:
+    one = Served(str(run))
+    yield one
+    one.end()
 
 
 # -- the browser -------------------------------------------------------------------------------------------------------

@@ -4,10 +4,14 @@ from pathlib import Path
 
 import pytest
 
+from coldloop.endpoints import Endpoint
 from coldloop.errors import ConfigurationError, UsageError
+from coldloop.modbus.settings import TlsSettings
 from hmi.access import RateLimit, Sessions, host_of, is_own_origin
 from hmi.settings import HmiSection
 from hmi.users import PageRole, User, Users, write_user
+from rig.page_process import pointed_at
+from rig.rig_endpoints import RigEndpoints
 from tests.hmi.conftest import OPERATOR, VIEWER, Site
 
 LOAD = {"kind": "load", "watts": 400.0}
@@ -180,3 +184,16 @@ def test_other_machines_are_served_with_https_or_on_purpose() -> None:
         HmiSection(host="0.0.0.0")  # noqa: S104
     assert HmiSection(host="0.0.0.0", insecure=True).insecure  # noqa: S104
     assert HmiSection(host="::1").is_local
+
+
+def test_a_page_reads_as_a_reader_and_commands_as_an_operator(tmp_path: Path) -> None:
+    for name in ("operator.crt", "operator.key", "reader.crt", "reader.key", "ca.crt"):
+        (tmp_path / name).touch()
+    tls = TlsSettings(certificate=tmp_path / "operator.crt", key=tmp_path / "operator.key", ca=tmp_path / "ca.crt")
+    ends = RigEndpoints(*(Endpoint(port=port, tls=tls) for port in (1, 2, 3)))
+    section = pointed_at(HmiSection(), ends)
+    assert section.operator_tls == tls
+    assert section.control_plc.tls is not None
+    assert section.control_plc.tls.certificate == tmp_path / "reader.crt"
+    (tmp_path / "reader.key").unlink()
+    assert pointed_at(HmiSection(), ends).plant.tls == tls, "where there is none, the operator's"

@@ -15,7 +15,7 @@ import pytest
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
-from hmi.explanation import Branch, Explanation, explain, increments_of
+from hmi.explanation import Branch, Explanation, explain, increments_of, period_ticks
 from hmi.sentences import sentence
 from optimizer_plc.updating_period import Algorithm1, Observation, assess
 
@@ -195,9 +195,14 @@ def test_the_time_line_of_the_plc_and_what_was_predicted_and_came() -> None:
     assert explain(update, None, optimization(5, 50, 9), RULE).came is None
 
 
-def test_iterations_that_would_have_changed_nothing_count_as_planned() -> None:
-    done = optimization(1, 10, 9)._replace(iterations=4)
-    assert explain(done, optimization(0, 0, 9), None, RULE).iterations == 9
+def test_a_period_that_is_longer_than_its_iterations_need_says_so() -> None:
+    case = decided_cases(1)[0]
+    late = case.update._replace(tau_u=period_ticks(case.update.iterations, RULE) + 3)
+    found = explain(late, case.before, None, RULE)
+    assert found.spare_s == 0.75
+    assert "0.75 s longer" in sentence(found, RULE)
+    assert found.budget.slack == pytest.approx(0.12 + 0.75)
+    assert "longer than" not in sentence(explain(case.update, case.before, None, RULE), RULE)
 
 
 def test_increments_are_found_again_on_both_sides_of_one() -> None:

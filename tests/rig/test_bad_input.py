@@ -305,7 +305,7 @@ def test_a_run_that_fails_says_nothing_but_why(coldloop: "Coldloop", results: Pa
 )
 def test_the_program_ends_with_the_code_and_one_line(arguments: list[str], code: int, tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "rig.cli", *arguments], cwd=tmp_path, env=os.environ, check=False, capture_output=True,
+        [sys.executable, "-m", "rig", *arguments], cwd=tmp_path, env=os.environ, check=False, capture_output=True,
         text=True,
     )  # fmt: skip
     assert done.returncode == code

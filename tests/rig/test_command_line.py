@@ -126,7 +126,7 @@ def test_a_line_is_completed(line: str, offered: str, tmp_path: Path) -> None:
     answer = tmp_path / "answer"
     answer.touch()
     python(
-        "-m", "rig.cli", _ARGCOMPLETE="1", COMP_LINE=line, COMP_POINT=str(len(line)), _ARGCOMPLETE_IFS="\n",
+        "-m", "rig", _ARGCOMPLETE="1", COMP_LINE=line, COMP_POINT=str(len(line)), _ARGCOMPLETE_IFS="\n",
         _ARGCOMPLETE_STDOUT_FILENAME=str(answer),
     )  # fmt: skip
     assert offered in answer.read_text().split()
@@ -135,7 +135,7 @@ def test_a_line_is_completed(line: str, offered: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("environment", [{}, {"NO_COLOR": "1"}, {"COLUMNS": "20"}, {"TERM": "dumb"}])
 def test_a_run_that_is_piped_writes_no_control_sequences(environment: dict[str, str], tmp_path: Path) -> None:
     out = tmp_path / "run"
-    done = python("-m", "rig.cli", "run", "--in-process", "--duration", "2s", "--out", str(out), **environment)
+    done = python("-m", "rig", "run", "--in-process", "--duration", "2s", "--out", str(out), **environment)
     assert done.returncode == 0
     assert "\x1b" not in done.stdout + done.stderr
     assert "\r" not in done.stdout + done.stderr
@@ -145,7 +145,7 @@ def test_a_run_that_is_piped_writes_no_control_sequences(environment: dict[str, 
 def test_a_full_standard_output_is_one_line(command: str) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [sys.executable, "-m", "rig.cli", *command.split()], check=False, stdout=full, stderr=subprocess.PIPE,
+            [sys.executable, "-m", "rig", *command.split()], check=False, stdout=full, stderr=subprocess.PIPE,
             text=True,
         )  # fmt: skip
     assert done.returncode == 1

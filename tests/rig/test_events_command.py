@@ -177,7 +177,7 @@ def test_over_tls_the_certificate_decides(coldloop: "Coldloop", serve: Serve, tm
 
 def test_follow_goes_on_with_new_events_until_it_is_interrupted(serve: Serve) -> None:
     with serve(2) as service:
-        command = [sys.executable, "-m", "rig.cli", "events", at(service), "--follow"]
+        command = [sys.executable, "-m", "rig", "events", at(service), "--follow"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             assert process.stderr is not None

@@ -54,7 +54,7 @@ def test_a_signal_in_the_middle_leaves_what_was_recorded(
     number: signal.Signals, way: tuple[str, ...], tmp_path: Path
 ) -> None:
     out = tmp_path / "run"
-    command = [sys.executable, "-m", "rig.cli", "run", *way, "--load", "6h", "--figures", "png", "--out", str(out)]
+    command = [sys.executable, "-m", "rig", "run", *way, "--load", "6h", "--figures", "png", "--out", str(out)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ, text=True)
     deadline = time.monotonic() + PATIENCE_S
     while not (out / "trace.parquet").exists() or (out / "trace.parquet").stat().st_size < 100_000:
@@ -72,7 +72,7 @@ def test_a_signal_in_the_middle_leaves_what_was_recorded(
 
 @pytest.mark.parametrize("delay_s", [0.05, 0.3, 0.8])
 def test_ctrl_c_before_there_is_anything_to_record_leaves_nothing(delay_s: float, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "rig.cli", "run", "--in-process", "--load", "6h", "--out", str(tmp_path / "run")]
+    command = [sys.executable, "-m", "rig", "run", "--in-process", "--load", "6h", "--out", str(tmp_path / "run")]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ, text=True)
     with pytest.raises(subprocess.TimeoutExpired):
         process.wait(delay_s)
@@ -168,3 +168,19 @@ def test_a_sink_that_fails_does_not_keep_blocks_from_the_others() -> None:
     with pytest.raises(OSError, match="broken"):
         recorder.sample(sample._replace(tick=BLOCK_TICKS + KEPT_TICKS - 1))
     assert [sink.ticks for sink in sinks] == [BLOCK_TICKS, BLOCK_TICKS]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_while_modules_are_imported_is_no_traceback(number: signal.Signals) -> None:
+    program = (
+        "import os, sys\n"
+        "from importlib.abc import MetaPathFinder\n"
+        "class Interrupting(MetaPathFinder):\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        f"        if name == 'rig.cli': os.kill(os.getpid(), {number.value})\n"
+        "sys.meta_path.insert(0, Interrupting())\n"
+        "from rig.__main__ import main\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (128 + number, "coldloop: interrupted\n")

@@ -29,7 +29,7 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The first port of a rig that is up."""
     os.environ["XDG_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
     base = str(_three_free_ports())
-    command = [sys.executable, "-m", "rig.cli", "up", "--port-base", base, "--load", "e", "--factor", FACTOR]
+    command = [sys.executable, "-m", "rig", "up", "--port-base", base, "--load", "e", "--factor", FACTOR]
     command += ["--set", "plant.sensors.level=0.01"]
     try:
         subprocess.run([*command, "--detach"], check=True, timeout=120, stdout=subprocess.DEVNULL)
@@ -209,7 +209,7 @@ def test_what_a_rig_runs_may_be_named_again(coldloop: Coldloop, up: str, results
 
 def test_ctrl_c_gives_an_attached_rig_back_too(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
     ends = [f"127.0.0.1:{int(up) + place}" for place in range(3)]
-    command = [sys.executable, "-m", "rig.cli", "run", "--attach", *ends, "--load", "e", "--duration", "100h"]
+    command = [sys.executable, "-m", "rig", "run", "--attach", *ends, "--load", "e", "--duration", "100h"]
     with subprocess.Popen(
         [*command, "--figures", "png", "--out", str(tmp_path / "run")], stderr=subprocess.DEVNULL
     ) as run:

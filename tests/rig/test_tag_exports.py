@@ -72,7 +72,7 @@ def test_a_node_red_flow_is_whole_and_its_tables_decode_what_the_server_sends(co
     y = tuple(float(value) for value in range(22))
     bank.put(Measurement(7, 400.0, y, (0.0,) * 28, 1))
     raw = bank.read(int(reader["adr"]), int(reader["quantity"]))
-    code = nodes[reader["wires"][1][0]]["func"]
+    code = nodes[reader["wires"][0][0]]["func"]
     table = json.loads(code[code.index("tags = ") + 7 : code.index(";\n")])
     name, letter, word = next(row for row in table if row[0] == "measurement_y_T5")
     (value,) = struct.unpack_from(f">{letter}", raw, 2 * word)

@@ -18,7 +18,7 @@ function line() {
   const hidden = state.alarms.filter((one) => ["shelved", "out of service"].includes(one.state)).length;
   const parts = told.slice(0, 4).map((one) => element("a", { class: `alarm ${WAITING.includes(one.state) ? "unacknowledged" : ""}`, href: "#alarms" }, badge(one), `${one.name}${one.cause ? ` (${one.cause})` : ""}, ${STATES[one.state]}`));
   if (!parts.length) parts.push(element("span", { class: "minor", text: state.catalog.replay ? "A recorded run: its alarms are in the history" : "No alarms" }));
-  const counts = `${told.length} alarms, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}`;
+  const counts = `${told.length} alarm${told.length === 1 ? "" : "s"}, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}`;
   holder.replaceChildren(element("span", { class: "told" }, ...parts), element("span", { class: "count", text: counts }));
   if (waiting) holder.append(element("button", { type: "button", class: "quiet operate-only", text: "Acknowledge all", hidden: !state.me.operates, onclick: () => command({ kind: "alarm", alarm: 65535, action: 1 }, true) }));
 }

@@ -30,7 +30,7 @@ function quantities(found) {
 function alternatives(found) {
   const rows = found.alternatives.map((one) => element("tr", { class: one.iterations === found.iterations ? "chosen" : "" },
     element("td", { class: "number", text: `${one.iterations}${one.iterations === found.iterations ? " (chosen)" : ""}` }), element("td", { class: "number", text: `${one.period_s} s` }),
-    element("td", { class: "number", text: digits(one.contraction) }), element("td", { class: "number", text: one.response_s === null ? "does not fall" : `${digits(one.response_s)} s` })));
+    element("td", { class: "number", text: digits(one.contraction, 6) }), element("td", { class: "number", text: one.response_s === null ? "does not fall" : `${digits(one.response_s)} s` })));
   byId("why-alternatives").replaceChildren(...(rows.length ? rows : [element("tr", {}, element("td", { colspan: "4", class: "minor", text: "Algorithm 1 did not decide here." }))]));
 }
 

@@ -1,0 +1,88 @@
+"""The registers of a service for Prometheus, over HTTP: `GET /metrics` and `/healthz`, and nothing else."""
+
+import asyncio
+import logging
+from typing import Annotated, Final
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from coldloop.errors import PortInUseError
+from coldloop.metrics import CONTENT_TYPE, bank_families, exposition
+from coldloop.registers.bank import RegisterBank
+
+log = logging.getLogger("coldloop.metrics")
+
+LONGEST_REQUEST: Final = 4096
+PATIENCE_S: Final = 2.0
+
+
+class MetricsSettings(BaseModel):
+    """Where a service tells its registers.
+
+    Args:
+        host: Address to listen on.
+        port: TCP port; 0 is off.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=0xFFFF)] = 0
+
+
+class MetricsServer:
+    """Answers one request a connection.
+
+    Args:
+        settings: Where it listens; port 0 is off.
+        bank: The registers that are shown.
+    """
+
+    def __init__(self, settings: MetricsSettings, bank: RegisterBank) -> None:
+        self._settings = settings
+        self._bank = bank
+
+    async def run(self) -> None:
+        """Serve until cancelled; return at once where it is off.
+
+        Raises:
+            PortInUseError: Somebody else listens there.
+        """
+        host, port = self._settings.host, self._settings.port
+        if not port:
+            return
+        try:
+            server = await asyncio.start_server(self._answer, host, port, limit=LONGEST_REQUEST)
+        except OSError as error:
+            raise PortInUseError(
+                f"{host}:{port}: {error.strerror}; give another one to `metrics.port` of the service"
+            ) from None
+        async with server:
+            await server.serve_forever()
+
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                head = await reader.readuntil(b"\r\n\r\n")
+                writer.write(self._response(head.partition(b"\r\n")[0].decode("latin-1").split(" ")))
+                await writer.drain()
+        except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            log.debug("a request for metrics that was none")
+        finally:
+            writer.close()
+
+    def _response(self, line: list[str]) -> bytes:
+        method, path = (line[0], line[1].partition("?")[0]) if len(line) > 1 else ("", "")
+        if method != "GET":
+            return _encoded("405 Method Not Allowed", "only GET\n")
+        if path == "/metrics":
+            return _encoded("200 OK", exposition(bank_families(self._bank)))
+        if path == "/healthz":
+            return _encoded("200 OK", "live\n")
+        return _encoded("404 Not Found", "there are /metrics and /healthz\n")
+
+
+def _encoded(status: str, text: str) -> bytes:
+    body = text.encode()
+    lines = f"HTTP/1.1 {status}", f"Content-Type: {CONTENT_TYPE}", f"Content-Length: {len(body)}", "Connection: close"
+    return "\r\n".join((*lines, "", "")).encode() + body

@@ -1,0 +1,81 @@
+"""Registers for Prometheus: what the text says, and who is answered."""
+
+import asyncio
+import math
+import shutil
+import subprocess
+
+import pytest
+
+from coldloop.errors import PortInUseError
+from coldloop.metrics import Family, Sample, bank_families, exposition
+from coldloop.metrics_server import MetricsServer, MetricsSettings
+from coldloop.registers.bank import RegisterBank
+from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
+
+
+def bank() -> RegisterBank:
+    one = RegisterBank(PLANT_MAP)
+    one.put(Measurement(7, 400.0, tuple(float(i) for i in range(22)), (0.0,) * 28, 1))
+    one.put(Actuators(7, 43.0, 75.0, 36.0, 1))
+    return one
+
+
+def test_each_number_is_a_gauge_with_its_description_and_unit() -> None:
+    lines = exposition(bank_families(bank())).splitlines()
+    assert 'coldloop_plant_measurement_y{element="T5"} 6' in lines
+    assert "# TYPE coldloop_plant_measurement_load gauge" in lines
+    assert "# HELP coldloop_plant_measurement_load Heat load NCR22_HL (the same heater, so it is known) (W)" in lines
+    assert "coldloop_plant_measurement_load 400" in lines
+    assert not [line for line in lines if "actuators" in line], "what a client writes is no state of the service"
+    assert not [line for line in lines if "_who" in line], "texts are no numbers"
+
+
+def test_what_is_not_finite_and_what_has_quotes_is_written_as_the_format_asks() -> None:
+    samples = (Sample(math.nan), Sample(math.inf), Sample(-math.inf), Sample(1.0, (("a", 'say "x"\n\\'),)))
+    lines = exposition([Family("one", "two\nlines", samples)]).splitlines()
+    assert lines[0] == r"# HELP one two\nlines"
+    assert lines[2:5] == ["one NaN", "one +Inf", "one -Inf"]
+    assert lines[5] == 'one{a="say \\"x\\"\\n\\\\"} 1'
+
+
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool of Debian's prometheus is not there")
+def test_promtool_finds_nothing_wrong() -> None:
+    text = exposition(bank_families(bank()))
+    done = subprocess.run(["promtool", "check", "metrics"], input=text, text=True, capture_output=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+async def asked(port: int, request: bytes) -> str:
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(request)
+    answer = await reader.read()
+    writer.close()
+    return answer.decode()
+
+
+async def test_the_server_answers_two_paths_and_survives_what_is_no_request(free_port: int) -> None:
+    server = asyncio.create_task(MetricsServer(MetricsSettings(port=free_port), bank()).run())
+    try:
+        while True:
+            try:
+                answer = await asked(free_port, b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")
+                break
+            except ConnectionError:
+                await asyncio.sleep(0)
+        assert answer.startswith("HTTP/1.1 200 OK\r\n")
+        assert "coldloop_plant_measurement_load 400" in answer
+        assert "live" in await asked(free_port, b"GET /healthz?x HTTP/1.0\r\n\r\n")
+        assert "404" in await asked(free_port, b"GET / HTTP/1.0\r\n\r\n")
+        assert "405" in await asked(free_port, b"POST /metrics HTTP/1.0\r\n\r\n")
+        assert await asked(free_port, b"x" * 10_000) == ""
+        assert "405" in await asked(free_port, b"\r\n\r\n")
+        with pytest.raises(PortInUseError, match=r"metrics\.port"):
+            await MetricsServer(MetricsSettings(port=free_port), bank()).run()
+    finally:
+        server.cancel()
+        await asyncio.gather(server, return_exceptions=True)
+
+
+async def test_without_a_port_it_is_off() -> None:
+    await MetricsServer(MetricsSettings(), bank()).run()

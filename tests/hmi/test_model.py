@@ -1,0 +1,217 @@
+"""What the page knows, thinned and explained without a rig."""
+
+import asyncio
+import json
+import shutil
+import subprocess
+from collections.abc import Iterator
+
+import pytest
+
+from coldloop.metrics import exposition
+from coldloop.registers.audit import Event, EventKind
+from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.control_plc import LadderStatus, Process
+from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
+from hmi.broadcast import WAITING, Broadcast
+from hmi.commands import read_load
+from hmi.documents import alarms_document, encoded, state_document, trend_document
+from hmi.model import STALE_S, Model, Told
+from hmi.page_metrics import page_families
+from hmi.reading import safe_cell
+from hmi.signals import MAPS, signals_of, words_in
+from hmi.trends import MOST_ROWS, TrendStore, thin
+
+
+class Clock:
+    """A clock that is set by hand."""
+
+    def __init__(self) -> None:
+        self.time = 100.0
+
+    def __call__(self) -> float:
+        return self.time
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def model(clock: Clock) -> Model:
+    one = Model(clock, 3600)
+    for service in MAPS:
+        one.put(service, Identity(session=1, tick=1))
+        one.heard(service)
+    one.put("plant", SessionPace(1, 1, 1.0, 0))
+    one.put("control_plc", process(1))
+    return one
+
+
+def process(tick: int, level: float = 60.0) -> Process:
+    return Process(tick, 400.0, (43.0, 75.0, 36.0), (level, *(0.0,) * 21))
+
+
+def test_descriptions_that_number_their_meanings_become_words_and_others_do_not() -> None:
+    assert words_in("0 auto, 1 classical loops, 2 manual") == {0: "auto", 1: "classical loops", 2: "manual"}
+    assert words_in("0 free, 1 held, 2 lingering: its connection has closed")[2] == "lingering"
+    assert words_in("Tick of the first step; 0 is none") == {}
+    assert words_in("Times that it has expired") == {}
+
+
+def test_every_register_of_a_block_with_one_row_is_a_signal() -> None:
+    for service, register_map in MAPS.items():
+        names = {signal.name for signal in signals_of(service)}
+        assert len(names) == len(signals_of(service))
+        for block in register_map.blocks:
+            if block.rows == 1:
+                assert any(name.startswith(f"{service}.{block.name}.") for name in names)
+
+
+def test_a_service_that_is_silent_is_not_live_and_its_values_are_stale(model: Model, clock: Clock) -> None:
+    assert model.stale_prefixes() == []
+    clock.time += STALE_S + 0.1
+    model.heard("plant")
+    model.heard("optimizer_plc")
+    assert model.stale_prefixes()[0] == "control_plc."
+    assert not state_document(model)["services"]["control_plc"]["live"]
+
+
+@pytest.mark.parametrize(
+    ("pace", "stands"),
+    [
+        (SessionPace(1, 1, 1.0, 0), True),
+        (SessionPace(1, 1, 1.0, 1), False),
+        (SessionPace(1, 0, 1.0, 0), False),
+        (SessionPace(1, 1, 0.01, 0), False),
+    ],
+    ids=["running", "paused", "lock-step", "slow"],
+)
+def test_a_tick_that_stands_still_is_stale_only_where_it_should_move(
+    model: Model, clock: Clock, pace: SessionPace, *, stands: bool
+) -> None:
+    model.put("plant", pace)
+    model.put("control_plc", process(5))
+    clock.time += STALE_S + 1.0
+    for service in MAPS:
+        model.heard(service)
+    assert ("control_plc.process." in model.stale_prefixes()) is stands
+
+
+def test_another_session_begins_with_empty_trends(model: Model) -> None:
+    for tick in range(10, 60):
+        model.put("control_plc", process(tick))
+    assert len(model.trends) == 51
+    model.put("control_plc", Identity(session=2, tick=0))
+    assert len(model.trends) == 0
+
+
+def test_thinning_keeps_every_excursion_and_says_nothing_that_was_not_there() -> None:
+    values = [0.0] * 10_000
+    values[4321], values[7777] = 9.0, -5.0
+    times, columns = thin([float(i) for i in range(10_000)], {"a": values}, 200)
+    assert len(times) == len(columns["a"]) <= 210
+    assert (max(columns["a"]), min(columns["a"])) == (9.0, -5.0)
+    assert set(columns["a"]) == {0.0, 9.0, -5.0}
+    assert times == sorted(times)
+    assert thin([1.0, 2.0], {"a": [3.0, 4.0]}, 200) == ([1.0, 2.0], {"a": [3.0, 4.0]})
+
+
+def test_the_store_forgets_what_is_too_old_and_never_grows_beyond_its_end() -> None:
+    store = TrendStore(kept_s=300)
+    for tick in range(0, 400_000, 4):
+        store.add(process(tick), 1)
+    assert len(store) <= 300 + 4096 + 1
+    assert store.ticks[-1] - store.ticks[0] >= 1200
+    long = TrendStore(kept_s=1e9)
+    for tick in range(MOST_ROWS + 10_000):
+        long.add(process(tick), 1)
+    assert len(long) <= MOST_ROWS + 4096
+
+
+def test_modes_are_told_stretch_by_stretch() -> None:
+    store = TrendStore(3600)
+    for tick, mode in enumerate([1, 1, 1, 3, 3, 1]):
+        store.add(process(tick), mode)
+    assert [(one.start, one.end, one.mode) for one in store.modes(0, 10)] == [
+        (0, 0.75, 1),
+        (0.75, 1.25, 3),
+        (1.25, 1.25, 1),
+    ]
+
+
+def test_alarms_that_wait_come_first_and_by_priority(model: Model) -> None:
+    rows = [Alarm(priority=AlarmPriority.LOW) for _ in AlarmKind]
+    rows[AlarmKind.MODE] = Alarm(AlarmState.ACKNOWLEDGED, 1, priority=AlarmPriority.CRITICAL)
+    rows[AlarmKind.T5_BAND] = Alarm(AlarmState.RETURNED, 0, priority=AlarmPriority.HIGH)
+    rows[AlarmKind.SCAN_OVERRUN] = Alarm(AlarmState.UNACKNOWLEDGED, 1, priority=AlarmPriority.LOW)
+    model.put_alarms(rows)
+    assert [one["name"] for one in alarms_document(model)][:3] == ["t5 band", "scan overrun", "mode"]
+
+
+def test_a_message_has_only_what_changed_and_numbers_that_json_has(model: Model) -> None:
+    model.put("control_plc", process(2, level=float("nan")))
+    model.changed.clear()
+    model.put("control_plc", process(3, level=float("nan")))
+    document = state_document(model, model.changed)
+    assert not document["whole"]
+    assert document["values"]["control_plc.process.tick"] == 3
+    assert "control_plc.process.load" not in document["values"]
+    whole = json.loads(encoded(state_document(model)))
+    assert whole["values"]["control_plc.process.y.L1"] is None
+
+
+def test_loads_and_alarms_are_marked_on_the_trends(model: Model) -> None:
+    model.put("control_plc", process(100))
+    kinds = (EventKind.LIVE_LOAD, EventKind.BOOT, EventKind.ALARM_RAISED)
+    model.put_events(Told.of("plant", Event(number, 1, 50 + number, kind=kind)) for number, kind in enumerate(kinds))
+    marks = trend_document(model, ["L1"], 0, 100, 100)["marks"]
+    assert [(mark["kind"], mark["time"]) for mark in marks] == [("load", 12.5), ("alarm", 13.0)]
+
+
+async def test_a_browser_that_is_too_slow_is_begun_anew_and_others_do_not_wait() -> None:
+    whole: Iterator[int] = iter(range(100))
+    broadcast = Broadcast(lambda: b"whole %d" % next(whole), most=2)
+    slow, quick = broadcast.messages(), broadcast.messages()
+    assert await anext(slow) == b"whole 0"
+    assert await anext(quick) == b"whole 1"
+    assert broadcast.is_full
+    for number in range(WAITING + 2):
+        broadcast.send(b"change %d" % number)
+        assert await asyncio.wait_for(anext(quick), 1) == b"change %d" % number
+    assert (await anext(slow)).startswith(b"whole"), "what waited is void: it gets the whole state"
+    await quick.aclose()
+    assert len(broadcast) == 1
+
+
+def test_load_files_are_read_or_refused_with_the_row() -> None:
+    assert read_load("time_s,load_w\n0,400\n10.25,500\n") == [(0, 400.0), (41, 500.0)]
+    for content, part in (
+        ("", "no rows"),
+        ("0,400\n0,300\n", "row 2"),
+        ("0,-1\n", "row 1"),
+        ("0\n", "not time_s,load_w"),
+    ):
+        with pytest.raises(ValueError, match=part):
+            read_load(content)
+
+
+def test_cells_of_a_table_are_no_formulas() -> None:
+    assert [safe_cell(text) for text in ("=1+1", "@x", "-5.5", "plain", 3)] == ["'=1+1", "'@x", "-5.5", "plain", 3]
+
+
+def test_metrics_of_a_silent_service_say_only_that_it_is_silent(model: Model, clock: Clock) -> None:
+    model.put("control_plc", LadderStatus(1, 2, 0, 1, 0, 0))
+    model.put_alarms([Alarm() for _ in AlarmKind])
+    text = exposition(page_families(model, 2))
+    assert 'coldloop_up{service="control_plc"} 1' in text
+    assert "coldloop_control_plc_ladder_mode 1" in text
+    assert 'coldloop_alarm_state{alarm="t5 band"} 0' in text
+    if shutil.which("promtool"):
+        done = subprocess.run(["promtool", "check", "metrics"], input=text, text=True, capture_output=True, check=False)
+        assert (done.returncode, done.stdout + done.stderr) == (0, "")
+    clock.time += 60
+    text = exposition(page_families(model, 2))
+    assert 'coldloop_up{service="control_plc"} 0' in text
+    assert "coldloop_control_plc_ladder_mode" not in text

@@ -1,0 +1,106 @@
+"""A recorded run on the page, without servers; two side by side; and the page of `coldloop up`."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from coldloop.errors import UsageError
+from hmi.explanation import Branch
+from rig.ports import ReservedPorts
+from rig.recorded_page import RecordedPage
+from rig.run_folder import RunFolder
+from rig.started_rigs import check_ports
+from tests.conftest import Coldloop
+from tests.hmi.conftest import RECORDED_S, Served, eventually
+
+
+def test_the_page_shows_what_the_files_of_the_run_have(served: Served, run: Path) -> None:
+    table = pq.read_table(run / "trace.parquet", columns=["L1", "T5", "CV155", "load_w"]).to_pylist()
+    for tick in (0, 100, 4 * RECORDED_S - 1):
+        served.ask("/api/replay", {"tick": tick})
+        values = served.ask("/api/state")["values"]
+        shown = [values[f"control_plc.process.{name}"] for name in ("y.L1", "y.T5", "u.CV155", "load")]
+        assert shown == pytest.approx(list(table[tick].values()), rel=1e-6)
+
+
+def test_a_trend_of_a_replay_has_every_tick(served: Served) -> None:
+    served.ask("/api/replay", {"tick": 4 * RECORDED_S - 1})
+    trend = served.ask(f"/api/trend?names=L1&seconds={RECORDED_S}&points=4000")
+    assert [round(time * 4) for time in trend["time"]] == list(range(4 * RECORDED_S))
+
+
+def test_the_replay_goes_on_at_its_speed_and_ends_at_the_end(served: Served) -> None:
+    served.ask("/api/replay", {"tick": 0, "speed": 200.0, "playing": True})
+    eventually(lambda: not served.ask("/api/replay")["playing"], "it ends")
+    assert served.ask("/api/replay")["tick"] == 4 * RECORDED_S - 1
+
+
+def test_updates_of_a_run_are_explained(served: Served, run: Path) -> None:
+    served.ask("/api/replay", {"tick": 4 * RECORDED_S - 1})
+    rows = pq.read_table(run / "updates.parquet").to_pylist()
+    first, second = (served.ask(f"/api/explanation?update={row['update']}") for row in rows[:2])
+    assert first["branch"] == Branch.FIRST
+    assert second["branch"] in {Branch.UP, Branch.DOWN}
+    assert second["predicted"] == pytest.approx(rows[1]["j_delivered"])
+    assert second["period_s"] == rows[1]["tau_u_s"]
+
+
+def test_a_replay_takes_no_commands(served: Served) -> None:
+    assert not served.ask("/api/me")["operates"]
+
+
+def test_recorded_settings_give_rule_and_limits(run: Path) -> None:
+    recorded = RecordedPage(RunFolder(run))
+    assert (recorded.rule.q_first, recorded.rule.delta, recorded.rule.iteration) == (9, 2, 0.25)
+    assert recorded.limits.output_high == (61.0, 16.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (("absent",), "name the folder of a run"),
+        (("a", "b", "c"), "two side by side"),
+        (("--page-port", "70000"), "--page-port"),
+    ],
+)
+def test_what_cannot_be_shown_is_one_line(coldloop: Coldloop, arguments: tuple[str, ...], part: str) -> None:
+    outcome = coldloop("page", *arguments)
+    assert outcome.code == 2
+    assert len(outcome.complaints) == 1
+    assert part in outcome.complaints[0]
+
+
+def test_up_with_its_page_prints_where_it_is_and_a_password_that_operates(tmp_path: Path) -> None:
+    with ReservedPorts(1) as reserved:
+        port = str(reserved.numbers[0])
+    base = next(base for base in range(23400, 23900, 7) if _are_free(base))
+    words = ["--port-base", str(base)]
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "rig.cli", "up", *words, "--page-port", port, "--detach"]
+    up = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=True)
+    try:
+        address = f"http://127.0.0.1:{port}"
+        assert address in up.stdout
+        found = re.search(r"user (\S+), password (\S+)", up.stdout)
+        assert found is not None
+        body = json.dumps({"user": found[1], "password": found[2]}).encode()
+        request = urllib.request.Request(f"{address}/api/login", body, {"Origin": address})  # noqa: S310 our own page
+        with urllib.request.urlopen(request, timeout=20) as answer:  # noqa: S310
+            assert json.loads(answer.read())["role"] == "operate"
+    finally:
+        subprocess.run([sys.executable, "-m", "rig.cli", "down", *words], env=environment, check=True, timeout=60)
+
+
+def _are_free(base: int) -> bool:
+    try:
+        check_ports((base, base + 1, base + 2))
+    except UsageError:
+        return False
+    return True
