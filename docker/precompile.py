@@ -12,12 +12,14 @@ if TYPE_CHECKING:
 
 
 def plant() -> None:
-    """Go one tick forward."""
-    from plant.cold_box import REFERENCE  # noqa: PLC0415 not in every image
-    from plant.program import LoadProfile, PlantProgram  # noqa: PLC0415
+    """Go one tick forward with each plant."""
+    from plant.kinds import plant_maker  # noqa: PLC0415 not in every image
+    from plant.program import LoadProfile  # noqa: PLC0415
+    from plant.settings import PlantKind, PlantSection  # noqa: PLC0415
 
     header = read_header(DEFAULT_MODEL_FILE)
-    PlantProgram(box=REFERENCE, x0=header.x0, u0=header.u0, load=LoadProfile((0,), (header.w0,))).advance()
+    for kind in PlantKind:
+        plant_maker(header, PlantSection(kind=kind))(LoadProfile((0,), (header.w0,)), 1).advance()
 
 
 def control_plc() -> None:

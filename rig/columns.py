@@ -6,12 +6,20 @@ from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
+from coldloop.process import (
+    INPUT_NAMES,
+    OUTPUT_NAMES,
+    OUTPUT_UNITS,
+    STATE_NAMES,
+    STATE_UNITS,
+    STATION_SIGNAL_NAMES,
+    STATION_SIGNAL_UNITS,
+)
 from coldloop.registers.audit import Event
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import Actuators, PlantSample
+from coldloop.registers.plant import Actuators, PlantSample, StationMode, StationSample
 from rig.driving import SHOWN
 
 FORMAT: Final = 2
@@ -122,19 +130,36 @@ FILES: Final = {
     "events.parquet": ("One row an event of the journals: modes, alarms, commands", EVENTS),
 }
 
+STATION: Final = (
+    _TICK,
+    _TIME,
+    *(
+        Column(name, pa.float32(), unit, fields_of(StationSample)["signals"].description)
+        for name, unit in zip(STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, strict=True)
+    ),
+    Column("mode", pa.int32(), "1", fields_of(StationSample)["mode"].description, StationMode),
+    Column("alarms", pa.int32(), "1", fields_of(StationSample)["alarms"].description),
+)
+STATION_FILE: Final = "station.parquet"
+STATION_FILES: Final = {
+    STATION_FILE: ("One row a tick: compression station and nitrogen; only where the plant is a refrigerator", STATION)
+}
+ALL_FILES: Final = {**FILES, **STATION_FILES}
+
 
 def arrow_schema(columns: Sequence[Column]) -> pa.Schema:
     """Return the Arrow schema of a file."""
     return pa.schema([column.field for column in columns], metadata={"coldloop_format": str(FORMAT)})
 
 
-def schema_document() -> dict[str, Any]:
-    """Return the content of `schema.json`."""
+def schema_document(*, station: bool = False) -> dict[str, Any]:
+    """Return the content of `schema.json`; with the station's file where there is one."""
+    files = ALL_FILES if station else FILES
     return {
         "format": FORMAT,
         "files": {
             name: {"description": description, "columns": [_described(column) for column in columns]}
-            for name, (description, columns) in FILES.items()
+            for name, (description, columns) in files.items()
         },
     }
 

@@ -11,7 +11,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 
 from coldloop.errors import ResultsError, UsageError
-from rig.columns import FILES
+from rig.columns import ALL_FILES, FILES
 from rig.results import prepare_folder, whole_file
 from rig.run_folder import RunFolder
 
@@ -46,7 +46,8 @@ Writers = dict[str, Callable[[Path], object]]
 
 
 def _tables(run: RunFolder) -> Tables:
-    return {name.removesuffix(".parquet"): run.file(name) for name in FILES}
+    present = [name for name in ALL_FILES if name in FILES or (run.path / name).exists()]
+    return {name.removesuffix(".parquet"): run.file(name) for name in present}
 
 
 def _csv(run: RunFolder) -> Writers:

@@ -11,13 +11,13 @@ import pyarrow.parquet as pq
 from coldloop.errors import ResultsError
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
-from rig.columns import FILES, arrow_schema
+from rig.columns import ALL_FILES, STATION_FILE, arrow_schema
 from rig.disk_reserve import DiskReserve, ReservedFile
 from rig.driving import DrivingHistory
 from rig.indicators import StageCost
 from rig.recorded import joined
 from rig.recording import SampleBlock, Sink
-from rig.tables import events_table, trace_table, updates_table
+from rig.tables import events_table, station_table, trace_table, updates_table
 
 T = TypeVar("T")
 
@@ -38,7 +38,7 @@ class ParquetFile:
         self._file = ReservedFile(path, reserve)
         self._reserve = reserve
         self._path = path
-        schema = arrow_schema(FILES[path.name][1])
+        schema = arrow_schema(ALL_FILES[path.name][1])
         self._writer = pq.ParquetWriter(
             pa.PythonFile(self._file, mode="w"), schema, compression="zstd", write_statistics=SEARCHED,
             use_dictionary=[field.name for field in schema if pa.types.is_string(field.type)],
@@ -111,6 +111,39 @@ class TraceSink(Sink):
                 self._write(joined(self._blocks))
         finally:
             self._file.close()
+
+
+class StationSink(Sink):
+    """Writes `station.parquet`, if there is a station."""
+
+    def __init__(self, folder: Path, reserve: DiskReserve) -> None:
+        self._path, self._reserve = folder / STATION_FILE, reserve
+        self._file: ParquetFile | None = None
+        self._blocks: list[SampleBlock] = []
+
+    def block(self, block: SampleBlock) -> None:
+        """Take ticks; write them when they are many."""
+        if not block.station.size:
+            return
+        if self._file is None:
+            self._file = ParquetFile(self._path, self._reserve)
+        self._blocks.append(block)
+        if sum(len(one.load) for one in self._blocks) >= GROUP_TICKS:
+            self._write(self._file)
+            self._file.check()
+
+    def _write(self, file: ParquetFile) -> None:
+        blocks, self._blocks = self._blocks, []
+        file.write(station_table(joined(blocks)))
+
+    def close(self) -> None:
+        """Write the rest."""
+        if self._file is not None:
+            try:
+                if self._blocks:
+                    self._write(self._file)
+            finally:
+                self._file.close()
 
 
 class _RowFile(Generic[T]):

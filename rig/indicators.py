@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.lti_model import LtiModel
-from coldloop.process import L1, T5, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process import L1, STATE_NAMES, T5, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.optimizer_plc import Optimization
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.prediction import state_weights
@@ -45,8 +45,9 @@ class StageCost:
     """The stage cost of what was really reached: deviations from the operating point, and violations of the bands."""
 
     def __init__(self, model: LtiModel, design: ControlDesign) -> None:
-        self._x0, self._u0 = model.x0, model.u0
-        self._state_weights = state_weights(model, design)
+        n = len(STATE_NAMES)  # a model of the whole refrigerator has further ones, which weigh nothing
+        self._x0, self._u0 = model.x0[:n], model.u0
+        self._state_weights = state_weights(model, design)[:n]
         self._design = design
 
     def of(self, block: SampleBlock) -> NDArray[np.float64]:
@@ -83,7 +84,7 @@ class RunEvaluation(Sink):
         outside = (constrained < self._design.output_low) | (constrained > self._design.output_high)
         self._outside += outside.sum(axis=0)
         self._stage_costs += float(np.nansum(self._cost.of(block)))
-        self._digest.update(block.rows.tobytes())
+        self._digest.update(block.digested)
         self.ticks += len(block.load)
 
     def update(self, update: Optimization) -> None:
@@ -101,7 +102,7 @@ class RunEvaluation(Sink):
 
     @property
     def trace_sha256(self) -> str:
-        """SHA-256 over load, inputs, outputs and states of all ticks, as little-endian single precision."""
+        """SHA-256 over load, inputs, outputs, states and station of all ticks, as little-endian single precision."""
         return self._digest.hexdigest()
 
     @property

@@ -6,8 +6,9 @@ from coldloop.registers.control_plc import Update, Verdict
 from coldloop.registers.plant import LoadStep, Measurement, PlantSample
 from control_plc.runtime import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
+from plant.kinds import plant_maker
 from plant.program import LoadProfile, PlantProgram
-from plant.runtime import make_program, own_header
+from plant.runtime import own_header
 from rig.recording import Recorder
 from rig.scenario import Scenario
 from rig.settings import Settings
@@ -28,7 +29,7 @@ class OneProcessRig:
         """Run a scenario from the operating point, in lock-step."""
         steps = [as_transmitted(LoadStep(*step)) for step in zip(scenario.load.times, scenario.load.watts, strict=True)]
         load_table = LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
-        plant = make_program(self._header, self._settings.plant.sensors, load_table, scenario.seed)
+        plant = plant_maker(self._header, self._settings.plant)(load_table, scenario.seed)
         self.optimizer.restart(scenario.updating_period_s)
         told = self.control.journal.count
         self.control.restart(session=1)
@@ -55,6 +56,8 @@ class OneProcessRig:
         measurement = as_transmitted(
             Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session)
         )
+        if plant.station is not None:
+            recorder.station(as_transmitted(plant.station))
         recorder.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
         plant.advance()
         return self.control.end_scan(measurement)

@@ -16,7 +16,7 @@ from coldloop.errors import ColdloopError, LinkError
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import PlantSample
+from coldloop.registers.plant import PlantSample, StationSample
 from rig.driving import CONTROL
 from rig.recorded import LinkStatistics, Recording, SampleBlock, joined
 
@@ -79,7 +79,7 @@ class MemorySink(Sink):
     def recording(self, link: LinkStatistics) -> Recording:
         """Return what was kept."""
         block = joined(self._blocks)
-        return Recording(block.load, block.u, block.y, block.x, self._updates, link)
+        return Recording(block.load, block.u, block.y, block.x, self._updates, link, block.station)
 
 
 class Recorder:
@@ -100,6 +100,8 @@ class Recorder:
         self._memory = MemorySink()
         self._sinks = (self._memory,) if sinks is None else tuple(sinks)
         self._pending: list[PlantSample] = []
+        self._stations: dict[int, StationSample] = {}
+        """Of the ticks that are pending."""
         self._unsettled: deque[Optimization] = deque()
         self._stop: ColdloopError | None = None
         self._closed = False
@@ -139,6 +141,10 @@ class Recorder:
             self._pass_on()
         if self._stop is not None:
             raise self._stop
+
+    def station(self, sample: StationSample) -> None:
+        """Take what goes with a tick that is about to come, where the plant is a whole refrigerator."""
+        self._stations[sample.tick] = sample
 
     def _put(self, sample: PlantSample) -> None:
         """Put a tick that is not the next one where it belongs."""
@@ -194,7 +200,9 @@ class Recorder:
         kept = 0 if self._closed else KEPT_TICKS
         calls = []
         while len(self._pending) > kept and (self._closed or len(self._pending) >= BLOCK_TICKS + kept):
-            block = SampleBlock.of(self._pending[:BLOCK_TICKS])
+            block = SampleBlock.of(self._pending[:BLOCK_TICKS], self._stations)
+            for sample in self._pending[:BLOCK_TICKS]:
+                self._stations.pop(sample.tick, None)
             del self._pending[:BLOCK_TICKS]
             calls += [partial(sink.block, block) for sink in self._sinks]
         _all(*calls)

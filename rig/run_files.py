@@ -11,9 +11,10 @@ from coldloop.config import Configuration
 from coldloop.errors import ColdloopError, ResultsError
 from coldloop.lti_model import load as load_model
 from coldloop.process import TICK_S
-from rig.columns import FILES, schema_document
+from plant.settings import PlantKind
+from rig.columns import ALL_FILES, schema_document
 from rig.disk_reserve import DiskReserve
-from rig.file_sinks import EventsSink, TraceSink, UpdatesSink
+from rig.file_sinks import EventsSink, StationSink, TraceSink, UpdatesSink
 from rig.indicators import RunEvaluation, StageCost
 from rig.inputs import FOLDER as INPUTS
 from rig.inputs import copy_inputs
@@ -25,7 +26,7 @@ from rig.scenario import Scenario
 from rig.settings import Settings
 
 NAMES: Final = (
-    "manifest.json", "summary.json", "schema.json", *FILES, "run.png", "run.pdf", "run.svg",
+    "manifest.json", "summary.json", "schema.json", *ALL_FILES, "run.png", "run.pdf", "run.svg",
     "chaos.json", "chaos.md", "chaos.png",
 )  # fmt: skip
 """Files of an earlier run that a new one in the same folder replaces."""
@@ -61,12 +62,13 @@ class RunFiles:
             effective, scenario, copy_inputs(settings, scenario.load, folder), way, arguments
         )
         write_json(folder / "manifest.json", self._manifest)
-        write_json(folder / "schema.json", schema_document())
+        write_json(folder / "schema.json", schema_document(station=settings.plant.kind is PlantKind.REFRIGERATOR))
         self._evaluation = RunEvaluation(model, design)
         files = (
             TraceSink(folder, self._reserve, StageCost(model, design)),
             UpdatesSink(folder, self._reserve),
             EventsSink(folder, self._reserve),
+            StationSink(folder, self._reserve),
         )
         self.recorder = Recorder(scenario.ticks, [self._evaluation, *files, *sinks])
 

@@ -15,7 +15,7 @@ from coldloop.process import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, LadderStatus, Mode, Status
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
-from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, PlantSession, SensorFault
+from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, STATION_ROWS, PlantSession, SensorFault, Surroundings
 from plant.runtime import own_header
 from rig.driving import CONTROL, PLANT
 from rig.load_stream import LoadStream, write_table
@@ -30,6 +30,8 @@ T = TypeVar("T")
 
 AHEAD: Final = HISTORY_ROWS - 32
 """Ticks that the control PLC may be ahead of the recording, so that the history still has them."""
+STATION_AHEAD: Final = STATION_ROWS - 32
+"""The same where the history of the station counts too."""
 QUIET_S: Final = 20.0
 """A rig on which nothing happens for this long is given up."""
 LAST_LOOK_S: Final = 2.0
@@ -199,7 +201,8 @@ class SessionClient:
             await self.contact(self.load.feed(done))
         if not self._scenario.realtime:
             known = None if self.load is None else self.load.known_until
-            ahead = min(until, done + AHEAD, LAST_TICK if known is None else known)
+            most = AHEAD if self._samples.has_station is False else STATION_AHEAD
+            ahead = min(until, done + most, LAST_TICK if known is None else known)
             await self.contact(self.control.write(Grant(ahead)))
 
     async def look(self) -> int | None:
@@ -240,6 +243,16 @@ class SessionClient:
     async def set_sensor_fault(self, output: int, fault: SensorFault) -> bool:
         """Write the fault of an output's sensor, by the output's index; return whether the plant has taken it."""
         return await self.contact(self._write_fault(output, fault)) is not None
+
+    async def change_surroundings(self, target: str, value: float) -> float | None:
+        """Change one of a refrigerator's surroundings; return what it was, None if the plant has not taken it."""
+        return await self.contact(self._write_surroundings(target, value))
+
+    async def _write_surroundings(self, target: str, value: float) -> float:
+        given = await self.plant.read(Surroundings)
+        before = getattr(given, target)
+        await self.plant.write(given._replace(**{target: type(before)(value)}))
+        return float(before)
 
     async def _write_fault(self, output: int, fault: SensorFault) -> bool:
         await self.plant.write_rows([fault], output)

@@ -9,7 +9,7 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import HISTORY_ROWS, PlantSample
+from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, PlantSample, StationSample
 from rig.recording import Recorder
 from rig.scenario import Scenario
 
@@ -41,6 +41,8 @@ class SampleReader:
         self._tolerant = tolerant
         self.read_until = 0
         """First tick that is still to be read."""
+        self.has_station: bool | None = None
+        """Whether the plant is a whole refrigerator; None while that is not known."""
 
     async def read(self) -> int:
         """Read the ticks that have gone by since the last call; return the plant's tick.
@@ -70,6 +72,7 @@ class SampleReader:
     async def _read_rows(self, last: int) -> None:
         for tick in range(self.read_until, last):
             (sample,) = await self._client.read_rows(PlantSample, tick % HISTORY_ROWS, 1)
+            await self._read_station(tick)
             if sample.tick == tick:
                 self._recorder.sample(sample)
             elif not self._tolerant:
@@ -77,6 +80,15 @@ class SampleReader:
                     f"{self._client.peer} has overwritten tick {tick} before it was recorded: choose a lower --factor"
                 )
             self.read_until = tick + 1
+
+    async def _read_station(self, tick: int) -> None:
+        """Read what goes with a tick, if the plant is a whole refrigerator: the first row that is read tells."""
+        if self.has_station is False:
+            return
+        (station,) = await self._client.read_rows(StationSample, tick % STATION_ROWS, 1)
+        self.has_station = self.has_station or any(station.signals)
+        if any(station.signals) and station.tick == tick:
+            self._recorder.station(station)
 
 
 class UpdateReader:

@@ -10,7 +10,7 @@ from coldloop.event_text import describe, utc_text
 from coldloop.process import TICK_S
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
-from rig.columns import EVENTS, TRACE, UPDATES, arrow_schema
+from rig.columns import EVENTS, STATION, TRACE, UPDATES, arrow_schema
 from rig.driving import DrivingHistory
 from rig.indicators import StageCost
 from rig.recording import SampleBlock
@@ -34,6 +34,16 @@ def trace_table(
     ]  # fmt: skip
     schema = arrow_schema(TRACE)
     return pa.table([pa.array(data, type=field.type) for field, data in zip(schema, columns, strict=True)], schema)
+
+
+def station_table(block: SampleBlock) -> pa.Table:
+    """Return what is known of the station at the ticks of a block that has one."""
+    ticks = block.first + np.arange(len(block.load))
+    unknown = np.isnan(block.station[:, 0])
+    columns = [pa.array(ticks), pa.array(ticks * TICK_S)]
+    columns += [pa.array(np.nan_to_num(column), mask=unknown) for column in block.station.T]
+    schema = arrow_schema(STATION)
+    return pa.table([column.cast(field.type) for field, column in zip(schema, columns, strict=True)], schema)
 
 
 def _held(ticks: Any, updates: Sequence[Optimization]) -> list[pa.Array]:  # noqa: ANN401 an array of integers

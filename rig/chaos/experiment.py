@@ -52,7 +52,7 @@ def perform(
         LoadFileError: The load of the plan cannot be had.
         ColdloopError: The run was interrupted, or failed before its first tick.
     """
-    settings = effective.settings
+    settings = plan.with_plant(effective.settings)
     scenario = plan.scenario(load_model(settings.model.file).w0)
     trace = ChaosTrace(scenario.ticks)
     failure = None

@@ -6,6 +6,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from coldloop.process import OUTPUT_NAMES, TICK_S
+from plant.refrigerator_events import EventTarget, RefrigeratorEvent
 
 Share = Annotated[float, Field(gt=0, le=1)]
 Duration = Annotated[float, Field(gt=0, le=86_400)]
@@ -234,6 +235,24 @@ class Sensor(Fault):
         return f"sensor {self.output} {self.shows if self.value is None else f'= {self.value:g}'}"
 
 
+class Given(Fault):
+    """Something that a refrigerator is given is otherwise: a compressor trips, nitrogen runs out, helium leaks."""
+
+    kind: Literal["given"]
+    target: EventTarget
+    value: Annotated[float, Field(allow_inf_nan=False)]
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        RefrigeratorEvent(at_s=0.0, target=self.target, value=self.value)
+        return self
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        return f"{self.target} = {self.value:g}"
+
+
 class WrongModel(Fault):
     """The optimiser is restarted with the model of another operating point, and with the right one at the end."""
 
@@ -247,6 +266,6 @@ class WrongModel(Fault):
 
 AnyFault = Annotated[
     Abort | Delay | Drop | Duplicate | Reorder | Reset | Freeze | Truncate | Flip
-    | Kill | Pause | Restart | Clock | Sensor | WrongModel,
+    | Kill | Pause | Restart | Clock | Sensor | Given | WrongModel,
     Field(discriminator="kind"),
 ]  # fmt: skip

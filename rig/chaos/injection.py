@@ -14,6 +14,7 @@ from rig.chaos.faults import (
     SERVICE_OF,
     AnyFault,
     Clock,
+    Given,
     Kill,
     Link,
     LinkFault,
@@ -31,11 +32,14 @@ ATTEMPTS: Final = 20
 _SHOWN: Final = {"nan": SensorFaultKind.NOT_A_NUMBER, "frozen": SensorFaultKind.FROZEN, "value": SensorFaultKind.VALUE}
 
 
-class SensorFaultWriter(Protocol):
-    """Puts faults into the plant's sensors."""
+class PlantWriter(Protocol):
+    """Puts faults into the plant's sensors, and changes what a refrigerator is given."""
 
     async def set_sensor_fault(self, output: int, fault: SensorFault) -> bool:
         """Write the fault of an output, by its index; return whether the plant has taken it."""
+
+    async def change_surroundings(self, target: str, value: float) -> float | None:
+        """Change one of the surroundings; return what it was, None if the plant has not taken it."""
 
 
 class Injector:
@@ -45,12 +49,13 @@ class Injector:
         self,
         services: LocalServices,
         proxies: Mapping[Link, LinkProxy],
-        sensors: SensorFaultWriter,
+        plant: PlantWriter,
         folder: Path,
     ) -> None:
         self._services = services
         self._proxies = proxies
-        self._sensors = sensors
+        self._plant = plant
+        self._given_before: dict[str, float] = {}
         self._wrong_model = folder / WRONG_MODEL
 
     async def begin(self, fault: AnyFault) -> None:
@@ -68,6 +73,9 @@ class Injector:
                 self._services.pause(service)
         elif isinstance(fault, Sensor):
             await self._set_sensor(fault.output, SensorFault(_SHOWN[fault.shows], fault.value or 0.0))
+        elif isinstance(fault, Given):
+            before = await self._give(fault.target, fault.value)
+            self._given_before.setdefault(fault.target, before)
         elif isinstance(fault, WrongModel):
             await self._services.stop("optimizer_plc", signal.SIGTERM)
             await self._services.start("optimizer_plc", {f"{PREFIX}MODEL__FILE": str(self._wrong_model)}, may_end=True)
@@ -87,15 +95,25 @@ class Injector:
                 self._services.resume(service)
         elif isinstance(fault, Sensor):
             await self._set_sensor(fault.output, SensorFault(SensorFaultKind.NONE, 0.0))
+        elif isinstance(fault, Given):
+            await self._give(fault.target, self._given_before.pop(fault.target))
         elif isinstance(fault, WrongModel):
             await self._services.stop("optimizer_plc", signal.SIGTERM)
             await self._services.start("optimizer_plc")
             return "optimizer_plc"
         return None
 
+    async def _give(self, target: str, value: float) -> float:
+        for _ in range(ATTEMPTS):
+            before = await self._plant.change_surroundings(target, value)
+            if before is not None:
+                return before
+            await asyncio.sleep(0.5)
+        raise LinkError(f"the plant took no {target} = {value:g}: see its log")
+
     async def _set_sensor(self, output: str, fault: SensorFault) -> None:
         for _ in range(ATTEMPTS):
-            if await self._sensors.set_sensor_fault(OUTPUT_NAMES.index(output), fault):
+            if await self._plant.set_sensor_fault(OUTPUT_NAMES.index(output), fault):
                 return
             await asyncio.sleep(0.5)
         raise LinkError(f"the plant took no sensor fault for {output}: see its log")

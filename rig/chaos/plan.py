@@ -14,7 +14,8 @@ from coldloop.process import TICK_S
 from coldloop.session import TimeMode
 from plant.load import concatenated, find_load, named_families, telegraph
 from plant.program import LoadProfile
-from rig.chaos.faults import AnyFault
+from plant.settings import PlantKind
+from rig.chaos.faults import AnyFault, Given
 from rig.scenario import Scenario
 from rig.settings import Settings
 
@@ -40,6 +41,8 @@ class Plan(BaseModel):
     load: str | tuple[str, ...] = "a"
     """Named load or CSV file; or named loads, one after the other."""
     duration_s: Annotated[float, Field(gt=0, le=7 * 86_400, multiple_of=TICK_S)]
+    plant: PlantKind | None = None
+    """Which plant; that of the configuration if the plan does not say."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     """Of all that is drawn: instants, the fate of frames, the sensors' noise."""
     mode: TimeMode = TimeMode.LOCKSTEP
@@ -65,6 +68,10 @@ class Plan(BaseModel):
         if any(fault.tick >= self.ticks for fault in self.faults):
             raise ValueError(f"a fault begins after the end of the run, {self.duration_s:g} s")
         _refuse_overlaps(self.schedule())
+        if any(isinstance(fault, Given) for fault in (*self.faults, *self.draw)) and (
+            self.plant is not PlantKind.REFRIGERATOR
+        ):
+            raise ValueError('a fault of kind "given" is one of a refrigerator: write plant = "refrigerator"')
         return self
 
     @property
@@ -89,9 +96,15 @@ class Plan(BaseModel):
                     drawn.append(fault.model_copy(update={"at_s": at}))
         return sorted([*self.faults, *drawn], key=lambda fault: fault.tick)
 
+    def with_plant(self, settings: Settings) -> Settings:
+        """Return settings with the plant that the plan asks for."""
+        if self.plant is None:
+            return settings
+        return settings.model_copy(update={"plant": settings.plant.model_copy(update={"kind": self.plant})})
+
     def configured(self, effective: Configuration[Settings]) -> Configuration[Settings]:
         """Return a configuration with the values of the plan, as a manifest records it."""
-        settings = effective.settings
+        settings = self.with_plant(effective.settings)
         optimizer, session = settings.optimizer_plc, settings.session
         program = optimizer.program.model_copy(update={"updating_period_s": self.updating_period_s})
         load = self.load if isinstance(self.load, str) else ", ".join(self.load)

@@ -8,14 +8,14 @@ from typing import Final
 
 MODES: Final = ("lockstep", "realtime")
 SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "daqp")
-LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h")
+LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h", "pulses")
 SERVICES: Final = ("control_plc", "optimizer_plc", "plant")
 REGISTER_FORMATS: Final = ("csv", "json", "markdown", "table")
 TAG_FORMATS: Final = ("fuxa", "ignition", "node-red", "telegraf")
 FIGURE_FORMATS: Final = ("png", "pdf", "svg")
 STUDIES: Final = (
     "cholesky", "unlimited", "limited", "solver-comparison", "trajectories", "updating-period", "plc-2h", "adaptive-2h",
-    "trade-off", "classical", "single-precision",
+    "trade-off", "classical", "single-precision", "coupling", "disturbances",
 )  # fmt: skip
 
 

@@ -4,6 +4,8 @@ from typing import Final
 
 from rig.studies.cholesky import CholeskyStudy
 from rig.studies.classical import ClassicalStudy
+from rig.studies.coupling import CouplingStudy
+from rig.studies.disturbances import DisturbancesStudy
 from rig.studies.experiments import ADAPTIVE_2H, PLC_2H
 from rig.studies.single_precision import SinglePrecision
 from rig.studies.solver_comparison import SolverComparison
@@ -24,6 +26,8 @@ _ALL: Final[tuple[Study, ...]] = (
     TradeOff(),
     ClassicalStudy(),
     SinglePrecision(),
+    CouplingStudy(),
+    DisturbancesStudy(),
 )
 
 STUDIES: Final = {study.name: study for study in _ALL}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from coldloop.config import load_configuration
 from coldloop.errors import UsageError
 from coldloop.lti_model import load as load_model
-from coldloop.process import L1, T5, TICK_S
+from coldloop.process import L1, OUTPUT_NAMES, STATION_SIGNAL_NAMES, T5, TICK_S
 from optimizer_plc.solvers import make_solver
 from plant.program import LoadProfile
 from rig.indicators import Indicators, evaluate, instantaneous_cost
@@ -39,6 +39,7 @@ RIG_MODULES = (
     "rig.studies.request",
 )
 SUFFIXES = (".py", ".json", ".npz", ".csv")
+T9 = OUTPUT_NAMES.index("T9")
 LIBRARIES = ("casadi", "daqp", "numba", "numpy", "osqp")
 UPDATE_COLUMNS = (
     "tick", "tau_u", "iterations", "j_effective", "j_hot_start", "j_delivered", "j_dev", "j_cst", "violation",
@@ -186,9 +187,12 @@ def _trace(recording: Recording, cost: Series, every: int) -> dict[str, list[flo
         "load": recording.load,
         "L1": recording.y[:, L1],
         "T5": recording.y[:, T5],
+        "T9": recording.y[:, T9],
         "CV155": recording.u[:, 0],
         "NCR22_A": recording.u[:, 1],
         "CV156": recording.u[:, 2],
         "cost": cost,
     }
+    if recording.station.size:
+        kept |= dict(zip((*STATION_SIGNAL_NAMES, "mode", "alarms"), recording.station.T, strict=True))
     return {name: [float(value) for value in column[::every]] for name, column in kept.items()}

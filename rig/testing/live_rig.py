@@ -17,7 +17,7 @@ from coldloop.process import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, Grant
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import PLANT_MAP, SensorFault
+from coldloop.registers.plant import PLANT_MAP, SensorFault, Surroundings
 from rig.chaos.faults import AnyFault, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
@@ -176,6 +176,16 @@ class LiveRig:
         except (PeerUnreachableError, RequestRefusedError):
             return False
         return True
+
+    async def change_surroundings(self, target: str, value: float) -> float | None:
+        """Change one of a refrigerator's surroundings, and return what it was; for the injector."""
+        try:
+            given = await self._clients["plant"].read(Surroundings)
+            before = getattr(given, target)
+            await self._clients["plant"].write(given._replace(**{target: type(before)(value)}))
+        except (PeerUnreachableError, RequestRefusedError):
+            return None
+        return float(before)
 
     def log(self, service: str) -> Path:
         """Return the log of `plant`, `control_plc` or `optimizer_plc`: one JSON object a line."""

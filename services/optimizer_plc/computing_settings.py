@@ -34,6 +34,10 @@ class EstimatorSettings(BaseModel):
     pressure_noise_pa: PositiveFloat = 50.0
     volume_noise_m3: PositiveFloat = 1e-5
     temperature_noise_k: PositiveFloat = 0.05
+    mass_noise_kg: PositiveFloat = 1e-4
+    """Of a line of the compression station, where the model has it, as the next two."""
+    flow_noise_kg_s: PositiveFloat = 1e-5
+    integral_noise_bar_s: PositiveFloat = 1e-5
     level_sensor: PositiveFloat = 0.01
     """Standard deviation of the sensors: %, Hz, K and bar."""
     speed_sensor: PositiveFloat = 1.0

@@ -102,8 +102,11 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
     """Return the gain of every updating period, in ticks, transposed: (n_y, n + 1); the load mismatch comes last."""
     nx = prediction.n_states
     C = np.ascontiguousarray(np.hstack([prediction.C, prediction.G]))
-    drift = np.full(nx + 1, settings.temperature_noise_k)
-    drift[0], drift[1], drift[nx] = settings.pressure_noise_pa, settings.volume_noise_m3, settings.load_walk_w
+    by_unit = {
+        "Pa": settings.pressure_noise_pa, "m3": settings.volume_noise_m3, "K": settings.temperature_noise_k,
+        "kg": settings.mass_noise_kg, "kg/s": settings.flow_noise_kg_s, "bar s": settings.integral_noise_bar_s,
+    }  # fmt: skip
+    drift = np.array([*(by_unit[unit] for unit in prediction.model.state_units), settings.load_walk_w])
     sensors = np.full(C.shape[0], settings.temperature_sensor)
     sensors[0], sensors[1], sensors[12:] = settings.level_sensor, settings.speed_sensor, settings.pressure_sensor
     P = np.diag(100.0 * drift**2)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.lti_model import LtiModel
-from coldloop.process import L1, T5, TICKS_PER_SAMPLE
+from coldloop.process import L1, STATE_NAMES, T5, TICKS_PER_SAMPLE
 from optimizer_plc.arithmetic import DOUBLE, Real
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.linear_algebra import multiply, respond
@@ -93,12 +93,16 @@ class PredictionModel:
 
 
 def state_weights(model: LtiModel, design: ControlDesign) -> Array:
-    """Return the diagonal of Q, shape (28,): pressure, level and the mean of the temperatures weigh alike."""
-    n = model.A.shape[0]
+    """Return the diagonal of Q, shape (n,): pressure, level and the mean of the cold box's temperatures weigh alike.
+
+    States beyond those of the cold box weigh nothing.
+    """
+    n = len(STATE_NAMES)
     scales = np.full(n, design.temperature_scale)
     scales[0] = design.pressure_scale
     scales[1] = design.level_scale / model.C[L1, 1]
     shares = np.full(n, 1.0 / (n - 2))
     shares[:2] = 1.0
-    weights: Array = design.state_weight * shares / scales**2
+    weights = np.zeros(model.A.shape[0])
+    weights[:n] = design.state_weight * shares / scales**2
     return weights

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.errors import ConfigurationError
 from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel
-from coldloop.process import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process import STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import (
@@ -111,6 +112,11 @@ class OptimizerProgram:
 
     def _make_estimator(self) -> Estimator:
         if self.settings.estimator.kind is EstimatorKind.STATE_FEEDBACK:
+            if self._prediction.n_states > len(STATE_NAMES):
+                raise ConfigurationError(
+                    "optimizer_plc.program.estimator.kind=state-feedback: the model has states that the plant does not"
+                    " tell; use kalman"
+                )
             return StateFeedback(self._prediction, self._real)
         return KalmanFilter(self._prediction, self.settings.estimator, self._real)
 

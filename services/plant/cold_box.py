@@ -19,7 +19,7 @@ from plant.components.phase_separator import PhaseSeparator, level, separate
 from plant.components.return_line import ReturnLine, return_flow
 from plant.components.turbine import Expansion, Turbine, expand, turbine_flow
 from plant.components.valve import Valve, valve_mass_flow
-from plant.helium.properties import Helium, isobar_enthalpy_and_density, saturation, vapour_temperature
+from plant.helium.properties import Helium, saturation, supply_enthalpy_and_density, vapour_temperature
 from plant.numeric import Array, at_least
 
 LOAD_NAME, LOAD_UNIT = "NCR22_HL", "W"
@@ -45,7 +45,7 @@ class ColdBox(NamedTuple):
     return_line: ReturnLine = ReturnLine(cold_resistance=0.05e5 / 0.028**2, warm_resistance=0.06e5 / 0.073**2)
     """The low-pressure side."""
     P_HP: float = 16e5
-    """Supply pressure, Pa; the tables hold the 16 bar isobar only."""
+    """Supply pressure, Pa, 5e5 to 19e5; the reference is that of the isobar's table."""
     P_LP: float = 1.05e5
     """Suction pressure of the compressor, Pa."""
     T_in: float = 80.0
@@ -94,10 +94,10 @@ class Streams(NamedTuple):
 @kernel
 def streams(x: Array, u: Array, box: ColdBox, helium: Helium) -> Streams:
     """Return the flows at the state `x` under the inputs `u`."""
-    h_jt, rho_jt = isobar_enthalpy_and_density(x[1 + box.nef1.cells], helium)
+    h_jt, rho_jt = supply_enthalpy_and_density(box.P_HP, x[1 + box.nef1.cells], helium)
     m_jt = valve_mass_flow(box.jt_valve, u[0], rho_jt, box.P_HP, x[0])
     T_turbine = x[1 + box.nef1.cells + box.nef2.cells + box.nef34.cells]
-    h_turbine, rho_turbine = isobar_enthalpy_and_density(T_turbine, helium)
+    h_turbine, rho_turbine = supply_enthalpy_and_density(box.P_HP, T_turbine, helium)
     m_t, P_turbine = turbine_flow(box.turbine, u[2], box.P_HP, T_turbine, rho_turbine)
     m_v, P_mix = return_flow(box.return_line, x[0], box.P_LP, m_t)
     exhaust = expand(box.turbine, h_turbine, P_turbine, P_mix, helium)
@@ -113,8 +113,13 @@ def mix(vapour: LowPressureFlow, s: Streams, helium: Helium) -> LowPressureFlow:
 
 
 @kernel
-def evaluate(x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Array, y: Array) -> None:
-    """Write the rates of the states into `dx` (28, per second) and the outputs into `y` (22, `OUTPUT_UNITS`)."""
+def evaluate(
+    x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Array, y: Array
+) -> tuple[Streams, LowPressureFlow]:
+    """Write the rates of the states into `dx` (28, per second) and the outputs into `y` (22, `OUTPUT_UNITS`).
+
+    Returns the flows, and what leaves at the warm end of the low-pressure side.
+    """
     s = streams(x, u, box, helium)
     first2 = 2 + box.nef1.cells
     first34 = first2 + box.nef2.cells
@@ -123,12 +128,12 @@ def evaluate(x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Arr
     dx[0], dx[1] = separate(box.separator, x[0], x[1], s.m_jt, s.h_jt, s.m_v, heat, helium)
 
     vapour = LowPressureFlow(s.m_v, x[0], sat.T, sat.h_v)
-    into_nef1 = HighPressureFlow(s.m_jt, x[first34 - 1])
+    into_nef1 = HighPressureFlow(s.m_jt, x[first34 - 1], box.P_HP)
     cold = exchange(box.nef1, x[2:first2], into_nef1, vapour, helium, dx[2:first2])
     mixed = mix(cold, s, helium)
-    into_nef2 = HighPressureFlow(s.m_jt, x[first34 + box.nef34.cells - 1])
+    into_nef2 = HighPressureFlow(s.m_jt, x[first34 + box.nef34.cells - 1], box.P_HP)
     middle = exchange(box.nef2, x[first2:first34], into_nef2, mixed, helium, dx[first2:first34])
-    into_nef34 = HighPressureFlow(s.m_jt + s.m_t, box.T_in)
+    into_nef34 = HighPressureFlow(s.m_jt + s.m_t, box.T_in, box.P_HP)
     warm = exchange(box.nef34, x[first34:], into_nef34, middle, helium, dx[first34:])
 
     exhaust_saturation = saturation(s.P_mix, helium)
@@ -145,6 +150,7 @@ def evaluate(x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Arr
     y[10] = box.T_in
     y[11] = warm.T
     _write_pressures(x[0], s, box, y[12:])
+    return s, warm
 
 
 @kernel

@@ -27,6 +27,8 @@ class Family(NamedTuple):
     shortest_s: float
     longest_s: float
     seed: int
+    in_turn: bool = False
+    """A train of pulses instead: the first step for the longest time, then the second for the shortest, and so on."""
 
 
 HOURS: Final = {
@@ -39,6 +41,7 @@ HOURS: Final = {
     **{
         str(hour): Family((0.0, 60.0, -60.0, 100.0, -100.0, 150.0), 60.0, 400.0, 20 + hour) for hour in range(1, 9)
     },  # sustained loads, under which throttled qpOASES predicts violations as large as in the paper (c1 of 20)
+    "pulses": Family((-45.0, 135.0), 150.0, 450.0, 30, in_turn=True),  # as a tokamak's magnets load their refrigerator
 }
 
 NAMED: Final = {
@@ -46,6 +49,7 @@ NAMED: Final = {
     "2h": ("a", "b"),
     "6h": tuple("abcdef"),
     "8h": tuple("12345678"),
+    "pulses": ("pulses",),
 }
 
 
@@ -56,6 +60,8 @@ DRAW_SEEDS: Final = 1000
 def telegraph(family: Family, mean_w: float) -> LoadProfile:
     """Return one hour of a family about `mean_w`, in whole ticks, starting at the mean."""
     draw = random.Random(family.seed).random  # noqa: S311 not for secrets; the one generator stable over versions
+    if family.in_turn:
+        return _pulses(family, mean_w, draw())
     times, watts = [0], [mean_w]
     tick = round(family.longest_s / TICK_S)
     while tick < HOUR_TICKS:
@@ -64,6 +70,18 @@ def telegraph(family: Family, mean_w: float) -> LoadProfile:
             times.append(tick)
             watts.append(step)
         tick += round((family.shortest_s + draw() * (family.longest_s - family.shortest_s)) / TICK_S)
+    return LoadProfile(tuple(times), tuple(watts))
+
+
+def _pulses(family: Family, mean_w: float, phase: float) -> LoadProfile:
+    """Return an hour of pulses that begins at the mean for a share `phase` (0 to 1) of the longest time."""
+    (low, high), times, watts = family.steps, [0], [mean_w]
+    tick = 1 + round(phase * family.longest_s / TICK_S)
+    while tick < HOUR_TICKS:
+        rising = watts[-1] == mean_w + low
+        times.append(tick)
+        watts.append(mean_w + (high if rising else low))
+        tick += round((family.shortest_s if rising else family.longest_s) / TICK_S)
     return LoadProfile(tuple(times), tuple(watts))
 
 

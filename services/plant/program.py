@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.registers.plant import StationSample, StationStatus, Surroundings
 from plant.cold_box import ColdBox, outputs
 from plant.helium.properties import load_helium
 from plant.integrator import advance_and_read, plain_tuples
@@ -136,6 +137,29 @@ class PlantProgram:
     def load(self) -> float:
         """The heat load (W) held from the current tick to the next."""
         return self._load.value(self.tick)
+
+    @property
+    def station(self) -> StationSample | None:
+        """Compression station and nitrogen at the current tick; a cold box alone has none."""
+        return None
+
+    @property
+    def station_status(self) -> StationStatus | None:
+        """The same for the registers, with what its controller asks for."""
+        return None
+
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """What a refrigerator is given at the current tick; a cold box alone is given nothing."""
+        return None
+
+    def give(self, surroundings: Surroundings) -> None:
+        """Change what a refrigerator is given, from the next tick on.
+
+        Raises:
+            ValueError: The plant is a cold box alone.
+        """
+        raise ValueError(f"{surroundings._fields}: the plant is a cold box alone; set plant.kind to refrigerator")
 
     def measure(self) -> tuple[float, ...]:
         """Return the 22 outputs at the current tick, taken before inputs applied at this tick act."""

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from coldloop.journal import Journal
 from coldloop.pace import Pace
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import pace_subject
@@ -22,6 +22,11 @@ from coldloop.registers.plant import (
     OutputVerdict,
     PlantSample,
     SensorFault,
+    StationAlarm,
+    StationMode,
+    StationSample,
+    StationStatus,
+    Surroundings,
 )
 from coldloop.watchdog import Watchdog
 from plant.faults import SensorFaults
@@ -95,6 +100,11 @@ class Rack:
         return self._program.tick
 
     @property
+    def station(self) -> StationSample | None:
+        """Compression station and nitrogen at the present tick; a cold box alone has none."""
+        return self._program.station
+
+    @property
     def silence_s(self) -> float:
         """Real time (s) after which the client that writes outputs counts as silent."""
         pace = self.session.pace
@@ -159,10 +169,43 @@ class Rack:
         program = self._program
         sample = PlantSample(program.tick, program.load, self.outputs.u, program.measure(), program.state)
         self.moving = self.session.pace.realtime
+        before = program.station
         program.advance()
+        if before is not None and program.station is not None:
+            self._note_station(before, program.station)
         if self.watchdog.check(program.tick):
             self._watchdog_expired()
         return sample
+
+    def _note_station(self, before: StationSample, now: StationSample) -> None:
+        """Tell changes of the station's mode and alarms."""
+        if now.mode != before.mode:
+            self.journal.note(self.tick, EventKind.STATION_MODE, now.mode)
+        for number, alarm in enumerate(StationAlarm):
+            if (now.alarms ^ before.alarms) & alarm:
+                self.journal.note(self.tick, EventKind.STATION_ALARM, number, int(bool(now.alarms & alarm)))
+
+    def give(self, asked: Surroundings, who: str) -> None:
+        """Change what a refrigerator is given, from the next tick on.
+
+        Raises:
+            ValueError: The plant is a cold box alone.
+        """
+        before = self._program.surroundings
+        self._program.give(asked)
+        for place, (old, new) in enumerate(zip(before or asked, asked, strict=True)):
+            if new != old:
+                self.journal.note(self.tick, EventKind.SURROUNDINGS, place, value=float(new), who=who)
+
+    @property
+    def station_status(self) -> StationStatus | None:
+        """What the registers show of the station; None for a cold box alone."""
+        return self._program.station_status
+
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """What a refrigerator is given now; None for a cold box alone."""
+        return self._program.surroundings
 
     def _watchdog_expired(self) -> None:
         """Bring the outputs into their safe state, where the configuration asks for that."""
@@ -232,11 +275,21 @@ class Rack:
 
     def snapshot(self) -> Mapping[str, object]:
         """Return what telemetry publishes."""
-        program = self._program
+        program, station = self._program, self._program.station
         return {
             "session": self.session.number,
             "tick": program.tick,
             "load_w": program.load,
             "inputs": dict(zip(INPUT_NAMES, self.outputs.u, strict=True)),
             "outputs": dict(zip(OUTPUT_NAMES, program.measure(), strict=True)),
+            **({} if station is None else {"station": station_snapshot(station)}),
         }
+
+
+def station_snapshot(station: StationSample) -> Mapping[str, object]:
+    """Return what telemetry publishes of compression station and nitrogen."""
+    return {
+        **dict(zip(STATION_SIGNAL_NAMES, station.signals, strict=True)),
+        "mode": StationMode(station.mode).name.lower(),
+        "alarms": [alarm.name.lower() for alarm in StationAlarm(station.alarms) if alarm.name],
+    }

@@ -19,6 +19,7 @@ from coldloop.registers.plant import (
     HISTORY_ROWS,
     LOAD_ROWS,
     PLANT_MAP,
+    STATION_ROWS,
     Actuators,
     LiveLoad,
     LoadAhead,
@@ -28,6 +29,8 @@ from coldloop.registers.plant import (
     OutputVerdict,
     PlantSession,
     SensorFault,
+    StationStatus,
+    Surroundings,
 )
 from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 from coldloop.registers.text import from_words
@@ -90,6 +93,7 @@ class RackRegisters:
         elif self.rack.session.number:
             self._show_pace()
         self.bank.put(WatchdogTime(self.rack.watchdog.time))
+        self.bank.put(self.rack.surroundings or Surroundings())
         self._show_applied()
         self._finish()
 
@@ -131,10 +135,12 @@ class RackRegisters:
         bank.judged_by(self._judge_load, LoadStep)
         bank.judged_by(self._judge_live_load, LiveLoad, LoadAhead)
         bank.judged_by(self._judge_pace, SessionPace)
+        bank.judged_by(self._judge_surroundings, Surroundings)
         bank.keep_fresh(Identity, self._identity)
         bank.keep_fresh(Measurement, self._measurement)
         bank.keep_fresh(WatchdogStatus, lambda: self.rack.watchdog.registers(self.rack.tick))
         bank.keep_fresh(LeaseStatus, self.lease.registers)
+        bank.keep_fresh(StationStatus, lambda: self.rack.station_status)
         bank.keep_fresh(LoadStatus, lambda: self.rack.load.status(self.rack.tick))
         self._takers: dict[type[tuple[object, ...]], Callable[[str], None]] = {
             PlantSession: self._start_session,
@@ -144,6 +150,7 @@ class RackRegisters:
             LiveLoad: self._set_load,
             LoadAhead: self._set_load_ahead,
             SessionPace: self._set_pace,
+            Surroundings: self._set_surroundings,
             JournalQuery: self._answer_query,
         }
 
@@ -183,6 +190,10 @@ class RackRegisters:
         except ValueError as error:
             raise IllegalValueError(f"pace: {error}") from None
 
+    def _judge_surroundings(self, _asked: Surroundings, _row: int, _caller: Caller) -> None:
+        if self.rack.surroundings is None:
+            raise IllegalValueError("the plant is a cold box alone: it has no surroundings")
+
     def _load_of(self, asked: PlantSession) -> LoadProfile:
         steps = [self.bank.get(LoadStep, row) for row in range(asked.load_steps)]
         return LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
@@ -213,6 +224,7 @@ class RackRegisters:
         for output in range(len(OUTPUT_NAMES)):
             self.bank.put(HEALTHY, output)
         self.bank.put(LiveLoad(0, self.rack.load.value(0)))
+        self.bank.put(self.rack.surroundings or Surroundings())
         self._show_pace()
         self._show_applied()
 
@@ -240,6 +252,9 @@ class RackRegisters:
         self.rack.set_pace(self.bank.get(SessionPace).of(self.rack.session.number), who)
         self._show_pace()
 
+    def _set_surroundings(self, who: str) -> None:
+        self.rack.give(self.bank.get(Surroundings), who)
+
     def _show_pace(self) -> None:
         session = self.rack.session
         self.bank.put(SessionPace.shown(session.number, session.pace))
@@ -262,6 +277,9 @@ class RackRegisters:
     def advance(self) -> None:
         """Advance the plant by one tick."""
         generation = self.rack.outputs.generation
+        station = self.rack.station
+        if station is not None:
+            self.bank.put(station, station.tick % STATION_ROWS)
         sample = self.rack.advance()
         self.bank.put(sample, sample.tick % HISTORY_ROWS)
         self._outdated = True

@@ -7,7 +7,7 @@ real time the plant moves by the clock, half a tick away from the scans, whateve
 import asyncio
 import logging
 import time
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 from coldloop import __version__
@@ -24,37 +24,35 @@ from coldloop.registers.plant import Actuators, PlantSession
 from coldloop.telemetry import Telemetry
 from plant.cold_box import REFERENCE
 from plant.helium.properties import load_helium
+from plant.kinds import plant_maker
 from plant.model import parameters_digest
-from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+from plant.refrigerator import REFERENCE_REFRIGERATOR
+from plant.refrigerator_file import KIND, refrigerator_digest
 from plant.registers import RackRegisters
-from plant.settings import PlantSettings, SensorSettings
+from plant.settings import PlantSettings
 
 log = logging.getLogger("coldloop.plant")
 
 
 def own_header(file: Path) -> ModelHeader:
-    """Return the header of a model file of this very plant.
+    """Return the header of a model file of this very plant: of the cold box alone, or of the refrigerator around it.
 
     Raises:
         ModelFileError: The file cannot be read, or the model was made from another plant.
     """
     header = read_header(file)
-    names = (header.state_names, header.input_names, header.output_names)
-    if header.parameters_digest != _own_parameters_digest() or names != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
+    names = (header.state_names[: len(STATE_NAMES)], header.input_names, header.output_names)
+    own = _own_parameters_digest(header.plant)
+    if header.parameters_digest != own or names != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
         raise ModelFileError(f"{file}: a model of another plant; make one with `coldloop model --out FILE`")
     return header
 
 
 @cache
-def _own_parameters_digest() -> str:
+def _own_parameters_digest(plant: str) -> str:
+    if plant == KIND:
+        return refrigerator_digest(REFERENCE_REFRIGERATOR, load_helium())
     return parameters_digest(REFERENCE, load_helium())
-
-
-def make_program(header: ModelHeader, sensors: SensorSettings, load: HeatLoad, seed: int) -> PlantProgram:
-    """Return the plant at the operating point of its model file."""
-    deviations = sensors.deviations
-    noise = MeasurementNoise(deviations, seed) if any(deviations) else None
-    return PlantProgram(box=REFERENCE, x0=header.x0, u0=header.u0, load=load, noise=noise)
 
 
 class PlantRuntime:
@@ -68,9 +66,7 @@ class PlantRuntime:
         self._position: float | None = None
         """While paused: where time stands, in ticks."""
         self._failure: asyncio.Future[None] | None = None
-        self.registers = RackRegisters(
-            settings, header, partial(make_program, header, settings.plant.sensors), age=self._age
-        )
+        self.registers = RackRegisters(settings, header, plant_maker(header, settings.plant), age=self._age)
 
     def on_write(self, block: Block, caller: Caller) -> None:
         """Take what a client has written, and see to it that the plant moves."""

@@ -1,6 +1,7 @@
 """Configuration of the plant service, checked when it is made and immutable after."""
 
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -14,8 +15,12 @@ from coldloop.registers.codec import WordOrder
 from coldloop.retained import RetainSettings
 from coldloop.session import SessionSettings
 from coldloop.telemetry import TelemetrySettings
+from plant.refrigerator_events import RANGES, EventTarget, RefrigeratorEvent
+from plant.station_settings import StationSettings
 
-SHOWN: Final = ("plant.sensors", "plant.clock_error_ppm", "plant.watchdog")
+SHOWN: Final = (
+    "plant.kind", "plant.station", "plant.refrigerator", "plant.sensors", "plant.clock_error_ppm", "plant.watchdog",
+)  # fmt: skip
 """What of the configuration decides results: shown in the registers. Load and seed are those of a session."""
 
 Deviation = Annotated[float, Field(ge=0)]
@@ -75,11 +80,39 @@ class PlantServer(ServerSettings):
     port: Annotated[int, Field(ge=0, le=0xFFFF)] = PLANT_PORT
 
 
+class PlantKind(StrEnum):
+    """Which plant is simulated."""
+
+    COLD_BOX = "cold-box"
+    """S1 and S2; pressures and inlet temperature are constant."""
+    REFRIGERATOR = "refrigerator"
+    """S1 to S4: with nitrogen pre-cooler and compression station."""
+
+
+class RefrigeratorSettings(BaseModel):
+    """What happens to a refrigerator."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    file: Path | None = None
+    """Its operating point and the gains of its pressure controller; by default those of the reference plant."""
+    ambient_k: Annotated[float, Field(ge=RANGES[EventTarget.AMBIENT][0], le=RANGES[EventTarget.AMBIENT][1])] = 300.0
+    """Temperature of the surroundings."""
+    daily_swing_k: Annotated[float, Field(ge=0, le=20)] = 0.0
+    """Amplitude of a day's sine about it; the first six hours are the warmer."""
+    events: tuple[RefrigeratorEvent, ...] = ()
+    """What happens, and when: `{at_s = 600, target = "nc1", value = 0}` trips a compressor after ten minutes."""
+
+
 class PlantSection(BaseModel):
     """Section `plant` of the configuration."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    kind: PlantKind = PlantKind.COLD_BOX
+    refrigerator: RefrigeratorSettings = RefrigeratorSettings()
+    """Read by the refrigerator only, as is `station`."""
+    station: StationSettings = StationSettings()
     server: PlantServer = PlantServer()
     word_order: WordOrder = WordOrder.HIGH_FIRST
     metrics: MetricsSettings = MetricsSettings()

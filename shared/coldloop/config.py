@@ -119,8 +119,17 @@ def to_environment(settings: BaseModel) -> dict[str, str]:
     """Return the variables that make a process load these settings."""
     flat = flattened(settings.model_dump(mode="json"))
     return {
-        PREFIX + key.upper().replace(".", "__"): json.dumps(value) for key, value in flat.items() if value is not None
+        PREFIX + key.upper().replace(".", "__"): _as_toml(value) for key, value in flat.items() if value is not None
     }
+
+
+def _as_toml(value: object) -> str:
+    """Return a value as TOML writes it in one line."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_as_toml(part)}" for key, part in value.items() if part is not None) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_as_toml, value)) + "]"
+    return json.dumps(value)
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

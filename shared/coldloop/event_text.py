@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, LinkCause, Mode, OperatorMode, PlantLinkState, Verdict
-from coldloop.registers.plant import SensorFaultKind
+from coldloop.registers.plant import SensorFaultKind, StationAlarm, StationMode, Surroundings
 from coldloop.registers.safety import AlarmKind
 from coldloop.registers.text import from_words
 
@@ -93,6 +93,11 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
     EventKind.LOST: _Wording(unit="events or lines"),
     EventKind.SENSOR: _Wording(_listed(OUTPUT_NAMES), _listed(("good again", "bad"))),
     EventKind.LIVE_LOAD: _Wording(_listed(("from one tick on", "steps ahead")), unit="W"),
+    EventKind.STATION_ALARM: _Wording(
+        _listed([str(alarm.name).lower().replace("_", " ") for alarm in StationAlarm]), _listed(("returned", "raised"))
+    ),
+    EventKind.STATION_MODE: _Wording(_members(StationMode)),
+    EventKind.SURROUNDINGS: _Wording(_listed(Surroundings._fields), unit=""),
     EventKind.PACE: _Wording(_listed(("lock-step", "real time", "paused")), unit="x real time"),
 }
 _ALARM_CAUSES: Final[Mapping[int, Words]] = {

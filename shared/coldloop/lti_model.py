@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ModelFileError
 from coldloop.model_file import (
+    COLD_BOX,
     FORMAT,
     REMEDY,
     VECTORS,
@@ -84,6 +85,8 @@ class LtiModel:
     load_unit: str
     parameters_digest: str
     """SHA-256 of the plant's parameters and property tables."""
+    plant: str = COLD_BOX
+    """Which plant it is the model of."""
 
     def __post_init__(self) -> None:
         n, m, p = len(self.state_names), len(self.input_names), len(self.output_names)
@@ -129,6 +132,8 @@ class LtiModel:
         document: dict[str, Any] = {"format": FORMAT}
         for field in fields(self):
             value = getattr(self, field.name)
+            if (field.name, value) == ("plant", COLD_BOX):
+                continue  # so is any file that names none
             if isinstance(value, np.ndarray):
                 document[field.name] = value.tolist()
             else:

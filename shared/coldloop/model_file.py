@@ -14,6 +14,9 @@ from typing import Any
 from coldloop.errors import ModelFileError
 
 FORMAT = 1
+REMEDY = "make it anew with `python -m plant.model FILE`"
+COLD_BOX = "cold-box"
+"""The plant of a model file that names none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +43,8 @@ class ModelHeader:
     """Load at the operating point, in `load_unit`."""
     y0: tuple[float, ...]
     """Outputs at the operating point, in `output_units`."""
+    plant: str = COLD_BOX
+    """Which plant the model was made of."""
 
     @property
     def short_digest(self) -> int:
@@ -62,7 +67,7 @@ def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
         described: dict[str, Any] = {name: str(document[name]) for name in TEXTS}
         described |= {name: tuple(str(text) for text in document[name]) for name in LISTS_OF_TEXT}
         described |= {name: tuple(float(number) for number in document[name]) for name in VECTORS}
-        header = ModelHeader(w0=float(document["w0"]), **described)
+        header = ModelHeader(w0=float(document["w0"]), plant=str(document.get("plant", COLD_BOX)), **described)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{path}: {error!r} in the model file; {REMEDY}") from error
     for kind, values in zip(KINDS, (header.x0, header.u0, header.y0), strict=True):
@@ -72,8 +77,8 @@ def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
     return header
 
 
-def read_document(path: Path) -> dict[str, Any]:
-    """Return the content of a model file whose format and digest are right.
+def read_document(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
+    """Return the content of a model file whose format and digest are right; `remedy` ends the message if not.
 
     Raises:
         ModelFileError: the file is missing, unreadable, not JSON, not finite, of another version or damaged.
@@ -81,17 +86,17 @@ def read_document(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
     except FileNotFoundError as error:
-        raise ModelFileError(f"{path}: no such model file; {REMEDY}") from error
+        raise ModelFileError(f"{path}: no such model file; {remedy}") from error
     except (OSError, ValueError, RecursionError) as error:
-        raise ModelFileError(f"{path}: not a readable model file ({error}); {REMEDY}") from error
+        raise ModelFileError(f"{path}: not a readable model file ({error}); {remedy}") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise ModelFileError(f"{path}: not a model file of format {FORMAT}; {REMEDY}")
+        raise ModelFileError(f"{path}: not a model file of format {FORMAT}; {remedy}")
     try:
         found = digest_of(document)
     except ValueError as error:  # a number such as 1e999 reads as infinite
-        raise ModelFileError(f"{path}: a number that is not finite; {REMEDY}") from error
+        raise ModelFileError(f"{path}: a number that is not finite; {remedy}") from error
     if document.get("digest") != found:
-        raise ModelFileError(f"{path}: digest mismatch, the file was changed after it was made; {REMEDY}")
+        raise ModelFileError(f"{path}: digest mismatch, the file was changed after it was made; {remedy}")
     return document
 
 
@@ -136,4 +141,3 @@ TEXTS = ("digest", "parameters_digest", "load_name", "load_unit")
 VECTORS = ("x0", "u0", "y0")
 KINDS = ("state", "input", "output")
 LISTS_OF_TEXT = tuple(f"{kind}_{what}" for kind in KINDS for what in ("names", "units"))
-REMEDY = "make it anew with `python -m plant.model FILE`"

@@ -1,10 +1,18 @@
 """Which prediction model a PLC runs."""
 
 from pathlib import Path
+from typing import Annotated, Final
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict
 
-DEFAULT_MODEL_FILE = Path(__file__).parent / "data" / "cold_box_model.json"
+_DATA: Final = Path(__file__).parent / "data"
+DEFAULT_MODEL_FILE = _DATA / "cold_box_model.json"
+SHIPPED_MODELS: Final = {"cold-box": DEFAULT_MODEL_FILE, "refrigerator": _DATA / "refrigerator_model.json"}
+"""Models that have a name: of the cold box alone, and of the refrigerator with its pressure loop closed."""
+
+
+def _named(value: object) -> object:
+    return SHIPPED_MODELS.get(value, value) if isinstance(value, str) else value
 
 
 class ModelSettings(BaseModel):
@@ -12,4 +20,5 @@ class ModelSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    file: Path = DEFAULT_MODEL_FILE
+    file: Annotated[Path, BeforeValidator(_named)] = DEFAULT_MODEL_FILE
+    """A file, or `cold-box` or `refrigerator` for one that is shipped."""

@@ -8,7 +8,7 @@ from rig.chaos.plan import SPREAD_S, Plan, find_plan, parse_plan, shipped_plans
 
 KINDS = {
     "delay", "drop", "duplicate", "reorder", "reset", "freeze", "truncate", "abort", "flip",
-    "kill", "pause", "restart", "clock", "sensor", "wrong_model",
+    "kill", "pause", "restart", "clock", "sensor", "given", "wrong_model",
 }  # fmt: skip
 
 HEAD = 'name = "mine"\ndescription = "one of mine"\nduration_s = 600\n'
@@ -38,6 +38,9 @@ def test_the_shipped_plans_are_sound_and_have_all_kinds() -> None:
         (with_fault('kind = "clock"', "at_s = 600", "duration_s = 3"), "begins after the end of the run"),
         (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T5"', 'shows = "value"'), "a value"),
         (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T99"', 'shows = "nan"'), "no output"),
+        (with_fault('kind = "given"', "at_s = 1", "duration_s = 3", 'target = "nc1"', "value = 0"), "refrigerator"),
+        ('plant = "refrigerator"\n' + with_fault('kind = "given"', "at_s = 1", "duration_s = 3", 'target = "leak"',
+                                                 "value = 99"), "outside 0 to 50"),
         (with_fault('kind = "kill"', "at_s = 1", "duration_s = 9", 'process = "plant"')
          + '\n[[faults]]\nkind = "clock"\nat_s = 5\nduration_s = 1', "begins before 'kill plant' has ended"),
         (HEAD + "every_s = 60", "every_s and `draw` go together"),

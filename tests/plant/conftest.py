@@ -1,6 +1,5 @@
 import struct
 from dataclasses import dataclass
-from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
@@ -23,9 +22,9 @@ from coldloop.seal import Seal, seal_of, sealed
 from plant.cold_box import REFERENCE, ColdBox, derivative, outputs
 from plant.helium.properties import Helium, load_helium
 from plant.integrator import advance
+from plant.kinds import plant_maker
 from plant.numeric import RealArray
 from plant.registers import RackRegisters
-from plant.runtime import make_program
 from plant.settings import PlantSettings
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -168,7 +167,7 @@ class RackOnTheBus:
     def __init__(self, **configuration: Any) -> None:  # noqa: ANN401 - any part of the configuration
         session = {"autostart": True} | configuration.pop("session", {})
         settings = PlantSettings.model_validate({"session": session, "plant": {"load": "a", **configuration}})
-        make_plant = partial(make_program, HEADER, settings.plant.sensors)
+        make_plant = plant_maker(HEADER, settings.plant)
         self.now = 1000.0
         self.registers = RackRegisters(
             settings,

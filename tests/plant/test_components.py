@@ -12,10 +12,10 @@ from plant.components.return_line import return_flow
 from plant.components.turbine import expand, turbine_flow
 from plant.components.valve import valve_mass_flow
 from plant.helium.properties import (
-    isobar_cell,
-    isobar_enthalpy_and_density,
     load_helium,
     saturation,
+    supply_cell,
+    supply_enthalpy_and_density,
     vapour_enthalpy_and_cp,
 )
 
@@ -42,14 +42,14 @@ def test_a_valve_passes_nothing_against_the_pressure() -> None:
 
 @given(opening=st.floats(1.0, 100.0), T=st.floats(10.0, 80.0))
 def test_turbine_valve_and_nozzle_pass_the_same_flow(opening: float, T: float) -> None:
-    _, rho = isobar_enthalpy_and_density(T, HELIUM)
+    _, rho = supply_enthalpy_and_density(16e5, T, HELIUM)
     flow, P_between = turbine_flow(TURBINE, opening, 16e5, T, rho)
     assert flow == pytest.approx(valve_mass_flow(TURBINE.inlet_valve, opening, rho, 16e5, P_between), rel=1e-6)
     assert flow == pytest.approx(TURBINE.nozzle * P_between / np.sqrt(T), rel=1e-12)
 
 
 def test_a_shut_turbine_neither_flows_nor_turns() -> None:
-    h, rho = isobar_enthalpy_and_density(19.0, HELIUM)
+    h, rho = supply_enthalpy_and_density(16e5, 19.0, HELIUM)
     flow, P_between = turbine_flow(TURBINE, 0.0, 16e5, 19.0, rho)
     assert (flow, P_between) == (0.0, 0.0)
     exhaust = expand(TURBINE, h, P_between, 1.15e5, HELIUM)
@@ -58,7 +58,7 @@ def test_a_shut_turbine_neither_flows_nor_turns() -> None:
 
 @given(P_in=st.floats(3e5, 16e5), T=st.floats(12.0, 80.0))
 def test_a_turbine_takes_its_share_of_the_isentropic_drop(P_in: float, T: float) -> None:
-    h, _ = isobar_enthalpy_and_density(T, HELIUM)
+    h, _ = supply_enthalpy_and_density(16e5, T, HELIUM)
     exhaust = expand(TURBINE, h, P_in, 1.15e5, HELIUM)
     drop = (exhaust.speed / TURBINE.speed_coefficient) ** 2
     assert 0.0 < drop < h
@@ -86,13 +86,13 @@ def test_what_an_exchanger_takes_from_one_stream_it_gives_to_the_other(
     h_low, _ = vapour_enthalpy_and_cp(1.15e5, T_low, saturation(1.15e5, HELIUM).T, HELIUM.vapour)
     entering = LowPressureFlow(m_low, 1.15e5, T_low, h_low)
     dT = np.empty(exchanger.cells)
-    leaving = exchange(exchanger, T, HighPressureFlow(m_high, T_high), entering, HELIUM, dT)
+    leaving = exchange(exchanger, T, HighPressureFlow(m_high, T_high, 16e5), entering, HELIUM, dT)
     stored = 0.0
     for T_cell, rate in zip(T, dT, strict=True):
-        _, rho_cp, c_wall = isobar_cell(T_cell, HELIUM)
+        _, rho_cp, c_wall = supply_cell(16e5, T_cell, HELIUM)
         stored += (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells * rate
-    h_in, _ = isobar_enthalpy_and_density(T_high, HELIUM)
-    h_out, _ = isobar_enthalpy_and_density(T[-1], HELIUM)
+    h_in, _ = supply_enthalpy_and_density(16e5, T_high, HELIUM)
+    h_out, _ = supply_enthalpy_and_density(16e5, T[-1], HELIUM)
     gained = m_low * (leaving.h - entering.h)
     assert stored == pytest.approx(m_high * (h_in - h_out) - gained, rel=1e-9, abs=1e-6)
     assert T_low <= leaving.T <= T_high

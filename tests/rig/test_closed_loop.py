@@ -12,8 +12,8 @@ from coldloop.model_file import read_header
 from coldloop.process import L1, T5, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import Verdict
 from optimizer_plc.design import ControlDesign
+from plant.kinds import make_program
 from plant.program import LoadProfile
-from plant.runtime import make_program
 from plant.settings import SensorSettings
 from rig.recording import Recording
 from rig.scenario import Scenario

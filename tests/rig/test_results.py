@@ -26,6 +26,7 @@ from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
 from rig import cli
 from rig.columns import FILES
+from rig.commands.options import PLACES
 from rig.indicators import evaluate
 from rig.recording import LinkStatistics, Recorder, Recording
 from rig.results import whole_file, write_json
@@ -170,8 +171,9 @@ def test_the_manifest_holds_what_is_needed_to_repeat_the_run(
     assert datetime.fromisoformat(manifest["started_utc"]) <= datetime.fromisoformat(manifest["ended_utc"])
     assert datetime.fromisoformat(manifest["started_utc"]).tzinfo is UTC
     assert manifest["configuration"]["plant.load"] == "e"
+    without_effect = {"session.factor", "session.autostart", *PLACES}
     settings = [f"--set={key}={json.dumps(value)}" for key, value in manifest["configuration"].items()
-                if key != "session.factor"]  # fmt: skip
+                if key not in without_effect]  # fmt: skip
     again = coldloop("run", "--in-process", "--duration", "60s", *settings, "--out", tmp_path / "again")
     assert again.code == 0, again.complaints
     assert read(tmp_path / "again" / "summary.json")["trace_sha256"] == minute.trace_sha256

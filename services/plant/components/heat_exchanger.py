@@ -6,7 +6,7 @@ import numpy as np
 
 from coldloop.compiled import kernel
 from plant.helium.interpolation import Surface
-from plant.helium.properties import Helium, Saturation, isobar_cell, saturation, vapour_enthalpy_and_cp
+from plant.helium.properties import Helium, Saturation, saturation, supply_cell, vapour_enthalpy_and_cp
 from plant.numeric import Array, at_least, at_most
 
 LARGEST_RATIO = 8.0  # of the mean to the cold-end difference; more would be too stiff for a step of 0.25 s
@@ -27,12 +27,14 @@ class HeatExchanger(NamedTuple):
 
 
 class HighPressureFlow(NamedTuple):
-    """The warm stream as it enters at the hot end, at 16 bar."""
+    """The warm stream as it enters at the hot end."""
 
     mass_flow: float
     """kg/s."""
     T: float
     """K."""
+    P: float
+    """Pa, the same all along."""
 
 
 class LowPressureFlow(NamedTuple):
@@ -97,10 +99,10 @@ def exchange(
     sweeping = at_least(low.mass_flow, TRICKLE)
     T_low, h_low = low.T, low.h
     _, cp_low = vapour_enthalpy_and_cp(low.P, T_low, sat.T, helium.vapour)
-    h_cell, rho_cp, c_wall = isobar_cell(T[exchanger.cells - 1], helium)
+    h_cell, rho_cp, c_wall = supply_cell(high.P, T[exchanger.cells - 1], helium)
     for i in range(exchanger.cells - 1, -1, -1):
         T_before = T[i - 1] if i > 0 else high.T
-        h_before, rho_cp_before, c_wall_before = isobar_cell(T_before, helium)
+        h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, helium)
         drive = driving_difference(T_before, T[i], T_low)
         T_low, h_next, cp_low = take_up(
             LowPressureFlow(sweeping, low.P, T_low, h_low), cp_low, drive, UA, sat, helium.vapour

@@ -21,6 +21,7 @@ from plant.numeric import RealArray
 
 FLUID = "Helium"
 P_HP = 16e5
+DEPARTURE_NODES = 24
 TARGET = Path(__file__).with_name("helium_tables.npz")
 
 # NIST cryogenic material properties, aluminium 6061-T6, 4 to 300 K: log10 c = sum a_k (log10 T)^k, c in J/(kg K).
@@ -39,6 +40,7 @@ def tabulate() -> dict[str, RealArray]:
     log_temperatures = np.linspace(np.log(4.0), np.log(300.0), 361)
     return {
         **curves("isobar", log_temperatures, _isobar),
+        **curves("departure", log_temperatures, _departure),
         **curves("saturation", pressures, _saturation),
         **surface("vapour", lines, superheats, _vapour),
         **surface("vapour_superheat", lines, excesses, _superheat),
@@ -78,6 +80,20 @@ def _isobar(log_temperature: float) -> list[float]:
     T = float(np.exp(log_temperature))
     h, rho, cp = (_property(name, "P", P_HP, "T", T) for name in ("H", "D", "C"))
     return [h, rho, rho * cp, aluminium_heat_capacity(T)]
+
+
+def _departure(log_temperature: float) -> list[float]:
+    """Return the cubics through 16 bar, in bar from there, that fit h, rho and rho cp best over 5 to 19 bar."""
+    T = float(np.exp(log_temperature))
+    angles = (np.arange(DEPARTURE_NODES) + 0.5) * np.pi / DEPARTURE_NODES
+    pressures = 12e5 + 7e5 * np.cos(angles)
+    bars = (pressures - P_HP) / 1e5
+    powers = np.stack([bars, bars**2, bars**3], axis=1)
+    h, rho, rho_cp, _ = _isobar(log_temperature)
+    rows = [[_property(name, "P", float(P), "T", T) for name in ("H", "D", "C")] for P in pressures]
+    departures = np.array([[row[0] - h, row[1] - rho, row[1] * row[2] - rho_cp] for row in rows])
+    cubics: RealArray = np.linalg.lstsq(powers, departures, rcond=None)[0]
+    return [float(coefficient) for coefficient in cubics.T.ravel()]
 
 
 def _saturation(P: float) -> list[float]:

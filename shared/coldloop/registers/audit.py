@@ -58,6 +58,12 @@ class EventKind(IntEnum):
     """The time base of a session was changed: subject 0 lock-step, 1 real time, 2 paused; value the factor."""
     LIVE_LOAD = 24
     """The load of the session under way was written: subject 0 from now on, 1 steps ahead; value its first one, W."""
+    STATION_ALARM = 25
+    """An alarm of the compression station: subject its number from 0, cause 1 raised, 0 returned."""
+    STATION_MODE = 26
+    """The mode of the station's controller changed: subject the new one."""
+    SURROUNDINGS = 27
+    """Something was changed that a refrigerator is given: subject what, value its new value."""
 
 
 class Event(NamedTuple):
@@ -74,7 +80,7 @@ class Event(NamedTuple):
             "1 mode, 2 alarm raised, 3 returned, 4 acknowledged, 5 shelved, 6 unshelved, 7 out of service, 8 in "
             "service, 9 boot, 10 session, 11 operator mode, 12 setpoint, 13 watchdog time, 14 watchdog expired, "
             "15 plant link, 16 lease, 17 sensor fault, 18 load, 19 certificate, 20 lost, 21 control link, "
-            "22 sensor, 23 pace, 24 live load",
+            "22 sensor, 23 pace, 24 live load, 25 station alarm, 26 station mode, 27 surroundings",
             values=EventKind,
         ),
     ] = 0

@@ -1,10 +1,20 @@
 """Register map of the plant: a remote I/O rack, and the controls of a simulation."""
 
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from itertools import accumulate
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
+from coldloop.process import (
+    INPUT_NAMES,
+    INPUT_UNITS,
+    OUTPUT_NAMES,
+    OUTPUT_UNITS,
+    STATE_NAMES,
+    STATE_UNITS,
+    STATION_SIGNAL_NAMES,
+    STATION_SIGNAL_UNITS,
+    STATION_VALVE_NAMES,
+)
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
@@ -12,6 +22,7 @@ from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_ar
 from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 
 HISTORY_ROWS: Final = 256
+STATION_ROWS: Final = 128
 LOAD_ROWS: Final = 2048
 MAX_LOAD_W: Final = 10_000.0
 AHEAD_STEPS: Final = 24
@@ -167,6 +178,71 @@ class PlantSample(NamedTuple):
     x: Annotated[tuple[float, ...], f32_array("Simulated state", STATE_NAMES, STATE_UNITS)]
 
 
+class StationMode(IntEnum):
+    """What the controller of the compression station can do about the pressures."""
+
+    AUTOMATIC = 0
+    """All valves are within their ranges."""
+    LIMITED = 1
+    """A valve is at the end of its range: a pressure may leave its set point."""
+    CHARGE_STOPPED = 2
+    """The low pressure is so high that helium is no longer let in from the buffer."""
+    ONE_COMPRESSOR = 3
+    STOPPED = 4
+    """No compressor runs; the valves are closed."""
+
+
+class StationAlarm(IntFlag):
+    """Alarms of compression station and nitrogen pre-cooler, one bit each."""
+
+    HP_HIGH = 1
+    HP_LOW = 2
+    LP_HIGH = 4
+    LP_LOW = 8
+    NC1_TRIPPED = 16
+    NC2_TRIPPED = 32
+    NITROGEN_LOW = 64
+    HELIUM_LOST = 128
+
+
+class StationSample(NamedTuple):
+    """Compression station and nitrogen pre-cooler at one tick; all 0 where the plant is a cold box alone."""
+
+    tick: Annotated[int, u32("Tick of the row")]
+    signals: Annotated[tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS)]
+    mode: Annotated[
+        int, u16("Pressure control: 0 automatic, 1 a valve at its end, 2 charging stopped, 3 one compressor, 4 stopped")
+    ] = StationMode.AUTOMATIC
+    alarms: Annotated[
+        int,
+        u16("Bits: 1 HP high, 2 HP low, 4 LP high, 8 LP low, 16 NC1, 32 NC2 tripped, 64 nitrogen low, 128 helium lost"),
+    ] = 0
+
+
+class StationStatus(NamedTuple):
+    """Compression station and nitrogen pre-cooler now; all 0 where the plant is a cold box alone."""
+
+    tick: Annotated[int, u32("Tick at which these values were read")] = 0
+    mode: Annotated[int, u16("As in the station history")] = StationMode.AUTOMATIC
+    alarms: Annotated[int, u16("As in the station history")] = 0
+    signals: Annotated[tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS)] = (
+        0.0,
+    ) * len(STATION_SIGNAL_NAMES)
+    commands: Annotated[tuple[float, ...], f32_array("Opening asked of valve", STATION_VALVE_NAMES, ("%",) * 4)] = (
+        0.0,
+    ) * len(STATION_VALVE_NAMES)
+
+
+class Surroundings(NamedTuple):
+    """What a refrigerator is given, from the next tick on; refused by a cold box alone."""
+
+    nc1: Annotated[int, u16("1: compressor NC1 runs, 0: it has tripped", high=1)] = 1
+    nc2: Annotated[int, u16("1: compressor NC2 runs, 0: it has tripped", high=1)] = 1
+    nitrogen: Annotated[int, u16("1: there is nitrogen in the tank, 0: there is none", high=1)] = 1
+    leak: Annotated[float, f32("Leak of the high-pressure line, as at 16 bar", unit="g/s", low=0, high=50)] = 0.0
+    ambient: Annotated[float, f32("Temperature of the surroundings", unit="K", low=270, high=320)] = 300.0
+
+
 PLANT_MAP: Final = RegisterMap(
     service="plant",
     version=3,
@@ -184,7 +260,16 @@ PLANT_MAP: Final = RegisterMap(
         Block("live load", 440, LiveLoad, "Heat load from a tick on", Role.OPERATOR, sealed=True),
         Block("sensor faults", 500, SensorFault, "Faults put into the outputs", Role.OPERATOR, len(OUTPUT_NAMES)),
         Block("load ahead", 600, LoadAhead, "Steps of the heat load to come", Role.OPERATOR, sealed=True),
+        Block("station", 700, StationStatus, "Compression station and nitrogen pre-cooler of a whole refrigerator"),
+        Block(
+            "surroundings",
+            760,
+            Surroundings,
+            "Trips, nitrogen, leak and weather of a whole refrigerator",
+            Role.OPERATOR,
+        ),
         Block("load table", 1000, LoadStep, "Heat load over the session", Role.OPERATOR, LOAD_ROWS),
+        Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
         Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
         Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
         Block("journal page", 45010, JournalPage, "State of the journal"),

@@ -1,0 +1,74 @@
+"""Counter-flow exchanger for warm helium, whose heat capacity is constant: few cells, however long the exchanger.
+
+The cells of `heat_exchanger` take the mean of each as the driving temperature, so their number bounds how close the
+streams come: half the fall over a cell, 14 K between 300 and 80 K with eight of them. Here each cell is itself a
+counter-flow exchanger: at rest, cells in series are exactly one exchanger of the sum of their UA.
+"""
+
+import numpy as np
+
+from coldloop.compiled import kernel
+from plant.components.heat_exchanger import TRICKLE, HeatExchanger, HighPressureFlow, LowPressureFlow
+from plant.components.parameters import require
+from plant.helium.properties import WARM_CP, Helium, supply_cell
+from plant.numeric import Array, at_least
+
+SMALL = 1e-3
+LARGEST_EXPONENT = 30.0
+
+
+@kernel
+def _decay(z: float) -> float:
+    """Return (1 - exp(-z))/z, which is 1 at z = 0."""
+    if abs(z.real) < SMALL:
+        return 1.0 - z * (0.5 - z * (1.0 / 6.0 - z / 24.0))
+    decay: float = (1.0 - np.exp(-z)) / z
+    return decay
+
+
+@kernel
+def exchanged_heat(UA: float, C_high: float, C_low: float, difference: float) -> float:
+    """Return the heat (W) between two counter-flowing streams of heat capacity flows `C_high` and `C_low` (W/K).
+
+    `difference` (K) is that of the two temperatures at which they enter. The closed solution of the two energy
+    balances, written so that it is smooth where both capacity flows are equal: Q = dT g/(1/UA + g/C_high), g = (1 -
+    exp(-z))/z, z = UA (1/C_low - 1/C_high).
+    """
+    unbalance = 1.0 / C_low - 1.0 / C_high
+    if abs(UA * unbalance.real) > LARGEST_EXPONENT:
+        UA = LARGEST_EXPONENT / abs(unbalance.real)  # a longer one exchanges no more
+    g = _decay(UA * unbalance)
+    return difference * g / (1.0 / UA + g / C_high)
+
+
+@kernel
+def exchange_warm(
+    exchanger: HeatExchanger, T: Array, high: HighPressureFlow, low: LowPressureFlow, helium: Helium, dT: Array
+) -> LowPressureFlow:
+    """Write the rates of the cell temperatures into `dT` (K/s) and return the low-pressure flow at the hot end.
+
+    `T` holds the temperature at which the high-pressure gas leaves each cell, hot end first (K), and of its wall.
+    """
+    UA = exchanger.UA / exchanger.cells
+    C_high = at_least(high.mass_flow, TRICKLE) * WARM_CP
+    C_low = at_least(low.mass_flow, TRICKLE) * WARM_CP
+    T_low, h_low = low.T, low.h
+    h_cell, rho_cp, c_wall = supply_cell(high.P, T[exchanger.cells - 1], helium)
+    for i in range(exchanger.cells - 1, -1, -1):
+        T_before = T[i - 1] if i > 0 else high.T
+        h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, helium)
+        heat = exchanged_heat(UA, C_high, C_low, T_before - T_low)
+        capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
+        dT[i] = (high.mass_flow * (h_before - h_cell) - heat) / capacity
+        T_low = T_low + heat / C_low
+        h_low = h_low + heat / at_least(low.mass_flow, TRICKLE)
+        h_cell, rho_cp, c_wall = h_before, rho_cp_before, c_wall_before
+    return LowPressureFlow(low.mass_flow, low.P, T_low, h_low)
+
+
+def check_warm_exchanger(name: str, exchanger: HeatExchanger, cells: int) -> None:
+    """Refuse parameters that no exchanger has, or another number of cells (`ParameterError`)."""
+    require(name, "UA", exchanger.UA, 0.0, 1e6)
+    require(name, "volume", exchanger.volume, 0.0, 100.0)
+    require(name, "aluminium", exchanger.aluminium, 0.0, 1e5)
+    require(name, "cells", exchanger.cells, cells - 1, cells)

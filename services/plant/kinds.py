@@ -1,0 +1,58 @@
+"""Makes the plant that a configuration asks for."""
+
+from functools import partial
+
+from coldloop.errors import ConfigurationError, ModelFileError
+from coldloop.model_file import COLD_BOX, ModelHeader
+from plant.cold_box import REFERENCE
+from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+from plant.rack import MakePlant
+from plant.refrigerator_events import EventSchedule
+from plant.refrigerator_file import SHIPPED, RefrigeratorFile, read_refrigerator_file
+from plant.refrigerator_program import RefrigeratorProgram
+from plant.settings import PlantKind, PlantSection, SensorSettings
+from plant.station_settings import StationControlKind
+
+
+def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
+    """Return what makes the plant at its operating point, for a load and a seed.
+
+    Raises:
+        ModelFileError: The refrigerator's file cannot be used.
+        ConfigurationError: Its gains are not of the configured weights.
+    """
+    if section.kind is PlantKind.COLD_BOX:
+        if header.plant != COLD_BOX:
+            raise ModelFileError(f"model.file: a model of the {header.plant}; set plant.kind to that, or take another")
+        return partial(make_program, header, section.sensors)
+    path = section.refrigerator.file or SHIPPED
+    file = read_refrigerator_file(path)
+    if section.station.control is StationControlKind.LQ and section.station.weights != file.weights:
+        raise ConfigurationError(
+            f"plant.station.weights: the gains in {path} are of other weights; make a file with"
+            " `python -m plant.refrigerator_model FILE` and name it in plant.refrigerator.file"
+        )
+    return partial(_make_refrigerator, header, section, file)
+
+
+def make_program(header: ModelHeader, sensors: SensorSettings, load: HeatLoad, seed: int) -> PlantProgram:
+    """Return the cold box at the operating point of its model file."""
+    return PlantProgram(box=REFERENCE, x0=header.x0, u0=header.u0, load=load, noise=_noise(sensors, seed))
+
+
+def _make_refrigerator(
+    header: ModelHeader, section: PlantSection, file: RefrigeratorFile, load: HeatLoad, seed: int
+) -> PlantProgram:
+    happening = section.refrigerator
+    return RefrigeratorProgram(
+        file=file,
+        u0=header.u0,
+        load=load,
+        station=section.station,
+        events=EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k),
+        noise=_noise(section.sensors, seed),
+    )
+
+
+def _noise(sensors: SensorSettings, seed: int) -> MeasurementNoise | None:
+    return MeasurementNoise(sensors.deviations, seed) if any(sensors.deviations) else None

@@ -1,0 +1,91 @@
+"""Settings of the station's controller: set points, weights, tunings, limits of the alarms."""
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+
+Bar = Annotated[float, Field(gt=0, le=100)]
+Percent = Annotated[float, Field(ge=0, le=100)]
+
+
+class StationControlKind(StrEnum):
+    """How the two pressures are held."""
+
+    LQ = "lq"
+    """Both by both valves, with state feedback and integral action."""
+    PI = "pi"
+    """The low pressure by the bypass, the high pressure by the buffer's valves, each a PI."""
+
+
+class LqWeights(BaseModel):
+    """What the LQ controller weighs: 1 over the square of each of these."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    hp_bar: PositiveFloat = 0.1
+    """Deviation of the high pressure, bar."""
+    lp_bar: PositiveFloat = 0.01
+    """Deviation of the low pressure, bar."""
+    hp_integral: PositiveFloat = 5.0
+    """Integral of the high pressure's deviation, bar s."""
+    lp_integral: PositiveFloat = 0.05
+    """The same for the low pressure."""
+    bypass_kg_s: PositiveFloat = 0.01
+    """Bypass flow, kg/s."""
+    inventory_kg_s: PositiveFloat = 0.01
+    """Flow into or out of the buffer, kg/s."""
+
+
+class PiTuning(BaseModel):
+    """Gain and integral time of one loop."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    gain: PositiveFloat
+    """kg/s per bar, or % per % for the nitrogen."""
+    integral_s: PositiveFloat
+
+
+class AlarmLimits(BaseModel):
+    """Where the station's alarms begin."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    hp_high_bar: Bar = 16.8
+    hp_low_bar: Bar = 14.5
+    lp_high_bar: Bar = 1.15
+    lp_low_bar: Bar = 0.97
+    nitrogen_low: Percent = 25.0
+    """%."""
+    helium_lost_kg: PositiveFloat = 0.5
+
+    @model_validator(mode="after")
+    def _low_is_below_high(self) -> "AlarmLimits":
+        if not (self.hp_low_bar < self.hp_high_bar and self.lp_low_bar < self.lp_high_bar):
+            raise ValueError("a low limit is not below its high one: write hp_low_bar < hp_high_bar, and so for lp")
+        return self
+
+
+class StationSettings(BaseModel):
+    """Section `plant.station`: the controller of the compression station."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    control: StationControlKind = StationControlKind.LQ
+    hp_bar: Annotated[float, Field(ge=8, le=17.5)] = 16.0
+    """Set point of the high pressure."""
+    lp_bar: Annotated[float, Field(ge=1.0, le=1.3)] = 1.05
+    """Set point of the low pressure."""
+    nitrogen_level: Annotated[float, Field(ge=5, le=95)] = 60.0
+    """Set point of the nitrogen level, %."""
+    weights: LqWeights = LqWeights()
+    """Of the LQ design. The gains are those of the refrigerator's file, which must be of these weights."""
+    anti_windup_s: PositiveFloat = 5.0
+    """Time constant with which integrals follow what the valves can do."""
+    pi_hp: PiTuning = PiTuning(gain=0.024, integral_s=50.0)
+    pi_lp: PiTuning = PiTuning(gain=0.2, integral_s=4.0)
+    pi_nitrogen: PiTuning = PiTuning(gain=2.0, integral_s=600.0)
+    charge_ends_bar: Annotated[float, Field(gt=0, le=0.5)] = 0.08
+    """So far above its set point does the low pressure close the charge valve, whatever the high pressure asks for."""
+    alarms: AlarmLimits = AlarmLimits()

@@ -1,0 +1,65 @@
+"""Runs of the whole refrigerator: one hash however it is connected, and what its folder holds."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pyarrow.parquet as pq
+import pytest
+
+from coldloop.process import STATION_SIGNAL_NAMES
+from rig import simulate
+
+if TYPE_CHECKING:
+    from tests.conftest import Coldloop
+
+TRIP = """
+[plant]
+kind = "refrigerator"
+load = "e"
+
+[plant.refrigerator]
+events = [{ at_s = 10, target = "nc1", value = 0 }, { at_s = 40, target = "nc1", value = 1 }]
+"""
+
+
+@pytest.fixture(scope="module")
+def configured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("trip") / "trip.toml"
+    file.write_text(TRIP, encoding="utf-8")
+    return file
+
+
+def test_a_trip_leaves_one_trace_in_one_process_and_over_the_link(
+    configured: Path, tmp_path: Path, coldloop: "Coldloop"
+) -> None:
+    common = ("--config", str(configured), "--duration", "60s", "--figures", "png")
+    coldloop("run", *common, "--in-process", "--out", str(tmp_path / "alone"))
+    coldloop("run", *common, "--out", str(tmp_path / "networked"))
+    alone, networked = (tmp_path / name for name in ("alone", "networked"))
+    assert trace_of(alone) == trace_of(networked)
+    table = pq.read_table(networked / "station.parquet").to_pydict()
+    assert table["tick"] == list(range(240))
+    assert min(table["P12"]) < 14.5
+    assert table == pq.read_table(alone / "station.parquet").to_pydict()
+    files = json.loads((networked / "schema.json").read_text(encoding="utf-8"))["files"]
+    columns = [column["name"] for column in files["station.parquet"]["columns"]]
+    assert columns == ["tick", "time_s", *STATION_SIGNAL_NAMES, "mode", "alarms"]
+
+
+def trace_of(folder: Path) -> str:
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    return str(summary["trace_sha256"])
+
+
+def test_a_cold_box_leaves_no_station(tmp_path: Path, coldloop: "Coldloop") -> None:
+    coldloop("run", "--in-process", "--load", "a", "--duration", "15s", "--out", str(tmp_path / "run"))
+    assert not (tmp_path / "run" / "station.parquet").exists()
+
+
+def test_the_optimiser_runs_with_a_model_that_knows_the_pressures() -> None:
+    plant = {"kind": "refrigerator"}
+    known = simulate("e", duration_s=300, plant=plant, model={"file": "refrigerator"})
+    unknown = simulate("e", duration_s=300, plant=plant)
+    assert known.summary["trace_sha256"] != unknown.summary["trace_sha256"]
+    assert known.summary["L1_outside_band_pct"] == known.summary["T5_outside_band_pct"] == 0.0
