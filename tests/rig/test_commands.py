@@ -42,6 +42,8 @@ def test_json_and_csv_say_the_same(coldloop: "Coldloop", listed: list[dict[str, 
     assert tuple(reader.fieldnames or ()) == COLUMNS
 
     def text(value: object) -> str:
+        if isinstance(value, dict):
+            return " ".join(f"{number}={meaning}" for number, meaning in value.items())
         return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
     assert list(reader) == [{name: text(value) for name, value in row.items()} for row in listed]
