@@ -20,8 +20,8 @@ from control_plc.classical import CV156, NCR22, ClassicalLoops, ClassicalSetting
 from control_plc.program import ControlProgram
 from control_plc.runtime import make_program
 from control_plc.settings import ControlSection, ControlStrategy
+from plant.kinds import make_program as make_plant
 from plant.load import find_load
-from plant.runtime import make_program as make_plant
 from plant.settings import SensorSettings
 
 HEADER = read_header(DEFAULT_MODEL_FILE)
