@@ -19,6 +19,7 @@ from coldloop.model_file import (
     short_digest_of,
     write_document,
 )
+from coldloop.process import STATE_NAMES
 
 RealArray: TypeAlias = NDArray[np.float64]
 
@@ -171,6 +172,11 @@ def load(path: Path) -> LtiModel:
     }
     try:
         arrays: dict[str, Any] = {name: np.array(document[name], dtype=np.float64) for name in (*MATRICES, *VECTORS)}
-        return LtiModel(**described, **arrays)
+        model = LtiModel(**described, **arrays)
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(f"{path}: {error} in the model file; {REMEDY}") from error
+    if len(model.state_names) < len(STATE_NAMES):
+        raise ModelFileError(
+            f"{path}: {len(model.state_names)} states in the model file, and a cold box has {len(STATE_NAMES)}; {REMEDY}"
+        )
+    return model

@@ -72,6 +72,7 @@ class StillPlant:
         self.tick = 0
         self._load = load
         self.state = HEADER.x0
+        self.station = self.station_status = None
 
     @property
     def load(self) -> float:

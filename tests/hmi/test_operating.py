@@ -92,7 +92,7 @@ def test_an_empty_field_is_not_a_zero(operated: "Page") -> None:
 @pytest.mark.parametrize("width", [821, 1024, 1180, 1280])
 def test_the_header_of_an_operator_fits(operated: "Page", width: int) -> None:
     operated.set_viewport_size({"width": width, "height": 720})
-    assert operated.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    operated.wait_for_function("document.documentElement.scrollWidth <= innerWidth")
     assert operated.evaluate("document.querySelector('#logout').getBoundingClientRect().right") <= width
 
 

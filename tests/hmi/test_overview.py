@@ -110,7 +110,7 @@ def test_a_stream_on_which_nothing_comes_is_given_up_for_another(page: "Page", s
 def test_the_alarm_line_is_on_every_view(page: "Page") -> None:
     for view in ("overview", "trends", "why", "alarms", "commands", "detail"):
         page.click(f"nav a[href='#{view}']")
-        assert page.is_visible(f"#{view}")
+        page.wait_for_selector(f"#{view}", state="visible")
         assert page.is_visible("#alarm-line")
 
 
