@@ -177,6 +177,6 @@ def load(path: Path) -> LtiModel:
         raise ModelFileError(f"{path}: {error} in the model file; {REMEDY}") from error
     if len(model.state_names) < len(STATE_NAMES):
         raise ModelFileError(
-            f"{path}: {len(model.state_names)} states in the model file, and a cold box has {len(STATE_NAMES)}; {REMEDY}"
+            f"{path}: {len(model.state_names)} states in the model file, a cold box has {len(STATE_NAMES)}; {REMEDY}"
         )
     return model
