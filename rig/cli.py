@@ -124,7 +124,3 @@ def _discard_output() -> None:
     """Let the interpreter's last flush of standard output succeed."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -55,6 +55,7 @@ class RunFiles:
         settings = effective.settings
         model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
         self.folder = folder
+        self._evaluation = RunEvaluation(model, design)
         self._discard()
         self._reserve = DiskReserve(folder)
         self._realtime = scenario.realtime
@@ -63,7 +64,6 @@ class RunFiles:
         )
         write_json(folder / "manifest.json", self._manifest)
         write_json(folder / "schema.json", schema_document(station=settings.plant.kind is PlantKind.REFRIGERATOR))
-        self._evaluation = RunEvaluation(model, design)
         files = (
             TraceSink(folder, self._reserve, StageCost(model, design)),
             UpdatesSink(folder, self._reserve),

@@ -47,9 +47,11 @@ class LinkProxy:
         """Stop listening and drop all connections."""
         if self._listener is not None:
             self._listener.close()
+        await asyncio.sleep(0)  # a connection that was accepted just now gets its task
         for task in self._serving:
             task.cancel()
         await asyncio.gather(*self._serving, return_exceptions=True)
+        await asyncio.sleep(0)  # aborted connections close their sockets in the next turn of the loop
 
     def begin(self, fault: LinkFault) -> None:
         """Disturb the link."""
@@ -82,8 +84,9 @@ class LinkProxy:
             await self._pass_both_ways((reader, writer), (far_reader, far_writer))
         except OSError:
             _reset(writer)  # nobody listens behind the proxy: as if nobody listened here
-        except asyncio.CancelledError:
-            pass  # the proxy is being closed
+        except asyncio.CancelledError:  # the proxy is being closed: what is not sent yet is not waited for
+            for end in ends:
+                end.transport.abort()
         finally:
             for end in ends:
                 self._open.discard(end)

@@ -95,7 +95,7 @@ def assert_recorded_as_an_ordinary_run(coldloop: "Coldloop", out: Path, ordinary
 
 def test_ctrl_c_in_the_middle_of_a_plan_leaves_what_was_recorded(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "rig.cli", "chaos", "undisturbed", "--duration", "10h", "--out", str(out)]
+    command = [sys.executable, "-m", "rig", "chaos", "undisturbed", "--duration", "10h", "--out", str(out)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
     while (

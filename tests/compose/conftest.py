@@ -138,7 +138,7 @@ def coldloop() -> Callable[..., None]:
 
     def run(*arguments: str) -> None:
         done = subprocess.run(
-            [sys.executable, "-m", "rig.cli", "run", *arguments], cwd=ROOT, check=False, stdin=subprocess.DEVNULL,
+            [sys.executable, "-m", "rig", "run", *arguments], cwd=ROOT, check=False, stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=600,
         )  # fmt: skip
         if done.returncode:

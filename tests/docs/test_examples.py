@@ -15,9 +15,7 @@ from typing import NamedTuple
 
 import pytest
 
-from rig.ports import ReservedPorts
-from rig.started_rigs import check_ports
-from tests.conftest import Coldloop
+from tests.conftest import Coldloop, first_of_three_ports
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -80,18 +78,6 @@ def shortened(command: str) -> str:
     for pattern, replacement in SHORTENED.items():
         command = re.sub(pattern, replacement, command)
     return command
-
-
-def first_of_three_ports() -> int:
-    for _ in range(100):
-        with ReservedPorts(1) as reserved:
-            base = reserved.numbers[0]
-        try:
-            check_ports((base, base + 1, base + 2))
-        except Exception:  # noqa: BLE001, S112 taken by somebody else
-            continue
-        return base
-    raise AssertionError("no three free ports in a row")
 
 
 class Reader:
@@ -187,7 +173,7 @@ class Reader:
         assert follower.returncode in {0, 128 + signal.SIGINT}
 
     def _executable(self, words: list[str]) -> list[str]:
-        return [sys.executable, "-m", "rig.cli", *words[1:]] if words[0] == "coldloop" else [*map(self._word, words)]
+        return [sys.executable, "-m", "rig", *words[1:]] if words[0] == "coldloop" else [*map(self._word, words)]
 
     def _test_suite(self, example: Example) -> None:
         """Run a block as somebody else's test suite, which knows Coldloop as an installed package only."""

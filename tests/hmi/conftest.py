@@ -236,7 +236,7 @@ class Witness:
 @pytest.fixture(scope="session")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "a run"
-    command = [sys.executable, "-m", "rig.cli", "run", "--in-process", "--load", "a", "--duration", f"{RECORDED_S}s"]
+    command = [sys.executable, "-m", "rig", "run", "--in-process", "--load", "a", "--duration", f"{RECORDED_S}s"]
     subprocess.run([*command, "--figures", "png", "--out", str(folder)], check=True, stderr=subprocess.DEVNULL)
     return folder
 
@@ -247,7 +247,7 @@ class Served:
     def __init__(self, *arguments: str) -> None:
         with ReservedPorts(1) as reserved:
             self.port = reserved.numbers[0]
-        command = [sys.executable, "-m", "rig.cli", "page", *arguments, "--page-port", str(self.port)]
+        command = [sys.executable, "-m", "rig", "page", *arguments, "--page-port", str(self.port)]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
         self.address = self._process.stdout.readline().strip().rstrip("/")

@@ -11,13 +11,11 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from coldloop.errors import UsageError
 from hmi.explanation import Branch
 from rig.ports import ReservedPorts
 from rig.recorded_page import RecordedPage
 from rig.run_folder import RunFolder
-from rig.started_rigs import check_ports
-from tests.conftest import Coldloop
+from tests.conftest import Coldloop, first_of_three_ports
 from tests.hmi.conftest import RECORDED_S, Served, eventually
 
 
@@ -80,10 +78,10 @@ def test_what_cannot_be_shown_is_one_line(coldloop: Coldloop, arguments: tuple[s
 def test_up_with_its_page_prints_where_it_is_and_a_password_that_operates(tmp_path: Path) -> None:
     with ReservedPorts(1) as reserved:
         port = str(reserved.numbers[0])
-    base = next(base for base in range(23400, 23900, 7) if _are_free(base))
+    base = first_of_three_ports()
     words = ["--port-base", str(base)]
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "rig.cli", "up", *words, "--page-port", port, "--detach"]
+    command = [sys.executable, "-m", "rig", "up", *words, "--page-port", port, "--detach"]
     up = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=True)
     try:
         address = f"http://127.0.0.1:{port}"
@@ -95,12 +93,4 @@ def test_up_with_its_page_prints_where_it_is_and_a_password_that_operates(tmp_pa
         with urllib.request.urlopen(request, timeout=20) as answer:  # noqa: S310
             assert json.loads(answer.read())["role"] == "operate"
     finally:
-        subprocess.run([sys.executable, "-m", "rig.cli", "down", *words], env=environment, check=True, timeout=60)
-
-
-def _are_free(base: int) -> bool:
-    try:
-        check_ports((base, base + 1, base + 2))
-    except UsageError:
-        return False
-    return True
+        subprocess.run([sys.executable, "-m", "rig", "down", *words], env=environment, check=True, timeout=60)

@@ -17,9 +17,8 @@ from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
 from rig import cli
-from rig.ports import ReservedPorts
-from rig.started_rigs import check_ports, running_rig
-from tests.conftest import Coldloop
+from rig.started_rigs import running_rig
+from tests.conftest import Coldloop, first_of_three_ports
 
 FACTOR = "5"
 
@@ -28,7 +27,7 @@ FACTOR = "5"
 def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The first port of a rig that is up."""
     os.environ["XDG_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
-    base = str(_three_free_ports())
+    base = str(first_of_three_ports())
     command = [sys.executable, "-m", "rig", "up", "--port-base", base, "--load", "e", "--factor", FACTOR]
     command += ["--set", "plant.sensors.level=0.01"]
     try:
@@ -38,18 +37,6 @@ def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         assert running_rig(int(base)) is None
     finally:
         del os.environ["XDG_RUNTIME_DIR"]
-
-
-def _three_free_ports() -> int:
-    for _ in range(100):
-        with ReservedPorts(1) as reserved:
-            base = reserved.numbers[0]
-        try:
-            check_ports((base, base + 1, base + 2))
-        except Exception:  # noqa: BLE001, S112 taken by somebody else
-            continue
-        return base
-    raise AssertionError("no three free ports in a row")
 
 
 def shown(coldloop: Coldloop, base: str) -> dict[str, str]:
@@ -147,7 +134,7 @@ def test_a_second_rig_on_the_same_ports_is_refused_and_the_holder_named(coldloop
 
 
 def test_a_port_of_another_program_is_named(coldloop: Coldloop) -> None:
-    base = _three_free_ports()
+    base = first_of_three_ports()
     with socket.socket() as other:
         other.bind(("127.0.0.1", base + 1))
         other.listen()
