@@ -51,20 +51,24 @@ class LoadProfile:
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """White Gaussian noise on the outputs, one draw a tick whoever reads them.
+    """White Gaussian noise on the outputs, one draw a tick whoever reads them, and a bias.
 
     Raises:
-        ValueError: not one standard deviation per output, or one that is negative or not finite.
+        ValueError: not one standard deviation and one bias per output, or one that is negative or not finite.
     """
 
     deviations: tuple[float, ...]
     """Standard deviation of each output, in its unit; shape (22,)."""
     seed: int
     """Seed of the PCG64 generator, 0 or more."""
+    biases: tuple[float, ...] = (0.0,) * len(OUTPUT_NAMES)
+    """What each output shows too much, in its unit; shape (22,)."""
 
     def __post_init__(self) -> None:
         if len(self.deviations) != len(OUTPUT_NAMES) or not all(0.0 <= sigma < inf for sigma in self.deviations):
             raise ValueError(f"noise needs {len(OUTPUT_NAMES)} standard deviations, finite and not negative")
+        if len(self.biases) != len(OUTPUT_NAMES) or not all(map(isfinite, self.biases)):
+            raise ValueError(f"noise needs {len(OUTPUT_NAMES)} biases, all finite")
 
 
 class PlantProgram:
@@ -102,6 +106,7 @@ class PlantProgram:
         self._u = _vector(u0, INPUT_NAMES, "inputs")
         self._load = load
         self._deviations = np.array(noise.deviations) if noise else None
+        self._biases = np.array(noise.biases) if noise else 0.0
         self._generator = np.random.Generator(np.random.PCG64(noise.seed if noise else 0))
         self._measured = self._sample(outputs(self._x, self._u, self.load, box, helium))
         self._step()  # no session waits for the compiler
@@ -185,7 +190,7 @@ class PlantProgram:
 
     def _sample(self, y: RealArray) -> tuple[float, ...]:
         if self._deviations is not None:
-            y = y + self._deviations * self._generator.standard_normal(len(y))
+            y = y + self._biases + self._deviations * self._generator.standard_normal(len(y))
         return tuple(y.tolist())
 
 
