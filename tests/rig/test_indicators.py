@@ -137,9 +137,17 @@ def test_c1_is_the_largest_violation_and_c2_the_mean_over_the_problems(model: Lt
     assert found.c2 == pytest.approx(3.6 / 3)
 
 
+def test_the_mean_period_is_that_over_time_and_the_one_per_update_is_beside_it(model: LtiModel) -> None:
+    """A period of 5 s and five of 1 s: half of the time has the one, five of six updates the other."""
+    updates = [update(0, 20, 1.0), *(update(20 + 4 * k, 4, 1.0) for k in range(5))]
+    found = evaluated(model, at_rest(model, 40), *updates)
+    assert found.tau_u_mean == 3.0
+    assert found.tau_u_mean_per_update == pytest.approx(10 / 6)
+
+
 def test_what_does_not_exist_is_not_a_number(model: LtiModel) -> None:
     found = evaluated(model, at_rest(model, 4))
-    of_updates = (found.J_dev, found.J_cst, found.J_open_mean, found.c1, found.c2, found.tau_u_mean)
+    of_updates = (found.J_dev, found.J_open_mean, found.c2, found.tau_u_mean, found.tau_u_mean_per_update)
     assert all(map(math.isnan, of_updates))
     nothing = RunEvaluation(model, DESIGN).indicators
     assert all(map(math.isnan, (nothing.J_BF, nothing.L1_outside_band_pct, nothing.T5_outside_band_pct)))
