@@ -7,6 +7,7 @@ store themselves: only requests go through the scheduler.
 
 import contextlib
 import logging
+import os
 import signal
 import time
 from collections.abc import Iterator, Sequence
@@ -46,6 +47,8 @@ class Workers:
             UsageError: The scheduler does not answer.
         """
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its import has set it to INFO
+        # an end at once, by a signal, leaves semaphores to a process that removes them, and need not warn of it
+        os.environ.setdefault("PYTHONWARNINGS", "ignore::UserWarning:multiprocessing.resource_tracker")
         with contextlib.ExitStack() as stack:
             address: str | LocalCluster
             if self.scheduler is None:
