@@ -95,7 +95,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=20, help="instants of each command")
     parser.add_argument("--only", choices=COMMANDS, nargs="+", default=list(COMMANDS))
     parser.add_argument("--signal", choices=("SIGINT", "SIGTERM"), default="SIGINT")
-    parser.add_argument("--latest", type=float, default=20.0, help="s after the start")
+    parser.add_argument("--latest", type=float, default=12.0, help="s after the start")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # shells let background jobs ignore it, and so would their children

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
 PENALTY_WEIGHT = 3000.0
-"""alpha that all solvers are judged by unless told otherwise: 30 times the weight of a band violation."""
+"""alpha that all solvers are judged by unless set otherwise: 30 times the weight of a band violation."""
 
 
 class Arithmetic(StrEnum):

@@ -114,7 +114,7 @@ class PlantProgram:
     def resume(
         self, tick: int, x: Sequence[float], u: Sequence[float], y: Sequence[float], noise_state: Mapping[str, Any]
     ) -> None:
-        """Go on from what `retained` told.
+        """Go on from what `retained` returned.
 
         Raises:
             ValueError: it is not of this plant.

@@ -92,7 +92,7 @@ class WatchdogSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     timeout_s: Annotated[float, Field(ge=0, le=16_000)] = 10.0
-    """Plant time without new outputs after which it expires; 0 is never. In lock-step plant time then stands."""
+    """Plant time without new outputs after which it expires; 0 is never. In lock-step plant time then stops."""
     action: SafeAction = SafeAction.HOLD
     safe_state: tuple[Percent, Power, Percent] = (43.0, 75.0, 36.0)
     """CV155 %, NCR22_A W, CV156 %."""
