@@ -4,7 +4,7 @@ For each update the control PLC latches, `plan` decides the updating period and 
 played from its end on. Pure: no sockets, no clock, no sleeping.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,7 +176,8 @@ class OptimizerProgram:
         """Find out which profile the control PLC plays from this instant on."""
         sent = self._sent
         if sent is not None and sent.sequence is not None and sent.sequence.header.number == update.playing:
-            self._playing = sent
+            late = update.tick - sent.first_tick  # scans were missed: it began before this instant
+            self._playing = replace(sent, z=self._problem.shifted(sent.z, late)) if late > 0 else sent
         elif self._last is not None:
             late = update.tick - self._last.update.tick
             self._playing = Delivery(
