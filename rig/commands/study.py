@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from rig.studies.execution import Workers
     from rig.studies.study import Study, StudyOptions
 
-DEFAULT_SEEDS: Final = 3
 OF_RUNS: Final = ("load", "duration", "seeds", "workers", "scheduler", "quick")
 """Options that only a study with runs has a use for."""
 
@@ -34,8 +33,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def add_scale_options(parser: argparse.ArgumentParser) -> None:
     """Declare how much is done, by whom, and where the results go."""
     scale = parser.add_mutually_exclusive_group()
-    scale.add_argument("--seeds", type=_positive, metavar="N",
-                       help=f"draws of each load; of a file, draws of the sensors' noise (default: {DEFAULT_SEEDS})"
+    scale.add_argument("--draws", "--seeds", dest="seeds", type=_positive, metavar="N",
+                       help="draws of each load; of a file, draws of the sensors' noise (default: the study's own)"
                        )  # fmt: skip
     scale.add_argument("--quick", action="store_true", help="one seed, ten minutes, fewer points")
     parser.add_argument("--workers", type=_positive, metavar="N", help="processes to use (default: one a core)")
@@ -67,9 +66,7 @@ def study_options(options: argparse.Namespace) -> "StudyOptions":
     from rig.studies.study import StudyOptions
 
     given = vars(options)
-    return StudyOptions(
-        options.seeds or DEFAULT_SEEDS, given.get("duration"), tuple(given.get("load", ())), options.quick
-    )
+    return StudyOptions(options.seeds, given.get("duration"), tuple(given.get("load", ())), options.quick)
 
 
 def execute(options: argparse.Namespace) -> int:

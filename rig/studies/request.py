@@ -5,6 +5,7 @@ import hashlib
 import json
 import tempfile
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from functools import cached_property, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,6 +27,8 @@ from rig.recording import Recorder, Recording
 from rig.results import installed_version
 from rig.scenario import Scenario
 from rig.settings import Settings
+from rig.studies.paired_run import harsh_run, paired_indicators, paired_run
+from rig.studies.problem_sequence import problem_sequence
 
 Series = NDArray[np.float64]
 
@@ -36,6 +39,9 @@ RIG_MODULES = (
     "rig.session_reader",
     "rig.one_process",
     "rig.recording",
+    "rig.studies.paired_run",
+    "rig.studies.played_profiles",
+    "rig.studies.problem_sequence",
     "rig.studies.request",
 )
 SUFFIXES = (".py", ".json", ".npz", ".csv")
@@ -44,6 +50,17 @@ LIBRARIES = ("casadi", "daqp", "numba", "numpy", "osqp")
 UPDATE_COLUMNS = (
     "tick", "tau_u", "iterations", "j_effective", "j_hot_start", "j_delivered", "j_dev", "j_cst", "violation",
 )  # fmt: skip
+
+
+class Procedure(StrEnum):
+    """Who decides in a run."""
+
+    CONFIGURED = "configured"
+    """The three programs, as they are configured."""
+    PAIRED_PROBLEMS = "paired problems"
+    """Nobody: the configured solver goes through the problems of a converged loop (`rig.studies.paired_run`)."""
+    HARSH_PROBLEMS = "harsh problems"
+    """The same, and only those count whose guess is far from the optimum, each solver beginning at the same one."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +82,7 @@ class RunRequest:
     """Three services on the bus instead of one process."""
     trace_ticks: int = 0
     """Every so many ticks of the trace are kept; 0 is none."""
+    procedure: Procedure = Procedure.CONFIGURED
 
     @cached_property
     def digest(self) -> str:
@@ -149,6 +167,8 @@ def perform(request: RunRequest) -> str:
     scenario = Scenario(
         request.ticks, LoadProfile(request.times, request.watts), request.updating_period_s, request.draw
     )
+    if request.procedure in (Procedure.PAIRED_PROBLEMS, Procedure.HARSH_PROBLEMS):
+        return _of_problems(request, settings, scenario).to_json()
     recorder = Recorder(request.ticks)
     if request.networked:
         with tempfile.TemporaryDirectory(prefix="coldloop-logs-") as logs:
@@ -167,6 +187,14 @@ def settings_of(assignments: tuple[str, ...]) -> Settings:
 @lru_cache(maxsize=1)
 def _rig(assignments: tuple[str, ...]) -> OneProcessRig:
     return OneProcessRig(settings_of(assignments))
+
+
+def _of_problems(request: RunRequest, settings: Settings, scenario: Scenario) -> Outcome:
+    sequence, program = problem_sequence(scenario, request.assignments), settings.optimizer_plc.program
+    run = paired_run if request.procedure is Procedure.PAIRED_PROBLEMS else harsh_run
+    columns = run(sequence, program)
+    indicators = paired_indicators(columns, request.updating_period_s)
+    return Outcome(programs_digest(), indicators, "", 0, columns, {})
 
 
 def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outcome:
