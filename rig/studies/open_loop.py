@@ -15,7 +15,7 @@ from rig import paper as published
 from rig.plot import COLOURS
 from rig.studies.crossing import crossing
 from rig.studies.drawing import legend_outside, panels
-from rig.studies.intervals import Indices, Interval, percentile_interval
+from rig.studies.intervals import Interval, over_draws
 from rig.studies.request import Outcome, Procedure, RunRequest, Series
 from rig.studies.solver_runs import throttled
 from rig.studies.study import Load, Outcomes, StudyOptions, loads
@@ -88,7 +88,7 @@ class OpenLoop:
             {solver: _against_power(load, solver, powers[solver], outcomes) for solver in powers} for load in drawn
         ])  # fmt: skip
 
-    def relative(self, solver: str, power: int, which: Indices) -> float:
+    def relative(self, solver: str, power: int, which: list[int]) -> float:
         """Return the total cost of a solver over the lowest, of some draws together, at the power of this number."""
         total, lowest = (
             sum(self.tables[draw][solver][name][power] for draw in which) for name in ("J_total", "lowest")
@@ -97,17 +97,17 @@ class OpenLoop:
 
     def interval(self, solver: str, power: int) -> Interval:
         """Return the interval of `relative`."""
-        return percentile_interval(partial(self.relative, solver, power), len(self.tables))
+        return over_draws(partial(self.relative, solver, power), len(self.tables))
 
     def crossing(self, one: str, other: str) -> Interval:
         """Return from which power on `one` costs no more than `other`, all draws together."""
         common = [power for power in self.powers[one].tolist() if power in self.powers[other]]
 
-        def curve(solver: str, which: Indices) -> Series:
+        def curve(solver: str, which: list[int]) -> Series:
             places = [self.powers[solver].tolist().index(power) for power in common]
             return np.array([self.relative(solver, place, which) for place in places])
 
-        return percentile_interval(
+        return over_draws(
             lambda which: crossing(np.array(common), curve(one, which), curve(other, which)), len(self.tables)
         )
 
@@ -153,13 +153,13 @@ def open_loop_table(found: OpenLoop) -> str:
     ]
     for solver, powers in found.powers.items():
         cells = [
-            found.interval(solver, powers.tolist().index(power)).text() if power in powers else "" for power in some
+            found.interval(solver, powers.tolist().index(power)).brief() if power in powers else "" for power in some
         ]
         lines.append(f"| {LABELS[solver]} | " + " | ".join(cells) + " |")
     for other in ("ode", "interior-point"):
         lines += [
             "",
-            f"qpOASES costs no more than {LABELS[other]} from P = {found.crossing('qpoases', other).text()} on.",
+            f"qpOASES costs no more than {LABELS[other]} from P = {found.crossing('qpoases', other).brief()} on.",
         ]
     return "\n".join(lines)
 

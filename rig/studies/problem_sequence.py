@@ -13,6 +13,7 @@ from coldloop.sequence import InputSequence
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, Situation
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.updating_period import UpdatingRule
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder
 from rig.scenario import Scenario
@@ -47,10 +48,10 @@ class ProblemSequence(NamedTuple):
 class _ListeningOptimizer(OptimizerProgram):
     """Keeps the situation and the profile of every problem."""
 
-    def restart(self, updating_period_s: float) -> None:
+    def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
         """Begin anew."""
         self.heard: list[Recorded] = []
-        super().restart(updating_period_s)
+        super().restart(updating_period_s, rule)
 
     def solve(self) -> InputSequence:
         """Solve, and keep what was solved."""

@@ -18,6 +18,8 @@ Cell = str | float | int
 
 USUAL_DRAWS = 3
 """Of each load, unless a study has a number of its own or the command says."""
+RUNS = "runs"
+"""Folder, beside those of the studies, in which runs are kept: studies share them."""
 QUICK_TICKS = 2400
 """Longest run of a quick study: ten minutes."""
 NOISE = (

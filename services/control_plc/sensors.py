@@ -1,16 +1,15 @@
-"""Measurements that cannot be right: found, replaced by the last good value, and told.
+"""Measurements that cannot be right: found, replaced by the last good value, and reported.
 
 A measurement is bad when it is no number, outside its sensor's range, or, for the outputs that are controlled, frozen:
-it stands to the last bit for a while in which most of the others move.
+it does not change by a bit for a while in which most of the others move.
 """
 
-from collections.abc import Sequence
-from operator import le, ne
+from collections.abc import MutableSequence, Sequence
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process import L1, OUTPUT_NAMES, T5, TICK_S
+from coldloop.process import L1, T5, TICK_S
 
 Range = tuple[FiniteFloat, FiniteFloat]
 CONTROLLED = (L1, T5)
@@ -32,7 +31,7 @@ class SensorCheckSettings(BaseModel):
     pressure: Range = (-1.0, 100.0)
     """bar."""
     frozen_s: Annotated[float, Field(gt=0)] = 20.0
-    """A controlled output that stands for so long, while others move, is frozen."""
+    """A controlled output that does not change for so long, while others move, is frozen."""
     bridged_s: Annotated[float, Field(ge=0)] = 10.0
     """How long the last good value of a controlled output is worked with; then what needs it is left."""
 
@@ -48,6 +47,37 @@ class SensorCheckSettings(BaseModel):
         return self
 
 
+def are_inside(y: Sequence[float], low: Sequence[float], high: Sequence[float]) -> bool:
+    """Tell whether all measurements are numbers within their ranges; the rig compiles this function, and the next."""
+    inside = True
+    for output in range(len(y)):
+        inside = inside and low[output] <= y[output] <= high[output]
+    return inside
+
+
+def watch_standing(
+    stands: MutableSequence[int], before: MutableSequence[float], y: Sequence[float], elapsed: int
+) -> None:
+    """Sum up for how many ticks each controlled output has stood while most of the others moved.
+
+    `before` (22) becomes `y`, the measurements `elapsed` ticks later.
+    """
+    for place in range(len(CONTROLLED)):
+        if y[CONTROLLED[place]] != before[CONTROLLED[place]]:
+            stands[place] = 0
+        elif 2 * moved(before, y) > len(y):
+            stands[place] += elapsed
+    before[:] = y
+
+
+def moved(before: Sequence[float], y: Sequence[float]) -> int:
+    """Return how many measurements are others than before."""
+    count = 0
+    for output in range(len(y)):
+        count += y[output] != before[output]
+    return count
+
+
 class SensorMonitor:
     """Looks at every measurement. All its times are plant time: scans can be missed.
 
@@ -59,20 +89,20 @@ class SensorMonitor:
         self._frozen_ticks = round(settings.frozen_s / TICK_S)
         self._bridged_ticks = round(settings.bridged_s / TICK_S)
         self._good = list(initial)
-        self._before = tuple(initial)
+        self._before = list(initial)
         self._tick: int | None = None
         self._now = 0
-        self._stands = dict.fromkeys(CONTROLLED, 0)
+        self._stands = [0] * len(CONTROLLED)
         self._recovering: dict[int, int] = {}
         """Output, and since which tick its measurements have been good again."""
         self.bad: dict[int, int] = {}
 
     def check(self, tick: int, y: Sequence[float]) -> Sequence[float]:
         """Return the outputs measured at `tick`, with bad ones replaced by their last good value."""
-        self._watch_standing(1 if self._tick is None else max(0, tick - self._tick), y)
+        watch_standing(self._stands, self._before, y, 1 if self._tick is None else max(0, tick - self._tick))
         self._tick = self._now = tick
-        frozen = self._frozen()
-        if not self.bad and not frozen and all(map(le, self._low, y)) and all(map(le, y, self._high)):
+        frozen = [output for output, ticks in zip(CONTROLLED, self._stands, strict=True) if ticks >= self._frozen_ticks]
+        if not self.bad and not frozen and are_inside(y, self._low, self._high):
             self._good[:] = y
             return y
         for output, value in enumerate(y):
@@ -86,18 +116,6 @@ class SensorMonitor:
         self._tick = None
         self.bad = {output: min(since, tick) for output, since in self.bad.items()}
         self._recovering = {output: min(since, tick) for output, since in self._recovering.items()}
-
-    def _watch_standing(self, elapsed: int, y: Sequence[float]) -> None:
-        """Sum up for how long each controlled output has stood while most of the others moved."""
-        for output in CONTROLLED:
-            if y[output] != self._before[output]:
-                self._stands[output] = 0
-            elif 2 * sum(map(ne, y, self._before)) > len(OUTPUT_NAMES):
-                self._stands[output] += elapsed
-        self._before = tuple(y)
-
-    def _frozen(self) -> list[int]:
-        return [output for output, ticks in self._stands.items() if ticks >= self._frozen_ticks]
 
     def _judge(self, output: int, *, ok: bool) -> None:
         if not ok:

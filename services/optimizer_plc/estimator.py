@@ -10,8 +10,8 @@ from coldloop.process import SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.control_plc import Update
 from optimizer_plc.arithmetic import DOUBLE, Real
 from optimizer_plc.computing_settings import EstimatorSettings
-from optimizer_plc.linear_algebra import apply, multiply
-from optimizer_plc.prediction import PredictionModel
+from optimizer_plc.linear_algebra import apply, multiply, respond
+from optimizer_plc.prediction import PredictionModel, Transition
 
 Array = NDArray[np.float64]
 
@@ -62,10 +62,11 @@ class StateFeedback:
 
 
 class KalmanFilter:
-    """Stationary Kalman filter on the LTI model with one slow load-mismatch state; the known load is fed in."""
+    """Stationary Kalman filter on the LTI model with one slow load-mismatch state; a load that is known is fed in."""
 
     def __init__(self, prediction: PredictionModel, settings: EstimatorSettings, real: Real = DOUBLE) -> None:
         self._model = prediction.rounded(real)
+        self._load_known = settings.load_known
         gains = stationary_gains(prediction, settings)
         self._gains = {ticks: gain.astype(real, copy=False) for ticks, gain in gains.items()}
         self.reset()
@@ -82,12 +83,11 @@ class KalmanFilter:
         """Correct the predicted state by the measurement, with the gain of the period that just ended."""
         m = self._model
         u = np.asarray(update.u_before, m.real) - m.u0
-        known = m.real(update.load) - m.w0
-        innovation = np.asarray(update.y, m.real) - m.y0 - m.output(self._x, u, known + self._mismatch)
-        correction = np.zeros(len(self._x) + 1, m.real)
-        apply(self._gains[min(self._since, len(self._gains))], innovation, correction)
-        self._x = self._x + correction[:-1]
-        self._mismatch += correction[-1]
+        known = m.real(update.load) - m.w0 if self._load_known else m.real(0.0)
+        y = np.asarray(update.y, m.real) - m.y0
+        gain = self._gains[min(self._since, len(self._gains))]
+        self._x, mismatch = corrected(gain, m.outputs, self._x, self._mismatch, u, known, y)
+        self._mismatch = m.real(mismatch)
         self._estimate = Estimate(self._x, known + self._mismatch, self._mismatch)
         return self._estimate
 
@@ -118,6 +118,21 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
         gain = stationary_gain(A, C, process, sensors**2, P, settings.longest_riccati)
         gains[ticks] = np.ascontiguousarray(gain.T)
     return gains
+
+
+@kernel
+def corrected(
+    gain: Array, outputs: Transition, x: Array, mismatch: float, u: Array, w: float, y: Array
+) -> tuple[Array, float]:
+    """Return the state (n,) and the load mismatch (W) after a measurement y (22,); all are deviations.
+
+    `gain` (22, n + 1) is that of the period which ends; `x` and `mismatch` are predicted, `u` (3,) was applied and `w`
+    is the known load (W).
+    """
+    innovation = y - respond(outputs.A, outputs.B, outputs.F, x, u, w + mismatch)
+    correction = np.zeros(gain.shape[1], gain.dtype)
+    apply(gain, innovation, correction)
+    return x + correction[:-1], mismatch + correction[-1]
 
 
 def _through(model: PredictionModel, x: Array, w: float, segments: list[tuple[Array, int]]) -> Array:

@@ -34,7 +34,7 @@ from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.rules import make_rule
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import make_solver
-from optimizer_plc.updating_period import Assessment, Observation
+from optimizer_plc.updating_period import Assessment, Observation, UpdatingRule
 
 Array = NDArray[np.float64]
 
@@ -95,10 +95,15 @@ class OptimizerProgram:
         self.solve()
         self.report(Verdict.NONE)
 
-    def restart(self, updating_period_s: float) -> None:
-        """Forget everything and begin a session at the operating point; 0 s is the adaptive updating period."""
+    def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
+        """Forget everything and begin a session at the operating point.
+
+        Args:
+            updating_period_s: Fixed updating period; 0 is adaptive.
+            rule: Decides adaptive periods instead of the rule that the settings name.
+        """
         self._fixed_ticks = round(updating_period_s / TICK_S)
-        self._rule = make_rule(self.settings, self.budget, self._fixed_ticks)
+        self._rule = rule or make_rule(self.settings, self.budget, self._fixed_ticks)
         self._estimator.reset()
         self._solver.reset()
         at_rest = np.zeros(3, self._real)

@@ -51,20 +51,24 @@ class LoadProfile:
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """White Gaussian noise on the outputs, one draw a tick whoever reads them.
+    """White Gaussian noise on the outputs, one draw a tick whoever reads them, and a bias.
 
     Raises:
-        ValueError: not one standard deviation per output, or one that is negative or not finite.
+        ValueError: not one standard deviation and one bias per output, or one that is negative or not finite.
     """
 
     deviations: tuple[float, ...]
     """Standard deviation of each output, in its unit; shape (22,)."""
     seed: int
     """Seed of the PCG64 generator, 0 or more."""
+    biases: tuple[float, ...] = (0.0,) * len(OUTPUT_NAMES)
+    """What each output shows too much, in its unit; shape (22,)."""
 
     def __post_init__(self) -> None:
         if len(self.deviations) != len(OUTPUT_NAMES) or not all(0.0 <= sigma < inf for sigma in self.deviations):
             raise ValueError(f"noise needs {len(OUTPUT_NAMES)} standard deviations, finite and not negative")
+        if len(self.biases) != len(OUTPUT_NAMES) or not all(map(isfinite, self.biases)):
+            raise ValueError(f"noise needs {len(OUTPUT_NAMES)} biases, all finite")
 
 
 class PlantProgram:
@@ -100,16 +104,20 @@ class PlantProgram:
         self._box, self._helium = plain_tuples(box), plain_tuples(helium)
         self._x = _vector(x0, STATE_NAMES, "states")
         self._u = _vector(u0, INPUT_NAMES, "inputs")
+        self._slope = np.empty_like(self._x)
+        self._held: tuple[float, ...] = ()
+        """Inputs and load that the slope of the state was computed with."""
         self._load = load
         self._deviations = np.array(noise.deviations) if noise else None
+        self._biases = np.array(noise.biases) if noise else 0.0
         self._generator = np.random.Generator(np.random.PCG64(noise.seed if noise else 0))
         self._measured = self._sample(outputs(self._x, self._u, self.load, box, helium))
-        self._step()  # no session waits for the compiler
+        self._step(self.load, held=False)  # no session waits for the compiler
 
     def resume(
         self, tick: int, x: Sequence[float], u: Sequence[float], y: Sequence[float], noise_state: Mapping[str, Any]
     ) -> None:
-        """Go on from what `retained` told.
+        """Go on from what `retained` returned.
 
         Raises:
             ValueError: it is not of this plant.
@@ -117,6 +125,7 @@ class PlantProgram:
         self.tick = tick
         self._x = _vector(x, STATE_NAMES, "states")
         self._u = _vector(u, INPUT_NAMES, "inputs")
+        self._held = ()
         self._generator.bit_generator.state = noise_state
         self._measured = tuple(_vector(y, OUTPUT_NAMES, "outputs").tolist())
 
@@ -175,17 +184,20 @@ class PlantProgram:
 
     def advance(self) -> None:
         """Go one tick forward."""
-        self._x, y = self._step()
+        w = self.load
+        conditions = (*self._u.tolist(), w)
+        self._x, y = self._step(w, held=conditions == self._held)
+        self._held = conditions
         self.tick += 1
         self._measured = self._sample(y)
 
-    def _step(self) -> tuple[RealArray, RealArray]:
-        """Return the state and the outputs one tick ahead."""
-        return advance_and_read(self._x, self._u, self.load, self._tick_s, self._box, self._helium)
+    def _step(self, w: float, *, held: bool) -> tuple[RealArray, RealArray]:
+        """Return the state and the outputs one tick ahead; `held` are inputs and load if they were so before."""
+        return advance_and_read(self._x, self._slope, held, self._u, w, self._tick_s, self._box, self._helium)
 
     def _sample(self, y: RealArray) -> tuple[float, ...]:
         if self._deviations is not None:
-            y = y + self._deviations * self._generator.standard_normal(len(y))
+            y = y + self._biases + self._deviations * self._generator.standard_normal(len(y))
         return tuple(y.tolist())
 
 

@@ -22,7 +22,7 @@ from plant.load import find_load
 from rig.scenario import Scenario
 from rig.studies import STUDIES
 from rig.studies.harsh_problems import harsh_request, harsh_table, harsh_values
-from rig.studies.intervals import interval_of_mean, percentile_interval
+from rig.studies.intervals import interval_of_mean, over_draws
 from rig.studies.open_loop import LABELS, OpenLoop, open_loop_table, paired_request, powers_of, watch
 from rig.studies.paired_run import equal_counts, harsh_run, paired_indicators, paired_run
 from rig.studies.played_profiles import PlayedProfiles
@@ -249,14 +249,15 @@ def test_a_profile_below_the_optimum_ends_the_study(made_up: "MakeOutcome") -> N
 def test_an_interval_is_made_of_draws_drawn_again() -> None:
     """Of the draws 0 and 1, a mean over two drawn again is 0, 0.5 or 1 with probabilities 1/4, 1/2 and 1/4."""
     values = np.array([0.0, 1.0])
-    found = percentile_interval(lambda which: float(values[which].mean()), 2)
-    assert (found.value, found.low, found.high, found.missing) == (0.5, 0.0, 1.0, 0.0)
-    assert found == percentile_interval(lambda which: float(values[which].mean()), 2), "the same every time"
-    assert interval_of_mean([3.0, 3.0, np.nan]).text() == "3 [3 to 3]"
-    assert interval_of_mean([np.nan]).text() == "none"
-    half = percentile_interval(lambda which: np.nan if which[0] == 0 else 7.0, 2)
+    found = over_draws(lambda which: float(values[which].mean()), 2)
+    assert found == (0.5, 0.0, 1.0, 0.0)
+    assert found == over_draws(lambda which: float(values[which].mean()), 2), "the same every time"
+    assert interval_of_mean([3.0, 3.0, np.nan]).brief() == "3 [3 to 3]"
+    assert interval_of_mean([4.0]).brief() == "4", "one draw has no interval"
+    assert interval_of_mean([np.nan]).brief() == "none"
+    half = over_draws(lambda which: np.nan if which[0] == 0 else 7.0, 2)
     assert half.missing == pytest.approx(0.5, abs=0.05)
-    assert half.text().startswith("none [7 to 7; none in 5") or half.text().startswith("none [7 to 7; none in 4")
+    assert half.brief() == f"none [7 to 7; none in {100 * half.missing:.0f} %]"
 
 
 @pytest.fixture
@@ -280,8 +281,8 @@ def test_totals_are_pooled_before_they_are_divided(short: StudyOptions, made_up:
                     c2=0.25,
                 )
     found = OpenLoop.of(short, outcomes)
-    assert found.relative("ode", 0, np.array([0, 1])) == 1.5, "60 / 40"
-    assert found.relative("qpoases", 1, np.array([0, 1])) == 6.0, "(110 + 130) / 40"
+    assert found.relative("ode", 0, [0, 1]) == 1.5, "60 / 40"
+    assert found.relative("qpoases", 1, [0, 1]) == 6.0, "(110 + 130) / 40"
     assert found.interval("ode", 0)[:3] == (1.5, pytest.approx(40 / 30), 2.0)
     # between P = 1 and 25 the ratio to the ODE-based solver falls from 240 / 60 to 48 / 60
     share = np.log(4.0) / (np.log(4.0) - np.log(0.8))
