@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from rig.studies.execution import Workers
     from rig.studies.study import Study, StudyOptions
 
-DEFAULT_SEEDS: Final = 3
-FEWER_SEEDS: Final = {"robustness": 1}
 OF_RUNS: Final = ("load", "duration", "seeds", "workers", "scheduler", "quick", "shard", "merge")
 """Options that only a study with runs has a use for."""
 
@@ -40,9 +38,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def add_scale_options(parser: argparse.ArgumentParser) -> None:
     """Declare how much is done, by whom, and where the results go."""
     scale = parser.add_mutually_exclusive_group()
-    scale.add_argument("--seeds", "--draws", type=_positive, metavar="N",
-                       help=f"draws of each load; of a file, draws of the sensors' noise (default: {DEFAULT_SEEDS}, of "
-                       "robustness 1)")  # fmt: skip
+    scale.add_argument("--draws", "--seeds", dest="seeds", type=_positive, metavar="N",
+                       help="draws of each load; of a file, draws of the sensors' noise (default: the study's own)"
+                       )  # fmt: skip
     scale.add_argument("--quick", action="store_true", help="one seed, ten minutes, fewer points")
     parser.add_argument("--workers", type=_positive, metavar="N", help="processes to use (default: one a core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler that is up, such as tcp://host:8786")
@@ -68,15 +66,12 @@ def workers(options: argparse.Namespace) -> "Workers":
     return Workers(options.workers or os.cpu_count() or 1, options.scheduler)
 
 
-def study_options(options: argparse.Namespace, study: str = "") -> "StudyOptions":
-    """Return the extent of a study, or of all of the report."""
+def study_options(options: argparse.Namespace) -> "StudyOptions":
+    """Return the extent of the study."""
     from rig.studies.study import StudyOptions
 
     given = vars(options)
-    return StudyOptions(
-        options.seeds or FEWER_SEEDS.get(study, DEFAULT_SEEDS), given.get("duration"), tuple(given.get("load", ())),
-        options.quick,
-    )  # fmt: skip
+    return StudyOptions(options.seeds, given.get("duration"), tuple(given.get("load", ())), options.quick)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -102,7 +97,7 @@ def _do(study: "Study", options: argparse.Namespace) -> None:
     from rig.studies.shards import Shard, conduct_shard, merge
     from rig.studies.study import RUNS
 
-    asked = study_options(options, study.name)
+    asked = study_options(options)
     useless = [f"--{name}" for name in OF_RUNS if getattr(options, name)]
     if useless and not study.requests(asked):
         raise UsageError(f"study {study.name} has no runs: {', '.join(useless)} would have no effect")

@@ -1,6 +1,6 @@
 """Means over hours with intervals, and the share of a gap that a rule closes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,12 +18,22 @@ class Interval(NamedTuple):
     value: float
     low: float
     high: float
+    missing: float = 0.0
+    """Share of the resamples in which there is no such value; the interval is of the others."""
 
     def text(self, digits: int = 3) -> str:
         """Write the value and the interval in brackets, which a single hour has not."""
         if np.isnan(self.low):
             return f"{self.value:.{digits}f}"
         return f"{self.value:.{digits}f} [{self.low:.{digits}f}, {self.high:.{digits}f}]"
+
+    def brief(self) -> str:
+        """Write value and interval with three digits, and how often there is none."""
+        value = f"{self.value:.3g}" if np.isfinite(self.value) else "none"
+        if not np.isfinite(self.low):
+            return value
+        absent = f"; none in {100 * self.missing:.0f} %" if self.missing else ""
+        return f"{value} [{self.low:.3g} to {self.high:.3g}{absent}]"
 
 
 def resampled(statistic: Callable[[Series], float], hours: Series) -> Interval:
@@ -37,9 +47,10 @@ def resampled(statistic: Callable[[Series], float], hours: Series) -> Interval:
     if len(hours) < 2:
         return Interval(value, np.nan, np.nan)
     picks = np.random.default_rng(SEED).integers(len(hours), size=(RESAMPLES, len(hours)))
-    drawn = [statistic(hours[pick]) for pick in picks]
-    low, high = np.nanquantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return Interval(value, float(low), float(high))
+    drawn = np.array([statistic(hours[pick]) for pick in picks])
+    known = drawn[np.isfinite(drawn)]
+    low, high = np.quantile(known, [(1 - LEVEL) / 2, (1 + LEVEL) / 2]) if len(known) else (np.nan, np.nan)
+    return Interval(value, float(low), float(high), 1.0 - len(known) / RESAMPLES)
 
 
 def geometric_mean(ratios: Series) -> float:
@@ -65,3 +76,16 @@ def gap_closed(costs: Series, reference: Series, best: Series) -> Interval:
         return float((usual - cost).sum()) / gap if gap > 0 else np.nan
 
     return resampled(share, np.column_stack([costs, reference, best]))
+
+
+def over_draws(statistic: Callable[[list[int]], float], draws: int) -> Interval:
+    """Return the interval of a statistic that is a function of the numbers of the draws it is computed from."""
+    return resampled(lambda rows: statistic([int(number) for number in rows[:, 0]]), np.arange(float(draws))[:, None])
+
+
+def interval_of_mean(values: Sequence[float]) -> Interval:
+    """Return the interval of the mean of one value a draw; draws without a value are left out."""
+    known = np.array([value for value in values if np.isfinite(value)])
+    if not len(known):
+        return Interval(np.nan, np.nan, np.nan, 1.0)
+    return resampled(lambda rows: float(rows.mean()), known[:, None])

@@ -30,6 +30,8 @@ from rig.scenario import Scenario
 from rig.settings import Settings
 from rig.studies.hindsight import Objective, run_best_in_hindsight
 from rig.studies.ideal_loop import run_ideal_loop
+from rig.studies.paired_run import harsh_run, paired_indicators, paired_run
+from rig.studies.problem_sequence import problem_sequence
 
 Series = NDArray[np.float64]
 
@@ -42,6 +44,9 @@ RIG_MODULES = (
     "rig.recording",
     "rig.studies.hindsight",
     "rig.studies.ideal_loop",
+    "rig.studies.paired_run",
+    "rig.studies.played_profiles",
+    "rig.studies.problem_sequence",
     "rig.studies.request",
 )
 SUFFIXES = (".py", ".json", ".npz", ".csv")
@@ -59,6 +64,10 @@ class Procedure(StrEnum):
 
     CONFIGURED = "configured"
     """The three programs, as they are configured."""
+    PAIRED_PROBLEMS = "paired problems"
+    """Nobody: the configured solver goes through the problems of a converged loop (`rig.studies.paired_run`)."""
+    HARSH_PROBLEMS = "harsh problems"
+    """The same, and only those count whose guess is far from the optimum, each solver beginning at the same one."""
     INFINITELY_FAST = "infinitely fast"
     """The exact optimum at once, every updating period (`rig.studies.ideal_loop`)."""
     BEST_CLOSED_LOOP = "best closed loop"
@@ -201,6 +210,8 @@ def perform(request: RunRequest) -> str:
     )
     recorder = Recorder(request.ticks)
     match request.procedure:
+        case Procedure.PAIRED_PROBLEMS | Procedure.HARSH_PROBLEMS:
+            return _of_problems(request, settings, scenario).to_json()
         case Procedure.INFINITELY_FAST:
             run_ideal_loop(settings, scenario, recorder, round(request.updating_period_s / TICK_S))
         case Procedure.BEST_CLOSED_LOOP:
@@ -224,6 +235,14 @@ def settings_of(assignments: tuple[str, ...]) -> Settings:
 @lru_cache(maxsize=1)
 def _rig(assignments: tuple[str, ...]) -> OneProcessRig:
     return OneProcessRig(settings_of(assignments))
+
+
+def _of_problems(request: RunRequest, settings: Settings, scenario: Scenario) -> Outcome:
+    sequence, program = problem_sequence(scenario, request.assignments), settings.optimizer_plc.program
+    run = paired_run if request.procedure is Procedure.PAIRED_PROBLEMS else harsh_run
+    columns = run(sequence, program)
+    indicators = paired_indicators(columns, request.updating_period_s)
+    return Outcome(programs_digest(), indicators, "", 0, columns, {})
 
 
 def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outcome:

@@ -82,7 +82,9 @@ class RobustnessStudy:
 
 def _cases(options: StudyOptions) -> Iterator[tuple[str, str, Load]]:
     options = replace(options, ticks=options.ticks or USUAL_TICKS)
-    hours = [load for draws in loads(options, *("ace" if options.quick else "abcdef")).values() for load in draws]
+    hours = [
+        load for draws in loads(options, *("ace" if options.quick else "abcdef"), usual=1).values() for load in draws
+    ]
     return ((condition, policy, load) for condition in CONDITIONS for policy in POLICIES for load in hours)
 
 
