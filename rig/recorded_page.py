@@ -1,7 +1,7 @@
 """A run folder as the operator's page replays it."""
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -37,10 +37,11 @@ class RecordedPage:
         self._folder = folder
         self.name = folder.path.resolve().name
         with folder.file("trace.parquet") as file:
-            table = file.read(columns=[*PROCESS, "mode", "cause"])
+            table = file.read(columns=[*PROCESS, "mode", "cause", "bad_sensors"])
         self._values = np.column_stack([table[name].to_numpy() for name in PROCESS]).astype(np.float32)
         self._modes = table["mode"].to_pylist()
         self._causes = table["cause"].to_pylist()
+        self._bad_sensors = [_bits(names) for names in table["bad_sensors"].to_pylist()]
         self._settings = self._read_settings()
 
     def _read_settings(self) -> OptimizerSettings:
@@ -84,8 +85,15 @@ class RecordedPage:
         """Return one tick."""
         load, *values = self._values[tick].tolist()
         u, y = tuple(values[: len(INPUT_NAMES)]), tuple(values[len(INPUT_NAMES) :])
-        mode, cause = self._modes[tick], self._causes[tick]
-        return Frame(Process(tick, load, u, y), _MODES.get(mode, int(Mode.MPC)), _CAUSES.get(cause, int(Cause.NONE)))
+        mode = _MODES.get(self._modes[tick], int(Mode.MPC))
+        cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
+        return Frame(Process(tick, load, u, y), mode, cause, self._bad_sensors[tick])
+
+
+@cache
+def _bits(names: str) -> int:
+    """Return the bits of outputs that are named in a text."""
+    return sum(1 << OUTPUT_NAMES.index(name) for name in names.split())
 
 
 def _optimization(row: Mapping[str, Any]) -> Optimization:

@@ -240,6 +240,7 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
         "modes": [
             {"from": one.start, "to": one.end, "mode": mode_name(one.mode)} for one in model.trends.modes(start, end)
         ],
+        "substituted": {name: found for name, found in model.trends.substituted(start, end).items() if name in names},
         "marks": _marks(model, start, end),
         "predictions": [prediction_document(one) for one in _some(shown)],
         "bands": _ranges(BANDED_OUTPUTS, limits.output_low, limits.output_high),

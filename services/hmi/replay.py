@@ -32,6 +32,8 @@ class Frame(NamedTuple):
     process: Process
     mode: int
     cause: int
+    bad_sensors: int = 0
+    """A bit for each output that the control PLC substituted. The process has the true value."""
 
 
 class RecordedRun(Protocol):
@@ -163,10 +165,11 @@ class Replay:
         every = max(1, math.ceil((tick - before) / points))
         for each in range(before + 1, tick, every):
             frame = run.frame(each)
-            model.trends.add(frame.process, frame.mode)
+            model.trends.add(frame.process, frame.mode, frame.bad_sensors)
         self._tick = tick
         newest = run.frame(tick)
-        model.trends.add(newest.process, newest.mode)  # after a step back the newest record may be the one known
+        # after a step back the newest record may be the one known
+        model.trends.add(newest.process, newest.mode, newest.bad_sensors)
         self._put(newest)
         updates, events = run.updates, run.events
         first, last = (bisect_right(updates, one, key=lambda update: update.tick) for one in (before, tick))
@@ -176,7 +179,7 @@ class Replay:
 
     def _put(self, frame: Frame) -> None:
         model, process = self._model, frame.process
-        model.put("control_plc", LadderStatus(frame.mode, frame.cause, 0, 1, 0, 0))
+        model.put("control_plc", LadderStatus(frame.mode, frame.cause, 0, 1, frame.bad_sensors, 0))
         model.put("control_plc", process)
         model.put("plant", LoadStatus(watts=process.load))
 
