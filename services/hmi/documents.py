@@ -18,6 +18,7 @@ from hmi.explanation import explain
 from hmi.model import Model, Told
 from hmi.sentences import sentence
 from hmi.signals import MAPS, signals_of
+from hmi.station import plant_document
 from hmi.trends import NAMES, mode_name, rounded, thin
 
 Document = dict[str, Any]
@@ -150,6 +151,7 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
         "tick": model.tick,
         "time_s": model.tick * TICK_S,
         "services": services_document(model),
+        "plant": plant_document(model),
         "stale": model.stale_prefixes(),
         "values": {name: finite(model.values[name]) for name in names},
     }

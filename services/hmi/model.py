@@ -78,6 +78,8 @@ class Model:
         """Events so far; the last ones are in `events`."""
         self.changed: set[str] = set()
         """Names of signals, `alarms`, `updates`, `prediction`: what changed since it was last looked at."""
+        self.configuration: Mapping[str, Any] = {}
+        """What the plant's registers tell of its configuration, by dotted key."""
         self._values: dict[str, float | int | str] = {}
         self._session = 0
         self.replay: dict[str, object] | None = None
@@ -224,7 +226,7 @@ class Model:
         if self.is_live("control_plc") and self.stands_still("control_plc"):
             stale.append("control_plc.process.")
         if self.is_live("plant") and self.stands_still("plant"):
-            stale.append("plant.measurement.")
+            stale += ["plant.measurement.", "plant.station."]
         bad = [name for i, name in enumerate(OUTPUT_NAMES) if self.bad_sensors >> i & 1]
         return stale + [f"control_plc.process.y.{name}" for name in bad]
 

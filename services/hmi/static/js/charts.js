@@ -26,7 +26,7 @@ export function makeChart(holder, lines, options) {
     scales: { x: { time: false, range: (_u, low, high) => options.range ? options.range(low, high) : [low, high] },
       y: options.log ? { distr: 3 } : { range: (_u, low, high) => spread(low, high, [...(extra.band || []), ...extra.replacedEnds], options.spread) } },
     axes: [
-      axis({ show: Boolean(options.axis), size: 24, values: (_u, ticks) => ticks.map(timeText), space: 90 }),
+      axis({ show: Boolean(options.axis), size: 24, values: (_u, ticks) => ticks.map((tick) => (tick < 0 ? "" : timeText(tick))), space: 90 }),
       axis({ size: options.small ? 42 : 58, space: 22, ...(options.log ? { filter: decades, grid: { stroke: colour("line"), width: 0.5, filter: decades } } : {}), values: (_u, ticks) => ticks.map((tick) => (tick === null ? "" : short(tick))) }),
     ],
     series: [{}, ...lines.map((line) => ({

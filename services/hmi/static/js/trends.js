@@ -7,10 +7,10 @@ const NAMES = "L1,T5,CV155,NCR22_A,CV156,load";
 const LAYOUT = [
   { id: "L1", title: "L1 %", lines: [{ label: "L1", stroke: "trend", from: "series" }], band: "L1", spread: 1, tall: true, ahead: ["L1"], ribbon: true },
   { id: "T5", title: "T5 K", lines: [{ label: "T5", stroke: "trend", from: "series" }], band: "T5", spread: 1, tall: true, ahead: ["T5"] },
-  { id: "valves", title: "%", lines: [{ label: "CV155", stroke: "trend", from: "series", stepped: true }, { label: "CV156", stroke: "trend-2", from: "series", stepped: true }], bounds: "CV155", spread: 2, ahead: ["CV155", "CV156"] },
-  { id: "heat", title: "W", lines: [{ label: "load", stroke: "trend-3", from: "series", stepped: true }, { label: "NCR22_A", stroke: "trend", from: "series", stepped: true }], spread: 20 },
+  { id: "valves", title: "(%)", lines: [{ label: "CV155", stroke: "trend", from: "series", stepped: true }, { label: "CV156", stroke: "trend-2", from: "series", stepped: true }], bounds: "CV155", spread: 2, ahead: ["CV155", "CV156"] },
+  { id: "heat", title: "(W)", lines: [{ label: "load", stroke: "trend-3", from: "series", stepped: true }, { label: "NCR22_A", stroke: "trend", from: "series", stepped: true }], spread: 20 },
   { id: "tau", title: "τu s, click to see why", lines: [{ label: "tau_u", stroke: "trend", from: "updates", stepped: true }], spread: 1 },
-  { id: "cost", title: "cost", tall: true, lines: [{ label: "J", name: "J reached", stroke: "trend", from: "updates" }, { label: "J_predicted", name: "J predicted", stroke: "trend-2", from: "updates", dash: [4, 3] }], log: true },
+  { id: "cost", title: "(cost)", tall: true, lines: [{ label: "J", name: "J reached", stroke: "trend", from: "updates" }, { label: "J_predicted", name: "J predicted", stroke: "trend-2", from: "updates", dash: [4, 3] }], log: true },
 ];
 const REFRESH_MS = 500;
 
