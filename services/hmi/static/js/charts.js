@@ -42,7 +42,7 @@ export function makeChart(holder, lines, options) {
   }, [[], ...lines.map(() => [])], holder);
   if (options.onPick) chart.over.addEventListener("click", () => { if (chart.cursor.left >= 0) options.onPick(chart.posToVal(chart.cursor.left, "x")); });
   new ResizeObserver(() => chart.setSize(size())).observe(holder);
-  return { chart, extra, show(data, more = {}) { Object.assign(extra, more); chart.setData(withoutReplaced(data, lines, extra)); } };
+  return { chart, extra, show(data, more = {}) { Object.assign(extra, more); chart.setData(withoutReplaced(data, lines, extra)); holder.dataset.substituted = extra.replaced.length; } };
 }
 
 // Where a sensor is bad another value stands in for it: what is not measured is no line like others.
