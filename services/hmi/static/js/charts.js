@@ -20,7 +20,7 @@ export function makeChart(holder, lines, options) {
   const size = () => ({ width: Math.max(80, holder.clientWidth), height: Math.max(40, holder.clientHeight) });
   const chart = new uPlot({
     ...size(),
-    padding: [4, 8, options.axis ? 0 : 4, 0],
+    padding: [4, options.small ? 8 : 28, options.axis ? 0 : 4, 0], // room for half of the last time
     legend: { show: false },
     cursor: { sync: options.sync ? { key: options.sync, setSeries: false } : undefined, drag: { x: Boolean(options.onZoom), y: false, setScale: false }, points: { size: 5 }, y: false },
     scales: { x: { time: false, range: (_u, low, high) => options.range ? options.range(low, high) : [low, high] },

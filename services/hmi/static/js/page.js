@@ -93,7 +93,7 @@ async function start() {
   if (first) take(first); else if (!state.me.role) byId("login-open").click();
   await refreshUser();
   connect(); show();
-  addEventListener("hashchange", () => { show(); byId("view").focus({ preventScroll: true }); });
+  addEventListener("hashchange", () => { show(); byId("view").focus({ preventScroll: true }); byId("view").scrollTop = 0; });
 }
 
 start();

@@ -21,7 +21,7 @@ function quantities(found) {
     ["ΔE/Δq", found.increments ? digits(found.increments.efficiency) : "–", ""],
     ["ΔD/Δq", found.increments ? digits(found.increments.mismatch) : "–", ""],
     ["ΔK/Δq", found.increments ? digits(found.increments.contraction) : "–", ""],
-    ["Γ", digits(u.gamma), u.contraction >= 1 ? "= ΔK/Δq, as K ≥ 1" : "= Δt_r/Δq, as K < 1"],
+    ["Γ", digits(u.gamma), !found.increments ? "" : u.contraction >= 1 ? "= ΔK/Δq, as K ≥ 1" : "= Δt_r/Δq, as K < 1"],
     ["branch", found.branch, "what decided"],
   ];
   byId("why-quantities").replaceChildren(...rows.map(([name, value, meaning]) => element("tr", {}, element("td", {}, ...indexed(name)), element("td", { class: "number", text: value }), element("td", { class: "minor" }, ...indexed(meaning)))));
@@ -31,7 +31,7 @@ function alternatives(found) {
   const rows = found.alternatives.map((one) => element("tr", { class: one.iterations === found.iterations ? "chosen" : "" },
     element("td", { class: "number", text: `${one.iterations}${one.iterations === found.iterations ? " (chosen)" : ""}` }), element("td", { class: "number", text: `${one.period_s} s` }),
     element("td", { class: "number", text: digits(one.contraction, 6) }), element("td", { class: "number", text: one.response_s === null ? "does not fall" : `${digits(one.response_s)} s` })));
-  byId("why-alternatives").replaceChildren(...(rows.length ? rows : [element("tr", {}, element("td", { colspan: "4", class: "minor", text: "Algorithm 1 did not decide here." }))]));
+  byId("why-alternatives").replaceChildren(...(rows.length ? rows : [element("tr", {}, element("td", { colspan: "4", class: "minor", text: ["up", "down", "level"].includes(found.branch) ? "K is 1 to the precision of the registers: nothing can be told of other q." : "Algorithm 1 did not decide here." }))]));
 }
 
 function budget(found) {
