@@ -13,8 +13,6 @@ if TYPE_CHECKING:  # the simulation behind it takes a second
 
 KEPT_AHEAD: Final = LOAD_ROWS
 """Steps that the plant is to know in advance; it keeps twice as many."""
-LONGEST_STEP: Final = 0xFFFF
-"""Ticks that one record can say that a step lasts."""
 
 
 class LoadStream:
@@ -79,16 +77,8 @@ class LoadStream:
             self._sent += record.length
 
     def _next(self) -> LoadAhead:
-        first, length, gaps = self._sent, 1, []
-        while length < AHEAD_STEPS and first + length < len(self._times):
-            gap = self._times[first + length] - self._times[first + length - 1]
-            if gap > LONGEST_STEP:
-                break
-            gaps.append(gap)
-            length += 1
-        watts = (*self._watts[first : first + length], *[0.0] * (AHEAD_STEPS - length))
-        ticks = (*gaps, *[0] * (AHEAD_STEPS - len(gaps)))
-        return LoadAhead(self._session, self._times[first], length, watts, ticks)
+        some = slice(self._sent, self._sent + AHEAD_STEPS)
+        return LoadAhead.first_of(self._session, self._times[some], self._watts[some])
 
     async def was_replaced(self) -> bool:
         """Return whether another client has written the load since: the last step known is not the last one sent."""

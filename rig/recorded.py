@@ -42,6 +42,15 @@ class SampleBlock(NamedTuple):
     station: FloatArray = NO_STATION
     """Signals, mode and alarms of the compression station, shape (N, 21); (0, 0) for a cold box alone."""
 
+    @classmethod
+    def of(cls, samples: Sequence[PlantSample]) -> "SampleBlock":
+        """Return samples that follow each other as a block."""
+        pending = PendingTicks(samples[0].tick)
+        pending.extend(len(samples))
+        for sample in samples:
+            pending.put(sample, None)
+        return pending.take(len(samples))
+
     def split(self, ticks: int) -> tuple["SampleBlock", "SampleBlock"]:
         """Return the first `ticks` ticks, and the rest."""
         parts = self[1:]
@@ -67,11 +76,11 @@ class SampleBlock(NamedTuple):
 class PendingTicks:
     """The newest ticks of a run, in a row, which may still be replaced; `first` is the oldest of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, first: int = 0) -> None:
         sizes = (1, len(INPUT_NAMES), len(OUTPUT_NAMES), len(STATE_NAMES), STATION_COLUMNS)
         self._parts = [np.empty((2048, size), np.float32) for size in sizes]
         self._has_station = False
-        self.first = self.count = 0
+        self.first, self.count = first, 0
 
     def extend(self, ticks: int) -> None:
         """Add ticks of which nothing is known."""

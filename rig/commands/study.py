@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from rig.studies.study import Study, StudyOptions
 
 DEFAULT_SEEDS: Final = 3
-OF_RUNS: Final = ("load", "duration", "seeds", "workers", "scheduler", "quick")
+FEWER_SEEDS: Final = {"robustness": 1}
+OF_RUNS: Final = ("load", "duration", "seeds", "workers", "scheduler", "quick", "shard", "merge")
 """Options that only a study with runs has a use for."""
 
 
@@ -27,6 +28,11 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=duration, help="plant time of each run (default: that of its load)")
     parser.add_argument("--load", nargs="+", metavar="LOAD", default=[],
                         help="named loads or CSV files time_s,load_w")  # fmt: skip
+    parts = parser.add_mutually_exclusive_group()
+    parts.add_argument("--shard", metavar="I/N", help="do every N-th run only, from the I-th on, and no evaluation")
+    parts.add_argument("--merge", type=Path, nargs="+", metavar="FOLDER",
+                       help="gather the runs of all shards from the --out folders they were done with, and evaluate"
+                       )  # fmt: skip
     add_scale_options(parser)
     parser.set_defaults(execute=execute)
 
@@ -34,9 +40,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def add_scale_options(parser: argparse.ArgumentParser) -> None:
     """Declare how much is done, by whom, and where the results go."""
     scale = parser.add_mutually_exclusive_group()
-    scale.add_argument("--seeds", type=_positive, metavar="N",
-                       help=f"draws of each load; of a file, draws of the sensors' noise (default: {DEFAULT_SEEDS})"
-                       )  # fmt: skip
+    scale.add_argument("--seeds", "--draws", type=_positive, metavar="N",
+                       help=f"draws of each load; of a file, draws of the sensors' noise (default: {DEFAULT_SEEDS}, of "
+                       "robustness 1)")  # fmt: skip
     scale.add_argument("--quick", action="store_true", help="one seed, ten minutes, fewer points")
     parser.add_argument("--workers", type=_positive, metavar="N", help="processes to use (default: one a core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler that is up, such as tcp://host:8786")
@@ -62,14 +68,15 @@ def workers(options: argparse.Namespace) -> "Workers":
     return Workers(options.workers or os.cpu_count() or 1, options.scheduler)
 
 
-def study_options(options: argparse.Namespace) -> "StudyOptions":
-    """Return the extent of the study."""
+def study_options(options: argparse.Namespace, study: str = "") -> "StudyOptions":
+    """Return the extent of a study, or of all of the report."""
     from rig.studies.study import StudyOptions
 
     given = vars(options)
     return StudyOptions(
-        options.seeds or DEFAULT_SEEDS, given.get("duration"), tuple(given.get("load", ())), options.quick
-    )
+        options.seeds or FEWER_SEEDS.get(study, DEFAULT_SEEDS), given.get("duration"), tuple(given.get("load", ())),
+        options.quick,
+    )  # fmt: skip
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -78,23 +85,36 @@ def execute(options: argparse.Namespace) -> int:
         raise UsageError(f"study {options.name}: there is no such study; `coldloop study --list` names them")
     for name in options.load:
         check_load(name)
-    from rig import studies
+    from rig.studies import APART
+    from rig.studies import STUDIES as REPORTED
 
+    everything = {**REPORTED, **APART}
     if options.list or options.name is None:
-        for name, study in studies.STUDIES.items():
+        for name, study in everything.items():
             sys.stdout.write(f"{name:18} {study.title}\n")
         return 0
-    _do(studies.STUDIES[options.name], options)
+    _do(everything[options.name], options)
     return 0
 
 
 def _do(study: "Study", options: argparse.Namespace) -> None:
     from rig.studies.results import conduct
+    from rig.studies.shards import Shard, conduct_shard, merge
+    from rig.studies.study import RUNS
 
-    asked = study_options(options)
+    asked = study_options(options, study.name)
     useless = [f"--{name}" for name in OF_RUNS if getattr(options, name)]
     if useless and not study.requests(asked):
         raise UsageError(f"study {study.name} has no runs: {', '.join(useless)} would have no effect")
+    if options.merge:
+        if options.workers or options.scheduler:
+            raise UsageError("--merge does no runs: leave out --workers and --scheduler")
+        merge(study, asked, options.merge, options.out)
+    if options.shard:
+        shard = Shard.parse(options.shard)
+        runs = conduct_shard(study, asked, workers(options), options.out, shard)
+        sys.stdout.write(f"shard {shard} of {study.name}: {runs} runs in {options.out / RUNS}\n")
+        return
     result = conduct(study, asked, workers(options), options.out)
     for what, values in result.values.items():
         sys.stdout.write(f"{what}: {', '.join(f'{value:.4g}' for value in values)}\n")

@@ -96,7 +96,7 @@ def advance_plant(w: World, plant: PlantState, u: Array, load: float, row: int) 
     evaluate(plant.x, inputs, load, w.box, w.helium, plant.slope, plant.y)
     if plant.noise.shape[0]:
         for i in range(plant.y.shape[0]):
-            plant.y[i] = plant.y[i] + w.deviations[i] * plant.noise[row, i]
+            plant.y[i] = plant.y[i] + w.biases[i] + w.deviations[i] * plant.noise[row, i]
 
 
 @kernel

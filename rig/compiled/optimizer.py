@@ -15,17 +15,25 @@ from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.scheme import ALGORITHM_1, CONTRACTION, FIXED, OPTIMIZER_STATE, Constants, Memory, Rule
 from optimizer_plc.session_state import Delivery, Period
 from optimizer_plc.solvers.ode import OdeSolver, flow_in
-from optimizer_plc.updating_period import Algorithm1, Assessment, ContractionParameters, ContractionRule, UpdatingRule
+from optimizer_plc.updating_period import (
+    Algorithm1,
+    Assessment,
+    ContractionParameters,
+    ContractionRule,
+    FixedPeriod,
+    UpdatingRule,
+)
 from rig.compiled.records import Array, Reports, empty_rows, record
 
 NO_CONTRACTION = ContractionParameters(0, 0, 0, 1.0, 0.0, 1.0)
 
 
 def is_compiled(program: OptimizerProgram) -> bool:
-    """Tell whether the program's updates have a compiled form: double precision, ODE-based solver, no interruption."""
-    settings = program.settings
-    single = program.problem.Phi.dtype != np.float64
-    return isinstance(program.solver, OdeSolver) and not single and not settings.interrupting_load_step_w
+    """Tell whether the program's updates have a compiled form: double precision, ODE-based solver, a rule of ours."""
+    if program.problem.Phi.dtype != np.float64 or program.settings.interrupting_load_step_w:
+        return False
+    known_rule = isinstance(program.rule, FixedPeriod | Algorithm1 | ContractionRule)
+    return isinstance(program.solver, OdeSolver) and known_rule
 
 
 def is_ordinary(program: OptimizerProgram) -> bool:
@@ -41,14 +49,15 @@ def constants_of(program: OptimizerProgram, limits: InputLimits) -> Constants:
     """Return what the program computes with in this session."""
     model, problem = program.model, program.problem
     steps = (model.transitions[ticks] for ticks in range(1, MAX_PERIOD_TICKS + 1))
-    kalman = isinstance(program.estimator, KalmanFilter)
-    gains = program.estimator.gains if isinstance(program.estimator, KalmanFilter) else {1: np.zeros((1, 1))}
+    estimator = program.estimator
+    gains = estimator.gains if isinstance(estimator, KalmanFilter) else {1: np.zeros((1, 1))}
     qp = problem.at(program.state.playing.situation)
     return Constants(
         steps=Transition(*(np.array(M) for M in zip(*steps, strict=True))),
         outputs=model.outputs,
         x0=np.array(model.x0), u0=np.array(model.u0), y0=np.array(model.y0), w0=float(model.w0),
-        kalman=kalman,
+        kalman=isinstance(estimator, KalmanFilter),
+        load_known=not isinstance(estimator, KalmanFilter) or estimator.load_known,
         gains=np.array([gains[ticks] for ticks in sorted(gains)]),
         Phi=problem.Phi, Gamma=problem.Gamma, matrices=matrices_of(qp), maps=problem.maps, shifts=problem.shifts,
         predicted=output_maps(problem),

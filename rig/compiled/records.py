@@ -46,6 +46,8 @@ class World(NamedTuple):
 
     box: ColdBox
     helium: Helium
+    biases: Array
+    """What the sensors show too much, shape (22,)."""
     deviations: Array
     """Standard deviations of the sensors' noise, shape (22,)."""
     load_ticks: NDArray[np.int64]

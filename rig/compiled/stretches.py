@@ -9,7 +9,6 @@ from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import MAX_LOAD_W
 from control_plc.program import ControlProgram
 from optimizer_plc.program import OptimizerProgram
-from plant.cold_box import REFERENCE
 from plant.helium.properties import load_helium
 from plant.program import LoadProfile, PlantProgram
 from rig.compiled import control, loops, optimizer
@@ -50,7 +49,7 @@ class CompiledStretches:
         self._pause_until = 0
         sensors = control_plc.sensors
         self._world = World(
-            REFERENCE, load_helium(), plant.deviations, np.array(load.times), np.array(load.watts),
+            plant.box, load_helium(), plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
             control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), sensors.frozen_ticks, MAX_LOAD_W,
             control_plc.watchdog.time,
         )  # fmt: skip

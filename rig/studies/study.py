@@ -11,11 +11,13 @@ from coldloop.model_settings import DEFAULT_MODEL_FILE
 from plant.load import find_load, named_families
 from plant.program import LoadProfile
 from rig.scenario import natural_ticks
-from rig.studies.request import Outcome, RunRequest
+from rig.studies.request import Outcome, Procedure, RunRequest
 
 Outcomes = Mapping[RunRequest, Outcome]
 Cell = str | float | int
 
+RUNS = "runs"
+"""Folder, beside those of the studies, in which runs are kept: studies share them."""
 QUICK_TICKS = 2400
 """Longest run of a quick study: ten minutes."""
 NOISE = (
@@ -63,11 +65,12 @@ class Load:
         *assignments: str,
         networked: bool = False,
         trace_ticks: int = 0,
+        procedure: Procedure = Procedure.CONFIGURED,
     ) -> RunRequest:
         """Return the request for a run under this load."""
         return RunRequest(
             self.name, self.profile.times, self.profile.watts, self.ticks, updating_period_s,
-            (*self.noise, *assignments), self.draw, networked, trace_ticks,
+            (*self.noise, *assignments), self.draw, networked, trace_ticks, procedure,
         )  # fmt: skip
 
 

@@ -2,9 +2,9 @@
 
     condition ──on-delay, off-delay──> active ──TRANSITIONS──> state ──> registers, journal
 
-A condition is told as it is (`holds`, `raised`, `returned`, `happened`). When it has changed for as long as the delay
-of its alarm, `active` follows, and the state makes a transition. Operators make the others. All times are plant time,
-measured by ticks and not by scans: scans can be missed.
+A condition is reported as it is (`holds`, `raised`, `returned`, `happened`). When it has changed for the delay of its
+alarm, `active` follows, and the state makes a transition. Operators make the others. All times are plant time, measured
+by ticks and not by scans: scans can be missed.
 
 "Suppressed by design" of the standard is not there: no alarm depends on another one.
 """

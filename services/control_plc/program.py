@@ -250,7 +250,7 @@ class ControlProgram:
         return self.guard.applied if row is None else row
 
     def _handing_over(self, tick: int) -> bool:
-        """Tell whether the loops stand still, so that the optimiser's first sequence begins where it was told."""
+        """Tell whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows."""
         if self.player.has_answer:  # it was judged from where the inputs are
             return True
         rested = tick - self._failed_handshake > HANDSHAKE_PAUSE_S / TICK_S

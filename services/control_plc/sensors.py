@@ -1,7 +1,7 @@
-"""Measurements that cannot be right: found, replaced by the last good value, and told.
+"""Measurements that cannot be right: found, replaced by the last good value, and reported.
 
 A measurement is bad when it is no number, outside its sensor's range, or, for the outputs that are controlled, frozen:
-it stands to the last bit for a while in which most of the others move.
+it does not change by a bit for a while in which most of the others move.
 """
 
 from collections.abc import MutableSequence, Sequence
@@ -32,7 +32,7 @@ class SensorCheckSettings(BaseModel):
     pressure: Range = (-1.0, 100.0)
     """bar."""
     frozen_s: Annotated[float, Field(gt=0)] = 20.0
-    """A controlled output that stands for so long, while others move, is frozen."""
+    """A controlled output that does not change for so long, while others move, is frozen."""
     bridged_s: Annotated[float, Field(ge=0)] = 10.0
     """How long the last good value of a controlled output is worked with; then what needs it is left."""
 

@@ -128,6 +128,14 @@ def host_of(header: str) -> str:
         return ""
 
 
+def port_of(header: str) -> int | None:
+    """Return the port in a Host header; None when there is none."""
+    try:
+        return urlsplit(f"//{header}").port
+    except ValueError:
+        return None
+
+
 def is_own_origin(origin: str | None, host: str) -> bool:
     """Tell whether a request that changes something comes from the page itself: `Origin` names the address asked for.
 

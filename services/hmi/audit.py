@@ -43,7 +43,7 @@ class Audit:
             what: What was asked for: login, logout, command, request.
             who: The user; empty when nobody has logged in.
             address: Where the request came from.
-            outcome: done, refused or failed.
+            outcome: done, refused, or uncertain when it is not known.
             detail: The command in words, what came back, or why not.
         """
         utc = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -10,7 +10,7 @@ from hmi.access import LoginSession
 from hmi.audit import Audit
 from hmi.commands import read_command
 from hmi.documents import encoded
-from hmi.guard import COOKIE, Guard, refusal
+from hmi.guard import Guard, cookie_name, refusal
 from hmi.operator_desk import OperatorDesk
 from hmi.reading import json_answer
 from hmi.settings import HmiSection
@@ -78,10 +78,10 @@ class Commanding:
             self._guard.refuse_login(name, address)
             return refusal(401, "wrong name or password")
         self._guard.logins.give_back(address)
-        self._guard.sessions.end(request.cookies.get(COOKIE))
+        self._guard.sessions.end(request.cookies.get(cookie_name(request)))
         answer = web.json_response({"user": user.name, "role": user.role.value})
         answer.set_cookie(
-            COOKIE, self._guard.sessions.begin(user), httponly=True, samesite="Strict", path="/",
+            cookie_name(request), self._guard.sessions.begin(user), httponly=True, samesite="Strict", path="/",
             secure=self._settings.https is not None,
         )  # fmt: skip
         self._audit.note("login", who=user.name, address=address, outcome="done", detail=user.role.value)
@@ -90,9 +90,9 @@ class Commanding:
     async def logout(self, request: web.Request) -> web.Response:
         """End the session."""
         self._note(request, "logout", "done", "")
-        self._guard.sessions.end(request.cookies.get(COOKIE))
+        self._guard.sessions.end(request.cookies.get(cookie_name(request)))
         answer = web.json_response({})
-        answer.del_cookie(COOKIE, path="/")
+        answer.del_cookie(cookie_name(request), path="/")
         return answer
 
     async def audit(self, request: web.Request) -> web.Response:
@@ -109,11 +109,11 @@ class Commanding:
             return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
         try:
             command = read_command(await _document(request))
-            token = await self._desk.prepare(command, operator.user.name)
+            token, text = await self._desk.prepare(command, operator.user.name)
         except (UsageError, LinkError) as error:
             self._note(request, "command", "refused", str(error))
             return refusal(422, str(error))
-        return web.json_response({"token": token, "text": command.text})
+        return web.json_response({"token": token, "text": text})
 
     async def confirm(self, request: web.Request) -> web.Response:
         """Carry out a command that was prepared; answer with what was asked and what came of it."""
@@ -125,9 +125,8 @@ class Commanding:
         except UsageError as error:
             self._note(request, "command", "refused", str(error))
             return refusal(409, str(error))
-        refused = bool(outcome.refused_because)
-        detail = f"{outcome.asked}: {outcome.refused_because or outcome.applied}"
-        self._note(request, "command", "refused" if refused else "done", detail)
+        word = "refused" if outcome.refused_because else "uncertain" if outcome.uncertain_because else "done"
+        self._note(request, "command", word, f"{outcome.asked}: {' '.join(filter(None, outcome[1:]))}")
         return json_answer(encoded(outcome._asdict()))
 
     def _operator(self, request: web.Request) -> LoginSession | web.Response:

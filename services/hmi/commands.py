@@ -19,6 +19,21 @@ MOST_STEPS: Final = 4000
 """Steps of a load that are sent at once; the plant keeps 4096."""
 
 
+def duration_text(seconds: float) -> str:
+    """Return a length of time as people say it, such as "1 h 30 min"."""
+    whole = round(seconds)
+    if whole < 1:
+        return f"{seconds:.2g} s"
+    parts = ((whole // 3600, "h"), (whole // 60 % 60, "min"), (whole % 60, "s"))
+    return " ".join(f"{number} {unit}" for number, unit in parts if number)
+
+
+def clock_text(seconds: float) -> str:
+    """Return a time of the plant as the page shows it, h:mm:ss."""
+    whole = int(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"
+
+
 class _Command(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -81,7 +96,8 @@ class PlayLoad(_Command):
         """The command in words."""
         steps = read_load(self.content)
         return (
-            f"Play a load of {len(steps)} steps, {steps[-1][0] * TICK_S:g} s long, from now on; its last value is held"
+            f"Play a load of {len(steps)} steps, {duration_text(steps[-1][0] * TICK_S)} long, from now on; its last "
+            "value is held"
         )
 
 
@@ -98,7 +114,7 @@ class SetFactor(_Command):
 
 
 class SetPaused(_Command):
-    """Plant time stands still, or goes on."""
+    """Pause or resume."""
 
     kind: Literal["pause"]
     paused: bool
@@ -116,7 +132,10 @@ class TreatAlarm(_Command):
     alarm: int
     action: Annotated[int, Field(ge=1, le=5)]
     time_s: Annotated[int, Field(ge=0, le=0xFFFF)] = 0
-    """How long it is shelved; 0 is the time of the configuration."""
+    """How long it is shelved, plant time; 0 is the time of the configuration."""
+    seen: dict[str, int] | None = None
+    """How often each alarm had been raised when the operator looked: those that were raised again are left alone.
+    Without it all are meant, seen or not."""
 
     @field_validator("alarm")
     @classmethod
@@ -129,7 +148,7 @@ class TreatAlarm(_Command):
     def text(self) -> str:
         """The command in words."""
         name = "all alarms" if self.alarm == ALL_ALARMS else f"alarm {word(AlarmKind(self.alarm))}"
-        time = f" for {self.time_s} s" if self.action == AlarmAction.SHELVE and self.time_s else ""
+        time = f" for {duration_text(self.time_s)}" if self.action == AlarmAction.SHELVE and self.time_s else ""
         return f"{word(AlarmAction(self.action)).capitalize()}: {name}{time}"
 
 

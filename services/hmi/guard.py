@@ -18,11 +18,11 @@ from hmi.access import (
     Sessions,
     host_of,
     is_own_origin,
+    port_of,
 )
 from hmi.audit import Audit
 from hmi.settings import HmiSection
 
-COOKIE: Final = "coldloop_session"
 HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
     "connect-src 'self'; frame-src 'self'; frame-ancestors 'self'; base-uri 'none'; form-action 'self'",
@@ -49,6 +49,11 @@ def refusal(status: int, message: str) -> web.Response:
     return web.json_response({"error": message}, status=status)
 
 
+def cookie_name(request: web.Request) -> str:
+    """Return the name of a session's cookie: browsers send cookies to all ports of a host, so it names the port."""
+    return f"coldloop_session_{port_of(request.host) or 'default'}"
+
+
 def path_in_exhibit(request: web.Request) -> str:
     """Return what is asked for of one rig or run, without the number of the run among several."""
     return _RUN.sub("/", request.path, count=1)
@@ -73,11 +78,13 @@ class Guard:
 
     def session(self, request: web.Request) -> LoginSession | None:
         """Return the session of a request."""
-        return self.sessions.find(request.cookies.get(COOKIE), is_use=path_in_exhibit(request) not in BY_ITSELF)
+        return self.sessions.find(
+            request.cookies.get(cookie_name(request)), is_use=path_in_exhibit(request) not in BY_ITSELF
+        )
 
     def who(self, request: web.Request) -> str:
         """Return the user of a request; empty when nobody has logged in."""
-        session = self.sessions.find(request.cookies.get(COOKIE), is_use=False)
+        session = self.sessions.find(request.cookies.get(cookie_name(request)), is_use=False)
         return session.user.name if session else ""
 
     def refuse_login(self, name: str, address: str) -> None:

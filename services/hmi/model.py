@@ -220,7 +220,7 @@ class Model:
         if self.is_live("plant") and self.stands_still("plant"):
             stale.append("plant.measurement.")
         ladder = self.record("control_plc", LadderStatus)
-        bad = ladder.bad_sensors if ladder else 0  # the last good value of such a sensor stands in for it
+        bad = ladder.bad_sensors if ladder else 0  # the last good value of such a sensor replaces it
         return stale + [f"control_plc.process.y.{name}" for i, name in enumerate(OUTPUT_NAMES) if bad >> i & 1]
 
     def alarm_rows(self) -> list[tuple[AlarmKind, Alarm]]:

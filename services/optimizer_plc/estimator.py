@@ -63,10 +63,11 @@ class StateFeedback:
 
 
 class KalmanFilter:
-    """Stationary Kalman filter on the LTI model with one slow load-mismatch state; the known load is fed in."""
+    """Stationary Kalman filter on the LTI model with one slow load-mismatch state; a load that is known is fed in."""
 
     def __init__(self, prediction: PredictionModel, settings: EstimatorSettings, real: Real = DOUBLE) -> None:
         self._model = prediction.rounded(real)
+        self.load_known = settings.load_known
         gains = stationary_gains(prediction, settings)
         self.gains = {ticks: gain.astype(real, copy=False) for ticks, gain in gains.items()}
         self.reset()
@@ -83,7 +84,7 @@ class KalmanFilter:
         """Correct the predicted state by the measurement, with the gain of the period that just ended."""
         m = self._model
         u = np.asarray(update.u_before, m.real) - m.u0
-        known = m.real(update.load) - m.w0
+        known = m.real(update.load) - m.w0 if self.load_known else m.real(0.0)
         y = np.asarray(update.y, m.real) - m.y0
         gain = self.gains[min(self.since, len(self.gains))]
         self.x, mismatch = corrected(gain, m.outputs, self.x, self.mismatch, u, known, y)

@@ -4,6 +4,8 @@ For each update the control PLC latches, `plan` decides the updating period and 
 played from its end on. Pure: no sockets, no clock, no sleeping.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,7 +33,7 @@ from optimizer_plc.rules import make_rule
 from optimizer_plc.session_state import UNDECIDED, Delivery, Period, SessionState
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import make_solver
-from optimizer_plc.updating_period import Assessment, Observation
+from optimizer_plc.updating_period import Assessment, Observation, UpdatingRule
 
 Array = NDArray[np.float64]
 
@@ -63,10 +65,15 @@ class OptimizerProgram:
         self.solve()
         self.report(Verdict.NONE)
 
-    def restart(self, updating_period_s: float) -> None:
-        """Forget everything and begin a session at the operating point; 0 s is the adaptive updating period."""
+    def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
+        """Forget everything and begin a session at the operating point.
+
+        Args:
+            updating_period_s: Fixed updating period; 0 is adaptive.
+            rule: Decides adaptive periods instead of the rule that the settings name.
+        """
         self.fixed_ticks = round(updating_period_s / TICK_S)
-        self.rule = make_rule(self.settings, self.budget, self.fixed_ticks)
+        self.rule = rule or make_rule(self.settings, self.budget, self.fixed_ticks)
         self.estimator.reset()
         self.solver.reset()
         at_rest = np.zeros(3, self._real)
@@ -125,7 +132,8 @@ class OptimizerProgram:
         """Find out which profile the control PLC plays from this instant on."""
         sent = self.state.sent
         if sent is not None and sent.sequence is not None and sent.sequence.header.number == update.playing:
-            self.state.playing = sent
+            late = update.tick - sent.first_tick  # scans were missed: it began before this instant
+            self.state.playing = replace(sent, z=self.problem.shifted(sent.z, late)) if late > 0 else sent
         elif self.state.last is not None:
             late, played = update.tick - self.state.last.update.tick, self.state.playing
             self.state.playing = Delivery(

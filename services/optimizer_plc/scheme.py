@@ -75,6 +75,8 @@ class Constants(NamedTuple):
     w0: float
     kalman: bool
     """Kalman filter, or else state feedback."""
+    load_known: bool
+    """The filter is fed the measured load."""
     gains: Array
     """Of the Kalman filter for periods of 1, 2, ... ticks, shape (ticks, 22, n + 1)."""
     Phi: Array
@@ -188,7 +190,7 @@ def take_answer(m: Memory) -> None:
 def estimate(c: Constants, m: Memory, u_before: Array, load: float, y: Array, x: Array) -> None:
     """Take the measurement at an updating instant, all in physical units."""
     s = m.numbers[0]
-    known = load - c.w0
+    known = load - c.w0 if c.load_known else 0.0
     if not c.kalman:
         m.x[:] = x - c.x0
         s.w, s.mismatch = known, 0.0

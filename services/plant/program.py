@@ -52,20 +52,24 @@ class LoadProfile:
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """White Gaussian noise on the outputs, one draw a tick whoever reads them.
+    """White Gaussian noise on the outputs, one draw a tick whoever reads them, and a bias.
 
     Raises:
-        ValueError: not one standard deviation per output, or one that is negative or not finite.
+        ValueError: not one standard deviation and one bias per output, or one that is negative or not finite.
     """
 
     deviations: tuple[float, ...]
     """Standard deviation of each output, in its unit; shape (22,)."""
     seed: int
     """Seed of the PCG64 generator, 0 or more."""
+    biases: tuple[float, ...] = (0.0,) * len(OUTPUT_NAMES)
+    """What each output shows too much, in its unit; shape (22,)."""
 
     def __post_init__(self) -> None:
         if len(self.deviations) != len(OUTPUT_NAMES) or not all(0.0 <= sigma < inf for sigma in self.deviations):
             raise ValueError(f"noise needs {len(OUTPUT_NAMES)} standard deviations, finite and not negative")
+        if len(self.biases) != len(OUTPUT_NAMES) or not all(map(isfinite, self.biases)):
+            raise ValueError(f"noise needs {len(OUTPUT_NAMES)} biases, all finite")
 
 
 class PlantProgram:
@@ -98,6 +102,7 @@ class PlantProgram:
         helium = load_helium()
         self.tick = 0
         self._tick_s = tick_s
+        self.box = box
         self._box, self._helium = plain_tuples(box), plain_tuples(helium)
         self._x = _vector(x0, STATE_NAMES, "states")
         self._u = _vector(u0, INPUT_NAMES, "inputs")
@@ -105,7 +110,12 @@ class PlantProgram:
         self._held: tuple[float, ...] = (nan,) * 4
         """Inputs and load that the slope of the state was computed with."""
         self._load = load
-        self._deviations = np.array(noise.deviations) if noise else None
+        self._noise = noise
+        nothing = (0.0,) * len(OUTPUT_NAMES)
+        self.biases = np.array(noise.biases if noise else nothing)
+        """What each output shows too much, shape (22,)."""
+        self.deviations = np.array(noise.deviations if noise else nothing)
+        """Standard deviation of the noise on each output, shape (22,)."""
         self._generator = np.random.Generator(np.random.PCG64(noise.seed if noise else 0))
         self._measured = self._sample(outputs(self._x, self._u, self.load, box, helium))
         self._step(self.load, held=False)  # no session waits for the compiler
@@ -113,7 +123,7 @@ class PlantProgram:
     def resume(
         self, tick: int, x: Sequence[float], u: Sequence[float], y: Sequence[float], noise_state: Mapping[str, Any]
     ) -> None:
-        """Go on from what `retained` told.
+        """Go on from what `retained` returned.
 
         Raises:
             ValueError: it is not of this plant.
@@ -150,16 +160,11 @@ class PlantProgram:
         """
         before, start = self._generator.bit_generator.state, self.tick
         outputs = len(OUTPUT_NAMES)
-        count = ticks if self._deviations is not None else 0
+        count = ticks if self._noise else 0
         yield self._generator.standard_normal((count, outputs))
         if count and self.tick - start < count:
             self._generator.bit_generator.state = before
             self._generator.standard_normal((self.tick - start, outputs))
-
-    @property
-    def deviations(self) -> RealArray:
-        """Standard deviation of the noise on each output, shape (22,)."""
-        return np.zeros(len(OUTPUT_NAMES)) if self._deviations is None else self._deviations
 
     @property
     def state(self) -> tuple[float, ...]:
@@ -220,8 +225,8 @@ class PlantProgram:
         return advance_and_read(self._x, self._slope, held, self._u, w, self._tick_s, self._box, self._helium)
 
     def _sample(self, y: RealArray) -> tuple[float, ...]:
-        if self._deviations is not None:
-            y = y + self._deviations * self._generator.standard_normal(len(y))
+        if self._noise:
+            y = y + self.biases + self.deviations * self._generator.standard_normal(len(y))
         return tuple(y.tolist())
 
 

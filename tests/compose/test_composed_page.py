@@ -33,8 +33,9 @@ def test_the_page_can_do_no_harm(refrigerator_rig: "ComposedRig") -> None:
 
 def test_the_user_of_the_project_is_for_one_machine(refrigerator_rig: "ComposedRig") -> None:
     assert "warning: the page's user is the one that comes with the project" in refrigerator_rig.compose("logs", "page")
+    elsewhere = ("-e", "PUBLISHED_ON=0.0.0.0")
     started = refrigerator_rig.compose(
-        "run", "--rm", "--no-deps", "-T", "-e", "PUBLISHED_ON=0.0.0.0", "page", check=False
+        "exec", "-T", *elsewhere, "page", "sh", "/opt/coldloop/entrypoint.sh", check=False
     )
     assert "error: the page's user is the one that comes with the project" in started
 

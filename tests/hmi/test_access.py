@@ -6,19 +6,19 @@ from http import HTTPStatus
 from http.client import HTTPConnection
 from pathlib import Path
 
+import aiohttp
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 
 from coldloop.endpoints import Endpoint
-from coldloop.errors import ConfigurationError, LinkError, UsageError
+from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.settings import TlsSettings
-from hmi.access import REQUEST_BURST, REQUESTS_A_BROWSER, RateLimit, Sessions, host_of, is_own_origin
+from hmi.access import REQUEST_BURST, REQUESTS_A_BROWSER, RateLimit, Sessions, host_of, is_own_origin, port_of
 from hmi.audit import Audit
-from hmi.commands import SetFactor
-from hmi.guard import COOKIE, Guard
+from hmi.guard import Guard
 from hmi.model import Model
-from hmi.operator_desk import OperatorDesk, Outcome
+from hmi.page_server import Exhibit, PageServer
 from hmi.settings import HmiSection, LoginSettings
 from hmi.users import PageRole, User, Users, hash_password, write_user
 from rig.page_process import pointed_at
@@ -129,7 +129,7 @@ def test_a_confirmation_counts_once_and_only_from_who_asked(site: Site) -> None:
         ({"Content-Type": "application/json; charset=none"}, "{}", 400),
         ({}, "[" * 50_000, 400),
         ({}, '{"user": "\\ud800", "password": "\\ud800"}', 401),
-        ({"Cookie": f"{COOKIE}=\xff"}, '{"user": "lena", "password": "wrong"}', 401),
+        ({"Cookie": "coldloop_session_default=\xff"}, '{"user": "lena", "password": "wrong"}', 401),
     ],
 )
 def test_requests_that_no_browser_sends_are_refused_like_others(
@@ -150,6 +150,25 @@ def test_who_logs_in_again_leaves_no_session_behind(site: Site) -> None:
     body = {"user": OPERATOR[0], "password": OPERATOR[1]}
     assert site.ask("/api/login", body, cookie=earlier).status == 200
     assert not site.ask("/api/me", cookie=earlier).document["operates"]
+
+
+async def test_two_pages_on_one_host_do_not_log_each_other_out(tmp_path: Path) -> None:
+    write_user(tmp_path / "users", OPERATOR[0], PageRole.OPERATE, OPERATOR[1])
+    section = HmiSection(port=0, login=LoginSettings(users=tmp_path / "users"))
+    pages = [PageServer(section, Exhibit(Model(Clock(), 300))) for _ in range(2)]
+    async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as browser:  # keeps cookies of an IP
+        for page in pages:
+            await page.start()
+        addresses = [page.address for page in pages]
+        for address in addresses:
+            body, origin = {"user": OPERATOR[0], "password": OPERATOR[1]}, {"Origin": address.rstrip("/")}
+            async with browser.post(f"{address}api/login", json=body, headers=origin) as answer:
+                assert answer.status == HTTPStatus.OK
+        for address in addresses:
+            async with browser.get(f"{address}api/me") as answer:
+                assert (await answer.json())["user"] == OPERATOR[0], address
+    for page in pages:
+        await page.close()
 
 
 # -- the parts, by themselves ------------------------------------------------------------------------------------------
@@ -189,7 +208,7 @@ def guard() -> Guard:
 def test_an_open_list_of_alarms_is_no_sign_of_life(guard: Guard) -> None:
     clock = Clock()
     guard.sessions = Sessions(clock, idle_s=100, longest_s=1000)
-    cookie = {"Cookie": f"{COOKIE}={guard.sessions.begin(User('anna', PageRole.OPERATE, ''))}"}
+    cookie = {"Cookie": f"coldloop_session_default={guard.sessions.begin(User('anna', PageRole.OPERATE, ''))}"}
     clock.time = 90.0
     for path in ("/api/events", "/api/audit", "/run/1/api/trend"):
         assert guard.session(make_mocked_request("GET", path, cookie)), path
@@ -229,41 +248,11 @@ def test_requests_of_one_address_are_limited_and_others_not() -> None:
     assert [limit.allows("here") for _ in range(3)] == [True, True, False]
 
 
-def test_time_goes_as_before_when_a_service_that_follows_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    written: list[str] = []
-
-    class Peer:
-        def __init__(self, service: str) -> None:
-            self.service = service
-
-        async def connect(self, _patience_s: float) -> None:
-            if self.service == "optimizer_plc":
-                raise LinkError("nobody listens as optimizer_plc")
-
-        async def read(self, record: type[tuple[object, ...]]) -> tuple[object, ...]:
-            return record()
-
-        async def write(self, _record: object) -> None:
-            written.append(self.service)
-
-        def close(self) -> None:
-            pass
-
-    desk = OperatorDesk({}, Model(Clock(), 300), Clock(), training=False)
-    monkeypatch.setattr(desk, "_client", Peer)
-
-    async def ask() -> Outcome:
-        return await desk.confirm(await desk.prepare(SetFactor(kind="factor", factor=2.0), "anna"), "anna")
-
-    outcome = asyncio.run(ask())
-    assert outcome.refused_because == "nobody listens as optimizer_plc"
-    assert written == [], "what is told as refused has not been done at any service"
-
-
 def test_own_origin_and_host() -> None:
     assert is_own_origin("http://127.0.0.1:8020", "127.0.0.1:8020")
     assert not is_own_origin(None, "127.0.0.1:8020")
     assert not is_own_origin("http://127.0.0.1:8021", "127.0.0.1:8020")
+    assert [port_of(name) for name in ("localhost:8020", "[::1]:8020", "a.b", "a:b", "[")] == [8020, 8020, *[None] * 3]
     assert [host_of(name) for name in ("localhost:8020", "[::1]:8020", "a.b", "[", "")] == [
         "localhost",
         "::1",

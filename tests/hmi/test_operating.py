@@ -42,6 +42,7 @@ def confirm(page: "Page") -> str:
     before = page.locator("#outcome-table tbody tr").count()
     page.click("#confirm-yes")
     eventually(lambda: page.locator("#outcome-table tbody tr").count() > before, "the outcome is shown")
+    page.wait_for_selector("body:not(.commanding)")
     return page.locator("#outcome-table tbody tr").first.inner_text()
 
 
@@ -77,8 +78,8 @@ def test_a_refused_command_says_why(operated: "Page") -> None:
     view(operated, "commands")
     operated.fill("#setpoint-CV155", "45")
     operated.click(".faceplate:has-text('CV155') button")
-    operated.wait_for_selector("#toast.refused")
-    assert "take over in manual first" in (operated.text_content("#toast") or "")
+    operated.wait_for_selector("#outcome-line.refused")
+    assert "take over in manual first" in (operated.text_content("#outcome-line") or "")
 
 
 def test_an_empty_field_is_not_a_zero(operated: "Page") -> None:
@@ -92,7 +93,8 @@ def test_an_empty_field_is_not_a_zero(operated: "Page") -> None:
 @pytest.mark.parametrize("width", [821, 1024, 1180, 1280])
 def test_the_header_of_an_operator_fits(operated: "Page", width: int) -> None:
     operated.set_viewport_size({"width": width, "height": 720})
-    operated.wait_for_function("document.documentElement.scrollWidth <= innerWidth")
+    fits = "document.documentElement.scrollWidth <= innerWidth"
+    eventually(lambda: operated.evaluate(fits), "the header fits")  # the policy forbids wait_for_function
     assert operated.evaluate("document.querySelector('#logout').getBoundingClientRect().right") <= width
 
 
@@ -177,8 +179,8 @@ def test_a_login_that_has_ended_is_told(operated: "Page") -> None:
     view(operated, "commands")
     operated.context.clear_cookies()
     operated.click("button:text-is('Pause')")
-    operated.wait_for_selector("#toast.refused")
-    assert "log in first" in (operated.text_content("#toast") or "")
+    operated.wait_for_selector("#outcome-line.refused")
+    assert "log in first" in (operated.text_content("#outcome-line") or "")
     eventually(lambda: operated.is_visible("#login-open"), "the page offers to log in")
 
 

@@ -1,7 +1,8 @@
 """Register map of the plant: a remote I/O rack, and the controls of a simulation."""
 
+from collections.abc import Sequence
 from enum import IntEnum, IntFlag
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process import (
@@ -27,6 +28,8 @@ LOAD_ROWS: Final = 2048
 MAX_LOAD_W: Final = 10_000.0
 AHEAD_STEPS: Final = 24
 """Steps of the load in one request."""
+LONGEST_AHEAD_TICKS: Final = 0xFFFF
+"""Ticks that one request can say that a step lasts."""
 
 
 class OutputVerdict(IntEnum):
@@ -152,6 +155,24 @@ class LoadAhead(NamedTuple):
         u16_array("Ticks from this step to the next one; of the last one unused", tuple(map(str, range(AHEAD_STEPS)))),
     ] = (0,) * AHEAD_STEPS
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
+
+    @classmethod
+    def first_of(cls, session: int, ticks: Sequence[int], watts: Sequence[float]) -> "LoadAhead":
+        """Return the first of these steps, as many as one record can say: `length` of them.
+
+        Args:
+            session: That they are for.
+            ticks: At which each step begins.
+            watts: Heat load of each.
+        """
+        gaps: list[int] = []
+        for before, after in pairwise(ticks[:AHEAD_STEPS]):
+            if after - before > LONGEST_AHEAD_TICKS:
+                break
+            gaps.append(after - before)
+        length = len(gaps) + 1
+        spare = AHEAD_STEPS - length
+        return cls(session, ticks[0], length, (*watts[:length], *[0.0] * spare), (*gaps, *[0] * (spare + 1)))
 
     @property
     def steps(self) -> list[LoadStep]:

@@ -12,6 +12,9 @@ function badge(alarm) {
   return element("span", { class: `shape ${quiet ? "idle" : `p${alarm.priority}`}`, "aria-hidden": "true", text: LETTERS[alarm.priority] || "" });
 }
 
+// What is acknowledged is what was seen: an alarm that is raised again meanwhile is left.
+const seenOf = (alarms) => Object.fromEntries(alarms.filter((one) => WAITING.includes(one.state)).map((one) => [one.name, one.times]));
+
 function line() {
   const holder = byId("alarm-line"), told = state.alarms.filter((one) => ["unacknowledged", "acknowledged", "returned"].includes(one.state));
   const waiting = told.filter((one) => WAITING.includes(one.state)).length;
@@ -20,14 +23,14 @@ function line() {
   if (!parts.length) parts.push(element("span", { class: "minor", text: state.catalog.replay ? "A recorded run: its alarms are in the history" : "No alarms" }));
   const counts = `${told.length} alarm${told.length === 1 ? "" : "s"}, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}`;
   holder.replaceChildren(element("span", { class: "told" }, ...parts), element("span", { class: "count", text: counts }));
-  if (waiting) holder.append(element("button", { type: "button", class: "quiet operate-only", text: "Acknowledge all", hidden: !state.me.operates, onclick: () => command({ kind: "alarm", alarm: 65535, action: 1 }, true) }));
+  if (waiting) holder.append(element("button", { type: "button", class: "quiet operate-only", text: "Acknowledge all", hidden: !state.me.operates, onclick: () => command({ kind: "alarm", alarm: 65535, action: 1, seen: seenOf(state.alarms) }, true) }));
 }
 
 function actions(alarm) {
-  const does = state.catalog.alarm_actions, act = (name, time = 0, now = false) => () => command({ kind: "alarm", alarm: alarm.number, action: does[name], time_s: time }, now);
+  const does = state.catalog.alarm_actions, act = (name, time = 0) => () => command({ kind: "alarm", alarm: alarm.number, action: does[name], time_s: time });
   const button = (text, onclick) => element("button", { type: "button", text, onclick, "aria-label": `${text}: ${alarm.name}` });
   const box = element("div", { class: "buttons" });
-  if (WAITING.includes(alarm.state)) box.append(button("Acknowledge", act("acknowledge", 0, true)));
+  if (WAITING.includes(alarm.state)) box.append(button("Acknowledge", () => command({ kind: "alarm", alarm: alarm.number, action: does.acknowledge, seen: seenOf([alarm]) }, true)));
   if (alarm.state === "shelved") box.append(button("Unshelve", act("unshelve")));
   else if (alarm.state !== "out of service") {
     const time = element("select", { "aria-label": `Shelve ${alarm.name} for` }, ...[["15 min", 900], ["1 h", 3600], ["8 h", 28800]].map(([text, value]) => element("option", { value, text })));

@@ -1,46 +1,93 @@
 // Commands in two steps: what would be done, then confirm; and what came of it. Login.
-import { ask, element, send, state, timeText } from "./store.js";
+import { ask, element, onChange, send, state, timeText } from "./store.js";
 import { bindAll } from "./values.js";
 
 const byId = (id) => document.getElementById(id);
 let onUser = () => {};
 
-function note(asked, outcome, refused) {
+// What has come of a command: in the list, and in the line above the alarms until the next one. It covers nothing.
+const WORDS = { applied: "applied: ", refused: "refused because ", uncertain: "UNCERTAIN: " };
+function note(asked, what, detail) {
+  const time = timeText(state.tick * state.catalog.tick_s), came = `${WORDS[what]}${detail}`;
   const body = byId("outcome-table").querySelector("tbody");
-  body.prepend(element("tr", {}, element("td", { class: "number", text: timeText(state.tick * state.catalog.tick_s) }), element("td", { text: asked }), element("td", { class: refused ? "refused" : "", text: `${refused ? "refused because " : "applied: "}${outcome}` })));
+  body.prepend(element("tr", {}, element("td", { class: "number", text: time }), element("td", { text: asked }), element("td", { class: what, text: came })));
   while (body.children.length > 50) body.lastChild.remove();
-  const banner = byId("toast") || document.body.appendChild(element("div", { id: "toast", role: "status" }));
-  banner.textContent = `${asked}: ${refused ? "refused because " : "applied: "}${outcome}`;
-  banner.className = refused ? "refused" : "";
-  clearTimeout(note.timer);
-  note.timer = setTimeout(() => banner.remove(), 8000);
+  const line = byId("outcome-line");
+  line.replaceChildren(element("span", { class: "label", text: time }), ` ${asked}: `, element("span", { class: what, text: came }));
+  line.className = what;
+  line.title = `${asked}: ${came}`;
+  line.hidden = false;
 }
 
 // Asks for the number in a field; for nothing when it has none: an empty field is not a zero.
 function numberIn(field, then) { if (field.value === "") field.focus(); else then(Number(field.value)); }
 
-// `atOnce` is for what does not touch the process, such as acknowledging an alarm.
+// `atOnce` is for what does not touch the process, such as acknowledging an alarm. One command at a time: a click while
+// another one is under way, or the second of a double click on Confirm, is no command, and changes nothing that is asked.
+const TOO_SOON_MS = 400;
+let underWay = false, closed = -Infinity;
 export async function command(body, atOnce = false) {
-  let prepared;
-  try { prepared = await send("api/commands", body); } catch (error) { note(body.kind, error.message, true); if (error.status === 401) await refreshUser(); return; }
-  if (!atOnce && !(await confirmed(prepared.text))) return;
-  try {
-    const outcome = await send(`api/commands/${prepared.token}`, {});
-    note(outcome.asked, outcome.refused_because || outcome.applied, Boolean(outcome.refused_because));
-  } catch (error) { note(prepared.text, error.message, true); if (error.status === 401) await refreshUser(); }
+  if (underWay) return;
+  underWay = true;
+  document.body.classList.add("commanding");
+  try { await oneCommand(body, atOnce); } finally {
+    setTimeout(() => { underWay = false; document.body.classList.remove("commanding"); }, Math.max(0, closed + TOO_SOON_MS - performance.now()));
+  }
 }
 
+async function oneCommand(body, atOnce) {
+  let prepared;
+  try { prepared = await send("api/commands", body); } catch (error) { await failed(body.kind, error, "refused"); return; }
+  if (!atOnce && !(await confirmed(prepared.text))) return;
+  try {
+    const { asked, applied, refused_because: refused, uncertain_because: uncertain } = await send(`api/commands/${prepared.token}`, {});
+    note(asked, uncertain ? "uncertain" : refused ? "refused" : "applied", uncertain || refused || applied);
+  } catch (error) { await failed(prepared.text, error, "uncertain"); }
+}
+
+// Without a status nobody has answered: a command that was only prepared is not done, of a confirmed one nobody knows.
+async function failed(asked, error, unanswered) {
+  if (error.status) note(asked, "refused", error.message);
+  else note(asked, unanswered, "the page's own server did not answer; look what has become of it before asking again");
+  if (error.status === 401) await refreshUser().catch(() => {});
+}
+
+// Enter does not confirm by itself: whoever holds a key down, or clicks twice, has not read what is asked.
 function confirmed(text) {
   const dialog = byId("confirm");
   byId("confirm-text").textContent = `${text}?`;
   dialog.showModal();
-  byId("confirm-yes").focus();
+  byId("confirm-no").focus();
+  byId("confirm-yes").disabled = true;
+  setTimeout(() => { byId("confirm-yes").disabled = false; }, TOO_SOON_MS);
   return new Promise((resolve) => {
-    const end = (answer) => () => { dialog.close(); resolve(answer); };
-    byId("confirm-yes").onclick = end(true);
-    byId("confirm-no").onclick = end(false);
-    dialog.oncancel = () => resolve(false);
+    let answer = false;
+    dialog.onclose = () => { closed = performance.now(); resolve(answer); };
+    byId("confirm-yes").onclick = () => { answer = true; dialog.close(); };
+    byId("confirm-no").onclick = () => dialog.close();
   });
+}
+
+// A field shows what there is until somebody writes into it: what is sent by mistake then changes nothing. Returns what
+// makes it follow again.
+function follow(field, name, others = []) {
+  let touched = false;
+  for (const one of [field, ...others]) one.addEventListener("input", () => { touched = true; });
+  onChange(() => {
+    const value = state.values[name];
+    if (touched || typeof value !== "number") return;
+    const text = String(Number(value.toPrecision(6)));
+    for (const one of [field, ...others]) if (one.value !== text && one !== document.activeElement) one.value = text;
+  });
+  return () => { touched = false; };
+}
+
+async function playFile() {
+  const field = byId("load-file"), [file] = field.files;
+  if (!file) { note("load file", "refused", "no file is chosen"); field.focus(); return; }
+  let content;
+  try { content = await file.text(); } catch { note("load file", "refused", `${file.name} cannot be read any more: choose it again`); return; }
+  await command({ kind: "load_file", content });
 }
 
 function faceplates() {
@@ -66,6 +113,7 @@ export async function refreshUser() {
   for (const one of document.querySelectorAll(".operate-only")) one.hidden = !state.me.operates;
   for (const one of document.querySelectorAll(".view-only")) one.hidden = state.me.operates;
   for (const one of document.querySelectorAll("#commands button:not(#login-open-2), #commands input, #commands select")) one.disabled = !state.me.operates;
+  byId("outcome-line").hidden = !state.me.operates && !byId("outcome-line").title;
   onUser();
 }
 
@@ -83,15 +131,18 @@ export function initCommands(userChanged) {
   const slider = byId("load-slider"), number = byId("load-number");
   slider.addEventListener("input", () => { number.value = slider.value; });
   number.addEventListener("input", () => { slider.value = number.value; });
-  byId("load-set").addEventListener("click", () => numberIn(number, (watts) => command({ kind: "load", watts })));
-  byId("load-play").addEventListener("click", async () => { const [file] = byId("load-file").files; if (file) command({ kind: "load_file", content: await file.text() }); });
-  byId("factor-set").addEventListener("click", () => numberIn(byId("factor"), (factor) => command({ kind: "factor", factor })));
+  const followLoad = follow(number, "plant.load status.watts", [slider]), followFactor = follow(byId("factor"), "plant.pace.factor");
+  byId("load-set").addEventListener("click", () => numberIn(number, (watts) => command({ kind: "load", watts }).then(followLoad)));
+  byId("load-play").addEventListener("click", playFile);
+  byId("factor-set").addEventListener("click", () => numberIn(byId("factor"), (factor) => command({ kind: "factor", factor }).then(followFactor)));
   byId("training").hidden = !state.catalog.training;
   for (const output of state.catalog.outputs) byId("fault-output").append(element("option", { text: output }));
   byId("fault-set").addEventListener("click", () => numberIn(byId("fault-value"), (value) => command({ kind: "sensor_fault", output: byId("fault-output").value, fault: Number(byId("fault-kind").value), value })));
   for (const id of ["login-open", "login-open-2"]) byId(id).addEventListener("click", login);
   byId("login-cancel").addEventListener("click", () => byId("login").close());
-  byId("logout").addEventListener("click", async () => { await send("api/logout", {}); await refreshUser(); });
+  byId("logout").addEventListener("click", async () => {
+    try { await send("api/logout", {}); await refreshUser(); } catch { note("log out", "refused", "the page's own server did not answer: still logged in"); }
+  });
   byId("login-form").addEventListener("submit", async (event) => {
     event.preventDefault();
     try {
@@ -101,5 +152,5 @@ export function initCommands(userChanged) {
       await refreshUser();
     } catch (error) { byId("login-error").textContent = error.message; }
   });
-  setInterval(refreshUser, 15000);
+  setInterval(() => refreshUser().catch(() => {}), 15000);
 }

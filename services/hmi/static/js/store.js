@@ -2,7 +2,7 @@
 
 export const state = { catalog: null, me: null, values: {}, services: {}, stale: [], alarms: [], update: null, tick: 0, heard: 0 };
 const listeners = [];
-const SILENT_MS = 1500, GIVEN_UP_MS = 5000;
+const SILENT_MS = 1500, GIVEN_UP_MS = 5000, SEND_MS = 20000;
 
 export function onChange(listener) { listeners.push(listener); }
 
@@ -82,7 +82,7 @@ export async function ask(path) {
 }
 
 export async function send(path, body) {
-  const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+  const answer = await fetch(path, { method: "POST", signal: AbortSignal.timeout(SEND_MS), headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
   const document_ = await answer.json();
   if (!answer.ok) throw Object.assign(new Error(document_.error || answer.statusText), { status: answer.status });
   return document_;

@@ -2,7 +2,7 @@
 import { element, isStale, onChange, shape, signal, state, valueText } from "./store.js";
 
 const bound = new Map(); // signal -> functions that draw
-const watched = [];      // [element, signal or prefix]
+const watched = [];      // [element, signals or prefixes: all of them are current, or the element is crossed out]
 
 function bind(name, draw) {
   if (!bound.has(name)) bound.set(name, []);
@@ -17,7 +17,7 @@ export function bindAll(root) {
   for (const one of root.querySelectorAll(".tag[data-signal]")) bindTag(one);
   for (const one of root.querySelectorAll(".bar[data-signal]")) bindBar(one);
   for (const one of root.querySelectorAll("[data-signal]:not(.tag):not(.bar)")) bindText(one);
-  for (const one of root.querySelectorAll("[data-source]")) watched.push([one, one.dataset.source]);
+  for (const one of root.querySelectorAll("[data-source]")) watched.push([one, ...one.dataset.source.split(" ")]);
 }
 
 export function bindText(one) {
@@ -100,5 +100,5 @@ onChange(({ names }) => {
   for (const name of names === null ? bound.keys() : names) {
     for (const draw of bound.get(name) || []) if (!drawn.has(draw)) { drawn.add(draw); draw(); }
   }
-  for (const [one, name] of watched) one.classList.toggle("stale", isStale(name));
+  for (const [one, ...names] of watched) one.classList.toggle("stale", names.some(isStale));
 });
