@@ -4,9 +4,11 @@ Kernels are compiled without fast-math and without contraction of multiply-add, 
 written: the same inputs give the same bits in every process and on every processor.
 
 The cache lives in `COLDLOOP_CACHE_DIR`, or in the user's cache directory, in a folder named after a digest of the
-sources of all compiled modules: numba itself does not notice that a kernel called from another file has changed.
+sources of all compiled modules: numba itself does not notice that a kernel called from another file has changed. What
+takes long to compute and depends on those sources is kept there too.
 """
 
+import contextlib
 import hashlib
 import os
 import tempfile
@@ -16,11 +18,18 @@ from pathlib import Path
 from typing import ParamSpec, TypeVar, cast
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-COMPILED_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc", "rig.compiled")
+COMPILED_PACKAGES = ("plant", "optimizer_plc", "rig.compiled")
+COMPILED_MODULES = (
+    "coldloop.compiled", "coldloop.process", "coldloop.single_precision", "control_plc.output_limits",
+    "control_plc.sensors",
+)  # fmt: skip
+"""What kernels call from other packages."""
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -43,7 +52,23 @@ def _sources_digest() -> str:
         for folder in (spec.submodule_search_locations or ()) if spec else ():
             for source in sorted(Path(folder).rglob("*.py")):
                 digest.update(source.read_bytes())
+    for spec in (find_spec(module) for module in COMPILED_MODULES if find_spec(module.partition(".")[0])):
+        if spec is not None and spec.origin is not None:
+            digest.update(Path(spec.origin).read_bytes())
     return digest.hexdigest()[:16]
+
+
+def kept(name: str, of: bytes, compute: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return what `compute` returns for `of`, from the cache where it is there and whole."""
+    path = Path(str(numba.config.CACHE_DIR)) / f"{name}-{hashlib.sha256(of).hexdigest()[:24]}.npy"  # type: ignore[attr-defined]
+    try:
+        found: NDArray[np.float64] = np.load(path)
+    except (OSError, ValueError, EOFError):
+        found = compute()
+        with contextlib.suppress(OSError), tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as draft:
+            np.save(draft, found)
+            Path(draft.name).replace(path)
+    return found
 
 
 def _cache_directory() -> Path:
