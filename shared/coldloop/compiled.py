@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 P = ParamSpec("P")
 R = TypeVar("R")
 
-COMPILED_PACKAGES = ("plant", "optimizer_plc", "rig.compiled")
+COMPILED_PACKAGES = ("plant", "optimizer_plc")
 COMPILED_MODULES = (
     "coldloop.compiled", "coldloop.process", "coldloop.single_precision", "control_plc.output_limits",
-    "control_plc.sensors",
+    "control_plc.sensors", "rig.compiled.loops", "rig.compiled.portable", "rig.compiled.records",
 )  # fmt: skip
 """What kernels call from other packages."""
 
@@ -48,14 +48,19 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
 def _sources_digest() -> str:
     digest = hashlib.sha256(numba.__version__.encode())
     for package in COMPILED_PACKAGES:
-        spec = find_spec(package)
-        for folder in (spec.submodule_search_locations or ()) if spec else ():
-            for source in sorted(Path(folder).rglob("*.py")):
-                digest.update(source.read_bytes())
-    for spec in (find_spec(module) for module in COMPILED_MODULES if find_spec(module.partition(".")[0])):
-        if spec is not None and spec.origin is not None:
-            digest.update(Path(spec.origin).read_bytes())
+        for source in sorted(source for folder in _folders(package) for source in folder.rglob("*.py")):
+            digest.update(source.read_bytes())
+    for module in COMPILED_MODULES:
+        package, *path = module.split(".")
+        for folder in _folders(package):
+            digest.update(folder.joinpath(*path).with_suffix(".py").read_bytes())
     return digest.hexdigest()[:16]
+
+
+def _folders(package: str) -> list[Path]:
+    """Return where a package is installed, without importing it; not every service has all of them."""
+    spec = find_spec(package)
+    return [Path(folder) for folder in (spec.submodule_search_locations or ())] if spec else []
 
 
 def kept(name: str, of: bytes, compute: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
