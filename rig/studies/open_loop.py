@@ -141,7 +141,7 @@ def open_loop_table(found: OpenLoop) -> str:
     """Return total costs over the lowest with their intervals, and where solvers cross, as Markdown."""
     some = [power for power in FEW_POWERS if any(power in powers for powers in found.powers.values())]
     caption = (
-        f"**Paired, open loop**: total cost of {len(found.tables)} draws together over the lowest cost of any profile "
+        f"**Paired, open loop**: total cost of all draws ({len(found.tables)}) over the lowest cost of any profile "
         "that can be played [95 % percentile interval over the draws]. All solvers have the same problems, each with "
         "its own hot starts, and are judged by what the control PLC would play; no ratio can be below 1."
     )
@@ -157,11 +157,14 @@ def open_loop_table(found: OpenLoop) -> str:
         ]
         lines.append(f"| {LABELS[solver]} | " + " | ".join(cells) + " |")
     for other in ("ode", "interior-point"):
-        lines += [
-            "",
-            f"qpOASES costs no more than {LABELS[other]} from P = {found.crossing('qpoases', other).brief()} on.",
-        ]
+        lines += ["", _crossing_text(found.crossing("qpoases", other), LABELS[other])]
     return "\n".join(lines)
+
+
+def _crossing_text(power: Interval, other: str) -> str:
+    if np.isnan(power.value):
+        return f"At no power does qpOASES cost as little as {other}, all draws together."
+    return f"qpOASES costs no more than {other} from P = {power.brief()} on."
 
 
 def open_loop_figure(found: OpenLoop) -> Figure:
