@@ -290,7 +290,7 @@ def test_totals_are_pooled_before_they_are_divided(short: StudyOptions, made_up:
     share = np.log(4.0) / (np.log(4.0) - np.log(0.8))
     assert found.crossing("qpoases", "ode").value == pytest.approx(25**share)
     text = open_loop_table(found)
-    assert "| ODE | 1.5 [1.33 to 2] |" in text
+    assert "| ODE | 1.5 [1.333 to 2] |" in text
     assert "qpOASES costs no more than ODE from P = " in text
 
 
