@@ -1,23 +1,26 @@
 """A run folder as the operator's page replays it."""
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
 from coldloop.event_text import EventText, word
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.control_plc import Cause, Mode, Process
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
+from coldloop.registers.plant import StationSample
 from hmi.model import Told
 from hmi.replay import Frame
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.rules import make_rule
 from optimizer_plc.settings import OptimizerSettings
 from optimizer_plc.solvers import make_solver
+from rig.columns import STATION_FILE
 from rig.run_folder import RunFolder
 
 PROCESS: Final = ("load_w", *INPUT_NAMES, *OUTPUT_NAMES)
@@ -37,11 +40,26 @@ class RecordedPage:
         self._folder = folder
         self.name = folder.path.resolve().name
         with folder.file("trace.parquet") as file:
-            table = file.read(columns=[*PROCESS, "mode", "cause"])
+            table = file.read(columns=[*PROCESS, "mode", "cause", "bad_sensors"])
         self._values = np.column_stack([table[name].to_numpy() for name in PROCESS]).astype(np.float32)
         self._modes = table["mode"].to_pylist()
         self._causes = table["cause"].to_pylist()
+        self._bad_sensors = [_bits(names) for names in table["bad_sensors"].to_pylist()]
         self._settings = self._read_settings()
+        self._station = self._read_station()
+
+    @property
+    def configuration(self) -> Mapping[str, Any]:
+        """What it was run with, by dotted key."""
+        return self._folder.configuration
+
+    def _read_station(self) -> NDArray[np.float32] | None:
+        """Return signals, mode and alarms of the station, a row a tick; None of a cold box alone."""
+        if not (self._folder.path / STATION_FILE).exists():
+            return None
+        with self._folder.file(STATION_FILE) as file:
+            table = file.read(columns=[*STATION_SIGNAL_NAMES, "mode", "alarms"])
+        return np.column_stack([column.to_numpy() for column in table.columns]).astype(np.float32)
 
     def _read_settings(self) -> OptimizerSettings:
         """Return what the optimiser was configured with."""
@@ -84,8 +102,21 @@ class RecordedPage:
         """Return one tick."""
         load, *values = self._values[tick].tolist()
         u, y = tuple(values[: len(INPUT_NAMES)]), tuple(values[len(INPUT_NAMES) :])
-        mode, cause = self._modes[tick], self._causes[tick]
-        return Frame(Process(tick, load, u, y), _MODES.get(mode, int(Mode.MPC)), _CAUSES.get(cause, int(Cause.NONE)))
+        mode = _MODES.get(self._modes[tick], int(Mode.MPC))
+        cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
+        return Frame(Process(tick, load, u, y), mode, cause, self._bad_sensors[tick], self._station_at(tick))
+
+    def _station_at(self, tick: int) -> StationSample | None:
+        if self._station is None or tick >= len(self._station):
+            return None
+        *signals, mode, alarms = self._station[tick].tolist()
+        return StationSample(tick, tuple(signals), int(mode), int(alarms))
+
+
+@cache
+def _bits(names: str) -> int:
+    """Return the bits of outputs that are named in a text."""
+    return sum(1 << OUTPUT_NAMES.index(name) for name in names.split())
 
 
 def _optimization(row: Mapping[str, Any]) -> Optimization:

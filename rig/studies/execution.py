@@ -7,6 +7,7 @@ store themselves: only requests go through the scheduler.
 
 import contextlib
 import logging
+import os
 import signal
 import time
 from collections.abc import Iterator, Sequence
@@ -25,6 +26,8 @@ from rig.studies.request import RunRequest, perform, programs_digest
 from rig.studies.store import Store, StoredOutcomes
 
 CONNECT_PATIENCE_S: Final = 10
+FINISHED: Final = "finished"
+"""State of a future whose task has ended well; one without a scheduler is cancelled, and has no exception either."""
 FILE_PATIENCE_S: Final = 60.0
 """Time after which a file that a worker has written on a file system that is shared is seen here too."""
 
@@ -45,7 +48,10 @@ class Workers:
         Raises:
             UsageError: The scheduler does not answer.
         """
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its import has set it to INFO
+        for name in ("distributed", "distributed.client"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # their import has set them to less
+        # an end at once, by a signal, leaves semaphores to a process that removes them, and need not warn of it
+        os.environ.setdefault("PYTHONWARNINGS", "ignore::UserWarning:multiprocessing.resource_tracker")
         with contextlib.ExitStack() as stack:
             address: str | LocalCluster
             if self.scheduler is None:
@@ -158,6 +164,8 @@ def _done(client: Client, store: Store, agenda: _Agenda, first: Sequence[RunRequ
         if error is not None:
             reason = _first_line(error)
             raise StudyError(f"a run under load {request.load} failed: {reason}; what was done before is kept")
+        if future.status != FINISHED:
+            raise StudyError("the scheduler is gone, or has given up a run; what was done before is kept: do it again")
         _await_file(store, request)
         yield request
         under_way.update(submit(agenda.next(request)))  # type: ignore[no-untyped-call]

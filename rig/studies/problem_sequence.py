@@ -56,8 +56,8 @@ class _ListeningOptimizer(OptimizerProgram):
     def solve(self) -> InputSequence:
         """Solve, and keep what was solved."""
         sequence = super().solve()
-        if self._sent is not None:
-            self.heard.append(Recorded(self._sent.situation, self._sent.z))
+        if self.state.sent is not None:
+            self.heard.append(Recorded(self.state.sent.situation, self.state.sent.z))
         return sequence
 
 
@@ -71,7 +71,7 @@ def _recorded(scenario: Scenario, assignments: tuple[str, ...]) -> ProblemSequen
     settings = load_configuration(Settings, environment={}, assignments=(*assignments, *CONVERGED)).settings
     program = settings.optimizer_plc.program
     model = load_model(settings.model.file)
-    rig = OneProcessRig(settings)
+    rig = OneProcessRig(settings, compiled=False)
     listening = rig.optimizer = _ListeningOptimizer(model, program, settings.limits)
     rig.run(scenario, Recorder(scenario.ticks, []))
     problem = PredictiveProblem(PredictionModel(model), program.design, settings.limits)

@@ -37,10 +37,17 @@ Series = NDArray[np.float64]
 
 PROGRAM_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc")
 RIG_MODULES = (
+    "rig.compiled.control",
+    "rig.compiled.loops",
+    "rig.compiled.optimizer",
+    "rig.compiled.portable",
+    "rig.compiled.records",
+    "rig.compiled.stretches",
     "rig.indicators",
     "rig.session_client",
     "rig.session_reader",
     "rig.one_process",
+    "rig.recorded",
     "rig.recording",
     "rig.studies.hindsight",
     "rig.studies.ideal_loop",

@@ -5,13 +5,14 @@ Plain Python, for the control PLC has no numba; the rig compiles these very func
 """
 
 import math
-from collections.abc import MutableSequence, Sequence
+from collections.abc import MutableSequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from coldloop.limits import InputLimits, RateReference
 from coldloop.process import TICKS_PER_SAMPLE
 from coldloop.single_precision import neighbour, single
+from control_plc.numbers import Numbers, Rows
 
 TOLERANCE: Final = 1e-5
 """Share of an input's range by which a sequence may miss a limit: single precision cannot tell it apart. The guard
@@ -71,7 +72,7 @@ class GuardState:
     """What was applied when the guard began is outside the bounds."""
 
 
-def beginning(limits: Limits, applied: Sequence[float]) -> GuardState:
+def beginning(limits: Limits, applied: Numbers) -> GuardState:
     """Return the state in which `applied` has stood for ever."""
     slots = range(limits.slew_ticks)
     return GuardState(list(applied), list(applied), [NEVER for _ in slots], [list(applied) for _ in slots])
@@ -94,7 +95,7 @@ def rate_share(limits: Limits, elapsed_ticks: int) -> float:
     return min(1.0, elapsed_ticks / TICKS_PER_SAMPLE) if limits.elapsed else 1.0
 
 
-def admit(state: GuardState, limits: Limits, tick: int, wanted: Sequence[float], update: bool) -> None:  # noqa: FBT001 compiled
+def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update: bool) -> None:  # noqa: FBT001 compiled
     """Apply `wanted` (3) at `tick` as far as it may be; `update` tells that a sequence begins there."""
     applied = state.applied
     if update or tick - state.start >= TICKS_PER_SAMPLE:
@@ -156,7 +157,7 @@ def is_reached(state: GuardState, limits: Limits, tick: int, value: float, i: in
     return reached
 
 
-def in_range(limits: Limits, row: Sequence[float]) -> bool:
+def in_range(limits: Limits, row: Numbers) -> bool:
     """Tell whether the outputs (3) are finite and inside the bounds, but for the slack."""
     inside = True
     for i in range(3):
@@ -164,7 +165,7 @@ def in_range(limits: Limits, row: Sequence[float]) -> bool:
     return inside
 
 
-def admits(state: GuardState, limits: Limits, first_tick: int, rows: Sequence[Sequence[float]], length: int) -> bool:
+def admits(state: GuardState, limits: Limits, first_tick: int, rows: Rows, length: int) -> bool:
     """Tell whether a sequence of `length` rows, one a tick, would be applied as it is; `state` moves along with it."""
     for k in range(length):
         admit(state, limits, first_tick + k, rows[k], k == 0)

@@ -10,6 +10,7 @@ from typing import Annotated, Self
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from coldloop.process import L1, T5, TICK_S
+from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
 CONTROLLED = (L1, T5)
@@ -47,7 +48,7 @@ class SensorCheckSettings(BaseModel):
         return self
 
 
-def are_inside(y: Sequence[float], low: Sequence[float], high: Sequence[float]) -> bool:
+def are_inside(y: Numbers, low: Numbers, high: Numbers) -> bool:
     """Tell whether all measurements are numbers within their ranges; the rig compiles this function, and the next."""
     inside = True
     for output in range(len(y)):
@@ -55,9 +56,7 @@ def are_inside(y: Sequence[float], low: Sequence[float], high: Sequence[float]) 
     return inside
 
 
-def watch_standing(
-    stands: MutableSequence[int], before: MutableSequence[float], y: Sequence[float], elapsed: int
-) -> None:
+def watch_standing(stands: MutableSequence[int], before: MutableSequence[float], y: Numbers, elapsed: int) -> None:
     """Sum up for how many ticks each controlled output has stood while most of the others moved.
 
     `before` (22) becomes `y`, the measurements `elapsed` ticks later.
@@ -70,7 +69,7 @@ def watch_standing(
     before[:] = y
 
 
-def moved(before: Sequence[float], y: Sequence[float]) -> int:
+def moved(before: Numbers, y: Numbers) -> int:
     """Return how many measurements are others than before."""
     count = 0
     for output in range(len(y)):
@@ -85,28 +84,28 @@ class SensorMonitor:
     """
 
     def __init__(self, settings: SensorCheckSettings, initial: Sequence[float]) -> None:
-        self._low, self._high = zip(*settings.ranges, strict=True)
-        self._frozen_ticks = round(settings.frozen_s / TICK_S)
+        self.low, self.high = zip(*settings.ranges, strict=True)
+        self.frozen_ticks = round(settings.frozen_s / TICK_S)
         self._bridged_ticks = round(settings.bridged_s / TICK_S)
         self._good = list(initial)
-        self._before = list(initial)
+        self.before = list(initial)
         self._tick: int | None = None
         self._now = 0
-        self._stands = [0] * len(CONTROLLED)
+        self.stands = [0] * len(CONTROLLED)
         self._recovering: dict[int, int] = {}
         """Output, and since which tick its measurements have been good again."""
         self.bad: dict[int, int] = {}
 
     def check(self, tick: int, y: Sequence[float]) -> Sequence[float]:
         """Return the outputs measured at `tick`, with bad ones replaced by their last good value."""
-        watch_standing(self._stands, self._before, y, 1 if self._tick is None else max(0, tick - self._tick))
+        watch_standing(self.stands, self.before, y, 1 if self._tick is None else max(0, tick - self._tick))
         self._tick = self._now = tick
-        frozen = [output for output, ticks in zip(CONTROLLED, self._stands, strict=True) if ticks >= self._frozen_ticks]
-        if not self.bad and not frozen and are_inside(y, self._low, self._high):
+        frozen = [output for output, ticks in zip(CONTROLLED, self.stands, strict=True) if ticks >= self.frozen_ticks]
+        if not self.bad and not frozen and are_inside(y, self.low, self.high):
             self._good[:] = y
             return y
         for output, value in enumerate(y):
-            self._judge(output, ok=self._low[output] <= value <= self._high[output] and output not in frozen)
+            self._judge(output, ok=self.low[output] <= value <= self.high[output] and output not in frozen)
             if output not in self.bad:
                 self._good[output] = value
         return tuple(self._good)
@@ -125,6 +124,11 @@ class SensorMonitor:
             since = self._recovering.setdefault(output, self._now)
             if self._now - since + 1 >= RECOVERY_TICKS:
                 del self.bad[output], self._recovering[output]
+
+    def seen(self, tick: int, y: Sequence[float]) -> None:
+        """Note that all outputs y (22) have been good up to `tick`, and what was measured there."""
+        self._tick = self._now = tick
+        self._good[:] = self.before[:] = y
 
     @property
     def unusable(self) -> list[int]:

@@ -18,6 +18,7 @@ from hmi.explanation import explain
 from hmi.model import Model, Told
 from hmi.sentences import sentence
 from hmi.signals import MAPS, signals_of
+from hmi.station import plant_document
 from hmi.trends import NAMES, mode_name, rounded, thin
 
 Document = dict[str, Any]
@@ -150,6 +151,7 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
         "tick": model.tick,
         "time_s": model.tick * TICK_S,
         "services": services_document(model),
+        "plant": plant_document(model),
         "stale": model.stale_prefixes(),
         "values": {name: finite(model.values[name]) for name in names},
     }
@@ -240,6 +242,7 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
         "modes": [
             {"from": one.start, "to": one.end, "mode": mode_name(one.mode)} for one in model.trends.modes(start, end)
         ],
+        "substituted": {name: found for name, found in model.trends.substituted(start, end).items() if name in names},
         "marks": _marks(model, start, end),
         "predictions": [prediction_document(one) for one in _some(shown)],
         "bands": _ranges(BANDED_OUTPUTS, limits.output_low, limits.output_high),

@@ -16,6 +16,8 @@ from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, Upd
 ROUNDING: Final = 1e-6
 RESOLUTION: Final = 2.0**-22
 """A change of E that is smaller is lost in the single precision of the registers."""
+STEEPEST: Final = 0.1
+"""Slope of K, 1/iteration, that is not reached where K is 1."""
 LONGEST_TICKS: Final = TICKS_PER_SAMPLE
 
 
@@ -151,8 +153,15 @@ def period_ticks(iterations: int, rule: UpdatingRuleStatus) -> int:
     return min(LONGEST_TICKS, math.ceil(needed - ROUNDING))
 
 
-def increments_of(update: Optimization, iterations_before: int) -> Increments:
-    """Return the increments that Gamma was made of: they follow from E, D, K, Gamma and q."""
+def is_rounded_to_one(update: Optimization) -> bool:
+    """Tell whether K was below 1, and is 1 in the single precision of the registers: Gamma is no slope of K then."""
+    return update.contraction == 1.0 and abs(update.gamma) >= STEEPEST
+
+
+def increments_of(update: Optimization, iterations_before: int) -> Increments | None:
+    """Return the increments that Gamma was made of: they follow from E, D, K, Gamma and q; None where they do not."""
+    if is_rounded_to_one(update):
+        return None
     E, D, K = update.efficiency, update.mismatch, update.contraction
     dD = (D - 1.0) / iterations_before
     if K >= 1.0:

@@ -78,6 +78,8 @@ class Model:
         """Events so far; the last ones are in `events`."""
         self.changed: set[str] = set()
         """Names of signals, `alarms`, `updates`, `prediction`: what changed since it was last looked at."""
+        self.configuration: Mapping[str, Any] = {}
+        """What the plant's registers tell of its configuration, by dotted key."""
         self._values: dict[str, float | int | str] = {}
         self._session = 0
         self.replay: dict[str, object] | None = None
@@ -101,7 +103,7 @@ class Model:
             self._identity(service, record)
         elif isinstance(record, Process):
             self._moved(source, record.tick)
-            self.trends.add(record, self.mode)
+            self.trends.add(record, self.mode, self.bad_sensors)
         elif isinstance(record, Prediction):
             self._predicted(record)
 
@@ -179,6 +181,12 @@ class Model:
         return ladder.mode if ladder else 0
 
     @property
+    def bad_sensors(self) -> int:
+        """Outputs for which the last good value stands in, a bit for each."""
+        ladder = self.record("control_plc", LadderStatus)
+        return ladder.bad_sensors if ladder else 0
+
+    @property
     def rule(self) -> UpdatingRuleStatus:
         """What decides the updating period."""
         return self.record("optimizer_plc", UpdatingRuleStatus) or UpdatingRuleStatus()
@@ -218,10 +226,9 @@ class Model:
         if self.is_live("control_plc") and self.stands_still("control_plc"):
             stale.append("control_plc.process.")
         if self.is_live("plant") and self.stands_still("plant"):
-            stale.append("plant.measurement.")
-        ladder = self.record("control_plc", LadderStatus)
-        bad = ladder.bad_sensors if ladder else 0  # the last good value of such a sensor replaces it
-        return stale + [f"control_plc.process.y.{name}" for i, name in enumerate(OUTPUT_NAMES) if bad >> i & 1]
+            stale += ["plant.measurement.", "plant.station."]
+        bad = [name for i, name in enumerate(OUTPUT_NAMES) if self.bad_sensors >> i & 1]
+        return stale + [f"control_plc.process.y.{name}" for name in bad]
 
     def alarm_rows(self) -> list[tuple[AlarmKind, Alarm]]:
         """Return the alarms with their kinds."""

@@ -10,12 +10,14 @@ from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.audit import EVENT_ROWS, Event, JournalPage
 from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
 from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStatus, Process, Status
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, ControlLinkStatus, Optimization, Prediction
-from coldloop.registers.plant import LoadStatus
+from coldloop.registers.plant import LoadStatus, StationStatus
 from coldloop.registers.safety import Alarm, AlarmKind
 from hmi.model import Model, Told
 from hmi.signals import MAPS, shown_blocks
+from hmi.station import KIND, REFRIGERATOR
 
 log = logging.getLogger("coldloop.hmi")
 
@@ -56,6 +58,7 @@ class Poller:
         self._last_event: Event | None = None
         self._next_update = 0
         self._checked = False
+        self._configured: ConfigurationDigest | None = None
         self._told = ""
 
     async def run(self) -> None:
@@ -98,6 +101,8 @@ class Poller:
         model.put(service, await self._client.read(Identity))
         for record in FAST[service]:
             model.put(service, await self._client.read(record))
+        if service == "plant" and model.configuration.get(KIND) == REFRIGERATOR:
+            model.put(service, await self._client.read(StationStatus))
         if service == "optimizer_plc":
             await self._read_updates()
         now = time.monotonic()
@@ -117,6 +122,20 @@ class Poller:
                 self._model.put(self._service, await self._client.read(record))
             except (DamagedAnswerError, RequestRefusedError):  # not sealed: nobody has written it yet
                 continue
+        if self._service == "plant":
+            await self._read_configuration()
+
+    async def _read_configuration(self) -> None:
+        """Read what the service runs, when it is not what was read last."""
+        digest = self._model.record(self._service, ConfigurationDigest)
+        if digest is None or digest == self._configured:
+            return
+        lines = await self._client.read_rows(ConfigurationLine, 0, lines_of(digest))
+        try:
+            self._model.configuration = configuration_of(digest, lines)
+        except ValueError:  # not one of ours, or it has changed meanwhile
+            return
+        self._configured = digest
 
     async def _read_updates(self) -> None:
         identity = self._model.record("optimizer_plc", Identity)

@@ -144,9 +144,10 @@ class Reading:
         columns = [self._model.trends.column(name, rows) for name in names]
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(["time_s", *names])
-        for tick, *values in zip(self._model.trends.ticks[rows.start : rows.stop], *columns, strict=True):
-            writer.writerow([tick * TICK_S, *(f"{value:.7g}" for value in values)])
+        writer.writerow(["time_s", *names, "substituted"])
+        for row, *values in zip(rows, *columns, strict=True):
+            bad = " ".join(name for name in self._model.trends.substituted_at(row) if name in names)
+            writer.writerow([self._model.trends.ticks[row] * TICK_S, *(f"{value:.7g}" for value in values), bad])
         return csv_answer(text.getvalue(), "coldloop-trend.csv")
 
     async def explanation(self, request: web.Request) -> web.Response:

@@ -4,17 +4,17 @@ import asyncio
 import math
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
-from typing import Final, NamedTuple, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NamedTuple, Protocol
 
 from aiohttp import web
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from coldloop.process import TICK_S
+from coldloop.process import STATION_VALVE_NAMES, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Process
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
-from coldloop.registers.plant import LoadStatus
+from coldloop.registers.plant import LoadStatus, StationSample, StationStatus
 from hmi.guard import refusal
 from hmi.model import Model, Told
 from hmi.page_server import Exhibit, PageServer
@@ -32,6 +32,10 @@ class Frame(NamedTuple):
     process: Process
     mode: int
     cause: int
+    bad_sensors: int = 0
+    """A bit for each output that the control PLC substituted. The process has the true value."""
+    station: StationSample | None = None
+    """Of a whole refrigerator."""
 
 
 class RecordedRun(Protocol):
@@ -60,6 +64,10 @@ class RecordedRun(Protocol):
     @property
     def limits(self) -> OperatingLimits:
         """Bands, bounds and rates."""
+
+    @property
+    def configuration(self) -> Mapping[str, Any]:
+        """What it was run with, by dotted key."""
 
     def frame(self, tick: int) -> Frame:
         """Return one tick."""
@@ -140,6 +148,7 @@ class Replay:
     def _begin(self) -> None:
         model = self._model
         model.put("control_plc", Identity(session=1))
+        model.configuration = self._run.configuration
         model.put("optimizer_plc", self._run.rule)
         model.put("optimizer_plc", self._run.limits)
 
@@ -163,10 +172,11 @@ class Replay:
         every = max(1, math.ceil((tick - before) / points))
         for each in range(before + 1, tick, every):
             frame = run.frame(each)
-            model.trends.add(frame.process, frame.mode)
+            model.trends.add(frame.process, frame.mode, frame.bad_sensors)
         self._tick = tick
         newest = run.frame(tick)
-        model.trends.add(newest.process, newest.mode)  # after a step back the newest record may be the one known
+        # after a step back the newest record may be the one known
+        model.trends.add(newest.process, newest.mode, newest.bad_sensors)
         self._put(newest)
         updates, events = run.updates, run.events
         first, last = (bisect_right(updates, one, key=lambda update: update.tick) for one in (before, tick))
@@ -176,9 +186,11 @@ class Replay:
 
     def _put(self, frame: Frame) -> None:
         model, process = self._model, frame.process
-        model.put("control_plc", LadderStatus(frame.mode, frame.cause, 0, 1, 0, 0))
+        model.put("control_plc", LadderStatus(frame.mode, frame.cause, 0, 1, frame.bad_sensors, 0))
         model.put("control_plc", process)
         model.put("plant", LoadStatus(watts=process.load))
+        if frame.station is not None:  # what its controller asked for is not recorded
+            model.put("plant", StationStatus(*_of_status(frame.station), (math.nan,) * len(STATION_VALVE_NAMES)))
 
     def _show(self) -> None:
         for service in MAPS:
@@ -189,6 +201,10 @@ class Replay:
             "name": self._run.name, "playing": self._playing, "speed": self._speed, "tick": self._tick,
             "last_tick": self._run.ticks - 1,
         }  # fmt: skip
+
+
+def _of_status(sample: StationSample) -> tuple[int, int, int, tuple[float, ...]]:
+    return sample.tick, sample.mode, sample.alarms, sample.signals
 
 
 async def serve_replays(runs: Sequence[RecordedRun], settings: HmiSection, announce: Callable[[str], None]) -> None:

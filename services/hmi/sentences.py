@@ -7,7 +7,7 @@ from coldloop.event_text import word
 from coldloop.process import TICK_S
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import UpdatingRuleStatus
-from hmi.explanation import Branch, Explanation
+from hmi.explanation import Branch, Explanation, is_rounded_to_one
 
 AT_REST: Final = 1e-9
 """A Gamma that is smaller is rounding: the cost is at its floor."""
@@ -77,7 +77,9 @@ def _late(found: Explanation, _rule: UpdatingRuleStatus) -> str:
 
 def _algorithm_1(found: Explanation, _rule: UpdatingRuleStatus) -> str:
     K, gamma = found.update.contraction, found.update.gamma
-    if K >= 1.0:
+    if is_rounded_to_one(found.update):
+        looks = "K is 1 to the precision of the registers (the cost stands still), and Gamma"
+    elif K >= 1.0:
         looks = f"K = {K:.6g} is not below 1 (the cost does not fall), so K itself is to fall: dK/dq"
     else:
         looks = f"K = {K:.6g} is below 1 (the cost falls), so the response time is to fall: dt_r/dq"

@@ -15,7 +15,21 @@ from coldloop.registers.plant import PLANT_MAP
 from coldloop.registers.text import from_words
 
 MAPS: Final[Mapping[str, RegisterMap]] = {one.service: one for one in (PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP)}
-DECIMALS: Final = {"%": 2, "K": 3, "bar": 3, "W": 1, "Hz": 1, "s": 3, "ms": 2, "ppm": 1, "Pa": 0, "m3": 5}
+DECIMALS: Final = {
+    "%": 2,
+    "K": 3,
+    "bar": 3,
+    "W": 1,
+    "Hz": 1,
+    "s": 3,
+    "ms": 2,
+    "ppm": 1,
+    "Pa": 0,
+    "m3": 5,
+    "g/s": 2,
+    "kg": 2,
+    "kW": 1,
+}
 _WORD: Final = re.compile(r"(\d+) ([^,;:()]+?)(?: \([^)]*\))?(?=[,;:]|$)")
 
 

@@ -2,7 +2,7 @@
 
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, TICK_S
@@ -23,6 +23,13 @@ class Stretch(NamedTuple):
     mode: int
 
 
+class Substitution(NamedTuple):
+    """A stretch of plant time in which another value stands in for that of a bad sensor."""
+
+    start: float
+    end: float
+
+
 class TrendStore:
     """Samples of the process in the order of their ticks, at most `kept_s` of plant time of them."""
 
@@ -30,6 +37,8 @@ class TrendStore:
         self._kept_ticks = round(kept_s / TICK_S)
         self.ticks = array("q")
         self._columns: dict[str, array[float]] = {name: array("f") for name in NAMES}
+        self._bad = array("L")
+        """Sensors whose value is substituted, a bit for each output."""
 
     def __len__(self) -> int:
         return len(self.ticks)
@@ -41,15 +50,16 @@ class TrendStore:
 
     def clear(self) -> None:
         """Forget everything."""
-        del self.ticks[:]
+        del self.ticks[:], self._bad[:]
         for column in self._columns.values():
             del column[:]
 
-    def add(self, process: Process, mode: int) -> None:
+    def add(self, process: Process, mode: int, bad_sensors: int = 0) -> None:
         """Add a sample; one that is not newer than the last one is left out."""
         if process.tick <= self.last_tick:
             return
         self.ticks.append(process.tick)
+        self._bad.append(bad_sensors)
         for name, value in zip(NAMES, (process.load, *process.u, *process.y, float(mode)), strict=True):
             self._columns[name].append(value)
         self._trim()
@@ -59,7 +69,7 @@ class TrendStore:
         oldest = bisect_left(self.ticks, self.ticks[-1] - self._kept_ticks)
         drop = max(excess, oldest)
         if drop >= SPARE_ROWS or (drop and 2 * drop >= len(self.ticks)):
-            del self.ticks[:drop]
+            del self.ticks[:drop], self._bad[:drop]
             for column in self._columns.values():
                 del column[:drop]
 
@@ -96,6 +106,34 @@ class TrendStore:
                     found[-1] = found[-1]._replace(end=time)
                 found.append(Stretch(time, time, mode))
         return found
+
+    def substituted(self, start: int, end: int) -> dict[str, list[Substitution]]:
+        """Return when another value stood in for outputs between two ticks, by name."""
+        rows = self.between(start, end)
+        bad = self._bad[rows.start : rows.stop]
+        if not any(bad):
+            return {}
+        times = [tick * TICK_S for tick in self.ticks[rows.start : rows.stop]]
+        found = {name: list(_stretches(times, bad, 1 << bit)) for bit, name in enumerate(OUTPUT_NAMES)}
+        return {name: stretches for name, stretches in found.items() if stretches}
+
+    def substituted_at(self, row: int) -> list[str]:
+        """Return the outputs for which another value stood in."""
+        bad = self._bad[row]
+        return [name for bit, name in enumerate(OUTPUT_NAMES) if bad >> bit & 1]
+
+
+def _stretches(times: Sequence[float], bad: Sequence[int], mask: int) -> Iterator[Substitution]:
+    """Yield the stretches in which a bit is set; each lasts until the first sample in which it is not."""
+    start: float | None = None
+    for time, bits in zip(times, bad, strict=True):
+        if bits & mask:
+            start = time if start is None else start
+        elif start is not None:
+            yield Substitution(start, time)
+            start = None
+    if start is not None:
+        yield Substitution(start, times[-1] + TICK_S)
 
 
 def thin(

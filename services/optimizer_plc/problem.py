@@ -69,9 +69,9 @@ class PredictiveProblem:
         self.bands = np.array([design.output_low, design.output_high, design.violation_weight])
         self.size = (N_INPUTS + N_SLACKS) * self.n_knots
         self._model = prediction
-        self._knots_to_samples = interpolation(design.decision_instants, np.arange(1.0, design.horizon + 1))
-        self._input_scale = np.asarray(design.input_scale)
-        self._u0, self._rate = np.array(prediction.model.u0), np.asarray(limits.rate)
+        self.knots_to_samples = interpolation(design.decision_instants, np.arange(1.0, design.horizon + 1))
+        self.input_scale = np.asarray(design.input_scale)
+        self._u0, self.rate = np.array(prediction.model.u0), np.asarray(limits.rate)
         self._condense()
         self._build_output_rows()
         self._build_rate_rows()
@@ -97,7 +97,7 @@ class PredictiveProblem:
         C, D, G = (matrix[list(model.constrained)] for matrix in (model.C, model.D, model.G))
         Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))
         outputs_z, outputs_s = [], []
-        for weights in self._knots_to_samples:
+        for weights in self.knots_to_samples:
             u_of_z = self._input_map(weights)
             to_z = multiply(A, to_z) + multiply(B, u_of_z)
             to_s = multiply(A, to_s)
@@ -125,7 +125,7 @@ class PredictiveProblem:
         u_of_z = np.zeros((N_INPUTS, self.size))
         for knot, weight in enumerate(weights):
             for i in range(N_INPUTS):
-                u_of_z[i, N_INPUTS * knot + i] = weight * self._input_scale[i]
+                u_of_z[i, N_INPUTS * knot + i] = weight * self.input_scale[i]
         return u_of_z
 
     def _slack_map(self, weights: Array) -> Array:
@@ -139,7 +139,7 @@ class PredictiveProblem:
         level, temperature = self.design.violation_weight
         rho = np.array([level, level, temperature, temperature])
         total = np.zeros((self.size, self.size))
-        for weights in self._knots_to_samples:
+        for weights in self.knots_to_samples:
             slack_of_z = self._slack_map(weights)
             total += multiply(_transposed(slack_of_z), rho[:, None] * slack_of_z)
         return total
@@ -149,7 +149,7 @@ class PredictiveProblem:
         design = self.design
         rows, states, bounds = [], [], []
         for instant in design.constraint_instants:
-            slack_of_z = self._slack_map(self._knots_to_samples[instant - 1])
+            slack_of_z = self._slack_map(self.knots_to_samples[instant - 1])
             for output in range(2):
                 y_z, y_s = self.outputs_z[instant - 1][output], self.outputs_s[instant - 1][output]
                 low, high = design.output_low[output] - self.y0[output], design.output_high[output] - self.y0[output]
@@ -174,9 +174,9 @@ class PredictiveProblem:
                 if limit >= ranges[i]:
                     continue
                 row = np.zeros(self.size)
-                row[N_INPUTS * knot + i] = self._input_scale[i]
+                row[N_INPUTS * knot + i] = self.input_scale[i]
                 if knot:
-                    row[N_INPUTS * (knot - 1) + i] = -self._input_scale[i]
+                    row[N_INPUTS * (knot - 1) + i] = -self.input_scale[i]
                 for sign in (1.0, -1.0):
                     rows.append(sign * row)
                     bounds.append(limit)
@@ -203,8 +203,8 @@ class PredictiveProblem:
         return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, self._real(constant))
 
     def _make_maps(self) -> "Maps":
-        low_u = (np.asarray(self.limits.low) - self._model.model.u0) / self._input_scale
-        high_u = (np.asarray(self.limits.high) - self._model.model.u0) / self._input_scale
+        low_u = (np.asarray(self.limits.low) - self._model.model.u0) / self.input_scale
+        high_u = (np.asarray(self.limits.high) - self._model.model.u0) / self.input_scale
         slacks = N_SLACKS * self.n_knots
         return Maps(
             phi=self._phi_map,
@@ -216,8 +216,8 @@ class PredictiveProblem:
             rate_before=self._rate_before,
             low=np.concatenate([np.tile(low_u, self.n_knots), np.zeros(slacks)]),
             high=np.concatenate([np.tile(high_u, self.n_knots), np.full(slacks, np.inf)]),
-            rate=np.asarray(self.limits.rate) / self._input_scale,
-            input_scale=self._input_scale,
+            rate=np.asarray(self.limits.rate) / self.input_scale,
+            input_scale=self.input_scale,
         )
 
     def memory(self) -> int:
@@ -238,7 +238,7 @@ class PredictiveProblem:
 
         The rates between knots are rows of the problem, which a truncated solution may break; what is sent keeps them.
         """
-        return inputs_of(self._knots_to_samples[:samples], z, self._input_scale, self._u0, self._rate)
+        return inputs_of(self.knots_to_samples[:samples], z, self.input_scale, self._u0, self.rate)
 
     def outputs(self, z: Array, situation: Situation) -> Array:
         """Return L1 and T5 predicted for a profile at the end of each sampling period, shape (horizon, 2)."""
@@ -251,7 +251,7 @@ class PredictiveProblem:
     def hold(self, u: Array) -> Array:
         """Return the profile that keeps the input deviation u, without slack."""
         return np.concatenate(
-            [np.tile(u / self._input_scale, self.n_knots), np.zeros(N_SLACKS * self.n_knots, self._real)]
+            [np.tile(u / self.input_scale, self.n_knots), np.zeros(N_SLACKS * self.n_knots, self._real)]
         )
 
 

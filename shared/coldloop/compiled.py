@@ -20,7 +20,7 @@ import numba
 P = ParamSpec("P")
 R = TypeVar("R")
 
-COMPILED_PACKAGES = ("plant", "optimizer_plc")
+COMPILED_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc", "rig.compiled")
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:

@@ -59,7 +59,7 @@ class Answer(NamedTuple):
 class Site:
     """Services and page as processes on ports of their own; each can be killed, stopped and started again."""
 
-    def __init__(self, folder: Path, ports: list[int], overrides: Mapping[str, object]) -> None:
+    def __init__(self, folder: Path, ports: list[int], overrides: Mapping[str, object], kind: str = "cold-box") -> None:
         self.ports = dict(zip(SERVICES, ports, strict=True))
         self.audit = folder / "audit.jsonl"
         users = folder / "users"
@@ -70,7 +70,10 @@ class Site:
         settings = Settings.model_validate(
             {
                 "session": {"autostart": True, "mode": "realtime", "factor": FACTOR},
-                "plant": {"server": {"port": plant}, "load": "a", "retain": {"file": str(folder / "plant.state")}},
+                "plant": {
+                    "kind": kind, "server": {"port": plant}, "load": "a",
+                    "retain": {"file": str(folder / "plant.state")},
+                },
                 "control_plc": {
                     "server": {"port": control}, "plant": {"port": plant},
                     "retain": {"file": str(folder / "control.state")},
@@ -163,9 +166,9 @@ def start_site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..
     started: list[Site] = []
     reserved: list[ReservedPorts] = []
 
-    def start(**overrides: object) -> Site:
+    def start(*, kind: str = "cold-box", **overrides: object) -> Site:
         reserved.append(ReservedPorts(len(SERVICES)))
-        one = Site(tmp_path_factory.mktemp("site"), list(reserved[-1].numbers), overrides)
+        one = Site(tmp_path_factory.mktemp("site"), list(reserved[-1].numbers), overrides, kind)
         started.append(one)
         for service in SERVICES:
             one.start(service)
@@ -199,6 +202,15 @@ def read_registers(port: int, address: int, count: int) -> bytes:
             answer += part
     assert answer[7:9] == bytes((3, 2 * count))
     return answer[9:]
+
+
+def write_registers(port: int, address: int, data: bytes) -> None:
+    """Write holding registers with nothing but a socket."""
+    words = len(data) // 2
+    with socket.create_connection(("127.0.0.1", port), 5) as bus:
+        bus.sendall(struct.pack(">HHHBBHHB", 1, 0, 7 + len(data), 255, 16, address, words, len(data)) + data)
+        answer = bus.recv(1024)
+    assert answer[7:] == struct.pack(">BHH", 16, address, words)
 
 
 def process_now(port: int) -> tuple[int, tuple[float, ...]]:

@@ -210,6 +210,23 @@ def test_increments_are_found_again_on_both_sides_of_one() -> None:
         a = assess(Observation(4, 1.25, 160.0, 200.0, 104.0, 100.0, effective))
         values = {"efficiency": a.efficiency, "mismatch": a.mismatch, "contraction": a.contraction, "gamma": a.gamma}
         found = increments_of(optimization(1, 5, 4, **values), 4)
+        assert found is not None
         assert found.efficiency == pytest.approx(a.efficiency_increment, rel=1e-4)
         assert found.mismatch == pytest.approx(a.mismatch_increment, rel=1e-4)
         assert found.contraction == pytest.approx(a.contraction_increment, rel=1e-4)
+
+
+def test_a_slope_where_k_rounds_to_one_is_not_told_as_the_slope_of_k() -> None:
+    """K = 1 - 1e-9 in the program, 1 in the registers: Gamma is dt_r/dq, of the size of 1 / ln(K)^2."""
+    observed = Observation(4, 1.25, 1.0, 1.0, 1.0, 1.0 - 2e-10, 1.0 - 1e-9)
+    a = assess(observed)
+    assert a.contraction < 1.0
+    assert abs(a.gamma) > 1e6
+    before = optimization(7, 100, 4)
+    update = optimization(8, 105, 2, contraction=a.contraction, gamma=a.gamma)
+    assert update.contraction == 1.0
+    found = explain(update, before, None, RULE)
+    assert (found.increments, found.alternatives) == (None, ())
+    text = sentence(found, RULE)
+    assert "K is 1 to the precision of the registers" in text
+    assert "dK/dq" not in text

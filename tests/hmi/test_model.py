@@ -185,6 +185,17 @@ def test_modes_are_told_stretch_by_stretch() -> None:
     ]
 
 
+def test_a_value_that_is_substituted_is_told_stretch_by_stretch_and_no_other(model: Model) -> None:
+    t5, l1 = (OUTPUT_NAMES.index(name) for name in ("T5", "L1"))
+    for tick, bad in ((2, 0), (3, 1 << t5), (4, 1 << t5), (5, 0), (6, 1 << l1 | 1 << t5)):
+        model.put("control_plc", LadderStatus(1, 0, 0, 1, bad, 0))
+        model.put("control_plc", process(tick))
+    assert model.trends.substituted(0, 10) == {"T5": [(0.75, 1.25), (1.5, 1.75)], "L1": [(1.5, 1.75)]}
+    document = json.loads(encoded(trend_document(model, ["L1", "load"], 0, 10, 100)))
+    assert document["substituted"] == {"L1": [[1.5, 1.75]]}
+    assert model.trends.substituted(0, 2) == {}
+
+
 def test_alarms_that_wait_come_first_and_by_priority(model: Model) -> None:
     rows = [Alarm(priority=AlarmPriority.LOW) for _ in AlarmKind]
     rows[AlarmKind.MODE] = Alarm(AlarmState.ACKNOWLEDGED, 1, priority=AlarmPriority.CRITICAL)

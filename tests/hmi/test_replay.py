@@ -11,9 +11,10 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from coldloop.process import OUTPUT_NAMES
 from hmi.explanation import Branch
 from rig.ports import ReservedPorts
-from rig.recorded_page import RecordedPage
+from rig.recorded_page import RecordedPage, _bits
 from rig.run_folder import RunFolder
 from tests.conftest import Coldloop, first_of_three_ports
 from tests.hmi.conftest import RECORDED_S, Served, eventually
@@ -94,3 +95,9 @@ def test_up_with_its_page_prints_where_it_is_and_a_password_that_operates(tmp_pa
             assert json.loads(answer.read())["role"] == "operate"
     finally:
         subprocess.run([sys.executable, "-m", "rig", "down", *words], env=environment, check=True, timeout=60)
+
+
+def test_a_recorded_run_says_which_sensors_were_bad(run: Path) -> None:
+    recorded = RecordedPage(RunFolder(run))
+    assert {recorded.frame(tick).bad_sensors for tick in range(recorded.ticks)} == {0}
+    assert _bits("L1 T5") == 1 << OUTPUT_NAMES.index("L1") | 1 << OUTPUT_NAMES.index("T5")

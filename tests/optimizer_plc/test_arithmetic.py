@@ -118,7 +118,7 @@ def test_an_instance_in_single_precision_is_that_in_double_rounded(
     model: LtiModel, problem: PredictiveProblem, situations: Callable[..., Any]
 ) -> None:
     program = single_program(model)
-    single = program._problem  # noqa: SLF001
+    single = program.problem
     rng = np.random.default_rng(21)
     for _ in range(20):
         situation = situations(rng)

@@ -30,7 +30,8 @@ from rig.studies.study import StudyOptions
 
 
 def outcome(closed: float, opened: float) -> Outcome:
-    indicators = Indicators(0.0, 0.0, opened, closed, 0.0, 0.0, 0.0, 0, 0.0, 0.0)
+    nothing = Indicators(*[0] * len(Indicators._fields))
+    indicators = nothing._replace(J_open_mean=opened, J_BF=closed)
     return Outcome("", indicators, "", 0, {}, {})
 
 

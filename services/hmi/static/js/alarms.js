@@ -19,9 +19,11 @@ function line() {
   const holder = byId("alarm-line"), told = state.alarms.filter((one) => ["unacknowledged", "acknowledged", "returned"].includes(one.state));
   const waiting = told.filter((one) => WAITING.includes(one.state)).length;
   const hidden = state.alarms.filter((one) => ["shelved", "out of service"].includes(one.state)).length;
-  const parts = told.slice(0, 4).map((one) => element("a", { class: `alarm ${WAITING.includes(one.state) ? "unacknowledged" : ""}`, href: "#alarms" }, badge(one), `${one.name}${one.cause ? ` (${one.cause})` : ""}, ${STATES[one.state]}`));
+  const parts = told.slice(0, 4).map((one) => element("a", { class: `alarm ${WAITING.includes(one.state) ? "unacknowledged" : ""}`, href: "#alarms" }, badge(one), element("span", { text: `${one.name}${one.cause ? ` (${one.cause})` : ""}, ${STATES[one.state]}` })));
+  for (const name of state.plant.alarms || []) parts.push(element("a", { class: "alarm", href: "#alarms" }, badge({ state: "acknowledged", priority: 3 }), element("span", { text: `station: ${name}` })));
   if (!parts.length) parts.push(element("span", { class: "minor", text: state.catalog.replay ? "A recorded run: its alarms are in the history" : "No alarms" }));
-  const counts = `${told.length} alarm${told.length === 1 ? "" : "s"}, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}`;
+  const station = (state.plant.alarms || []).length;
+  const counts = `${told.length} alarm${told.length === 1 ? "" : "s"}, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}${station ? `, ${station} of the station` : ""}`;
   holder.replaceChildren(element("span", { class: "told" }, ...parts), element("span", { class: "count", text: counts }));
   if (waiting) holder.append(element("button", { type: "button", class: "quiet operate-only", text: "Acknowledge all", hidden: !state.me.operates, onclick: () => command({ kind: "alarm", alarm: 65535, action: 1, seen: seenOf(state.alarms) }, true) }));
 }
@@ -46,6 +48,16 @@ function row(one) {
     element("td", { class: "alarm-state", text: `${STATES[one.state] || one.state}${one.active ? ", active" : ""}${one.state === "shelved" ? ` until ${timeText(one.shelved_until_s)}` : ""}` }),
     element("td", { text: one.cause }), element("td", { class: "number", text: one.times ? timeText(one.raised_s) : "" }), element("td", { class: "number", text: one.times }),
     element("td", {}, state.me.operates ? actions(one) : ""));
+}
+
+// Shelving counts plant time: what that is by the clock is said wherever it is not the same.
+function shelvingNote() {
+  const factor = state.values["plant.pace.factor"], real = state.values["plant.pace.realtime"], paused = state.values["plant.pace.paused"];
+  const text = !state.values["plant.pace.session"] || (real && !paused && factor === 1) ? "" : !real ? "Shelving counts plant time, which goes as far as it is granted."
+    : paused ? "Shelving counts plant time, which stands still." : `Shelving counts plant time: at factor ${factor}, 15 min are over in ${(900 / factor).toPrecision(3)} s by the clock.`;
+  const note = byId("shelving-note");
+  note.hidden = !text;
+  if (note.textContent !== text) note.textContent = text;
 }
 
 // Only rows that have changed are made anew: a button is not replaced under somebody's hand.
@@ -80,12 +92,22 @@ async function history() {
   } catch { /* logged out meanwhile */ }
 }
 
+let shownStation = "";
+function stationNote() {
+  const note = byId("station-note"), told = state.plant.alarms || [];
+  note.hidden = state.plant.kind !== "refrigerator";
+  note.textContent = `Compression station and nitrogen: ${told.length ? told.join(", ") : "no alarms"}. They end by themselves; the history has them.`;
+  note.classList.toggle("refused", told.length > 0);
+}
+
 export function initAlarms() {
   for (const service of state.catalog.services) byId("event-service").append(element("option", { value: service, text: service }));
   byId("event-search").addEventListener("input", history);
   byId("event-service").addEventListener("change", history);
   onChange(({ alarms, names }) => {
-    if (alarms || names === null) { line(); table(); }
+    const station = JSON.stringify(state.plant.alarms || []);
+    if (alarms || names === null || station !== shownStation) { shownStation = station; line(); table(); stationNote(); }
+    shelvingNote();
     byId("alarm-line").classList.toggle("stale", isStale("control_plc."));
     byId("alarm-table").classList.toggle("stale", isStale("control_plc."));
   });

@@ -8,7 +8,7 @@ const MODE_SHADE = { mpc: null, rest: "medium-ground", hold: "high-ground", clas
 
 // lines: [{label, stroke, stepped, width}], options: {title, unit, decimals, log, band, sync, axis, small}
 export function makeChart(holder, lines, options) {
-  const extra = { band: null, predictions: [], marks: [], modes: [], now: null };
+  const extra = { substituted: {}, replaced: [], replacedEnds: [], band: null, predictions: [], marks: [], modes: [], now: null };
   const axis = (side) => ({
     stroke: colour("muted"), grid: { stroke: colour("line"), width: 0.5 }, ticks: { stroke: colour("line"), width: 0.5, size: 4 },
     font: "11px system-ui, sans-serif", ...side,
@@ -20,29 +20,66 @@ export function makeChart(holder, lines, options) {
   const size = () => ({ width: Math.max(80, holder.clientWidth), height: Math.max(40, holder.clientHeight) });
   const chart = new uPlot({
     ...size(),
-    padding: [4, 8, options.axis ? 0 : 4, 0],
+    padding: [4, options.small ? 8 : 28, options.axis ? 0 : 4, 0], // room for half of the last time
     legend: { show: false },
     cursor: { sync: options.sync ? { key: options.sync, setSeries: false } : undefined, drag: { x: Boolean(options.onZoom), y: false, setScale: false }, points: { size: 5 }, y: false },
     scales: { x: { time: false, range: (_u, low, high) => options.range ? options.range(low, high) : [low, high] },
-      y: options.log ? { distr: 3 } : { range: (_u, low, high) => spread(low, high, extra.band, options.spread) } },
+      y: options.log ? { distr: 3 } : { range: (_u, low, high) => spread(low, high, [...(extra.band || []), ...extra.replacedEnds], options.spread) } },
     axes: [
-      axis({ show: Boolean(options.axis), size: 24, values: (_u, ticks) => ticks.map(timeText), space: 90 }),
+      axis({ show: Boolean(options.axis), size: 24, values: (_u, ticks) => ticks.map((tick) => (tick < 0 ? "" : timeText(tick))), space: 90 }),
       axis({ size: options.small ? 42 : 58, space: 22, ...(options.log ? { filter: decades, grid: { stroke: colour("line"), width: 0.5, filter: decades } } : {}), values: (_u, ticks) => ticks.map((tick) => (tick === null ? "" : short(tick))) }),
     ],
     series: [{}, ...lines.map((line) => ({
       label: line.label, stroke: () => colour(line.stroke), width: line.width || 1.4, points: { show: false }, dash: line.dash,
-      paths: line.stepped ? uPlot.paths.stepped({ align: 1 }) : undefined, spanGaps: true,
+      paths: line.stepped ? uPlot.paths.stepped({ align: 1 }) : undefined, spanGaps: false,
     }))],
     hooks: {
       drawClear: [(u) => drawGround(u, extra)],
-      draw: [(u) => drawAhead(u, extra, lines)],
+      draw: [(u) => { drawAhead(u, extra, lines); drawReplaced(u, extra); }],
       setCursor: options.onCursor ? [(u) => options.onCursor(u)] : [],
       setSelect: options.onZoom ? [(u) => { if (u.select.width > 4) options.onZoom(u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")); u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false); }] : [],
     },
   }, [[], ...lines.map(() => [])], holder);
   if (options.onPick) chart.over.addEventListener("click", () => { if (chart.cursor.left >= 0) options.onPick(chart.posToVal(chart.cursor.left, "x")); });
   new ResizeObserver(() => chart.setSize(size())).observe(holder);
-  return { chart, extra, show(data, more = {}) { Object.assign(extra, more); chart.setData(data); } };
+  return { chart, extra, show(data, more = {}) { Object.assign(extra, more); chart.setData(withoutReplaced(data, lines, extra)); holder.dataset.substituted = extra.replaced.length; } };
+}
+
+// Where a sensor is bad another value stands in for it: what is not measured is no line like others.
+function withoutReplaced([times, ...columns], lines, extra) {
+  extra.replaced = []; extra.replacedEnds = [];
+  return [times, ...columns.map((values, place) => {
+    let shown = values;
+    for (const [from, to] of extra.substituted[lines[place].label] || []) {
+      const points = times.map((time, i) => [time, values[i], i]).filter(([time, value]) => time >= from && time < to && value !== null);
+      if (shown === values) shown = [...values];
+      for (const [, , i] of points) shown[i] = null;
+      if (!points.length) continue;
+      extra.replaced.push([...points, [to, points.at(-1)[1]]]);
+      for (const [, value] of points) extra.replacedEnds.push(value);
+    }
+    return shown;
+  })];
+}
+
+function drawReplaced(u, extra) {
+  if (!extra.replaced.length || u.scales.y.min === null) return;
+  const { ctx, bbox } = u;
+  ctx.save();
+  ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip();
+  ctx.strokeStyle = ctx.fillStyle = colour("muted"); ctx.lineWidth = 1.4 * devicePixelRatio;
+  ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+  const size = 4 * devicePixelRatio;
+  for (const points of extra.replaced) {
+    const places = points.map(([time, value]) => [u.valToPos(time, "x", true), u.valToPos(value, "y", true)]);
+    ctx.setLineDash([2 * devicePixelRatio, 4 * devicePixelRatio]);
+    ctx.beginPath(); places.forEach(([x, y], i) => (i ? ctx.lineTo(x, y) : ctx.moveTo(x, y))); ctx.stroke();
+    ctx.setLineDash([]);
+    for (const [x, y] of [places[0], places.at(-1)]) { ctx.beginPath(); ctx.moveTo(x - size, y - size); ctx.lineTo(x + size, y + size); ctx.moveTo(x - size, y + size); ctx.lineTo(x + size, y - size); ctx.stroke(); }
+    const left = Math.max(bbox.left, places[0][0]);
+    if (places.at(-1)[0] - left > 120 * devicePixelRatio) ctx.fillText("sensor bad: substituted", left + 2 * size, places[0][1] - 1.5 * size);
+  }
+  ctx.restore();
 }
 
 function swatch(line) {

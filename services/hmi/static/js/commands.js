@@ -1,5 +1,5 @@
 // Commands in two steps: what would be done, then confirm; and what came of it. Login.
-import { ask, element, onChange, send, state, timeText } from "./store.js";
+import { ask, element, onChange, send, signal, state, timeText } from "./store.js";
 import { bindAll } from "./values.js";
 
 const byId = (id) => document.getElementById(id);
@@ -76,7 +76,7 @@ function follow(field, name, others = []) {
   onChange(() => {
     const value = state.values[name];
     if (touched || typeof value !== "number") return;
-    const text = String(Number(value.toPrecision(6)));
+    const text = String(Number(value.toFixed(signal(name).decimals)));
     for (const one of [field, ...others]) if (one.value !== text && one !== document.activeElement) one.value = text;
   });
   return () => { touched = false; };

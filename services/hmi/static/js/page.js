@@ -70,23 +70,30 @@ function overview() {
   setInterval(refreshStrips, 1000);
 }
 
-async function mimic() {
-  const text = await (await fetch("static/mimic.svg")).text();
+// One drawing for each kind of plant. Where another plant is found later, the page begins anew.
+const MIMICS = { refrigerator: "static/mimic-refrigerator.svg" };
+async function mimic(kind) {
+  const text = await (await fetch(MIMICS[kind] || "static/mimic.svg")).text();
   byId("mimic").append(document.importNode(new DOMParser().parseFromString(text, "image/svg+xml").documentElement, true));
+  document.body.dataset.plant = kind;
+  onChange(() => { if ((MIMICS[state.plant.kind] || "") !== (MIMICS[kind] || "")) location.reload(); });
 }
 
 async function start() {
-  [state.catalog, state.me] = await Promise.all([ask("api/catalog"), ask("api/me"), mimic()]);
+  [state.catalog, state.me] = await Promise.all([ask("api/catalog"), ask("api/me")]);
+  const first = await ask("api/state").catch(() => null); // not for who has to log in first
+  if (first) state.plant = first.plant;
+  await mimic(state.plant.kind);
   theme(localStorage.getItem("theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
   byId("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; localStorage.setItem("theme", next); theme(next); });
   initDetail(); for (const one of [document.querySelector("header"), byId("overview"), byId("commands")]) bindAll(one);
   links(); overview();
   initTrends((time) => { location.hash = "#why"; pick(`?at=${time}`); });
   initWhy(); initCommands(redrawAlarms); initAlarms(); initReplay();
-  try { take(await ask("api/state")); } catch (error) { if (!state.me.role) byId("login-open").click(); }
+  if (first) take(first); else if (!state.me.role) byId("login-open").click();
   await refreshUser();
   connect(); show();
-  addEventListener("hashchange", () => { show(); byId("view").focus({ preventScroll: true }); });
+  addEventListener("hashchange", () => { show(); byId("view").focus({ preventScroll: true }); byId("view").scrollTop = 0; });
 }
 
 start();

@@ -7,10 +7,10 @@ const NAMES = "L1,T5,CV155,NCR22_A,CV156,load";
 const LAYOUT = [
   { id: "L1", title: "L1 %", lines: [{ label: "L1", stroke: "trend", from: "series" }], band: "L1", spread: 1, tall: true, ahead: ["L1"], ribbon: true },
   { id: "T5", title: "T5 K", lines: [{ label: "T5", stroke: "trend", from: "series" }], band: "T5", spread: 1, tall: true, ahead: ["T5"] },
-  { id: "valves", title: "%", lines: [{ label: "CV155", stroke: "trend", from: "series", stepped: true }, { label: "CV156", stroke: "trend-2", from: "series", stepped: true }], bounds: "CV155", spread: 2, ahead: ["CV155", "CV156"] },
-  { id: "heat", title: "W", lines: [{ label: "load", stroke: "trend-3", from: "series", stepped: true }, { label: "NCR22_A", stroke: "trend", from: "series", stepped: true }], spread: 20 },
+  { id: "valves", title: "(%)", lines: [{ label: "CV155", stroke: "trend", from: "series", stepped: true }, { label: "CV156", stroke: "trend-2", from: "series", stepped: true }], bounds: "CV155", spread: 2, ahead: ["CV155", "CV156"] },
+  { id: "heat", title: "(W)", lines: [{ label: "load", stroke: "trend-3", from: "series", stepped: true }, { label: "NCR22_A", stroke: "trend", from: "series", stepped: true }], spread: 20 },
   { id: "tau", title: "τu s, click to see why", lines: [{ label: "tau_u", stroke: "trend", from: "updates", stepped: true }], spread: 1 },
-  { id: "cost", title: "cost", tall: true, lines: [{ label: "J", name: "J reached", stroke: "trend", from: "updates" }, { label: "J_predicted", name: "J predicted", stroke: "trend-2", from: "updates", dash: [4, 3] }], log: true },
+  { id: "cost", title: "(cost)", tall: true, lines: [{ label: "J", name: "J reached", stroke: "trend", from: "updates" }, { label: "J_predicted", name: "J predicted", stroke: "trend-2", from: "updates", dash: [4, 3] }], log: true },
 ];
 const REFRESH_MS = 500;
 
@@ -43,7 +43,8 @@ function readout(u) {
   const target = document.getElementById("readout");
   if (time === null || !newest) { target.textContent = ""; return; }
   const at = (times, values) => { let i = times.findIndex((one) => one > time); i = i < 0 ? times.length - 1 : i - 1; return i < 0 ? null : values[i]; };
-  const parts = Object.entries(newest.series).map(([name, values]) => [name, at(newest.time, values)]);
+  const isReplaced = (name) => (newest.substituted[name] || []).some(([from, to]) => from <= time && time < to);
+  const parts = Object.entries(newest.series).map(([name, values]) => [`${name}${isReplaced(name) ? " (substituted)" : ""}`, at(newest.time, values)]);
   parts.push(["τu", at(newest.updates.time, newest.updates.tau_u)], ["q", at(newest.updates.time, newest.updates.q)]);
   target.textContent = `${timeText(Math.round(time * 4) / 4)}  ${parts.filter((one) => one[1] !== null).map(([name, value]) => `${name} ${Number(value.toPrecision(5))}`).join("  ")}`;
 }
@@ -54,7 +55,7 @@ function show(one) {
   const predictions = one.ahead ? newest.predictions.map((each) => ({ time: one.ahead[0].startsWith("CV") ? each.input_time : each.time, curves: one.ahead.map((name) => each[name]) })) : [];
   one.show([times, ...one.lines.map(source)], {
     band: one.band ? newest.bands[one.band] : one.bounds ? newest.bounds[one.bounds] : null,
-    predictions, marks: newest.marks, modes: newest.modes, now: newest.now_s, ribbon: one.ribbon,
+    predictions, substituted: newest.substituted, marks: newest.marks, modes: newest.modes, now: newest.now_s, ribbon: one.ribbon,
   });
 }
 
@@ -86,7 +87,7 @@ export function initTrends(pick) {
   document.getElementById("export-png").addEventListener("click", () => {
     asPicture(charts || []).toBlob((blob) => { const link = element("a", { href: URL.createObjectURL(blob), download: "coldloop-trends.png" }); link.click(); URL.revokeObjectURL(link.href); });
   });
-  document.getElementById("trend-legend").textContent = "Band and bounds: dashed lines. Ahead of now: what the newest sequence is expected to lead to; faint: earlier predictions. Marks: load (dotted), alarms, commands, faults. Ground: modes other than MPC. Drag to zoom.";
+  document.getElementById("trend-legend").textContent = "Band and bounds: dashed lines. Ahead of now: what the newest sequence is expected to lead to; faint: earlier predictions. Marks: load (dotted), alarms, commands, faults. Ground: modes other than MPC. Dotted between crosses: the sensor is bad, another value stands in for it. Drag to zoom.";
 }
 
 export function showTrends() { refresh(); if (!timer) timer = setInterval(refresh, REFRESH_MS); }
@@ -111,7 +112,7 @@ export async function refreshStrips() {
   }
   for (const one of strips) {
     const times = one.updates ? found.updates.time : found.time;
-    one.show([times, one.updates ? found.updates.tau_u : found.series[one.lines[0].label]], { band: one.band ? found.bands[one.band] : null, modes: found.modes, marks: found.marks });
+    one.show([times, one.updates ? found.updates.tau_u : found.series[one.lines[0].label]], { band: one.band ? found.bands[one.band] : null, substituted: found.substituted, modes: found.modes, marks: found.marks });
   }
 }
 export function recolourStrips() { if (strips) { strips.forEach((one) => one.chart.destroy()); strips = null; refreshStrips(); } }

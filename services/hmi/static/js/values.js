@@ -34,10 +34,16 @@ function scale(one, value, ends) {
   return (x) => (x - low) / (high - low || 1);
 }
 
+// Where the plant's own alarms of a signal begin; an end that there is not is the end of the scale.
+function ownBand(one, name) {
+  const [low, high] = (state.plant.bands || {})[name] || [null, null];
+  return low === null && high === null ? null : [low === null ? Number(one.dataset.low) : low, high === null ? Number(one.dataset.high) : high];
+}
+
 function place(one, parts, width) {
   const name = one.dataset.signal, value = number(name);
-  const band = pair(one.dataset.band), bounds = pair(one.dataset.bounds);
-  const ends = (band || bounds || []).map(number);
+  const own = ownBand(one, name), band = own || pair(one.dataset.band), bounds = pair(one.dataset.bounds);
+  const ends = own || (band || bounds || []).map(number);
   const known = ends.length === 2 && ends[1] > ends[0];
   const at = scale(one, value, known ? ends : []);
   if (known) {
@@ -52,7 +58,17 @@ function place(one, parts, width) {
   return { value, known, ends, at };
 }
 
+// A value without a bar, for what has no limits.
+function bindSmallTag(tag) {
+  const name = tag.dataset.signal, width = Number(tag.dataset.width) || 100;
+  const text = shape("text", { x: width, y: 12, "text-anchor": "end", class: "reading" });
+  tag.append(shape("rect", { class: "ground", x: -2, y: 0, width: width + 4, height: 16, rx: 2, opacity: 0.85 }), shape("text", { class: "name", x: 0, y: 12 }, tag.dataset.name), text);
+  bind(name, () => { text.textContent = valueText(name); });
+  watched.push([tag, name]);
+}
+
 function bindTag(tag) {
+  if (tag.classList.contains("small")) { bindSmallTag(tag); return; }
   const name = tag.dataset.signal, width = 100;
   const frame = shape("rect", { class: "frame", x: -3, y: -1, width: width + 6, height: 32, rx: 2 });
   const ground = shape("rect", { class: "ground", x: -2, y: 0, width: width + 4, height: 30, rx: 2, opacity: 0.85 });
@@ -69,8 +85,8 @@ function bindTag(tag) {
     text.textContent = valueText(name);
     const { value } = place(tag, parts, width);
     if (tag.dataset.level && Number.isFinite(value)) {
-      const bath = document.getElementById(tag.dataset.level), height = 206 * Math.min(1, Math.max(0, value / 100));
-      bath.setAttribute("y", 384 - height);
+      const bath = document.getElementById(tag.dataset.level), height = Number(bath.dataset.full) * Math.min(1, Math.max(0, value / 100));
+      bath.setAttribute("y", Number(bath.dataset.bottom) - height);
       bath.setAttribute("height", height);
     }
   };
@@ -95,7 +111,14 @@ function bindBar(bar) {
   watched.push([text, name], [drawing, name]);
 }
 
+// What stands in words on the drawing, and machines that have tripped.
+function drawStation() {
+  for (const one of document.querySelectorAll("[data-station]")) { const text = `${one.dataset.station}${state.plant.mode || ""}`; if (one.textContent !== text) one.textContent = text; }
+  for (const one of document.querySelectorAll("[data-alarm-of]")) one.classList.toggle("tripped", (state.plant.alarms || []).includes(one.dataset.alarmOf));
+}
+
 onChange(({ names }) => {
+  drawStation();
   const drawn = new Set();
   for (const name of names === null ? bound.keys() : names) {
     for (const draw of bound.get(name) || []) if (!drawn.has(draw)) { drawn.add(draw); draw(); }

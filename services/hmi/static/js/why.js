@@ -21,7 +21,7 @@ function quantities(found) {
     ["ΔE/Δq", found.increments ? digits(found.increments.efficiency) : "–", ""],
     ["ΔD/Δq", found.increments ? digits(found.increments.mismatch) : "–", ""],
     ["ΔK/Δq", found.increments ? digits(found.increments.contraction) : "–", ""],
-    ["Γ", digits(u.gamma), u.contraction >= 1 ? "= ΔK/Δq, as K ≥ 1" : "= Δt_r/Δq, as K < 1"],
+    ["Γ", digits(u.gamma), !found.increments ? "" : u.contraction >= 1 ? "= ΔK/Δq, as K ≥ 1" : "= Δt_r/Δq, as K < 1"],
     ["branch", found.branch, "what decided"],
   ];
   byId("why-quantities").replaceChildren(...rows.map(([name, value, meaning]) => element("tr", {}, element("td", {}, ...indexed(name)), element("td", { class: "number", text: value }), element("td", { class: "minor" }, ...indexed(meaning)))));
@@ -31,7 +31,7 @@ function alternatives(found) {
   const rows = found.alternatives.map((one) => element("tr", { class: one.iterations === found.iterations ? "chosen" : "" },
     element("td", { class: "number", text: `${one.iterations}${one.iterations === found.iterations ? " (chosen)" : ""}` }), element("td", { class: "number", text: `${one.period_s} s` }),
     element("td", { class: "number", text: digits(one.contraction, 6) }), element("td", { class: "number", text: one.response_s === null ? "does not fall" : `${digits(one.response_s)} s` })));
-  byId("why-alternatives").replaceChildren(...(rows.length ? rows : [element("tr", {}, element("td", { colspan: "4", class: "minor", text: "Algorithm 1 did not decide here." }))]));
+  byId("why-alternatives").replaceChildren(...(rows.length ? rows : [element("tr", {}, element("td", { colspan: "4", class: "minor", text: ["up", "down", "level"].includes(found.branch) ? "K is 1 to the precision of the registers: nothing can be told of other q." : "Algorithm 1 did not decide here." }))]));
 }
 
 function budget(found) {
@@ -58,7 +58,7 @@ async function curves(found) {
   }
   for (const one of charts) {
     const predictions = found.prediction ? [{ time: found.prediction.time, curves: [found.prediction[one.name]] }] : [];
-    one.show([trend.time, trend.series[one.name]], { band: trend.bands[one.name], predictions, now: found.time_s });
+    one.show([trend.time, trend.series[one.name]], { band: trend.bands[one.name], substituted: trend.substituted, predictions, now: found.time_s });
   }
   const came = found.came === null ? "not known yet" : digits(found.came, 5);
   byId("why-cost").textContent = `Cost at the end of this period: predicted ${digits(found.predicted, 5)}, came ${came}. ${found.prediction ? "Dashed: the trajectory that was predicted." : "The predicted trajectory of this update is not kept any more."} Vertical line: the updating instant.`;

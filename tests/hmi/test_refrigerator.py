@@ -1,0 +1,170 @@
+"""The whole refrigerator on the page: its drawing, and values, alarms and limits of the station."""
+
+import re
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from coldloop.process import OUTPUT_NAMES, STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
+from coldloop.registers.plant import StationAlarm, StationStatus
+from hmi.model import Model
+from hmi.reading import STATIC
+from hmi.signals import MAPS, signals_of
+from hmi.station import plant_document
+from tests.hmi.conftest import Served, Site, eventually, opened, read_registers, write_registers
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+STATION, STATION_WORDS, SURROUNDINGS = 700, 50, 760
+SHOWN = [f"signals.{name}" for name in STATION_SIGNAL_NAMES] + [f"commands.{name}" for name in STATION_VALVE_NAMES]
+COMPARED = 40
+"""Ticks."""
+COLLECT = """() => {
+  window.seen = {};
+  const tick = document.querySelector("#detail [data-signal='plant.station.tick']");
+  new MutationObserver(() => {
+    const values = {};
+    for (const one of document.querySelectorAll("#mimic .tag[data-signal^='plant.station']"))
+      values[one.dataset.signal.slice("plant.station.".length)] = one.querySelector(".reading").textContent;
+    window.seen[tick.textContent] = values;
+  }).observe(tick, { childList: true, characterData: true, subtree: true });
+}"""
+
+
+@pytest.fixture(scope="module")
+def refrigerator(start_site: Callable[..., Site]) -> Site:
+    return start_site(kind="refrigerator")
+
+
+@pytest.fixture
+def page(browser: "Browser", refrigerator: Site) -> "Iterator[Page]":
+    with opened(browser, refrigerator.address) as one:
+        yield one
+
+
+def station_now(site: Site) -> tuple[int, dict[str, float]]:
+    """Read tick, signals and commands with nothing but a socket."""
+    tick, _, _, *values = struct.unpack(">IHH23f", read_registers(site.ports["plant"], STATION, STATION_WORDS))
+    return tick, dict(zip(SHOWN, values, strict=True))
+
+
+def give(site: Site, *, nc1: int) -> None:
+    write_registers(site.ports["plant"], SURROUNDINGS, struct.pack(">HHHff", nc1, 1, 1, 0.0, 300.0))
+
+
+def test_every_value_of_the_station_is_that_of_an_independent_reading_of_the_same_tick(
+    page: "Page", refrigerator: Site
+) -> None:
+    page.evaluate(COLLECT)
+    read: dict[int, dict[str, float]] = {}
+
+    def is_enough() -> bool:
+        tick, values = station_now(refrigerator)
+        read[tick] = values
+        return len(read) > COMPARED + 10
+
+    eventually(is_enough, f"{COMPARED} ticks", 60)
+    shown = {int(tick): values for tick, values in page.evaluate("window.seen").items()}
+    both = set(shown) & set(read)
+    assert len(both) >= COMPARED
+    for tick in both:
+        for name, text in shown[tick].items():
+            number = text.partition(" ")[0]
+            step = 10.0 ** -len(number.partition(".")[2])
+            assert abs(float(number) - read[tick][name]) <= 0.501 * step + 1e-6 * abs(read[tick][name]), (tick, name)
+
+
+def test_a_tripped_compressor_is_seen_on_the_drawing_and_in_the_alarm_line(page: "Page", refrigerator: Site) -> None:
+    assert page.locator(".compressor.tripped").count() == 0
+    assert page.text_content("#mimic text[data-station]") == "pressure control: automatic"
+    give(refrigerator, nc1=0)
+    try:
+        eventually(lambda: page.locator(".compressor.tripped").count() == 1, "NC1 is marked")
+        assert page.is_visible(".compressor.tripped .trip"), "by a word too, not by colour alone"
+        eventually(lambda: "station: nc1 tripped" in page.inner_text("#alarm-line"), "the alarm line has it")
+        low = "#mimic .tag[data-signal='plant.station.signals.P12'].abnormal"
+        eventually(lambda: page.locator(low).count() == 1, "the high pressure leaves its band", 60)
+        page.click("nav a[href='#alarms']")
+        assert "nc1 tripped" in page.inner_text("#station-note")
+    finally:
+        give(refrigerator, nc1=1)
+    eventually(lambda: page.locator(".compressor.tripped").count() == 0, "it runs again")
+
+
+def test_values_of_the_station_are_crossed_out_with_the_plant(page: "Page", refrigerator: Site) -> None:
+    tags = "#mimic .tag[data-signal^='plant.station']"
+    assert page.locator(f"{tags}.stale").count() == 0
+    refrigerator.freeze("plant")
+    try:
+        eventually(lambda: page.locator(f"{tags}.stale").count() == page.locator(tags).count(), "all are crossed out")
+    finally:
+        refrigerator.thaw("plant")
+    eventually(lambda: page.locator(f"{tags}.stale").count() == 0, "they come back", 60)
+
+
+def test_the_drawing_is_that_of_the_plant(browser: "Browser", site: Site, refrigerator: Site) -> None:
+    for one, names in ((site, 0), (refrigerator, len(SHOWN))):
+        with opened(browser, one.address) as page:
+            assert page.locator("#mimic .tag[data-signal^='plant.station']").count() <= names
+            assert (page.locator("#mimic .compressor").count() == 2) is (names > 0)
+            assert page.locator("#mimic .tag[data-signal='control_plc.process.y.T5']").count() == 1
+
+
+def test_a_recorded_refrigerator_is_replayed_with_its_station(
+    browser: "Browser", tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("runs") / "cold and warm"
+    command = [sys.executable, "-m", "rig", "run", "--in-process", "--duration", "60s", "--out", str(folder)]
+    subprocess.run(
+        [*command, "--figures", "png", "--set", "plant.kind=refrigerator"], check=True, stderr=subprocess.DEVNULL
+    )
+    served = Served(str(folder))
+    try:
+        with opened(browser, served.address) as page:
+            assert page.locator("#mimic .compressor").count() == 2
+            readings = page.locator("#mimic .tag[data-signal='plant.station.signals.P12'] .reading")
+            assert re.fullmatch(r"1[56]\.\d+ bar", readings.text_content() or "")
+            asked = page.locator("#mimic .tag[data-signal='plant.station.commands.CV956'] .reading")
+            assert asked.text_content() == "\u2013", "what its controller asked for is not recorded"
+    finally:
+        served.end()
+
+
+# -- the parts, by themselves ------------------------------------------------------------------------------------------
+
+
+def drawn(name: str) -> list[str]:
+    return [one.get("data-signal", "") for one in ET.parse(STATIC / name).iter() if one.get("data-signal")]  # noqa: S314 our own
+
+
+def test_every_tag_of_a_drawing_is_a_signal_and_drawn_once() -> None:
+    signals = {signal.name for service in MAPS for signal in signals_of(service)}
+    for name in ("mimic.svg", "mimic-refrigerator.svg"):
+        tags = drawn(name)
+        assert set(tags) <= signals
+        assert len(tags) == len(set(tags))
+        assert {f"control_plc.process.y.{output}" for output in OUTPUT_NAMES} <= set(tags)
+
+
+def test_the_refrigerator_shows_all_that_the_station_measures() -> None:
+    measured = {f"plant.station.signals.{name}" for name in STATION_SIGNAL_NAMES if name != "CV167"}
+    assert measured <= set(drawn("mimic-refrigerator.svg"))
+
+
+def test_limits_and_words_are_those_of_the_plants_registers() -> None:
+    model = Model(lambda: 0.0, 300)
+    assert plant_document(model) == {"kind": ""}
+    model.configuration = {
+        "plant.kind": "refrigerator", "plant.station.alarms.hp_low_bar": 14.0, "plant.station.alarms.hp_high_bar": 17
+    }  # fmt: skip
+    model.put("plant", StationStatus(7, 3, StationAlarm.NC1_TRIPPED | StationAlarm.HP_LOW))
+    told = plant_document(model)
+    assert (told["mode"], told["alarms"]) == ("one compressor", ["hp low", "nc1 tripped"])
+    assert told["bands"]["plant.station.signals.P12"] == [14.0, 17.0]
+    assert told["bands"]["plant.station.signals.L_N2"] == [None, None]
