@@ -85,7 +85,7 @@ def record(hours: str, minutes: float, period_s: float) -> list[Recorded]:
     for hour in hours:
         rig = OneProcessRig(settings)
         listener = Listener(make_solver(settings.optimizer_plc.program))
-        rig.optimizer._solver = listener  # noqa: SLF001 only here does anybody want to listen
+        rig.optimizer.solver = listener
         ticks = round(240 * minutes)
         rig.run(Scenario(ticks, find_load(hour, load(settings.model.file).w0), period_s, seed=1), Recorder(ticks))
         heard += listener.heard

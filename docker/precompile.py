@@ -30,7 +30,7 @@ def optimizer_plc() -> None:
     """Let each solver that has kernels of its own answer two updates of a plant that stands still."""
     from optimizer_plc.settings import ProgramSettings, SolverName  # noqa: PLC0415
 
-    for solver in (SolverName.ODE, SolverName.FAST_GRADIENT):
+    for solver in (SolverName.ODE, SolverName.FAST_GRADIENT, SolverName.INTERIOR_POINT):
         _answer_two_updates(ProgramSettings(solver=solver))
 
 

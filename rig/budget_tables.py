@@ -55,7 +55,7 @@ def budget_tables(settings: Settings, power: float | None, period_s: float | Non
     return "\n\n".join("\n".join(lines) for lines in parts) + "\n"
 
 
-def _aligned(rows: Table) -> list[str]:
+def aligned(rows: Table) -> list[str]:
     """Return a table as lines, the first column to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
@@ -100,7 +100,7 @@ def _operation_lines(problem: PredictiveProblem, prediction: PredictionModel, cu
         for name, count in counts.items()
     ]
     rows.append(("qpOASES, as in the paper", "", "", f"{_paper_qpoases_s(n):.3f}"))
-    return _aligned(rows)
+    return aligned(rows)
 
 
 def interior_point(problem: PredictiveProblem) -> Operations:
@@ -133,7 +133,7 @@ def _iteration_lines(program: ProgramSettings, powers: Sequence[float], periods:
             plc = PlcBudget(program.budget.model_copy(update={"power": power}), seconds)
             done = (str(plc.iterations(round(period / TICK_S))) for period in periods)
             rows.append((solver, f"{seconds:.3f}", f"{power:g}", *done))
-    return _aligned(rows)
+    return aligned(rows)
 
 
 def _memory_lines(footprints: Sequence[Footprint], sizes: Sequence[int]) -> list[str]:
@@ -143,4 +143,4 @@ def _memory_lines(footprints: Sequence[Footprint], sizes: Sequence[int]) -> list
     rows += [(text, *(f"{getattr(one, name):,}" for one in footprints)) for name, text in names.items()]
     rows.append(("total", *(f"{one.total:,}" for one in footprints)))
     rows.append(("share of 2 MB", *(f"{100 * one.total / MEMORY_BYTES:.1f} %" for one in footprints)))
-    return _aligned(rows)
+    return aligned(rows)

@@ -27,7 +27,8 @@ from rig.run_plot import save_figure
 
 FIGURES: Final = (
     "complete", "ticks", "updates", "J_BF", "J_open_mean", "J_dev", "J_cst", "c1", "c2", "tau_u_mean",
-    "iterations_total", "L1_outside_band_pct", "T5_outside_band_pct", "deadline_misses", "trace_sha256",
+    "tau_u_mean_per_update", "iterations_total", "L1_outside_band_pct", "T5_outside_band_pct", "deadline_misses",
+    "trace_sha256",
 )  # fmt: skip
 PANELS: Final = (
     ("load_w", "heat load (W)"), ("L1", "L1 (%)"), ("T5", "T5 (K)"),

@@ -1,4 +1,4 @@
-"""Room on the disk that is kept for ending a run in good order."""
+"""Space on the disk that is kept for ending a run in good order."""
 
 import errno
 import os

@@ -35,9 +35,12 @@ class Indicators(NamedTuple):
     c2: float
     """Mean over the problems of the largest predicted violation."""
     tau_u_mean: float
-    """Mean updating period, s."""
+    """Mean updating period over time, s: the mean length of the period that a moment belongs to."""
+    tau_u_mean_per_update: float
+    """Mean updating period over the updates, s, in which short periods count more often."""
     iterations_total: int
     L1_outside_band_pct: float
+    """Share of the ticks that are known."""
     T5_outside_band_pct: float
 
 
@@ -75,7 +78,7 @@ class RunEvaluation(Sink):
         self._outside = np.zeros(2, dtype=int)
         self._stage_costs = 0.0
         self._j_dev = self._j_cst = self._weighted = self._violations = self._largest = 0.0
-        self._taus = self._delivered = 0
+        self._taus = self._squared_taus = self._delivered = self._known = 0
         self.ticks = self.updates = self.iterations = 0
 
     def block(self, block: SampleBlock) -> None:
@@ -83,6 +86,7 @@ class RunEvaluation(Sink):
         constrained = block.y[:, [L1, T5]]
         outside = (constrained < self._design.output_low) | (constrained > self._design.output_high)
         self._outside += outside.sum(axis=0)
+        self._known += int(np.isfinite(block.load).sum())
         self._stage_costs += float(np.nansum(self._cost.of(block)))
         self._digest.update(block.digested)
         self.ticks += len(block.load)
@@ -97,6 +101,7 @@ class RunEvaluation(Sink):
         self._violations += update.violation
         self._largest = max(self._largest, update.violation)
         self._taus += update.tau_u
+        self._squared_taus += update.tau_u**2
         self.iterations += update.iterations
         self.updates += 1
 
@@ -108,17 +113,18 @@ class RunEvaluation(Sink):
     @property
     def indicators(self) -> Indicators:
         """The indicators of what was taken so far."""
-        count, ticks = self.updates or math.nan, self.ticks or math.nan
+        count, known = self.updates or math.nan, self._known or math.nan
         exists = 1.0 if self.updates else math.nan
-        level, temperature = 100.0 * self._outside / ticks
+        level, temperature = 100.0 * self._outside / known
         return Indicators(
             J_dev=self._j_dev * exists,
             J_cst=self._j_cst * exists,
             J_open_mean=self._weighted / (self._delivered or math.nan),
-            J_BF=self._stage_costs / TICKS_PER_SAMPLE if self.ticks else math.nan,
+            J_BF=self._stage_costs / TICKS_PER_SAMPLE if self._known else math.nan,
             c1=self._largest * exists,
             c2=self._violations / count,
-            tau_u_mean=self._taus * TICK_S / count,
+            tau_u_mean=self._squared_taus * TICK_S / (self._taus or math.nan),
+            tau_u_mean_per_update=self._taus * TICK_S / count,
             iterations_total=self.iterations,
             L1_outside_band_pct=float(level),
             T5_outside_band_pct=float(temperature),

@@ -29,7 +29,7 @@ class LocalServices:
     Args:
         settings: Their configuration.
         log_folder: Their logs go to `<folder>/<service>.log`.
-        detours: Where something stands between clients and servers.
+        detours: Where something is between clients and servers.
         environment: Further variables for all of them.
         ports: Where they listen; by default on ports that nobody else uses.
     """

@@ -9,18 +9,26 @@ from optimizer_plc.program import OptimizerProgram
 from plant.kinds import plant_maker
 from plant.program import LoadProfile, PlantProgram
 from plant.runtime import own_header
+from plant.settings import PlantKind
+from rig.compiled.stretches import CompiledStretches
 from rig.recording import Recorder
 from rig.scenario import Scenario
 from rig.settings import Settings
 
 
 class OneProcessRig:
-    """Plant, control PLC and optimiser PLC, connected by calls."""
+    """Plant, control PLC and optimiser PLC, connected by calls.
 
-    def __init__(self, settings: Settings) -> None:
+    Args:
+        settings: Configuration.
+        compiled: Ordinary ticks of a cold box alone are done in compiled loops, with the same bits.
+    """
+
+    def __init__(self, settings: Settings, *, compiled: bool = True) -> None:
         header = own_header(settings.model.file)
         self._settings = settings
         self._header = header
+        self._compiled = compiled and settings.plant.kind is PlantKind.COLD_BOX
         program = settings.optimizer_plc.program
         self.optimizer = OptimizerProgram(load(settings.model.file), program, settings.limits)
         self.control = make_control_program(header, settings.control_plc, settings.limits)
@@ -33,16 +41,27 @@ class OneProcessRig:
         self.optimizer.restart(scenario.updating_period_s)
         told = self.control.journal.count
         self.control.restart(session=1)
+        stretches = None
+        if self._compiled:
+            stretches = CompiledStretches(plant, self.control, self.optimizer, load_table, self._settings.limits)
         recorder.begin()
-        for _ in range(scenario.ticks):
-            if self.control.awaiting_sequence:
-                self._deliver(recorder)
-            update = self._scan(plant, recorder)
-            if update is not None:
-                self.control.accept_plan(as_transmitted(self.optimizer.plan(as_transmitted(update))))
+        while self.control.tick < scenario.ticks:
+            stretch = stretches.ahead(scenario.ticks) if stretches else None
+            if stretch is not None:
+                recorder.stretch(*stretch)
+                continue
+            self._tick(plant, recorder)
             for event in self.control.journal.since(told):
                 recorder.event(event)
                 told = event.number
+
+    def _tick(self, plant: PlantProgram, recorder: Recorder) -> None:
+        """Let the programs do one tick."""
+        if self.control.awaiting_sequence:
+            self._deliver(recorder)
+        update = self._scan(plant, recorder)
+        if update is not None:
+            self.control.accept_plan(as_transmitted(self.optimizer.plan(as_transmitted(update))))
 
     def _deliver(self, recorder: Recorder) -> None:
         sequence = self.optimizer.solve()

@@ -27,7 +27,7 @@ WIDE: Final = 120
 
 
 class PlantTimeBar:
-    """A progress bar that appears with its first sign of progress; what goes wrong before stands alone."""
+    """A progress bar that appears with its first sign of progress; what goes wrong before is shown alone."""
 
     _bar: Progress
 
@@ -90,7 +90,7 @@ class RunProgress(PlantTimeBar, Sink):
             self._show(sample, now - self._began)
 
     def _show(self, sample: PlantSample, elapsed_s: float) -> None:
-        self._bar.start()  # not before there is something to show: an error then stands alone
+        self._bar.start()  # not before there is something to show: an error is then shown alone
         seconds = self._done * TICK_S
         self._bar.update(
             self._task,

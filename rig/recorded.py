@@ -1,7 +1,7 @@
 """What a run leaves behind: the physical trace, tick by tick, and what the optimiser did, update by update."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,19 +43,13 @@ class SampleBlock(NamedTuple):
     """Signals, mode and alarms of the compression station, shape (N, 21); (0, 0) for a cold box alone."""
 
     @classmethod
-    def of(cls, samples: Sequence[PlantSample], stations: Mapping[int, StationSample] | None = None) -> "SampleBlock":
-        """Return samples, and what is known of the station at their ticks, as a block."""
-        load, u, y, x = (
-            np.array([getattr(sample, name) for sample in samples], dtype=np.float32)
-            for name in ("load", "u", "y", "x")
-        )
-        if not stations:
-            return cls(samples[0].tick, load, u, y, x)
-        station = np.full((len(samples), STATION_COLUMNS), np.nan, dtype=np.float32)
-        for row, sample in enumerate(samples):
-            if known := stations.get(sample.tick):
-                station[row] = (*known.signals, known.mode, known.alarms)
-        return cls(samples[0].tick, load, u, y, x, station)
+    def of(cls, samples: Sequence[PlantSample]) -> "SampleBlock":
+        """Return samples that follow each other as a block."""
+        pending = PendingTicks(samples[0].tick)
+        pending.extend(len(samples))
+        for sample in samples:
+            pending.put(sample, None)
+        return pending.take(len(samples))
 
     def split(self, ticks: int) -> tuple["SampleBlock", "SampleBlock"]:
         """Return the first `ticks` ticks, and the rest."""
@@ -77,6 +71,51 @@ class SampleBlock(NamedTuple):
         if not self.station.size:
             return self.rows.tobytes()
         return np.ascontiguousarray(np.hstack([self.rows, self.station]), dtype="<f4").tobytes()
+
+
+class PendingTicks:
+    """The newest ticks of a run, in a row, which may still be replaced; `first` is the oldest of them."""
+
+    def __init__(self, first: int = 0) -> None:
+        sizes = (1, len(INPUT_NAMES), len(OUTPUT_NAMES), len(STATE_NAMES), STATION_COLUMNS)
+        self._parts = [np.empty((2048, size), np.float32) for size in sizes]
+        self._has_station = False
+        self.first, self.count = first, 0
+
+    def extend(self, ticks: int) -> None:
+        """Add ticks of which nothing is known."""
+        end = self.count + ticks
+        if end > len(self._parts[0]):
+            self._parts = [np.resize(part, (2 * end, part.shape[1])) for part in self._parts]
+        for part in self._parts:
+            part[self.count : end] = np.nan
+        self.count = end
+
+    def put(self, sample: PlantSample, station: StationSample | None) -> bool:
+        """Put a tick where it belongs; tell whether nothing was known of it before."""
+        row = sample.tick - self.first
+        load, u, y, x, warm = self._parts
+        unknown = bool(np.isnan(load[row, 0]))
+        load[row, 0], u[row], y[row], x[row] = sample.load, sample.u, sample.y, sample.x
+        if station is not None:
+            self._has_station = True
+            warm[row] = (*station.signals, station.mode, station.alarms)
+        return unknown
+
+    def put_block(self, block: SampleBlock) -> None:
+        """Put ticks in a row where they belong."""
+        rows = slice(block.first - self.first, block.first - self.first + len(block.load))
+        load, u, y, x, _ = self._parts
+        load[rows, 0], u[rows], y[rows], x[rows] = block.load, block.u, block.y, block.x
+
+    def take(self, ticks: int) -> SampleBlock:
+        """Take the oldest ticks away."""
+        ticks = min(ticks, self.count)
+        load, u, y, x, warm = (part[:ticks].copy() for part in self._parts)
+        for part in self._parts:
+            part[: self.count - ticks] = part[ticks : self.count].copy()
+        first, self.first, self.count = self.first, self.first + ticks, self.count - ticks
+        return SampleBlock(first, load[:, 0], u, y, x, warm if self._has_station else NO_STATION)
 
 
 def joined(blocks: Sequence[SampleBlock]) -> SampleBlock:

@@ -4,7 +4,6 @@ A rig calls the `Recorder`; the recorder passes samples on in blocks, and update
 its sinks. Sinks write files, evaluate, show a line, or keep all in memory.
 """
 
-import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -13,12 +12,11 @@ from itertools import islice
 from typing import Final
 
 from coldloop.errors import ColdloopError, LinkError
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample
 from rig.driving import CONTROL
-from rig.recorded import LinkStatistics, Recording, SampleBlock, joined
+from rig.recorded import LinkStatistics, PendingTicks, Recording, SampleBlock, joined
 
 __all__ = ["LinkStatistics", "MemorySink", "Recorder", "Recording", "SampleBlock", "Sink"]
 
@@ -99,9 +97,9 @@ class Recorder:
         self.link = LinkStatistics()
         self._memory = MemorySink()
         self._sinks = (self._memory,) if sinks is None else tuple(sinks)
-        self._pending: list[PlantSample] = []
+        self._pending = PendingTicks()
         self._stations: dict[int, StationSample] = {}
-        """Of the ticks that are pending."""
+        """Of ticks that are about to come."""
         self._unsettled: deque[Optimization] = deque()
         self._stop: ColdloopError | None = None
         self._closed = False
@@ -129,15 +127,40 @@ class Recorder:
             LinkError: A tick came again that is older than `KEPT_TICKS`.
             ColdloopError: The run is to stop; the tick is recorded.
         """
-        if sample.tick == self.next_tick:
-            self._pending.append(sample)
-            self.next_tick += 1
-        else:
-            self._put(sample)
+        place = sample.tick - self._pending.first
+        if place < 0:
+            raise LinkError(
+                f"tick {sample.tick} came again after tick {self.next_tick - 1}: the plant went back too far"
+            )
+        missing = max(0, sample.tick - self.next_tick)
+        again = sample.tick < self.next_tick
+        if not again:
+            self._pending.extend(missing + 1)
+            self.next_tick = sample.tick + 1
+        unknown = self._pending.put(sample, self._stations.pop(sample.tick, None))
+        self.missing_ticks += missing - (again and unknown)
+        self._taken(sample)
+
+    def stretch(self, block: SampleBlock, updates: Sequence[Optimization]) -> None:
+        """Take the next ticks at once, and the updates that were reported in them; sinks see the last tick of them.
+
+        Raises:
+            ColdloopError: The run is to stop; the ticks are recorded.
+        """
+        for update in updates:
+            self.update(update)
+        self._pending.extend(len(block.load))
+        self._pending.put_block(block)
+        self.next_tick += len(block.load)
+        load, u, y, x = (part[-1].tolist() for part in (block.load, block.u, block.y, block.x))
+        self._taken(PlantSample(self.next_tick - 1, load, tuple(u), tuple(y), tuple(x)))
+
+    def _taken(self, sample: PlantSample) -> None:
+        """Pass on what is old enough, and stop where that is asked for."""
         self._last = time.monotonic()
         for sink in self._sinks:
             sink.sample(sample)
-        if len(self._pending) >= BLOCK_TICKS + KEPT_TICKS:
+        if self._pending.count >= BLOCK_TICKS + KEPT_TICKS:
             self._pass_on()
         if self._stop is not None:
             raise self._stop
@@ -145,22 +168,6 @@ class Recorder:
     def station(self, sample: StationSample) -> None:
         """Take what goes with a tick that is about to come, where the plant is a whole refrigerator."""
         self._stations[sample.tick] = sample
-
-    def _put(self, sample: PlantSample) -> None:
-        """Put a tick that is not the next one where it belongs."""
-        if sample.tick > self.next_tick:
-            gap = range(self.next_tick, sample.tick)
-            self._pending += [*map(unknown_sample, gap), sample]
-            self.missing_ticks += len(gap)
-            self.next_tick = sample.tick + 1
-            return
-        place = len(self._pending) + sample.tick - self.next_tick
-        if place < 0:
-            raise LinkError(
-                f"tick {sample.tick} came again after tick {self.next_tick - 1}: the plant went back too far"
-            )
-        self.missing_ticks -= is_unknown(self._pending[place])
-        self._pending[place] = sample
 
     def update(self, update: Optimization) -> None:
         """Take the next update, also one that a load step will cut off."""
@@ -199,11 +206,8 @@ class Recorder:
         self._settle()
         kept = 0 if self._closed else KEPT_TICKS
         calls = []
-        while len(self._pending) > kept and (self._closed or len(self._pending) >= BLOCK_TICKS + kept):
-            block = SampleBlock.of(self._pending[:BLOCK_TICKS], self._stations)
-            for sample in self._pending[:BLOCK_TICKS]:
-                self._stations.pop(sample.tick, None)
-            del self._pending[:BLOCK_TICKS]
+        while self._pending.count > kept and (self._closed or self._pending.count >= BLOCK_TICKS + kept):
+            block = self._pending.take(BLOCK_TICKS)
             calls += [partial(sink.block, block) for sink in self._sinks]
         _all(*calls)
 
@@ -224,17 +228,6 @@ class Recorder:
             self._unsettled.popleft()
             if not cut_off:
                 yield update
-
-
-def unknown_sample(tick: int) -> PlantSample:
-    """Return the sample of a tick of which nothing is known."""
-    nan = math.nan
-    return PlantSample(tick, nan, (nan,) * len(INPUT_NAMES), (nan,) * len(OUTPUT_NAMES), (nan,) * len(STATE_NAMES))
-
-
-def is_unknown(sample: PlantSample) -> bool:
-    """Tell whether nothing is known of a tick."""
-    return math.isnan(sample.load)
 
 
 def _all(*calls: Callable[[], None]) -> None:

@@ -1,6 +1,8 @@
 """Folders and files of results. A file appears whole or not at all, and only a regular file is replaced."""
 
 import json
+import os
+import socket
 import tempfile
 from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -50,9 +52,9 @@ def require_regular_file(path: Path) -> None:
 
 
 def whole_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` make the file under another name, then give it its own."""
+    """Let `write` make the file under another name, then give it its own; others may do so at the same time."""
     require_regular_file(path)
-    draft = path.with_name(f".{path.name}.draft")
+    draft = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.draft")
     try:
         write(draft)
         draft.replace(path)

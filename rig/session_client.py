@@ -38,7 +38,7 @@ LAST_LOOK_S: Final = 2.0
 """How long the events of a run that has ended are waited for."""
 LAST_TICK: Final = 2**32 - 1
 CONTACT_S: Final = 1.0
-"""With `tolerant`: how long an answer may take. A process that stands still must not hold up the rest for long."""
+"""With `tolerant`: how long an answer may take. A process that does not go on must not hold up the rest for long."""
 
 
 class SessionClient:
@@ -189,7 +189,7 @@ class SessionClient:
                 quiet_since = now
             elif now - quiet_since > max(QUIET_S, 4 * TICK_S / scenario.factor):
                 raise LinkError(
-                    f"{self.plant.peer} stands at tick {done} for {now - quiet_since:.0f} s: "
+                    f"{self.plant.peer} has been at tick {done} for {now - quiet_since:.0f} s: "
                     "see the logs of the control PLC and of the optimiser"
                 )
             await asyncio.sleep(min(max(pause_s, 0.001), 0.2))
@@ -224,7 +224,7 @@ class SessionClient:
         return tick
 
     async def _read_updates(self) -> None:
-        """Read updates beside the rest, which an optimiser that stands still is not to hold up."""
+        """Read updates beside the rest, which an optimiser that does not answer is not to hold up."""
         await self.contact(self._updates.read())
 
     async def ladder(self) -> LadderStatus | None:

@@ -1,4 +1,4 @@
-"""A rig that stays up: three services on fixed ports, in real time, until they are told to end."""
+"""A rig that stays up: three services on fixed ports, in real time, until they are ended."""
 
 import os
 import sys

@@ -50,8 +50,8 @@ class Plan(BaseModel):
     updating_period_s: Annotated[float, Field(ge=0, le=5)] = 0.0
     """0 is adaptive."""
     standstill_s: Annotated[float, Field(gt=0, le=600)] = 8.0
-    """In lock-step a fault under which plant time stands still ends after so much real time. The control PLC gives an
-    optimiser up that stands still for `control_plc.ladder.optimizer_patience_s`, and goes on."""
+    """In lock-step a fault under which plant time does not go on ends after so much real time. The control PLC gives an
+    optimiser up that does not go on for `control_plc.ladder.optimizer_patience_s`, and goes on."""
     faults: tuple[AnyFault, ...] = ()
     every_s: Annotated[float, Field(ge=2 * SPREAD_S)] | None = None
     """Draw a fault so often, from `draw`."""

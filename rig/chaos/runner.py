@@ -55,7 +55,7 @@ async def conduct(
                 await services.during(driver.run())
         except TimeoutError:
             raise LinkError(
-                f"plan {plan.name} has taken {_patience_s(plan):.0f} s of real time and stands at "
+                f"plan {plan.name} has taken {_patience_s(plan):.0f} s of real time and is at "
                 f"{driver.tick * TICK_S:g} s: see the logs in {folder / 'logs'}"
             ) from None
         finally:

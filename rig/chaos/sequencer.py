@@ -80,7 +80,7 @@ class FaultSequencer:
     async def _next_moment(self) -> Moment | None:
         """Let the rig go on until a fault begins or ends; return None at the end of the run."""
         while True:
-            with contextlib.suppress(TimeoutError):  # what stands still must not keep a fault from ending in time
+            with contextlib.suppress(TimeoutError):  # what does not go on must not keep a fault from ending in time
                 async with asyncio.timeout(self._timeline.left_s(self._seconds)):
                     await self._look()
             moment = self._timeline.due(self.tick, self._seconds) or self._cut_short()
@@ -109,10 +109,10 @@ class FaultSequencer:
         return ladder
 
     def _cut_short(self) -> Moment | None:
-        """Return the end of a fault under which plant time stands still.
+        """Return the end of a fault under which plant time does not go on.
 
         Raises:
-            LinkError: It stands still without a fault.
+            LinkError: It does not go on, without a fault.
         """
         standing = time.monotonic() - self._standing_since
         for end in self._timeline.on:
@@ -124,7 +124,7 @@ class FaultSequencer:
                 return self._timeline.take(end)
         if not self._timeline.on and standing > max(STANDSTILL_PATIENCE_S, 4 * TICK_S / self._plan.factor):
             raise LinkError(
-                f"plan {self._plan.name}: the plant stands at {self.tick * TICK_S:g} s for {standing:.0f} s without a "
+                f"plan {self._plan.name}: the plant is at {self.tick * TICK_S:g} s for {standing:.0f} s without a "
                 f"fault: see {self._services.log('control_plc')}"
             )
         return None

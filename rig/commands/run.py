@@ -95,7 +95,7 @@ def _job(options: argparse.Namespace) -> "Job":
 def _tell(out: Path, summary: dict[str, Any]) -> None:
     updates = "no updates"
     if summary["updates"]:
-        updates = f"{summary['updates']} updates, tau_u {summary['tau_u_mean']:.2f} s on average"
+        updates = f"{summary['updates']} updates, tau_u {summary['tau_u_mean']:.2f} s on average over time"
     sys.stdout.write(
         f"{summary['ticks']} ticks, {updates}, {summary['realtime_factor'] or 0:,.0f} x real time\n"
         f"outside the bands: L1 {summary['L1_outside_band_pct']:.2f} %, T5 {summary['T5_outside_band_pct']:.2f} %; "

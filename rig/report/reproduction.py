@@ -15,7 +15,7 @@ from rig.results import whole_file, write_json
 from rig.studies import STUDIES
 from rig.studies.execution import Workers
 from rig.studies.results import conduct, section
-from rig.studies.study import StudyOptions, StudyResult
+from rig.studies.study import USUAL_DRAWS, StudyOptions, StudyResult
 
 EXPLANATIONS = TOLERANCES.with_name("explanations.toml")
 SLIPS = TOLERANCES.with_name("slips.md")
@@ -60,14 +60,20 @@ def _write(path: Path, text: str) -> None:
     whole_file(path, lambda draft: draft.write_text(text, encoding="utf-8"))
 
 
+def _draws(options: StudyOptions) -> str:
+    if options.quick or options.seeds:
+        return f"{len(options.draws)} draw(s) of each load"
+    return f"{USUAL_DRAWS} draws of each load, where a study has no other number"
+
+
 def report(options: StudyOptions, results: Mapping[str, StudyResult], judged: Sequence[Judged], effort: str) -> str:
     """Return the report as Markdown."""
-    scale = " --quick" if options.quick else f" --seeds {options.seeds}"
+    scale = " --quick" if options.quick else f" --draws {options.seeds}" if options.seeds else ""
     commands = {name: f"coldloop study {name}{scale}" for name in STUDIES}
     explanations = tomllib.loads(EXPLANATIONS.read_text(encoding="utf-8"))
     circumstances = (
         f"Coldloop {__version__}, Python {platform.python_version()}, {datetime.now(UTC):%Y-%m-%d}; "
-        f"{len(options.draws)} draw(s) of each load; {effort}, what was kept from before included."
+        f"{_draws(options)}; {effort}, what was kept from before included."
     )
     parts = [
         f"# {TITLE}",

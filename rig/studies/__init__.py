@@ -7,6 +7,8 @@ from rig.studies.classical import ClassicalStudy
 from rig.studies.coupling import CouplingStudy
 from rig.studies.disturbances import DisturbancesStudy
 from rig.studies.experiments import ADAPTIVE_2H, PLC_2H
+from rig.studies.oracles import OraclesStudy
+from rig.studies.robustness import RobustnessStudy
 from rig.studies.single_precision import SinglePrecision
 from rig.studies.solver_comparison import SolverComparison
 from rig.studies.study import Study
@@ -31,4 +33,8 @@ _ALL: Final[tuple[Study, ...]] = (
 )
 
 STUDIES: Final = {study.name: study for study in _ALL}
-"""In the order of the paper."""
+"""Those of the report, in the order of the paper."""
+
+_APART: Final[tuple[Study, ...]] = (OraclesStudy(), RobustnessStudy())
+APART: Final = {study.name: study for study in _APART}
+"""Those that are too long for the report."""

@@ -3,16 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from rig.studies.drawing import time_panels
-from rig.studies.request import Outcome, RunRequest
+from rig.studies.load_response import response
+from rig.studies.request import RunRequest
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
-from rig.studies.trajectories import BANDS, seconds_since_step
+from rig.studies.trajectories import BANDS
 
 TRACE_TICKS = 4
-SOON_S = 5.0
-LATE_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -34,8 +31,9 @@ class ExperimentStudy:
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare traces, bands and updating periods."""
         result = StudyResult(
-            ("load", "case", "rig", "J_BF", "L1 outside (%)", "T5 outside (%)", "tau_u mean (s)", "trace"), [], {}
-        )
+            ("load", "case", "rig", "J_BF", "L1 outside (%)", "T5 outside (%)", "tau_u mean (s)",
+             "tau_u mean per update (s)", "trace"), [], {},
+        )  # fmt: skip
         for load in self._loads(options):
             labelled = []
             for label, period in self.cases:
@@ -45,14 +43,15 @@ class ExperimentStudy:
                     i = run.indicators
                     result.rows.append(
                         (load.name, label, rig, i.J_BF, i.L1_outside_band_pct, i.T5_outside_band_pct, i.tau_u_mean,
-                         run.trace_sha256)
+                         i.tau_u_mean_per_update, run.trace_sha256)
                     )  # fmt: skip
                 same = networked.trace_sha256 == alone.trace_sha256
                 result.values.setdefault(f"{self.name}: same trace, {label}", []).append(float(same))
                 outside = max(networked.indicators.L1_outside_band_pct, networked.indicators.T5_outside_band_pct)
                 result.values.setdefault(f"{self.name}: time outside the bands, {label}", []).append(outside)
                 if not period:
-                    result.values.setdefault(f"{self.name}: rise after a load step", []).append(_rise(networked, load))
+                    for what, value in response([(networked, load)], label).items():
+                        result.values.setdefault(f"{self.name}: {what}", []).append(value)
             if not result.figures:
                 result.figures["time courses"] = time_panels(labelled, BANDS)
         return result
@@ -60,13 +59,6 @@ class ExperimentStudy:
 
 def _both(load: Load, period_s: float) -> Sequence[RunRequest]:
     return [load.request(period_s, networked=networked, trace_ticks=TRACE_TICKS) for networked in (True, False)]
-
-
-def _rise(run: Outcome, load: Load) -> float:
-    """Return the mean updating period that begins just after a load step over that in quiet."""
-    since, tau = seconds_since_step(run, load), run.column("tau_u")
-    soon, late = tau[since < SOON_S], tau[since >= LATE_S]
-    return float(np.mean(soon) / np.mean(late)) if len(soon) and len(late) else float("nan")
 
 
 PLC_2H = ExperimentStudy("plc-2h", "Two hours on the bus at tau_u = 5 s (figure scenario_exp)", (("5 s", 5.0),))

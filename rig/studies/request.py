@@ -4,7 +4,9 @@ import asyncio
 import hashlib
 import json
 import tempfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from functools import cached_property, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,24 +28,59 @@ from rig.recording import Recorder, Recording
 from rig.results import installed_version
 from rig.scenario import Scenario
 from rig.settings import Settings
+from rig.studies.hindsight import Objective, run_best_in_hindsight
+from rig.studies.ideal_loop import run_ideal_loop
+from rig.studies.paired_run import harsh_run, paired_indicators, paired_run
+from rig.studies.problem_sequence import problem_sequence
 
 Series = NDArray[np.float64]
 
 PROGRAM_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc")
 RIG_MODULES = (
+    "rig.compiled.control",
+    "rig.compiled.loops",
+    "rig.compiled.optimizer",
+    "rig.compiled.portable",
+    "rig.compiled.records",
+    "rig.compiled.stretches",
     "rig.indicators",
     "rig.session_client",
     "rig.session_reader",
     "rig.one_process",
+    "rig.recorded",
     "rig.recording",
+    "rig.studies.hindsight",
+    "rig.studies.ideal_loop",
+    "rig.studies.paired_run",
+    "rig.studies.played_profiles",
+    "rig.studies.problem_sequence",
     "rig.studies.request",
 )
 SUFFIXES = (".py", ".json", ".npz", ".csv")
 T9 = OUTPUT_NAMES.index("T9")
+DECISIVE = {"limits", "model", "session", "plant", "control_plc", "optimizer_plc"}
+"""Sections of the configuration that a run reads."""
 LIBRARIES = ("casadi", "daqp", "numba", "numpy", "osqp")
 UPDATE_COLUMNS = (
     "tick", "tau_u", "iterations", "j_effective", "j_hot_start", "j_delivered", "j_dev", "j_cst", "violation",
 )  # fmt: skip
+
+
+class Procedure(StrEnum):
+    """Who decides in a run."""
+
+    CONFIGURED = "configured"
+    """The three programs, as they are configured."""
+    PAIRED_PROBLEMS = "paired problems"
+    """Nobody: the configured solver goes through the problems of a converged loop (`rig.studies.paired_run`)."""
+    HARSH_PROBLEMS = "harsh problems"
+    """The same, and only those count whose guess is far from the optimum, each solver beginning at the same one."""
+    INFINITELY_FAST = "infinitely fast"
+    """The exact optimum at once, every updating period (`rig.studies.ideal_loop`)."""
+    BEST_CLOSED_LOOP = "best closed loop"
+    """The sequence of updating periods that is best for J_BF (`rig.studies.hindsight`)."""
+    BEST_OPEN_LOOP = "best open loop"
+    """That which is best for J_open_mean."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +102,12 @@ class RunRequest:
     """Three services on the bus instead of one process."""
     trace_ticks: int = 0
     """Every so many ticks of the trace are kept; 0 is none."""
+    procedure: Procedure = Procedure.CONFIGURED
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the request and of the programs that will do it."""
-        content = json.dumps([asdict(self), programs_digest()], sort_keys=True)
-        return hashlib.sha256(content.encode()).hexdigest()[:20]
+        """Digest of all that decides the outcome: the same for requests that ask for the same run in other words."""
+        return decisive_digest(self, settings_of(self.assignments))
 
 
 @dataclass(frozen=True)
@@ -113,6 +150,35 @@ class Outcome:
             raise ValueError(str(error)) from None
 
 
+def decisive_digest(request: RunRequest, settings: Settings) -> str:
+    """Return a digest of the load, of the settings that have an effect on a run, and of the programs that do it."""
+    asked = asdict(request)
+    for name in ("load", "assignments"):
+        del asked[name]
+    configured = _plain(settings.model_dump(include=DECISIVE))
+    content = json.dumps([asked, configured, programs_digest()], sort_keys=True, default=str)
+    return hashlib.sha256(content.encode()).hexdigest()[:20]
+
+
+def _plain(value: object) -> object:
+    """Return settings as plain data; a file counts by what is in it, wherever it is."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, Path):
+        return _file_digest(value)
+    return value
+
+
+@lru_cache(maxsize=16)
+def _file_digest(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return str(path)  # the run will say what is wrong with it
+
+
 @lru_cache(maxsize=1)
 def programs_digest() -> str:
     """Return a digest of all that decides what a run gives: sources, data files, versions of libraries."""
@@ -150,15 +216,24 @@ def perform(request: RunRequest) -> str:
         request.ticks, LoadProfile(request.times, request.watts), request.updating_period_s, request.draw
     )
     recorder = Recorder(request.ticks)
-    if request.networked:
-        with tempfile.TemporaryDirectory(prefix="coldloop-logs-") as logs:
-            asyncio.run(run_on_localhost(settings, scenario, recorder, Path(logs)))
-    else:
-        _rig(request.assignments).run(scenario, recorder)
+    match request.procedure:
+        case Procedure.PAIRED_PROBLEMS | Procedure.HARSH_PROBLEMS:
+            return _of_problems(request, settings, scenario).to_json()
+        case Procedure.INFINITELY_FAST:
+            run_ideal_loop(settings, scenario, recorder, round(request.updating_period_s / TICK_S))
+        case Procedure.BEST_CLOSED_LOOP:
+            run_best_in_hindsight(settings, scenario, recorder, Objective.CLOSED_LOOP)
+        case Procedure.BEST_OPEN_LOOP:
+            run_best_in_hindsight(settings, scenario, recorder, Objective.OPEN_LOOP)
+        case Procedure.CONFIGURED if request.networked:
+            with tempfile.TemporaryDirectory(prefix="coldloop-logs-") as logs:
+                asyncio.run(run_on_localhost(settings, scenario, recorder, Path(logs)))
+        case Procedure.CONFIGURED:
+            _rig(request.assignments).run(scenario, recorder)
     return _outcome(recorder.recording(), settings, request.trace_ticks).to_json()
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=1024)
 def settings_of(assignments: tuple[str, ...]) -> Settings:
     """Return the settings of a request; those of the environment do not count."""
     return load_configuration(Settings, environment={}, assignments=assignments).settings
@@ -169,12 +244,24 @@ def _rig(assignments: tuple[str, ...]) -> OneProcessRig:
     return OneProcessRig(settings_of(assignments))
 
 
+def _of_problems(request: RunRequest, settings: Settings, scenario: Scenario) -> Outcome:
+    sequence, program = problem_sequence(scenario, request.assignments), settings.optimizer_plc.program
+    run = paired_run if request.procedure is Procedure.PAIRED_PROBLEMS else harsh_run
+    columns = run(sequence, program)
+    indicators = paired_indicators(columns, request.updating_period_s)
+    return Outcome(programs_digest(), indicators, "", 0, columns, {})
+
+
 def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outcome:
     model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
+    trace_sha256 = recording.trace_sha256
+    if any(settings.plant.sensors.biases):  # costs are those of what was reached, not of what was shown
+        true_y = recording.y - np.array(settings.plant.sensors.biases, dtype=np.float32)
+        recording = recording._replace(y=true_y)
     return Outcome(
         programs=programs_digest(),
         indicators=evaluate(recording, model, design),
-        trace_sha256=recording.trace_sha256,
+        trace_sha256=trace_sha256,
         deadline_misses=recording.link.deadline_misses,
         updates={name: [float(getattr(row, name)) for row in recording.updates] for name in UPDATE_COLUMNS},
         trace=_trace(recording, instantaneous_cost(recording, model, design), trace_ticks) if trace_ticks else {},

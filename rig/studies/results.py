@@ -7,12 +7,10 @@ from pathlib import Path
 from coldloop.errors import ResultsError
 from rig.results import prepare_folder, whole_file
 from rig.run_plot import save_figure
-from rig.studies.execution import Store, Workers, perform_all
+from rig.studies.execution import Workers, perform_all
 from rig.studies.request import check
-from rig.studies.study import Cell, Study, StudyOptions, StudyResult
-
-RUNS = "runs"
-"""Folder, beside those of the studies, in which runs are kept: studies share them."""
+from rig.studies.store import Store
+from rig.studies.study import RUNS, Cell, Study, StudyOptions, StudyResult
 
 
 def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path) -> StudyResult:

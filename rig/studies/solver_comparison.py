@@ -1,6 +1,7 @@
 """Costs of throttled solvers against the computing power of the PLC (paper, figure `solv_cmp`)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -8,90 +9,125 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from plant.load import HOUR_TICKS
 from rig import paper as published
 from rig.plot import COLOURS
+from rig.studies.crossing import crossing
 from rig.studies.drawing import legend_outside, panels, paper, spans_decade, spread
+from rig.studies.harsh_problems import harsh_ratios, harsh_requests, harsh_table, harsh_values
+from rig.studies.open_loop import OpenLoop, open_loop_figure, open_loop_table, paired_requests, paper_powers
 from rig.studies.request import RunRequest, Series
 from rig.studies.solver_runs import throttled
-from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.studies.study import Cell, Load, Outcomes, StudyOptions, StudyResult, loads
 
 Table = Mapping[str, Mapping[str, Series]]
 """Values against power, by solver and indicator."""
 
 SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES"}
 INDICATORS: Final = ("J_dev", "J_cst", "J_total", "c1", "c2", "J_BF")
-QUICK_POWERS: Final = (0.2, 1.0, 25.0)
+CLOSED_DRAWS: Final = 6
+CLOSED_TICKS: Final = 2 * HOUR_TICKS
+"""Of the eight hours, in the closed loop: six draws of two hours say more than one and a half of eight."""
+COLUMNS: Final = ("part", "load", "solver", "power", *INDICATORS, "J_total over the lowest")
 
 
 class SolverComparison:
-    """18 powers, two solvers, six indicators, eight hours."""
+    """Open loop, paired, and closed loop, two solvers at 18 powers and the others at some; harsh problems."""
 
     name = "solver-comparison"
     title = "Solvers against computing power (figure solv_cmp)"
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
-        """Return every solver at every power under every draw; long runs first."""
-        return [
+        """Return the problems of all solvers, then every solver of the paper in the closed loop, long runs first."""
+        closed = [
             throttled(load, solver, power)
-            for power in sorted(_powers(options), reverse=True)
+            for power in sorted(paper_powers(options), reverse=True)
             for solver in SOLVERS
-            for load in _loads(options)
+            for load in _closed_loads(options)
         ]
+        return [*paired_requests(options), *harsh_requests(options), *closed]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Compare costs with those of converged qpOASES, and with the paper's."""
-        powers = np.array(_powers(options))
-        tables = [_table(load, powers, outcomes) for load in _loads(options)]
-        result = StudyResult(("load", "solver", "power", *INDICATORS), [], {"indicators": _figure(powers, tables)})
-        for load, table in zip(_loads(options), tables, strict=True):
-            for solver, indicators in table.items():
-                for i, power in enumerate(powers):
-                    result.rows.append((load.name, solver, power, *(indicators[name][i] for name in INDICATORS)))
-            for claim, value in measures(powers, table).items():
-                result.values.setdefault(claim, []).append(value)
+        """Compare costs with those of converged qpOASES, with the lowest there are, and with the paper's."""
+        powers = np.array(paper_powers(options))
+        paired = OpenLoop.of(options, outcomes)
+        closed = [_closed_table(load, powers, outcomes) for load in _closed_loads(options)]
+        result = StudyResult(COLUMNS, [], {
+            "indicators": _figure(powers, paired.tables, closed),
+            "paired open loop": open_loop_figure(paired),
+        })  # fmt: skip
+        for load, table in zip(paired.loads, paired.tables, strict=True):
+            result.rows += _open_rows(load, table, paired.powers)
+            _gather(result, open_loop_measures(powers, table))
+        for load, table in zip(_closed_loads(options), closed, strict=True):
+            result.rows += [
+                (
+                    "closed",
+                    load.name,
+                    solver,
+                    power,
+                    *(np.nan,) * (len(INDICATORS) - 1),
+                    table[solver]["J_BF"][i],
+                    np.nan,
+                )
+                for solver in SOLVERS
+                for i, power in enumerate(powers.tolist())
+            ]
+            _gather(result, closed_loop_measures(powers, table))
+        result.values |= harsh_values(harsh_ratios(options, outcomes))
+        result.remarks += [open_loop_table(paired), harsh_table(options, outcomes)]
         return result
 
 
-def _powers(options: StudyOptions) -> tuple[float, ...]:
-    if options.quick:
-        return QUICK_POWERS
-    return tuple(published.solver_comparison()["ode"]["normalized_power"].tolist())
+def _gather(result: StudyResult, values: Mapping[str, float]) -> None:
+    for claim, value in values.items():
+        result.values.setdefault(claim, []).append(value)
 
 
-def _loads(options: StudyOptions) -> list[Load]:
-    return [load for draws in loads(options, "8h").values() for load in draws]
+def _open_rows(
+    load: Load, table: Mapping[str, Mapping[str, Series]], powers: Mapping[str, Series]
+) -> list[tuple[Cell, ...]]:
+    return [
+        ("paired", load.name, solver, power, *(columns[name][i] for name in INDICATORS[:-1]), np.nan,
+         columns["J_total"][i] / columns["lowest"][i])
+        for solver, columns in table.items()
+        for i, power in enumerate(powers[solver].tolist())
+    ]  # fmt: skip
 
 
-def _table(load: Load, powers: Series, outcomes: Outcomes) -> Table:
-    table = {}
-    for solver in SOLVERS:
-        runs = [outcomes[throttled(load, solver, power)].indicators for power in powers.tolist()]
-        table[solver] = {
-            name: np.array([run.J_dev + run.J_cst if name == "J_total" else getattr(run, name) for run in runs])
-            for name in INDICATORS
-        }
-    return table
+def _closed_loads(options: StudyOptions) -> list[Load]:
+    longest = options.ticks or CLOSED_TICKS
+    drawn = loads(options, "8h", usual=CLOSED_DRAWS).values()
+    return [replace(load, ticks=min(load.ticks, longest)) for draws in drawn for load in draws]
+
+
+def _closed_table(load: Load, powers: Series, outcomes: Outcomes) -> Table:
+    return {
+        solver: {"J_BF": np.array([outcomes[throttled(load, solver, p)].indicators.J_BF for p in powers.tolist()])}
+        for solver in SOLVERS
+    }
 
 
 def measures(powers: Series, table: Table) -> dict[str, float]:
-    """Return what the claims are judged by; works on the paper's own points as well."""
+    """Return what the claims are judged by, of points that have both parts: the paper's own."""
+    return {**open_loop_measures(powers, table), **closed_loop_measures(powers, table)}
+
+
+def open_loop_measures(powers: Series, table: Table) -> dict[str, float]:
+    """Return what the claims on predicted costs are judged by."""
     ode, qpoases = table["ode"], table["qpoases"]
     converged = qpoases["J_total"][-1]
     relative = qpoases["J_total"] / converged
     distance = np.abs(relative - 1)
-    at = {power: int(np.argmin(np.abs(powers - power))) for power in (0.2, 1.0)}
-    one = at[1.0]
+    one, fifth = _place(powers, 1.0), _place(powers, 0.2)
     return {
         "qpOASES over converged at P = 1": float(relative[one]),
-        "qpOASES over converged at P = 0.2": float(relative[at[0.2]]),
+        "qpOASES over converged at P = 0.2": float(relative[fifth]),
         "qpOASES from P = 10 on, largest distance from converged": _largest(distance[:-1], powers[:-1] >= 10),
         "qpOASES, largest rise of total cost with P": float((relative[1:] / relative[:-1] - 1).max()),
         "ODE over converged, largest from P = 0.6 on": float((ode["J_total"][powers >= 0.6] / converged).max()),
         "qpOASES over ODE in total cost at P = 1": float(qpoases["J_total"][one] / ode["J_total"][one]),
-        "qpOASES over ODE in J_BF at P = 1": float(qpoases["J_BF"][one] / ode["J_BF"][one]),
         "crossing in total cost": crossing(powers, qpoases["J_total"], ode["J_total"]),
-        "crossing in J_BF": crossing(powers, qpoases["J_BF"], ode["J_BF"]),
-        "crossing in J_BF within 2 %": crossing(powers, qpoases["J_BF"], 1.02 * ode["J_BF"]),
         "c1 of qpOASES at P = 1": float(qpoases["c1"][one]),
         "c2 of qpOASES at P = 1": float(qpoases["c2"][one]),
         "c1 of ODE at P = 1": float(ode["c1"][one]),
@@ -99,24 +135,26 @@ def measures(powers: Series, table: Table) -> dict[str, float]:
     }
 
 
+def closed_loop_measures(powers: Series, table: Table) -> dict[str, float]:
+    """Return what the claims on J_BF are judged by."""
+    ode, qpoases = table["ode"]["J_BF"], table["qpoases"]["J_BF"]
+    one = _place(powers, 1.0)
+    return {
+        "qpOASES over ODE in J_BF at P = 1": float(qpoases[one] / ode[one]),
+        "crossing in J_BF": crossing(powers, qpoases, ode),
+        "crossing in J_BF within 2 %": crossing(powers, qpoases, 1.02 * ode),
+    }
+
+
+def _place(powers: Series, power: float) -> int:
+    return int(np.argmin(np.abs(powers - power)))
+
+
 def _largest(values: Series, which: "NDArray[np.bool_]") -> float:
     return float(values[which].max()) if which.any() else float("nan")
 
 
-def crossing(powers: Series, one: Series, other: Series) -> float:
-    """Return the power from which on `one` is not above `other` any more; NaN if there is none."""
-    above = np.log(one / other)
-    if not np.isfinite(above).all():
-        return float("nan")
-    behind = np.flatnonzero(above > 0)
-    if len(behind) == 0 or behind[-1] == len(powers) - 1:
-        return float("nan") if len(behind) else float(powers[0])
-    i = behind[-1]
-    share = above[i] / (above[i] - above[i + 1])
-    return float(np.exp(np.interp(share, [0, 1], np.log(powers[i : i + 2]))))
-
-
-def _figure(powers: Series, tables: list[Table]) -> Figure:
+def _figure(powers: Series, paired: Sequence[Table], closed: Sequence[Table]) -> Figure:
     """Draw ours and the paper's, each relative to its own qpOASES at the largest power where units differ."""
     labels = {
         "J_dev": "(a) $J^{dev}$, relative (1)",
@@ -126,7 +164,7 @@ def _figure(powers: Series, tables: list[Table]) -> Figure:
     theirs = published.solver_comparison()
     with panels(3, 2, (9.5, 10.0), sharex=True) as (figure, axes):
         for place, name in zip(axes, INDICATORS, strict=True):
-            relative = name.startswith("J")
+            relative, tables = name.startswith("J"), closed if name == "J_BF" else paired
             for solver, colour in zip(SOLVERS, COLOURS, strict=False):
                 ours = [table[solver][name] / (table["qpoases"][name][-1] if relative else 1.0) for table in tables]
                 spread(place, powers, ours, colour, f"{SOLVERS[solver]}, here")

@@ -11,11 +11,15 @@ from coldloop.model_settings import DEFAULT_MODEL_FILE
 from plant.load import find_load, named_families
 from plant.program import LoadProfile
 from rig.scenario import natural_ticks
-from rig.studies.request import Outcome, RunRequest
+from rig.studies.request import Outcome, Procedure, RunRequest
 
 Outcomes = Mapping[RunRequest, Outcome]
 Cell = str | float | int
 
+USUAL_DRAWS = 3
+"""Of each load, unless a study has a number of its own or the command says."""
+RUNS = "runs"
+"""Folder, beside those of the studies, in which runs are kept: studies share them."""
 QUICK_TICKS = 2400
 """Longest run of a quick study: ten minutes."""
 NOISE = (
@@ -32,8 +36,8 @@ PROGRAM = "optimizer_plc.program."
 class StudyOptions:
     """How much of a study is asked for."""
 
-    seeds: int = 3
-    """Draws of each named load; of a load file, draws of the sensors' noise."""
+    seeds: int | None = None
+    """Draws of each named load, if not the study's own number; of a load file, draws of the sensors' noise."""
     ticks: int | None = None
     """Length of each run, if not that of its load."""
     loads: tuple[str, ...] = ()
@@ -43,8 +47,12 @@ class StudyOptions:
 
     @property
     def draws(self) -> range:
-        """Numbers of the draws."""
-        return range(1, (1 if self.quick else self.seeds) + 1)
+        """Numbers of the draws of a study that has no number of its own."""
+        return self.drawn(USUAL_DRAWS)
+
+    def drawn(self, usual: int) -> range:
+        """Return the numbers of the draws of a study, or of a part of it, that has so many of its own."""
+        return range(1, (1 if self.quick else self.seeds or usual) + 1)
 
 
 @dataclass(frozen=True)
@@ -63,11 +71,12 @@ class Load:
         *assignments: str,
         networked: bool = False,
         trace_ticks: int = 0,
+        procedure: Procedure = Procedure.CONFIGURED,
     ) -> RunRequest:
         """Return the request for a run under this load."""
         return RunRequest(
             self.name, self.profile.times, self.profile.watts, self.ticks, updating_period_s,
-            (*self.noise, *assignments), self.draw, networked, trace_ticks,
+            (*self.noise, *assignments), self.draw, networked, trace_ticks, procedure,
         )  # fmt: skip
 
 
@@ -83,10 +92,10 @@ def draw_of(name: str, draw: int, options: StudyOptions) -> Load:
     return Load(drawn if named or draw == 1 else f"{name}#{draw}", draw, profile, ticks, noise)
 
 
-def loads(options: StudyOptions, *names: str) -> dict[str, list[Load]]:
+def loads(options: StudyOptions, *names: str, usual: int = USUAL_DRAWS) -> dict[str, list[Load]]:
     """Return the draws of the loads asked for, or else of these, by name; a name such as a@2 is one draw."""
     return {
-        name: [draw_of(name, draw, options) for draw in (range(1, 2) if "@" in name else options.draws)]
+        name: [draw_of(name, draw, options) for draw in (range(1, 2) if "@" in name else options.drawn(usual))]
         for name in options.loads or names
     }
 

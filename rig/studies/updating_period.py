@@ -1,20 +1,18 @@
 """Cost against updating period, fixed and adapted (paper, figure `tu_opt`), and what the literal rule needs to work."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from coldloop.process import TICK_S
 from rig import paper as published
-from rig.plot import ACCENT, COLOURS, INK, THIRD
+from rig.plot import ACCENT, INK, THIRD
 from rig.studies.drawing import legend_outside, panels
+from rig.studies.load_response import response, response_figure, response_table
 from rig.studies.request import Outcome, RunRequest, Series
-from rig.studies.study import NOISE, PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
-from rig.studies.trajectories import seconds_since_step
+from rig.studies.study import NOISE, PROGRAM, Cell, Load, Outcomes, StudyOptions, StudyResult, loads
 
 NINE: Final = tuple(published.updating_period()["a"]["tau_u_s"].tolist())
 """Periods of the paper, s."""
@@ -40,6 +38,8 @@ OWN: Final = Policy("contraction rule", ADAPTIVE, (f"{RULE}contraction",))
 OWN_INTERRUPT: Final = Policy("contraction rule, interrupt", ADAPTIVE, (f"{RULE}contraction", INTERRUPT))
 CONTROL: Final = Policy("fixed 2.5 s, interrupt", 2.5, (INTERRUPT,))
 POLICIES: Final = (LITERAL, OWN, OWN_INTERRUPT, CONTROL, Policy("fixed 1.5 s, interrupt", 1.5, (INTERRUPT,)))
+RESPONDING: Final = (LITERAL, OWN, OWN_INTERRUPT)
+"""Whose response to load steps is told."""
 TUNING_DRAWS: Final = (11, 12)
 """Draws that the constants of the contraction rule were chosen on."""
 
@@ -67,6 +67,11 @@ VARIANTS: Final = (
 )
 
 
+COLUMNS: Final = (
+    "variant", "load", "policy", "tau_u mean (s)", "J per time", "J_BF", "tau_u mean per update (s)",
+)  # fmt: skip
+
+
 class UpdatingPeriodStudy:
     """Six hours, nine periods and the rules; further draws of the six families are hours never used for tuning."""
 
@@ -84,31 +89,35 @@ class UpdatingPeriodStudy:
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Rank fixed periods and rules in each hour."""
-        result = StudyResult(("variant", "load", "policy", "tau_u mean (s)", "J per time", "J_BF"), [], {})
+        result = StudyResult(COLUMNS, [], {})
         hours = {load.name: _Hour.of(load, options, outcomes) for load in _hours(options)}
         for name, hour in hours.items():
             for label, run in hour.runs():
-                indicators = run.indicators
-                result.rows.append(("", name, label, indicators.tau_u_mean, indicators.J_open_mean, indicators.J_BF))
+                result.rows.append(_row("", name, label, run))
         for load in _hours(options):
             for variant in _variants(options) if load.draw == 1 else ():
                 labels = [f"fixed {period:g} s" for period in variant.periods] + [p.label for p in variant.policies]
                 for label, request in zip(labels, _variant_runs(load, variant), strict=True):
-                    one = outcomes[request].indicators
-                    row = (variant.label, load.name, label, one.tau_u_mean, one.J_open_mean, one.J_BF)
-                    result.rows.append(row)
+                    result.rows.append(_row(variant.label, load.name, label, outcomes[request]))
         first = {name: hour for name, hour in hours.items() if hour.load.draw == 1}
         fresh = {name: hour for name, hour in hours.items() if hour.load.draw not in (1, *TUNING_DRAWS)}
         result.figures["cost against period"] = _figure(first, fresh)
-        result.figures["period after a load step"] = _response_figure(list(hours.values()))
+        responses = {p.label: [(hour.policies[p.label], hour.load) for hour in hours.values()] for p in RESPONDING}
+        result.figures["period after a load step"] = response_figure(responses)
         _judge(result, "hours", first)
         if fresh:
             _judge(result, "fresh hours", fresh)
         for policy in (LITERAL, OWN_INTERRUPT):
-            _judge_response(result, list(hours.values()), policy)
+            found = response(responses[policy.label], policy.label)
+            result.values |= {name: [value] for name, value in found.items()}
         result.remarks += [_table("Hours a to f", first), *([_table("Fresh hours", fresh)] if fresh else [])]
-        result.remarks += [_response_table(list(hours.values())), _variant_table(result)]
+        result.remarks += [response_table(responses), _variant_table(result)]
         return result
+
+
+def _row(variant: str, load: str, policy: str, run: Outcome) -> tuple[Cell, ...]:
+    i = run.indicators
+    return variant, load, policy, i.tau_u_mean, i.J_open_mean, i.J_BF, i.tau_u_mean_per_update
 
 
 def _hours(options: StudyOptions) -> list[Load]:
@@ -208,65 +217,6 @@ def _geometric_mean(ratios: Series) -> float:
     return float(np.exp(np.log(ratios).mean()))
 
 
-RESPONSE_EDGES_S: Final = np.array([0.0, 2.5, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0])
-SOON_S: Final = (0.0, 5.0)
-LATER_S: Final = (5.0, 20.0)
-QUIET_S: Final = (60.0, np.inf)
-
-
-def _periods_since_step(hours: Sequence[_Hour], policy: Policy) -> tuple[Series, Series]:
-    """Return, for all updates of all hours, the time since the load step (s) and the updating period (s)."""
-    runs = [(hour.policies[policy.label], hour.load) for hour in hours]
-    since = np.concatenate([seconds_since_step(run, load) for run, load in runs])
-    return since, np.concatenate([run.column("tau_u") for run, _ in runs]) * TICK_S
-
-
-def _judge_response(result: StudyResult, hours: Sequence[_Hour], policy: Policy) -> None:
-    """Compare the mean period just after a load step, and a little later, with that in quiet."""
-    since, tau = _periods_since_step(hours, policy)
-
-    def mean(span: tuple[float, float]) -> float:
-        chosen = tau[(span[0] <= since) & (since < span[1])]
-        return float(chosen.mean()) if len(chosen) else np.nan
-
-    quiet = mean(QUIET_S)
-    result.values[f"tau_u just after a load step over that in quiet, {policy.label}"] = [mean(SOON_S) / quiet]
-    result.values[f"tau_u 5 to 20 s after a load step over that in quiet, {policy.label}"] = [mean(LATER_S) / quiet]
-
-
-def _response_means(hours: Sequence[_Hour], policy: Policy) -> list[float]:
-    """Return the mean period in each span of time since the step; not a number where there is none."""
-    since, tau = _periods_since_step(hours, policy)
-    bins = np.digitize(since, RESPONSE_EDGES_S)
-    return [float(tau[bins == i].mean()) if (bins == i).any() else np.nan for i in range(1, len(RESPONSE_EDGES_S))]
-
-
-def _response_table(hours: Sequence[_Hour]) -> str:
-    spans = [f"{low:g}-{high:g} s" for low, high in pairwise(RESPONSE_EDGES_S.tolist())]
-    lines = [
-        "**Mean updating period (s) against the time since the load step**, all hours together.",
-        "",
-        "| policy | " + " | ".join(spans) + " |",
-        "|---|" + "---|" * len(spans),
-    ]
-    for policy in (LITERAL, OWN, OWN_INTERRUPT):
-        cells = ["" if np.isnan(mean) else f"{mean:.2f}" for mean in _response_means(hours, policy)]
-        lines.append(f"| {policy.label} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def _response_figure(hours: Sequence[_Hour]) -> Figure:
-    with panels(1, 1, (8.0, 3.6)) as (figure, (place,)):
-        for policy, colour in zip((LITERAL, OWN, OWN_INTERRUPT), COLOURS, strict=False):
-            means = _response_means(hours, policy)
-            place.stairs(means, RESPONSE_EDGES_S, color=colour, baseline=None, linewidth=1.4, label=policy.label)
-        place.set_xlabel("time since the load step (s)")
-        place.set_ylabel("mean updating period (s)")
-        place.set_ylim(bottom=0)
-        legend_outside(figure, place)
-    return figure
-
-
 def _figure(first: Mapping[str, _Hour], fresh: Mapping[str, _Hour]) -> Figure:
     """Draw each hour in % of its worst of the paper's periods, the paper's points beside it."""
     rows = -(-len(first) // 2)
@@ -338,7 +288,7 @@ def _variant_table(result: StudyResult) -> str:
     caption = (
         "**Variants** (first draws): costs over those of the best fixed period tried, geometric mean of the hours."
     )
-    lines = [caption, "", "| variant | policy | open loop | J_BF | mean tau_u (s) |", "|---|---|---|---|---|"]
+    lines = [caption, "", "| variant | policy | open loop | J_BF | mean tau_u, by time (s) |", "|---|---|---|---|---|"]
     rows = [row for row in result.rows if row[0]]
     for variant in dict.fromkeys(row[0] for row in rows):
         mine = [row for row in rows if row[0] == variant]

@@ -117,7 +117,7 @@ class LiveRig:
         """Wait until `condition()` is true, for at most `within_s` of plant time; return the plant time then.
 
         The condition is looked at every 0.25 s of plant time in lock-step, and a hundred times a second in real time.
-        While plant time stands, as without the plant, real time counts.
+        While plant time does not go on, as without the plant, real time counts.
 
         Raises:
             TimeoutError: It did not become true.
@@ -130,7 +130,9 @@ class LiveRig:
                 raise TimeoutError(f"the condition was not true within {within_s:g} s of plant time")
             if self._scenario.realtime or tick is None:
                 if time.monotonic() > deadline:
-                    raise TimeoutError(f"the condition was not true within {within_s:g} s, and plant time stands")
+                    raise TimeoutError(
+                        f"the condition was not true within {within_s:g} s, and plant time does not go on"
+                    )
                 time.sleep(LOOK_S)
             else:
                 self.advance(TICK_S)

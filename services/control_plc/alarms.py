@@ -2,9 +2,9 @@
 
     condition ──on-delay, off-delay──> active ──TRANSITIONS──> state ──> registers, journal
 
-A condition is told as it is (`holds`, `raised`, `returned`, `happened`). When it has changed for as long as the delay
-of its alarm, `active` follows, and the state makes a transition. Operators make the others. All times are plant time,
-measured by ticks and not by scans: scans can be missed.
+A condition is reported as it is (`holds`, `raised`, `returned`, `happened`). When it has changed for the delay of its
+alarm, `active` follows, and the state makes a transition. Operators make the others. All times are plant time, measured
+by ticks and not by scans: scans can be missed.
 
 "Suppressed by design" of the standard is not there: no alarm depends on another one.
 """
@@ -16,7 +16,7 @@ from coldloop.journal import Journal
 from coldloop.process import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
-from control_plc.alarm_settings import PASSING, AlarmSettings
+from control_plc.alarm_settings import BANDS, PASSING, AlarmSettings
 
 TRANSITIONS: Final[Mapping[AlarmState, Mapping[EventKind, AlarmState]]] = {
     AlarmState.NORMAL: {
@@ -147,6 +147,28 @@ class AlarmPanel:
             else:
                 self._raise(kind, cause)
 
+    def pending(self, *kinds: AlarmKind) -> list[int | None]:
+        """Return since when the condition of each alarm has been another than it shows; None where it is the same."""
+        changes = map(self._pending.get, kinds)
+        return [None if change is None else change.since for change in changes]
+
+    def set_pending(self, kind: AlarmKind, since: int | None) -> None:
+        """Note since when the condition of an alarm has been another than it shows."""
+        self._pending.pop(kind, None)
+        if since is not None:
+            self._pending[kind] = _Pending(since, 0)
+
+    @property
+    def are_quiet(self) -> bool:
+        """No alarm but those of the bands is active, or about to be."""
+        others = (row for kind, row in zip(AlarmKind, self.rows, strict=True) if kind not in BANDS)
+        return not any(row.active for row in others) and all(kind in BANDS for kind in self._pending)
+
+    def delay(self, kind: AlarmKind) -> int:
+        """Return for how many ticks its condition must have changed until an alarm follows it."""
+        rule = self._rules[kind]
+        return rule.off_ticks if self.rows[kind].active else rule.on_ticks
+
     def raised(self, kind: AlarmKind, cause: int = 0) -> None:
         """Tell that the condition of an alarm holds, and why."""
         self.holds(kind, condition=True, cause=cause)
@@ -165,11 +187,11 @@ class AlarmPanel:
 
     def _settle(self, kind: AlarmKind) -> None:
         """Let a change of a condition take effect if its delay is over."""
-        pending, rule, active = self._pending[kind], self._rules[kind], self.rows[kind].active
-        if self.now - pending.since < (rule.off_ticks if active else rule.on_ticks):
+        pending = self._pending[kind]
+        if self.now - pending.since < self.delay(kind):
             return
         del self._pending[kind]
-        if active:
+        if self.rows[kind].active:
             self._return(kind)
         else:
             self._raise(kind, pending.cause)

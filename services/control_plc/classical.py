@@ -1,6 +1,6 @@
 """The classical control of the cold box: two PI loops and a valve held constant (paper, section IV-A).
 
-T5 is controlled by the turbine valve CV156, the level L1 by the actuator part of the heater NCR22, and CV155 stands
+T5 is controlled by the turbine valve CV156, the level L1 by the actuator part of the heater NCR22, and CV155 is fixed
 where it is. Pure: measured outputs and applied inputs in, wanted inputs out. The output guard has the last word.
 """
 

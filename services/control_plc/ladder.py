@@ -26,7 +26,7 @@ class Situation:
 
 
 class Ladder:
-    """Where the ladder stands; `since` is the tick at which the mode began."""
+    """Step of the ladder; `since` is the tick at which the mode began."""
 
     def __init__(self, hold_ticks: int, mode: Mode, cause: Cause, tick: int = 0) -> None:
         self._hold_ticks = hold_ticks

@@ -128,14 +128,14 @@ class PlantLink:
             now: Real time, in ticks from any beginning; None in lock-step.
         """
         changed = reading.generation != self.generation
-        stands = self._stands(reading, now)
+        stopped = self._clock_stopped(reading, now)
         self._refused = reading.refused
         if reading.session != session or not session:
             self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
         elif not all(map(math.isfinite, reading.u)):
             self._enter(PlantLinkState.JOINING, LinkCause.NOT_FINITE)
-        elif stands:
-            self._enter(PlantLinkState.FROZEN, LinkCause.STANDS)
+        elif stopped:
+            self._enter(PlantLinkState.FROZEN, LinkCause.STOPPED)
         else:
             if changed and self.generation:  # somebody else, or its watchdog, has moved the outputs
                 self._alarms.raised(AlarmKind.PLANT_LOST, LinkCause.CHANGED)
@@ -152,7 +152,7 @@ class PlantLink:
 
         In real time the rack's tick may differ by one: it changes between two scans, and a scan may be late.
         """
-        stands = self._stands(answer, now)
+        stopped = self._clock_stopped(answer, now)
         self._watch_others(answer)
         if answer.verdict != OutputVerdict.TAKEN:
             self._enter(*REFUSED_OUTPUTS.get(answer.verdict, NOT_TAKEN))
@@ -160,8 +160,8 @@ class PlantLink:
             self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
         elif answer.u != sent[1:4] or answer.holder != self.holder or answer.generation != self.generation:
             self._enter(PlantLinkState.JOINING, LinkCause.CHANGED)
-        elif stands:
-            self._enter(PlantLinkState.FROZEN, LinkCause.STANDS)
+        elif stopped:
+            self._enter(PlantLinkState.FROZEN, LinkCause.STOPPED)
         elif abs(answer.tick - sent.tick) > (now is not None):
             self._enter(PlantLinkState.JOINING, LinkCause.LEAPT)
         else:
@@ -183,8 +183,8 @@ class PlantLink:
             self._refused = answer.refused
             self._alarms.happened(AlarmKind.SECOND_WRITER, SECOND_MASTER)
 
-    def _stands(self, reading: Measurement, now: float | None) -> bool:
-        """Note where the rack is; tell whether its clock stands. At tick 0 it waits for the first outputs."""
+    def _clock_stopped(self, reading: Measurement, now: float | None) -> bool:
+        """Note where the rack is; tell whether its clock has stopped. At tick 0 it waits for the first outputs."""
         moved = (reading.session, reading.tick) != (self.session, self.tick)
         self.session, self.tick = reading.session, reading.tick
         if now is None or moved or reading.tick == 0 or self._moved_at is None:

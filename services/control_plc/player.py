@@ -157,6 +157,28 @@ class SequencePlayer:
         """Number of the next update."""
         return self._updates
 
+    def is_ordinary(self, tick: int) -> bool:
+        """Tell whether a sequence is being played in time, and the update under way is planned."""
+        if self._playing is None or self.late or not self.invited or self.next_update_tick < tick:
+            return False
+        if self._spare is None:
+            return self.phase is UpdatePhase.PLANNED and not self._load_step
+        return self.phase is UpdatePhase.ANSWERED
+
+    @property
+    def load_step(self) -> float:
+        """Change of the load (W) that interrupts the update under way; 0 is never."""
+        return self._load_step
+
+    def take_over(self, playing: InputSequence, update: Update, next_update_tick: int, sequences: int) -> None:
+        """Go on after so many more sequences were accepted: the last one is being played, and its update is planned."""
+        self._playing, self.update = playing, update
+        self._updates = update.update + 1
+        self.next_update_tick = next_update_tick
+        self.phase, self.late = UpdatePhase.PLANNED, False
+        self.accepted += sequences
+        self.acknowledgement = Acknowledgement(playing.header.number, Verdict.ACCEPTED)
+
     # -- who else drives, and time that leaps --------------------------------------------------------------------------
 
     def dismiss(self) -> None:

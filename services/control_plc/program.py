@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from coldloop.errors import ConfigurationError
 from coldloop.journal import Journal
 from coldloop.limits import InputLimits
-from coldloop.process import L1, T5, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
     Acknowledgement,
@@ -37,6 +37,7 @@ from control_plc.classical import ClassicalLoops
 from control_plc.guard import OutputGuard
 from control_plc.ladder import Ladder, Situation
 from control_plc.player import SequencePlayer
+from control_plc.process_alarms import ProcessAlarms
 from control_plc.sensors import SensorMonitor
 from control_plc.settings import ControlSection, ControlStrategy
 
@@ -66,6 +67,7 @@ class ControlProgram:
         self._limits = limits
         self._point = point
         self._section = section
+        self.alarm_settings = section.alarms
         self._initial = SequenceRow(*point.inputs)
         if OutputGuard(limits, self._initial).out_of_range([self._initial]):
             raise ConfigurationError(
@@ -84,7 +86,7 @@ class ControlProgram:
         self._begin(session, 0, self._initial, updates=0)
         classical = self._section.driver is ControlStrategy.CLASSICAL
         mode = Mode.CLASSICAL if classical else Mode.HOLD
-        self._ladder = Ladder(self._section.ladder.hold_ticks, mode, Cause.SESSION_STARTED)
+        self.ladder = Ladder(self._section.ladder.hold_ticks, mode, Cause.SESSION_STARTED)
         if session:
             self._note_mode(0)
 
@@ -131,8 +133,8 @@ class ControlProgram:
         self.operator = operator
         self._begin(session, tick, SequenceRow(*applied), updates=updates)
         ours = playing is not None and SequenceRow(*applied) in playing.rows[: max(0, tick - playing.header.first_tick)]
-        self._player.resume(playing if ours else None, tick)
-        self._ladder = Ladder(self._section.ladder.hold_ticks, Mode.HOLD, Cause.RESTARTED, tick)
+        self.player.resume(playing if ours else None, tick)
+        self.ladder = Ladder(self._section.ladder.hold_ticks, Mode.HOLD, Cause.RESTARTED, tick)
         self._note_mode(tick)
 
     def _begin(self, session: int, tick: int, applied: SequenceRow, *, updates: int) -> None:
@@ -140,19 +142,19 @@ class ControlProgram:
         self.tick = tick
         self.process: Process | None = None
         self.optimizer_present = True
-        self._guard = OutputGuard(self._limits, self._initial)
+        self.guard = OutputGuard(self._limits, self._initial)
         if applied != self._initial:
-            self._guard.begin_at(tick, applied)
-        self._before = self._guard.applied
-        self._player = SequencePlayer(self._guard, self._point.model_digest, updates=updates)
-        self._sensors = SensorMonitor(self._section.sensors, self._point.outputs)
+            self.guard.begin_at(tick, applied)
+        self._before = self.guard.applied
+        self.player = SequencePlayer(self.guard, self._point.model_digest, updates=updates)
+        self.sensors = SensorMonitor(self._section.sensors, self._point.outputs)
         self._unknown = False
         """The load or the state that was measured last makes no sense."""
         self._failed_handshake = -math.inf
         self._in_scan = False
         self.watchdog.set(self.watchdog.time, tick)
         self._loops.restart()
-        self._bad_before: frozenset[int] = frozenset()
+        self._process_alarms = ProcessAlarms(self.alarms, self.journal, self.alarm_settings)
         self.alarms.begin_at(tick)
 
     # -- what others see -----------------------------------------------------------------------------------------------
@@ -160,47 +162,37 @@ class ControlProgram:
     @property
     def mode(self) -> Mode:
         """Who decides the outputs."""
-        return self._ladder.mode
-
-    @property
-    def ladder(self) -> Ladder:
-        """Mode, cause and since when."""
-        return self._ladder
-
-    @property
-    def player(self) -> SequencePlayer:
-        """Updates, sequences, and what was thought of them."""
-        return self._player
+        return self.ladder.mode
 
     @property
     def bad_sensors(self) -> int:
         """Bit i is set when output i is substituted."""
-        return self._sensors.mask
+        return self.sensors.mask
 
     @property
     def applied(self) -> SequenceRow:
         """The inputs being applied."""
-        return self._guard.applied
+        return self.guard.applied
 
     @property
     def remaining(self) -> int:
         """Ticks of the sequence that are still to be played, the present one included."""
-        return self._player.remaining(self.tick)
+        return self.player.remaining(self.tick)
 
     @property
     def awaiting_plan(self) -> bool:
         """The last update has no updating period yet, and an optimiser is there to choose one."""
-        return self.optimizer_present and self._player.awaiting_plan
+        return self.optimizer_present and self.player.awaiting_plan
 
     @property
     def awaiting_sequence(self) -> bool:
         """An updating instant has come, its sequence has not, and an optimiser is there to send it."""
-        return self.optimizer_present and self._player.awaiting_sequence(self.tick)
+        return self.optimizer_present and self.player.awaiting_sequence(self.tick)
 
     @property
     def _usable(self) -> bool:
         """MPC can work with what is measured."""
-        return not (self._unknown or self._sensors.unusable)
+        return not (self._unknown or self.sensors.unusable)
 
     @property
     def _earliest(self) -> int:
@@ -212,33 +204,33 @@ class ControlProgram:
         """Decide the outputs of this tick."""
         tick = self.alarms.now = self.tick
         self._in_scan = True
-        self._before = self._guard.applied
+        self._before = self.guard.applied
         if self.watchdog.check(tick):
             self.optimizer_lost()
-        began = self._player.begin(tick)
-        if self._player.broken_promise:
+        began = self.player.begin(tick)
+        if self.player.broken_promise:
             self._failed_handshake = tick
-        row = self._player.row(tick)
+        row = self.player.row(tick)
         self._climb(tick, row)
-        applied = self._guard.admit(tick, self._wanted(tick, row), update=began)
+        applied = self.guard.admit(tick, self._wanted(tick, row), update=began)
         return Actuators(tick, *applied, self.session)
 
     def _climb(self, tick: int, row: SequenceRow | None) -> None:
         """Let the ladder choose the mode of this scan."""
-        before = self._ladder.mode
-        changed = self._ladder.step(
+        before = self.ladder.mode
+        changed = self.ladder.step(
             tick,
             Situation(
                 operator=OperatorMode(self.operator.mode),
                 sensors_unusable=not self._usable,
                 row=row is not None,
-                late=self._player.late or not self.optimizer_present,
+                late=self.player.late or not self.optimizer_present,
             ),
         )
         if not changed:
             return
-        if self._ladder.mode is Mode.CLASSICAL:
-            self._player.drop()
+        if self.ladder.mode is Mode.CLASSICAL:
+            self.player.drop()
             if before is not Mode.CLASSICAL:
                 self._loops.restart()
         elif before is Mode.CLASSICAL:
@@ -246,40 +238,42 @@ class ControlProgram:
         self._note_mode(tick)
 
     def _note_mode(self, tick: int) -> None:
-        self.journal.note(tick, EventKind.MODE, self._ladder.mode, self._ladder.cause)
+        self.journal.note(tick, EventKind.MODE, self.ladder.mode, self.ladder.cause)
 
     def _wanted(self, tick: int, row: SequenceRow | None) -> SequenceRow:
         """Return what is asked for by whom the ladder has chosen."""
-        mode = self._ladder.mode
+        mode = self.ladder.mode
         if mode is Mode.MANUAL:
             return SequenceRow(*self.operator[1:])
         if mode is Mode.CLASSICAL and self.process is not None and not self._handing_over(tick):
-            return self._loops.wanted(tick, self.process.y, self._guard.applied, without=self._sensors.unusable)
-        return self._guard.applied if row is None else row
+            return self._loops.wanted(tick, self.process.y, self.guard.applied, without=self.sensors.unusable)
+        return self.guard.applied if row is None else row
 
     def _handing_over(self, tick: int) -> bool:
-        """Tell whether the loops stand still, so that the optimiser's first sequence begins where it was told."""
-        if self._player.has_answer:  # it was judged from where the inputs are
+        """Tell whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows."""
+        if self.player.has_answer:  # it was judged from where the inputs are
             return True
         rested = tick - self._failed_handshake > HANDSHAKE_PAUSE_S / TICK_S
-        return rested and self.operator.mode == OperatorMode.AUTO and self._player.answering
+        return rested and self.operator.mode == OperatorMode.AUTO and self.player.answering
 
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
-        applied = tuple(self._guard.applied)
-        y = tuple(self._sensors.check(self.tick, measurement.y))
+        applied = tuple(self.guard.applied)
+        y = tuple(self.sensors.check(self.tick, measurement.y))
         self.process = Process(self.tick, measurement.load, applied, y)
         self._unknown = not (0.0 <= measurement.load <= MAX_LOAD_W and all(map(math.isfinite, measurement.x)))
         self._let_play(usable=self._usable)
         latched = None
-        if self._player.latches(self.tick, measurement.load):
-            latched = self._player.latch(
+        if self.player.latches(self.tick, measurement.load):
+            latched = self.player.latch(
                 Update(
                     session=self.session, update=0, tick=self.tick, playing=0, load=measurement.load,
                     u_before=tuple(self._before), u=applied, y=y, x=measurement.x,
                 )
             )  # fmt: skip
-        self._watch(y)
+        self._process_alarms.watch(
+            self.tick, y, self.ladder, late=self.player.late, optimizer=self.optimizer_present, bad=self.sensors.bad
+        )
         self.tick += 1
         self._in_scan = False
         return latched
@@ -287,10 +281,10 @@ class ControlProgram:
     def _let_play(self, *, usable: bool) -> None:
         """Invite the optimiser, or send it away: an operator drives, or MPC would work with what is not so."""
         invited = usable and self.operator.mode == OperatorMode.AUTO
-        if invited and not self._player.invited:
-            self._player.invite(self.tick)
-        elif not invited and self._player.invited:
-            self._player.dismiss()
+        if invited and not self.player.invited:
+            self.player.invite(self.tick)
+        elif not invited and self.player.invited:
+            self.player.dismiss()
 
     def interrupt(self) -> None:
         """Give up the scan under way: what the rack has done with its outputs is not known."""
@@ -310,46 +304,16 @@ class ControlProgram:
             self._set_back(tick)
         self.tick = self.alarms.now = tick
         self._in_scan = False
-        self._guard.begin_at(self.tick, SequenceRow(*applied))
+        self.guard.begin_at(self.tick, SequenceRow(*applied))
 
     def _set_back(self, tick: int) -> None:
         if self.tick - tick > SET_BACK_TICKS:
-            self._player.set_back(tick)
-        self._sensors.set_back(tick)
-        self._ladder.set_back(tick)
+            self.player.set_back(tick)
+        self.sensors.set_back(tick)
+        self.ladder.set_back(tick)
         self.watchdog.set_back(tick)
         self._failed_handshake = min(self._failed_handshake, tick)
         self.alarms.begin_at(tick)
-
-    # -- alarms --------------------------------------------------------------------------------------------------------
-
-    def _watch(self, y: Sequence[float]) -> None:
-        """Raise and return the alarms that depend on the process and on the ladder."""
-        holds, bands = self.alarms.holds, self._section.alarms
-        for kind, value, (low, high) in (
-            (AlarmKind.LEVEL_BAND, y[L1], bands.level_band),
-            (AlarmKind.T5_BAND, y[T5], bands.t5_band),
-        ):
-            holds(kind, condition=not low <= value <= high)
-        mode, cause = self._ladder.mode, self._ladder.cause
-        fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR)
-        holds(AlarmKind.MODE, condition=fallen, cause=cause)
-        exhausted = mode is not Mode.MPC and cause in (Cause.SEQUENCE_EXHAUSTED, Cause.HOLD_EXPIRED)
-        holds(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
-        holds(AlarmKind.SEQUENCE_LATE, condition=self._player.late)
-        holds(AlarmKind.OPTIMIZER_LOST, condition=not self.optimizer_present)
-        self._watch_sensors()
-
-    def _watch_sensors(self) -> None:
-        """Note each sensor that became bad or good, and raise the alarm; its cause is the newest one's output."""
-        bad = frozenset(self._sensors.bad)
-        for output in sorted(bad ^ self._bad_before):
-            self.journal.note(self.tick, EventKind.SENSOR, output, int(output in bad))
-        for output in sorted(bad - self._bad_before):
-            self.alarms.raised(AlarmKind.SENSOR_BAD, output)
-        if not bad:
-            self.alarms.returned(AlarmKind.SENSOR_BAD)
-        self._bad_before = bad
 
     # -- the optimiser's side ------------------------------------------------------------------------------------------
 
@@ -371,17 +335,17 @@ class ControlProgram:
     def accept_plan(self, plan: Plan) -> bool:
         """Take the updating period of the last update; tell whether it was acceptable."""
         self.optimizer_seen()
-        return self._player.accept_plan(plan, self._earliest)
+        return self.player.accept_plan(plan, self._earliest)
 
     def abandon(self) -> None:
         """Give up the update under way: an optimiser that has lost the thread asks for a new one."""
-        self._player.abandon(self._earliest)
+        self.player.abandon(self._earliest)
 
     def offer(self, sequence: InputSequence) -> Acknowledgement:
         """Check a committed sequence; accept it for its first tick, or reject it with a reason."""
         self.optimizer_seen()
         lost = self.alarms.now - self.tick > LOST_TICKS
-        answer = self._player.offer(sequence, self._earliest, plant_lost=lost)
+        answer = self.player.offer(sequence, self._earliest, plant_lost=lost)
         accepted = answer.verdict == Verdict.ACCEPTED
         self.alarms.holds(AlarmKind.SEQUENCE_REJECTED, condition=not accepted, cause=answer.verdict)
         if accepted or answer.verdict == Verdict.WRONG_MODEL:
@@ -392,7 +356,7 @@ class ControlProgram:
 
     def track(self) -> bool:
         """Let the manual setpoints follow what is applied, so that manual begins without a bump; tell if they moved."""
-        applied = self._guard.applied
+        applied = self.guard.applied
         if self.operator.mode == OperatorMode.MANUAL or self.operator[1:] == applied[:]:
             return False
         self.operator = Operator(self.operator.mode, *applied)

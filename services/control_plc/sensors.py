@@ -1,16 +1,16 @@
-"""Measurements that cannot be right: found, replaced by the last good value, and told.
+"""Measurements that cannot be right: found, replaced by the last good value, and reported.
 
 A measurement is bad when it is no number, outside its sensor's range, or, for the outputs that are controlled, frozen:
-it stands to the last bit for a while in which most of the others move.
+it does not change by a bit for a while in which most of the others move.
 """
 
-from collections.abc import Sequence
-from operator import le, ne
+from collections.abc import MutableSequence, Sequence
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process import L1, OUTPUT_NAMES, T5, TICK_S
+from coldloop.process import L1, T5, TICK_S
+from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
 CONTROLLED = (L1, T5)
@@ -32,7 +32,7 @@ class SensorCheckSettings(BaseModel):
     pressure: Range = (-1.0, 100.0)
     """bar."""
     frozen_s: Annotated[float, Field(gt=0)] = 20.0
-    """A controlled output that stands for so long, while others move, is frozen."""
+    """A controlled output that does not change for so long, while others move, is frozen."""
     bridged_s: Annotated[float, Field(ge=0)] = 10.0
     """How long the last good value of a controlled output is worked with; then what needs it is left."""
 
@@ -48,6 +48,35 @@ class SensorCheckSettings(BaseModel):
         return self
 
 
+def are_inside(y: Numbers, low: Numbers, high: Numbers) -> bool:
+    """Tell whether all measurements are numbers within their ranges; the rig compiles this function, and the next."""
+    inside = True
+    for output in range(len(y)):
+        inside = inside and low[output] <= y[output] <= high[output]
+    return inside
+
+
+def watch_standing(stands: MutableSequence[int], before: MutableSequence[float], y: Numbers, elapsed: int) -> None:
+    """Sum up for how many ticks each controlled output has stood while most of the others moved.
+
+    `before` (22) becomes `y`, the measurements `elapsed` ticks later.
+    """
+    for place in range(len(CONTROLLED)):
+        if y[CONTROLLED[place]] != before[CONTROLLED[place]]:
+            stands[place] = 0
+        elif 2 * moved(before, y) > len(y):
+            stands[place] += elapsed
+    before[:] = y
+
+
+def moved(before: Numbers, y: Numbers) -> int:
+    """Return how many measurements are others than before."""
+    count = 0
+    for output in range(len(y)):
+        count += y[output] != before[output]
+    return count
+
+
 class SensorMonitor:
     """Looks at every measurement. All its times are plant time: scans can be missed.
 
@@ -55,28 +84,28 @@ class SensorMonitor:
     """
 
     def __init__(self, settings: SensorCheckSettings, initial: Sequence[float]) -> None:
-        self._low, self._high = zip(*settings.ranges, strict=True)
-        self._frozen_ticks = round(settings.frozen_s / TICK_S)
+        self.low, self.high = zip(*settings.ranges, strict=True)
+        self.frozen_ticks = round(settings.frozen_s / TICK_S)
         self._bridged_ticks = round(settings.bridged_s / TICK_S)
         self._good = list(initial)
-        self._before = tuple(initial)
+        self.before = list(initial)
         self._tick: int | None = None
         self._now = 0
-        self._stands = dict.fromkeys(CONTROLLED, 0)
+        self.stands = [0] * len(CONTROLLED)
         self._recovering: dict[int, int] = {}
         """Output, and since which tick its measurements have been good again."""
         self.bad: dict[int, int] = {}
 
     def check(self, tick: int, y: Sequence[float]) -> Sequence[float]:
         """Return the outputs measured at `tick`, with bad ones replaced by their last good value."""
-        self._watch_standing(1 if self._tick is None else max(0, tick - self._tick), y)
+        watch_standing(self.stands, self.before, y, 1 if self._tick is None else max(0, tick - self._tick))
         self._tick = self._now = tick
-        frozen = self._frozen()
-        if not self.bad and not frozen and all(map(le, self._low, y)) and all(map(le, y, self._high)):
+        frozen = [output for output, ticks in zip(CONTROLLED, self.stands, strict=True) if ticks >= self.frozen_ticks]
+        if not self.bad and not frozen and are_inside(y, self.low, self.high):
             self._good[:] = y
             return y
         for output, value in enumerate(y):
-            self._judge(output, ok=self._low[output] <= value <= self._high[output] and output not in frozen)
+            self._judge(output, ok=self.low[output] <= value <= self.high[output] and output not in frozen)
             if output not in self.bad:
                 self._good[output] = value
         return tuple(self._good)
@@ -87,18 +116,6 @@ class SensorMonitor:
         self.bad = {output: min(since, tick) for output, since in self.bad.items()}
         self._recovering = {output: min(since, tick) for output, since in self._recovering.items()}
 
-    def _watch_standing(self, elapsed: int, y: Sequence[float]) -> None:
-        """Sum up for how long each controlled output has stood while most of the others moved."""
-        for output in CONTROLLED:
-            if y[output] != self._before[output]:
-                self._stands[output] = 0
-            elif 2 * sum(map(ne, y, self._before)) > len(OUTPUT_NAMES):
-                self._stands[output] += elapsed
-        self._before = tuple(y)
-
-    def _frozen(self) -> list[int]:
-        return [output for output, ticks in self._stands.items() if ticks >= self._frozen_ticks]
-
     def _judge(self, output: int, *, ok: bool) -> None:
         if not ok:
             self.bad.setdefault(output, self._now)
@@ -107,6 +124,11 @@ class SensorMonitor:
             since = self._recovering.setdefault(output, self._now)
             if self._now - since + 1 >= RECOVERY_TICKS:
                 del self.bad[output], self._recovering[output]
+
+    def seen(self, tick: int, y: Sequence[float]) -> None:
+        """Note that all outputs y (22) have been good up to `tick`, and what was measured there."""
+        self._tick = self._now = tick
+        self._good[:] = self.before[:] = y
 
     @property
     def unusable(self) -> list[int]:

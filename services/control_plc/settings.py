@@ -57,7 +57,7 @@ class LadderSettings(BaseModel):
     optimizer_timeout_s: Annotated[float, Field(ge=0, le=16_000)] = 15.0
     """An optimiser that gives no sign of life for so long is lost; 0 is never. Plant time, longer than any tau_u."""
     optimizer_patience_s: Annotated[float, Field(gt=0)] = 5.0
-    """In lock-step plant time stands while the optimiser is waited for: it is lost after so long in real time."""
+    """In lock-step plant time waits while the optimiser is waited for: it is lost after so long in real time."""
 
     @property
     def hold_ticks(self) -> int:

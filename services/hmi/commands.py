@@ -114,7 +114,7 @@ class SetFactor(_Command):
 
 
 class SetPaused(_Command):
-    """Plant time stands still, or goes on."""
+    """Pause or resume."""
 
     kind: Literal["pause"]
     paused: bool

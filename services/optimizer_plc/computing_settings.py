@@ -1,12 +1,12 @@
 """Settings of what the optimiser computes with: arithmetic, estimator, solvers. It imports nothing that takes time."""
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
 PENALTY_WEIGHT = 3000.0
-"""alpha that all solvers are judged by unless told otherwise: 30 times the weight of a band violation."""
+"""alpha that all solvers are judged by unless set otherwise: 30 times the weight of a band violation."""
 
 
 class Arithmetic(StrEnum):
@@ -29,8 +29,10 @@ class EstimatorSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: EstimatorKind = EstimatorKind.KALMAN
+    load_known: bool = True
+    """Whether the heat load is measured; where it is not, all of it is load mismatch, and no period is interrupted."""
     load_walk_w: PositiveFloat = 3.0
-    """Random walk of the load mismatch, W."""
+    """Random walk of the load mismatch, W; for a load that is not measured, of the size of its steps."""
     pressure_noise_pa: PositiveFloat = 50.0
     volume_noise_m3: PositiveFloat = 1e-5
     temperature_noise_k: PositiveFloat = 0.05
@@ -45,6 +47,12 @@ class EstimatorSettings(BaseModel):
     pressure_sensor: PositiveFloat = 1e-3
     longest_riccati: Annotated[int, Field(ge=1)] = 2000
     """Longest run of the Riccati recursion for a stationary gain, in periods."""
+
+    @model_validator(mode="after")
+    def _someone_estimates(self) -> Self:
+        if self.kind is EstimatorKind.STATE_FEEDBACK and not self.load_known:
+            raise ValueError("state-feedback estimates no load; choose kind = kalman for load_known = false")
+        return self
 
 
 class OdeSettings(BaseModel):

@@ -42,7 +42,7 @@ class ControlClient:
 
     Args:
         endpoint: Where it is.
-        link: Is told of damaged answers, and of the steps of an introduction.
+        link: Counts damaged answers, and of the steps of an introduction.
         model_digest: Of our model.
         model_name: Of our model, for messages.
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.compiled import kernel
-from optimizer_plc.linear_algebra import apply
+from optimizer_plc.linear_algebra import Columns, add_product, apply, by_columns
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 
 Array = NDArray[np.float64]
@@ -38,6 +38,38 @@ def augmented_cost(qp: QuadraticProblem, z: Array, alpha: float) -> float:
     return quadratic_cost(qp.Phi, qp.phi, z) + alpha * penalty
 
 
+class Matrices(NamedTuple):
+    """The constant matrices of a problem, stored for products without the zeros at the ends of columns and rows."""
+
+    Phi: Columns
+    """Shape (n, n)."""
+    Gamma: Columns
+    """Shape (m, n)."""
+    rows: Columns
+    """Gamma transposed: the rows of Gamma as columns."""
+
+
+def matrices_of(qp: QuadraticProblem) -> Matrices:
+    """Return the matrices of a problem."""
+    return Matrices(by_columns(qp.Phi), by_columns(qp.Gamma), by_columns(np.ascontiguousarray(qp.Gamma.T)))
+
+
+@kernel
+def cost_by_columns(constant: Matrices, qp: QuadraticProblem, z: Array, alpha: float) -> float:
+    """Return what `augmented_cost` does, to the bit, for a problem with these matrices."""
+    zero = z.dtype.type(0.0)
+    slope, excess = qp.phi.copy(), -qp.gamma
+    add_product(constant.Phi, z, slope)
+    add_product(constant.Gamma, z, excess)
+    total, penalty = zero, zero
+    for i in range(z.shape[0]):
+        total += slope[i] * z[i]
+    for r in range(excess.shape[0]):
+        if excess[r] > zero:
+            penalty += excess[r] * excess[r]
+    return total + alpha * penalty
+
+
 class Indicators(NamedTuple):
     """Predicted costs and violation of a profile."""
 
@@ -49,14 +81,48 @@ class Indicators(NamedTuple):
     """Largest violated row, max(Gamma p - gamma, 0), in the units of the row (%, K, or input units)."""
 
 
+class OutputMaps(NamedTuple):
+    """How the constrained outputs over the horizon of N samples follow from a profile and a situation."""
+
+    resting: Array
+    """L1 and T5 in turn at the operating point, shape (2 N,)."""
+    of_z: Array
+    """Shape (n, 2 N)."""
+    of_x: Array
+    """Shape (n_x, 2 N)."""
+    of_w: Array
+    """Shape (2 N,)."""
+    bands: Array
+    """Low, high and weight of L1 and T5, shape (3, 2)."""
+    row_gains: Array
+    """What the rows of Gamma were multiplied by, shape (m,)."""
+
+
+def output_maps(problem: PredictiveProblem) -> OutputMaps:
+    """Return the maps of a problem."""
+    return OutputMaps(
+        problem.resting_outputs, problem.stacked_outputs_z, problem.stacked_outputs_x, problem.stacked_outputs_w,
+        problem.bands, problem.row_gains,
+    )  # fmt: skip
+
+
 def indicators(problem: PredictiveProblem, qp: QuadraticProblem, z: Array, situation: Situation) -> Indicators:
     """Return the indicators of profile z in a situation (paper, section V); `qp` is the problem's instance there."""
-    outputs = problem.resting_outputs.copy()
-    apply(problem.stacked_outputs_z, z, outputs)
-    apply(problem.stacked_outputs_x, situation.x, outputs)
-    j_cst = violation_cost(outputs, problem.stacked_outputs_w, situation.w, problem.bands)
-    j_dev = deviation_cost(qp, z, problem.n_inputs) + qp.constant
-    return Indicators(j_dev, j_cst, largest_violation(qp, z, problem.row_gains))
+    maps, real = output_maps(problem), z.dtype.type
+    return Indicators(*map(float, predicted_indicators(maps, qp, z, situation.x, real(situation.w), problem.n_inputs)))
+
+
+@kernel
+def predicted_indicators(
+    maps: OutputMaps, qp: QuadraticProblem, z: Array, x: Array, w: float, n_inputs: int
+) -> Indicators:
+    """Return the indicators of profile z (n,) at the state x (n_x,) under the load w (W), both as deviations."""
+    outputs = maps.resting.copy()
+    apply(maps.of_z, z, outputs)
+    apply(maps.of_x, x, outputs)
+    j_cst = violation_cost(outputs, maps.of_w, w, maps.bands)
+    j_dev = deviation_cost(qp, z, n_inputs) + qp.constant
+    return Indicators(j_dev, j_cst, largest_violation(qp, z, maps.row_gains))
 
 
 @kernel

@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.compiled import kernel
-from coldloop.process import SAMPLING_PERIOD_S, TICK_S
+from coldloop.errors import ConfigurationError
+from coldloop.process import SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
 from coldloop.registers.control_plc import Update
 from optimizer_plc.arithmetic import DOUBLE, Real
-from optimizer_plc.computing_settings import EstimatorSettings
-from optimizer_plc.linear_algebra import apply, multiply
-from optimizer_plc.prediction import PredictionModel
+from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
+from optimizer_plc.linear_algebra import apply, multiply, respond
+from optimizer_plc.prediction import PredictionModel, Transition
 
 Array = NDArray[np.float64]
 
@@ -48,54 +49,70 @@ class StateFeedback:
     def reset(self) -> None:
         """Begin at the operating point."""
         real = self._model.real
-        self._estimate = Estimate(np.zeros(self._model.n_states, real), real(0.0), real(0.0))
+        self.estimate = Estimate(np.zeros(self._model.n_states, real), real(0.0), real(0.0))
 
     def correct(self, update: Update) -> Estimate:
         """Take the simulated state."""
         m = self._model
-        self._estimate = Estimate(np.asarray(update.x, m.real) - m.x0, m.real(update.load) - m.w0, m.real(0.0))
-        return self._estimate
+        self.estimate = Estimate(np.asarray(update.x, m.real) - m.x0, m.real(update.load) - m.w0, m.real(0.0))
+        return self.estimate
 
     def predict(self, segments: list[tuple[Array, int]]) -> Array:
         """Predict with the model."""
-        return _through(self._model, self._estimate.x, self._estimate.w, segments)
+        return _through(self._model, self.estimate.x, self.estimate.w, segments)
 
 
 class KalmanFilter:
-    """Stationary Kalman filter on the LTI model with one slow load-mismatch state; the known load is fed in."""
+    """Stationary Kalman filter on the LTI model with one slow load-mismatch state; a load that is known is fed in."""
 
     def __init__(self, prediction: PredictionModel, settings: EstimatorSettings, real: Real = DOUBLE) -> None:
         self._model = prediction.rounded(real)
+        self.load_known = settings.load_known
         gains = stationary_gains(prediction, settings)
-        self._gains = {ticks: gain.astype(real, copy=False) for ticks, gain in gains.items()}
+        self.gains = {ticks: gain.astype(real, copy=False) for ticks, gain in gains.items()}
         self.reset()
 
     def reset(self) -> None:
         """Begin at the operating point."""
         real = self._model.real
-        self._x = np.zeros(self._model.n_states, real)
-        self._mismatch = real(0.0)
-        self._estimate = Estimate(self._x, real(0.0), real(0.0))
-        self._since = 1
+        self.x = np.zeros(self._model.n_states, real)
+        self.mismatch = real(0.0)
+        self.estimate = Estimate(self.x, real(0.0), real(0.0))
+        self.since = 1
 
     def correct(self, update: Update) -> Estimate:
         """Correct the predicted state by the measurement, with the gain of the period that just ended."""
         m = self._model
         u = np.asarray(update.u_before, m.real) - m.u0
-        known = m.real(update.load) - m.w0
-        innovation = np.asarray(update.y, m.real) - m.y0 - m.output(self._x, u, known + self._mismatch)
-        correction = np.zeros(len(self._x) + 1, m.real)
-        apply(self._gains[min(self._since, len(self._gains))], innovation, correction)
-        self._x = self._x + correction[:-1]
-        self._mismatch += correction[-1]
-        self._estimate = Estimate(self._x, known + self._mismatch, self._mismatch)
-        return self._estimate
+        known = m.real(update.load) - m.w0 if self.load_known else m.real(0.0)
+        y = np.asarray(update.y, m.real) - m.y0
+        gain = self.gains[min(self.since, len(self.gains))]
+        self.x, mismatch = corrected(gain, m.outputs, self.x, self.mismatch, u, known, y)
+        self.mismatch = m.real(mismatch)
+        self.estimate = Estimate(self.x, known + self.mismatch, self.mismatch)
+        return self.estimate
 
     def predict(self, segments: list[tuple[Array, int]]) -> Array:
         """Predict with the model and the mismatch."""
-        self._x = _through(self._model, self._estimate.x, self._estimate.w, segments)
-        self._since = sum(ticks for _, ticks in segments)
-        return self._x
+        self.x = _through(self._model, self.estimate.x, self.estimate.w, segments)
+        self.since = sum(ticks for _, ticks in segments)
+        return self.x
+
+
+def make_estimator(prediction: PredictionModel, settings: EstimatorSettings, real: Real) -> Estimator:
+    """Return the estimator that the settings name.
+
+    Raises:
+        ConfigurationError: The simulated state is to be believed, and is not that of the model.
+    """
+    if settings.kind is EstimatorKind.KALMAN:
+        return KalmanFilter(prediction, settings, real)
+    if prediction.n_states > len(STATE_NAMES):
+        raise ConfigurationError(
+            "optimizer_plc.program.estimator.kind=state-feedback: the model has states that the plant does not"
+            " tell; use kalman"
+        )
+    return StateFeedback(prediction, real)
 
 
 def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> dict[int, Array]:
@@ -118,6 +135,21 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
         gain = stationary_gain(A, C, process, sensors**2, P, settings.longest_riccati)
         gains[ticks] = np.ascontiguousarray(gain.T)
     return gains
+
+
+@kernel
+def corrected(
+    gain: Array, outputs: Transition, x: Array, mismatch: float, u: Array, w: float, y: Array
+) -> tuple[Array, float]:
+    """Return the state (n,) and the load mismatch (W) after a measurement y (22,); all are deviations.
+
+    `gain` (22, n + 1) is that of the period which ends; `x` and `mismatch` are predicted, `u` (3,) was applied and `w`
+    is the known load (W).
+    """
+    innovation = y - respond(outputs.A, outputs.B, outputs.F, x, u, w + mismatch)
+    correction = np.zeros(gain.shape[1], gain.dtype)
+    apply(gain, innovation, correction)
+    return x + correction[:-1], mismatch + correction[-1]
 
 
 def _through(model: PredictionModel, x: Array, w: float, segments: list[tuple[Array, int]]) -> Array:

@@ -87,9 +87,14 @@ class PredictionModel:
             ticks -= step
         return x
 
+    @property
+    def outputs(self) -> Transition:
+        """C, D and G, which give outputs as a transition gives states."""
+        return Transition(self.C, self.D, self.G)
+
     def output(self, x: Array, u: Array, w: float) -> Array:
         """Return the deviation of the measured output, shape (22,)."""
-        return respond(self.C, self.D, self.G, x, u, w)
+        return respond(*self.outputs, x, u, w)
 
 
 def state_weights(model: LtiModel, design: ControlDesign) -> Array:

@@ -2,7 +2,7 @@
 
 z holds, knot by knot, the 3 inputs (deviations from the operating point over `input_scale`) and then, knot by knot,
 the 4 slacks of the output bands. phi and gamma are affine in the predicted state, the load and the input applied
-before the first knot; Phi and Gamma are constant. No factor 1/2 stands before Phi (`docs/science.md`, ruling 11).
+before the first knot; Phi and Gamma are constant. There is no factor 1/2 before Phi (`docs/science.md`, ruling 11).
 """
 
 from typing import NamedTuple
@@ -24,6 +24,10 @@ Array = NDArray[np.float64]
 RATE_ROW_GAIN = 4.0
 """Rate rows are divided by their largest coefficient and multiplied by this: with a softer penalty a truncated or
 penalised solution undercuts the optimum by breaking the rate limits."""
+
+
+SHIFTS = TICKS_PER_SAMPLE
+"""Longest shift, in ticks, that is tabulated: that of the longest updating period."""
 
 
 class QuadraticProblem(NamedTuple):
@@ -65,15 +69,17 @@ class PredictiveProblem:
         self.bands = np.array([design.output_low, design.output_high, design.violation_weight])
         self.size = (N_INPUTS + N_SLACKS) * self.n_knots
         self._model = prediction
-        self._knots_to_samples = interpolation(design.decision_instants, np.arange(1.0, design.horizon + 1))
-        self._input_scale = np.asarray(design.input_scale)
-        self._u0, self._rate = np.array(prediction.model.u0), np.asarray(limits.rate)
+        self.knots_to_samples = interpolation(design.decision_instants, np.arange(1.0, design.horizon + 1))
+        self.input_scale = np.asarray(design.input_scale)
+        self._u0, self.rate = np.array(prediction.model.u0), np.asarray(limits.rate)
         self._condense()
         self._build_output_rows()
         self._build_rate_rows()
         self.Gamma = np.ascontiguousarray(np.vstack([self._output_rows, self._rate_rows]))
-        self._maps = _Maps(*(M.astype(real, copy=False) for M in self._make_maps()))
-        self._shifts: dict[int, Array] = {}
+        self.maps = Maps(*(M.astype(real, copy=False) for M in self._make_maps()))
+        self.shifts = np.array(
+            [shift(design.decision_instants, ticks / TICKS_PER_SAMPLE) for ticks in range(SHIFTS + 1)]
+        )
         self._real = real
         self._round()
 
@@ -91,7 +97,7 @@ class PredictiveProblem:
         C, D, G = (matrix[list(model.constrained)] for matrix in (model.C, model.D, model.G))
         Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))
         outputs_z, outputs_s = [], []
-        for weights in self._knots_to_samples:
+        for weights in self.knots_to_samples:
             u_of_z = self._input_map(weights)
             to_z = multiply(A, to_z) + multiply(B, u_of_z)
             to_s = multiply(A, to_s)
@@ -119,7 +125,7 @@ class PredictiveProblem:
         u_of_z = np.zeros((N_INPUTS, self.size))
         for knot, weight in enumerate(weights):
             for i in range(N_INPUTS):
-                u_of_z[i, N_INPUTS * knot + i] = weight * self._input_scale[i]
+                u_of_z[i, N_INPUTS * knot + i] = weight * self.input_scale[i]
         return u_of_z
 
     def _slack_map(self, weights: Array) -> Array:
@@ -133,7 +139,7 @@ class PredictiveProblem:
         level, temperature = self.design.violation_weight
         rho = np.array([level, level, temperature, temperature])
         total = np.zeros((self.size, self.size))
-        for weights in self._knots_to_samples:
+        for weights in self.knots_to_samples:
             slack_of_z = self._slack_map(weights)
             total += multiply(_transposed(slack_of_z), rho[:, None] * slack_of_z)
         return total
@@ -143,7 +149,7 @@ class PredictiveProblem:
         design = self.design
         rows, states, bounds = [], [], []
         for instant in design.constraint_instants:
-            slack_of_z = self._slack_map(self._knots_to_samples[instant - 1])
+            slack_of_z = self._slack_map(self.knots_to_samples[instant - 1])
             for output in range(2):
                 y_z, y_s = self.outputs_z[instant - 1][output], self.outputs_s[instant - 1][output]
                 low, high = design.output_low[output] - self.y0[output], design.output_high[output] - self.y0[output]
@@ -168,9 +174,9 @@ class PredictiveProblem:
                 if limit >= ranges[i]:
                     continue
                 row = np.zeros(self.size)
-                row[N_INPUTS * knot + i] = self._input_scale[i]
+                row[N_INPUTS * knot + i] = self.input_scale[i]
                 if knot:
-                    row[N_INPUTS * (knot - 1) + i] = -self._input_scale[i]
+                    row[N_INPUTS * (knot - 1) + i] = -self.input_scale[i]
                 for sign in (1.0, -1.0):
                     rows.append(sign * row)
                     bounds.append(limit)
@@ -193,14 +199,14 @@ class PredictiveProblem:
     def at(self, situation: Situation) -> QuadraticProblem:
         """Return the instance of the problem for a situation."""
         share = self._real(self.limits.rate_share(situation.elapsed_ticks))
-        phi, gamma, low, high, constant = _instance(self._maps, situation.x, situation.w, situation.u_before, share)
+        phi, gamma, low, high, constant = instance(self.maps, situation.x, situation.w, situation.u_before, share)
         return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, self._real(constant))
 
-    def _make_maps(self) -> "_Maps":
-        low_u = (np.asarray(self.limits.low) - self._model.model.u0) / self._input_scale
-        high_u = (np.asarray(self.limits.high) - self._model.model.u0) / self._input_scale
+    def _make_maps(self) -> "Maps":
+        low_u = (np.asarray(self.limits.low) - self._model.model.u0) / self.input_scale
+        high_u = (np.asarray(self.limits.high) - self._model.model.u0) / self.input_scale
         slacks = N_SLACKS * self.n_knots
-        return _Maps(
+        return Maps(
             phi=self._phi_map,
             constant=self._constant_map,
             outputs=self._output_states,
@@ -210,34 +216,29 @@ class PredictiveProblem:
             rate_before=self._rate_before,
             low=np.concatenate([np.tile(low_u, self.n_knots), np.zeros(slacks)]),
             high=np.concatenate([np.tile(high_u, self.n_knots), np.full(slacks, np.inf)]),
-            rate=np.asarray(self.limits.rate) / self._input_scale,
-            input_scale=self._input_scale,
+            rate=np.asarray(self.limits.rate) / self.input_scale,
+            input_scale=self.input_scale,
         )
 
     def memory(self) -> int:
         """Return the bytes of the constant arrays that an instance is made of: Phi, Gamma and the maps."""
-        return sum(M.nbytes for M in (self.Phi, self.Gamma, *self._maps))
+        return sum(M.nbytes for M in (self.Phi, self.Gamma, *self.maps))
 
     # -- profiles ----------------------------------------------------------------------------------------------------
 
     def shifted(self, z: Array, ticks: int) -> Array:
         """Return the profile z shifted by `ticks` ticks."""
-        if ticks not in self._shifts:
-            S = shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE).T
-            whole = np.zeros((self.size, self.size), self._real)
-            whole[: self.n_inputs, : self.n_inputs] = np.kron(S, np.eye(N_INPUTS))
-            whole[self.n_inputs :, self.n_inputs :] = np.kron(S, np.eye(N_SLACKS))
-            self._shifts[ticks] = whole
-        result = np.zeros(self.size, self._real)
-        apply(self._shifts[ticks], z, result)
-        return result
+        if ticks <= SHIFTS:
+            return shifted(self.shifts[ticks], z)
+        S = shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE)
+        return shifted(S.astype(self._real, copy=False), z)
 
     def inputs(self, z: Array, samples: int) -> Array:
         """Return the inputs of the first `samples` sampling periods, shape (samples, 3), in physical units.
 
         The rates between knots are rows of the problem, which a truncated solution may break; what is sent keeps them.
         """
-        return _inputs(self._knots_to_samples[:samples], z, self._input_scale, self._u0, self._rate)
+        return inputs_of(self.knots_to_samples[:samples], z, self.input_scale, self._u0, self.rate)
 
     def outputs(self, z: Array, situation: Situation) -> Array:
         """Return L1 and T5 predicted for a profile at the end of each sampling period, shape (horizon, 2)."""
@@ -250,7 +251,7 @@ class PredictiveProblem:
     def hold(self, u: Array) -> Array:
         """Return the profile that keeps the input deviation u, without slack."""
         return np.concatenate(
-            [np.tile(u / self._input_scale, self.n_knots), np.zeros(N_SLACKS * self.n_knots, self._real)]
+            [np.tile(u / self.input_scale, self.n_knots), np.zeros(N_SLACKS * self.n_knots, self._real)]
         )
 
 
@@ -258,7 +259,7 @@ def _transposed(M: Array) -> Array:
     return np.ascontiguousarray(M.T)
 
 
-class _Maps(NamedTuple):
+class Maps(NamedTuple):
     """How an instance follows from a situation; the state and the load are stacked as s = (x, w)."""
 
     phi: Array
@@ -281,9 +282,22 @@ class _Maps(NamedTuple):
 
 
 @kernel
-def _instance(
-    maps: _Maps, x: Array, w: float, u_before: Array, share: float
-) -> tuple[Array, Array, Array, Array, float]:
+def shifted(S: Array, z: Array) -> Array:
+    """Return the profile z (n,) whose values at the knots are combined by S (knots, knots), inputs and slacks alike."""
+    result = np.zeros_like(z)
+    knots, start = S.shape[0], 0
+    for width in (N_INPUTS, N_SLACKS):
+        for old in range(knots):
+            for new in range(knots):
+                if S[new, old] != z.dtype.type(0.0):
+                    for i in range(width):
+                        result[start + width * new + i] += S[new, old] * z[start + width * old + i]
+        start += width * knots
+    return result
+
+
+@kernel
+def instance(maps: Maps, x: Array, w: float, u_before: Array, share: float) -> tuple[Array, Array, Array, Array, float]:
     """Return phi, gamma, low, high and the constant of the cost."""
     zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
     s = np.empty(x.shape[0] + 1, x.dtype)
@@ -315,7 +329,11 @@ def _instance(
 
 
 @kernel
-def _inputs(weights: Array, z: Array, scale: Array, u0: Array, rate: Array) -> Array:
+def inputs_of(weights: Array, z: Array, scale: Array, u0: Array, rate: Array) -> Array:
+    """Return the inputs (samples, 3) of a profile z (n,), for the knots' weights (samples, knots) in each sample.
+
+    They are in physical units, `u0` + `scale` z, and from one sample to the next within `rate`.
+    """
     samples, m = weights.shape[0], scale.shape[0]
     u = np.empty((samples, m), z.dtype)
     for sample in range(samples):

@@ -4,15 +4,14 @@ For each update the control PLC latches, `plan` decides the updating period and 
 played from its end on. Pure: no sockets, no clock, no sleeping.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.errors import ConfigurationError
 from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel
-from coldloop.process import STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import (
@@ -26,49 +25,20 @@ from coldloop.registers.optimizer_plc import (
 from coldloop.sequence import InputSequence, with_checksum
 from optimizer_plc.arithmetic import real_of
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
-from optimizer_plc.computing_settings import EstimatorKind
 from optimizer_plc.costs import augmented_cost, indicators
-from optimizer_plc.estimator import Estimate, Estimator, KalmanFilter, StateFeedback
+from optimizer_plc.estimator import make_estimator
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.rules import make_rule
+from optimizer_plc.session_state import UNDECIDED, Delivery, Period, SessionState
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import make_solver
-from optimizer_plc.updating_period import Assessment, Observation
+from optimizer_plc.updating_period import Assessment, Observation, UpdatingRule
 
 Array = NDArray[np.float64]
 
 LONGEST_GAP_TICKS = 4 * SEQUENCE_ROWS
 """After a longer time without an update nothing is predicted from the last one."""
-
-UNDECIDED = Assessment(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True)
-class Delivery:
-    """A profile, the situation it was computed for, and the sequence that tells it to the control PLC."""
-
-    z: Array
-    situation: Situation
-    first_tick: int
-    sequence: InputSequence | None
-    qp: QuadraticProblem | None = None
-    hot_start: float = 0.0
-    last_but_one: float = 0.0
-    delivered: float = 0.0
-    iterations: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class _Period:
-    """The updating period being computed."""
-
-    update: Update
-    estimate: Estimate
-    iterations: int
-    ticks: int
-    effective: float
-    assessment: Assessment
 
 
 class OptimizerProgram:
@@ -78,12 +48,12 @@ class OptimizerProgram:
         self.settings = settings
         self.model_digest = model.short_digest
         self._real = real_of(settings.arithmetic)
-        self._prediction = PredictionModel(model)
-        self._problem = PredictiveProblem(self._prediction, settings.design, limits, self._real)
-        self._solver = make_solver(settings)
-        self.budget = PlcBudget(settings.budget, self._solver.tau_1_s)
-        self._estimator = self._make_estimator()
-        self._prediction = self._prediction.rounded(self._real)
+        self.model = PredictionModel(model)
+        self.problem = PredictiveProblem(self.model, settings.design, limits, self._real)
+        self.solver = make_solver(settings)
+        self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
+        self.estimator = make_estimator(self.model, settings.estimator, self._real)
+        self.model = self.model.rounded(self._real)
         self._compile_kernels(model)
         self.restart(settings.updating_period_s)
 
@@ -95,100 +65,89 @@ class OptimizerProgram:
         self.solve()
         self.report(Verdict.NONE)
 
-    def restart(self, updating_period_s: float) -> None:
-        """Forget everything and begin a session at the operating point; 0 s is the adaptive updating period."""
-        self._fixed_ticks = round(updating_period_s / TICK_S)
-        self._rule = make_rule(self.settings, self.budget, self._fixed_ticks)
-        self._estimator.reset()
-        self._solver.reset()
-        at_rest = np.zeros(3, self._real)
-        nothing = Situation(np.zeros(self._prediction.n_states, self._real), self._real(0.0), at_rest)
-        self._playing = Delivery(self._problem.hold(at_rest), nothing, 0, None)
-        self._sent: Delivery | None = None
-        self._last: _Period | None = None
-        self._sequences = 0
-        self._allowance = 0
-        """Ticks that adaptive periods are longer than the budget says: answers have been late by the clock."""
+    def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
+        """Forget everything and begin a session at the operating point.
 
-    def _make_estimator(self) -> Estimator:
-        if self.settings.estimator.kind is EstimatorKind.STATE_FEEDBACK:
-            if self._prediction.n_states > len(STATE_NAMES):
-                raise ConfigurationError(
-                    "optimizer_plc.program.estimator.kind=state-feedback: the model has states that the plant does not"
-                    " tell; use kalman"
-                )
-            return StateFeedback(self._prediction, self._real)
-        return KalmanFilter(self._prediction, self.settings.estimator, self._real)
+        Args:
+            updating_period_s: Fixed updating period; 0 is adaptive.
+            rule: Decides adaptive periods instead of the rule that the settings name.
+        """
+        self.fixed_ticks = round(updating_period_s / TICK_S)
+        self.rule = rule or make_rule(self.settings, self.budget, self.fixed_ticks)
+        self.estimator.reset()
+        self.solver.reset()
+        at_rest = np.zeros(3, self._real)
+        nothing = Situation(np.zeros(self.model.n_states, self._real), self._real(0.0), at_rest)
+        self.state = SessionState(Delivery(self.problem.hold(at_rest), nothing, 0, None))
 
     # -- steps (4), (5) and (2): at an updating instant ---------------------------------------------------------------
 
     def plan(self, update: Update) -> Plan:
         """Take the update latched at t_i and decide the updating period that begins there."""
-        elapsed = update.tick - self._last.update.tick if self._last else 0
+        elapsed = update.tick - self.state.last.update.tick if self.state.last else 0
         if not 0 <= elapsed <= LONGEST_GAP_TICKS or not self._knows_what_is_played(update):
             self._begin_again(update)
         interrupted = self._return_to(update)
-        estimate = self._estimator.correct(update)
+        estimate = self.estimator.correct(update)
         self._follow(update)
-        self._sequences = max(self._sequences, update.playing)
-        played = self._playing
+        self.state.sequences = max(self.state.sequences, update.playing)
+        played = self.state.playing
         here = played.situation._replace(x=estimate.x, w=estimate.w)
-        effective = self._cost(self._problem.at(here), played.z)
+        effective = self._cost(self.problem.at(here), played.z)
         wanted, assessment = self._decide(effective, update, interrupted=interrupted)
         iterations = min(wanted, self.budget.iterations(MAX_PERIOD_TICKS))
-        ticks = self._fixed_ticks or min(self.budget.period(iterations) + self._allowance, MAX_PERIOD_TICKS)
-        self._last = _Period(update, estimate, iterations, ticks, effective, assessment)
+        ticks = self.fixed_ticks or min(self.budget.period(iterations) + self.state.allowance, MAX_PERIOD_TICKS)
+        self.state.last = Period(update, estimate, iterations, ticks, effective, assessment)
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
         return Plan(update.update, update.tick + ticks, load_step)
 
     def _knows_what_is_played(self, update: Update) -> bool:
         """Tell whether the control PLC plays something of ours, or has not begun to."""
-        if self._playing.sequence is None:
+        if self.state.playing.sequence is None:
             return True
-        ours = (delivery.sequence for delivery in (self._playing, self._sent) if delivery is not None)
+        ours = (delivery.sequence for delivery in (self.state.playing, self.state.sent) if delivery is not None)
         return any(sequence is not None and sequence.header.number == update.playing for sequence in ours)
 
     def _begin_again(self, update: Update) -> None:
         """Forget what was sent: others have moved the inputs since, from which the next profile sets out."""
-        self._estimator.reset()
-        u = np.asarray(update.u, self._real) - self._prediction.u0
-        self._playing = Delivery(self._problem.hold(u), self._playing.situation._replace(u_before=u), update.tick, None)
-        self._sent = self._last = None
+        self.estimator.reset()
+        u = np.asarray(update.u, self._real) - self.model.u0
+        situation = self.state.playing.situation._replace(u_before=u)
+        self.state.playing = Delivery(self.problem.hold(u), situation, update.tick, None)
+        self.state.sent = self.state.last = None
 
     def _return_to(self, update: Update) -> bool:
         """Predict to this instant if another one was planned; tell whether a load step has cut the period off."""
-        last = self._last
+        last = self.state.last
         if last is None:
             return False
         elapsed = update.tick - last.update.tick
         if 0 < elapsed != last.ticks:
-            self._estimator.predict(self._segments(last.update, elapsed))
+            self.estimator.predict(self._segments(last.update, elapsed))
         stepped = abs(update.load - last.update.load) > self.settings.interrupting_load_step_w > 0
         return stepped and 0 < elapsed < last.ticks
 
     def _follow(self, update: Update) -> None:
         """Find out which profile the control PLC plays from this instant on."""
-        sent = self._sent
+        sent = self.state.sent
         if sent is not None and sent.sequence is not None and sent.sequence.header.number == update.playing:
-            self._playing = sent
-        elif self._last is not None:
-            late = update.tick - self._last.update.tick
-            self._playing = Delivery(
-                self._problem.shifted(self._playing.z, late),
-                self._playing.situation,
-                self._playing.first_tick,
-                self._playing.sequence,
+            late = update.tick - sent.first_tick  # scans were missed: it began before this instant
+            self.state.playing = replace(sent, z=self.problem.shifted(sent.z, late)) if late > 0 else sent
+        elif self.state.last is not None:
+            late, played = update.tick - self.state.last.update.tick, self.state.playing
+            self.state.playing = Delivery(
+                self.problem.shifted(played.z, late), played.situation, played.first_tick, played.sequence
             )
 
     def _decide(self, effective: float, update: Update, *, interrupted: bool) -> tuple[int, Assessment]:
         """Step (4): the rule decides, unless the last sequence never took effect."""
-        last, played = self._last, self._playing
+        last, played = self.state.last, self.state.playing
         if last is None:
-            return self._rule.first, UNDECIDED
+            return self.rule.first, UNDECIDED
         if interrupted:
-            return self._rule.after_interruption(), UNDECIDED
-        if played is not self._sent or played.first_tick != update.tick:
+            return self.rule.after_interruption(), UNDECIDED
+        if played is not self.state.sent or played.first_tick != update.tick:
             return last.iterations, UNDECIDED
         observation = Observation(
             last.iterations,
@@ -199,7 +158,7 @@ class OptimizerProgram:
             played.delivered,
             effective,
         )
-        return self._rule.next(observation)
+        return self.rule.next(observation)
 
     # -- step (3): during the updating period -------------------------------------------------------------------------
 
@@ -208,42 +167,42 @@ class OptimizerProgram:
         return self.budget.answer_after_s(self._period.iterations)
 
     @property
-    def _period(self) -> _Period:
-        if self._last is None:
+    def _period(self) -> Period:
+        if self.state.last is None:
             raise RuntimeError("solve and answer_after_s follow plan")
-        return self._last
+        return self.state.last
 
     def solve(self) -> InputSequence:
         """Predict the state at t_{i+1}, shift the profile, do q iterations; return the sequence to play from there."""
         period = self._period
         segments = self._segments(period.update, period.ticks)
-        x = self._estimator.predict(segments)
+        x = self.estimator.predict(segments)
         situation = Situation(x, period.estimate.w, segments[-1][0], period.ticks)
-        qp = self._problem.at(situation)
-        self._solver.start(qp, self._problem.shifted(self._playing.z, period.ticks))
-        hot_start = self._solver.cost
-        done = self._solver.iterate(period.iterations - 1)
-        last_but_one = self._solver.cost
-        done += self._solver.iterate(1)
-        z = self._solver.solution
+        qp = self.problem.at(situation)
+        self.solver.start(qp, self.problem.shifted(self.state.playing.z, period.ticks))
+        hot_start = self.solver.cost
+        done = self.solver.iterate(period.iterations - 1)
+        last_but_one = self.solver.cost
+        done += self.solver.iterate(1)
+        z = self.solver.solution
         sequence = self._sequence(period, z)
-        self._sent = Delivery(
+        self.state.sent = Delivery(
             z, situation, sequence.header.first_tick, sequence, qp,
-            self._whole(hot_start, qp), self._whole(last_but_one, qp), self._whole(self._solver.cost, qp),
+            self._whole(hot_start, qp), self._whole(last_but_one, qp), self._whole(self.solver.cost, qp),
             done,
         )  # fmt: skip
         return sequence
 
     def _segments(self, update: Update, ticks: int) -> list[tuple[Array, int]]:
         """Return the inputs played from an update on as (deviation, ticks), runs of equal inputs joined."""
-        u0 = self._prediction.u0
-        sequence = self._playing.sequence
+        u0 = self.model.u0
+        sequence = self.state.playing.sequence
         if sequence is None:
             return [(np.asarray(update.u, self._real) - u0, ticks)]
         segments: list[tuple[Array, int]] = []
         previous: SequenceRow | None = None
         for tick in range(update.tick, update.tick + ticks):
-            row = sequence.rows[min(tick - self._playing.first_tick, len(sequence.rows) - 1)]
+            row = sequence.rows[min(tick - self.state.playing.first_tick, len(sequence.rows) - 1)]
             if row == previous:
                 segments[-1] = (segments[-1][0], segments[-1][1] + 1)
             else:
@@ -251,14 +210,14 @@ class OptimizerProgram:
             previous = row
         return segments
 
-    def _sequence(self, period: _Period, z: Array) -> InputSequence:
+    def _sequence(self, period: Period, z: Array) -> InputSequence:
         length = max(self.settings.sequence_ticks, 2 * period.ticks)
         samples = -(-length // TICKS_PER_SAMPLE)
-        inputs = [as_transmitted(SequenceRow(*row)) for row in self._problem.inputs(z, samples).tolist()]
+        inputs = [as_transmitted(SequenceRow(*row)) for row in self.problem.inputs(z, samples).tolist()]
         rows = [inputs[tick // TICKS_PER_SAMPLE] for tick in range(length)]
-        self._sequences += 1
+        self.state.sequences += 1
         header = SequenceHeader(
-            number=self._sequences,
+            number=self.state.sequences,
             update=period.update.update,
             first_tick=period.update.tick + period.ticks,
             length=length,
@@ -269,7 +228,7 @@ class OptimizerProgram:
         return with_checksum(header, rows)
 
     def _cost(self, qp: QuadraticProblem, z: Array) -> float:
-        return self._whole(augmented_cost(qp, z, self._real(self._solver.alpha)), qp)
+        return self._whole(augmented_cost(qp, z, self._real(self.solver.alpha)), qp)
 
     def _whole(self, cost: float, qp: QuadraticProblem) -> float:
         """Return J with its constant and its floor; rounding, in single precision, must not take it below the floor."""
@@ -283,20 +242,20 @@ class OptimizerProgram:
         what is allowed for them, each one in time takes a tick off.
         """
         if late:
-            self._allowance = min(max(1, 2 * self._allowance), MAX_PERIOD_TICKS)
+            self.state.allowance = min(max(1, 2 * self.state.allowance), MAX_PERIOD_TICKS)
         else:
-            self._allowance = max(0, self._allowance - 1)
+            self.state.allowance = max(0, self.state.allowance - 1)
 
     # -- diagnostics --------------------------------------------------------------------------------------------------
 
     def prediction(self) -> Prediction:
         """Return what the last profile is expected to lead to."""
-        sent = self._sent
+        sent = self.state.sent
         if sent is None or sent.sequence is None:
             raise RuntimeError("prediction follows solve")
-        horizon = self._problem.design.horizon
-        outputs = self._problem.outputs(sent.z, sent.situation)
-        inputs = self._problem.inputs(sent.z, horizon)
+        horizon = self.problem.design.horizon
+        outputs = self.problem.outputs(sent.z, sent.situation)
+        inputs = self.problem.inputs(sent.z, horizon)
         shown = outputs[[min(sample, horizon) - 1 for sample in PREDICTED_SAMPLES]]
         planned = inputs[[min(sample, horizon) - 1 for sample in INPUT_SAMPLES]]
         header = sent.sequence.header
@@ -308,19 +267,19 @@ class OptimizerProgram:
     @property
     def operating_limits(self) -> OperatingLimits:
         """Bands, bounds and rates that profiles keep."""
-        design, limits = self.settings.design, self._problem.limits
+        design, limits = self.settings.design, self.problem.limits
         return OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
 
     def rule_status(self) -> UpdatingRuleStatus:
         """Return what decides the updating period in this session."""
-        return self._rule.status._replace(**self.budget.times._asdict())
+        return self.rule.status._replace(**self.budget.times._asdict())
 
     def report(self, verdict: Verdict) -> Optimization:
         """Return what was done with the last update, once the control PLC has answered."""
-        period, sent = self._period, self._sent
+        period, sent = self._period, self.state.sent
         if sent is None or sent.qp is None:
             raise RuntimeError("report follows solve")
-        predicted = indicators(self._problem, sent.qp, sent.z, sent.situation)
+        predicted = indicators(self.problem, sent.qp, sent.z, sent.situation)
         a = period.assessment
         return Optimization(
             update=period.update.update, tick=period.update.tick, tau_u=period.ticks, iterations=sent.iterations,

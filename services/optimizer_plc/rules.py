@@ -2,7 +2,7 @@
 
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.settings import ProgramSettings, RuleName
-from optimizer_plc.updating_period import Algorithm1, ContractionRule, FixedPeriod, UpdatingRule
+from optimizer_plc.updating_period import Algorithm1, ContractionParameters, ContractionRule, FixedPeriod, UpdatingRule
 
 
 def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int) -> UpdatingRule:
@@ -17,5 +17,5 @@ def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int) ->
         return FixedPeriod(budget.iterations(fixed_ticks))
     adaptive = settings.adaptive
     if adaptive.rule is RuleName.CONTRACTION:
-        return ContractionRule(**adaptive.contraction.model_dump())
+        return ContractionRule(ContractionParameters(**adaptive.contraction.model_dump()))
     return Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta)

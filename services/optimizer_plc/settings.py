@@ -134,6 +134,12 @@ class ProgramSettings(BaseModel):
         return value
 
     @model_validator(mode="after")
+    def _load_steps_are_seen(self) -> Self:
+        if self.interrupting_load_step_w and not self.estimator.load_known:
+            raise ValueError("interrupting_load_step_w needs a load that is measured, estimator.load_known = true")
+        return self
+
+    @model_validator(mode="after")
     def _own_arithmetic(self) -> Self:
         if self.arithmetic is Arithmetic.FLOAT32 and self.solver not in SINGLE_PRECISION_SOLVERS:
             raise ValueError(

@@ -6,13 +6,12 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
 
 
-@dataclass(frozen=True, slots=True)
-class Observation:
+class Observation(NamedTuple):
     """What is known at t_{k+1} of the period that ends there; costs are positive (Assumption 1 of the paper)."""
 
     iterations: int
@@ -31,8 +30,7 @@ class Observation:
     """J_{k+1}: p(t_{k+1}) at the state reached at t_{k+1}."""
 
 
-@dataclass(frozen=True, slots=True)
-class Assessment:
+class Assessment(NamedTuple):
     """The quantities of Algorithm 1. `gamma` is the gradient whose sign decides; increments are per iteration."""
 
     efficiency: float
@@ -53,7 +51,7 @@ class Assessment:
 
 
 def assess(observation: Observation) -> Assessment:
-    """Compute the quantities of Algorithm 1 as printed."""
+    """Compute the quantities of Algorithm 1 as printed; the rig compiles this function and what the rules decide by."""
     o = observation
     q = o.iterations
     E = o.delivered / o.hot_start
@@ -63,8 +61,8 @@ def assess(observation: Observation) -> Assessment:
     dE = (o.delivered - o.last_but_one) / o.hot_start
     dK = E * dD + D * dE
     log_K = math.log(K)
-    dt_r = (-log_K + q / K * dK) / log_K**2 if log_K != 0.0 else math.copysign(math.inf, dK)
-    return Assessment(E, D, K, dD, dE, dK, dt_r, gamma=dK if K >= 1.0 else dt_r)
+    dt_r = (-log_K + q / K * dK) / (log_K * log_K) if log_K != 0.0 else math.copysign(math.inf, dK)
+    return Assessment(E, D, K, dD, dE, dK, dt_r, dK if K >= 1.0 else dt_r)
 
 
 class UpdatingRule(Protocol):
@@ -136,9 +134,41 @@ class Algorithm1:
     def next(self, observation: Observation) -> tuple[int, Assessment]:
         """Return max(q_min, min(q_max, q - delta sign(Gamma)))."""
         assessment = assess(observation)
-        sign = int(assessment.gamma > 0) - int(assessment.gamma < 0)
-        q = observation.iterations - self.delta * sign
-        return max(self.q_min, min(self.q_max, q)), assessment
+        return one_step(self.q_min, self.q_max, self.delta, observation.iterations, assessment.gamma), assessment
+
+
+def one_step(q_min: int, q_max: int, delta: int, q: int, gamma: float) -> int:
+    """Return max(q_min, min(q_max, q - delta sign(Gamma))), the decision of Algorithm 1."""
+    sign = int(gamma > 0) - int(gamma < 0)
+    return max(q_min, min(q_max, q - delta * sign))
+
+
+class ContractionParameters(NamedTuple):
+    """Parameters of the contraction rule."""
+
+    q_busy: int
+    q_quiet: int
+    q_step: int
+    rate: float
+    """Contraction, 1/s, from which on the period is shortest."""
+    memory: float
+    """What is left of v after a second."""
+    surprise: float
+
+
+def recent_contraction(rule: ContractionParameters, contraction: float, delivered: float, o: Observation) -> float:
+    """Return v (1/s) at the end of a period, from v before and the cost delivered then (0 for none)."""
+    improvement = math.log(delivered / o.delivered) / o.period_s if delivered else 0.0
+    remembered: float = rule.memory**o.period_s * contraction
+    return max(min(improvement, 2.0 * rule.rate), remembered)
+
+
+def by_contraction(rule: ContractionParameters, contraction: float, o: Observation) -> int:
+    """Return q(t_{k+1}) for v at the end of the period: about a dozen operations with those of v."""
+    if o.effective > rule.surprise * o.delivered:
+        return rule.q_step
+    busy = min(1.0, contraction / rule.rate)
+    return round(rule.q_quiet - (rule.q_quiet - rule.q_busy) * busy)
 
 
 @dataclass(slots=True)
@@ -150,41 +180,31 @@ class ContractionRule:
     `surprise` times what was predicted, and a load step, are answered by one long solve of `q_step` iterations.
     """
 
-    q_busy: int
-    q_quiet: int
-    q_step: int
-    rate: float
-    """Contraction, 1/s, from which on the period is shortest."""
-    memory: float
-    """What is left of v after a second."""
-    surprise: float
-    _contraction: float = 0.0
-    _delivered: float = 0.0
+    parameters: ContractionParameters
+    contraction: float = 0.0
+    """v."""
+    delivered: float = 0.0
+    """J-hat of the profile before; 0 where it says nothing."""
 
     @property
     def first(self) -> int:
         """Iterations in quiet."""
-        return self.q_quiet
+        return self.parameters.q_quiet
 
     @property
     def status(self) -> UpdatingRuleStatus:
         """The three numbers that q moves between; the first period has that of quiet."""
-        return UpdatingRuleStatus(UpdatingRuleKind.CONTRACTION, self.q_step, self.q_busy, self.q_step)
+        rule = self.parameters
+        return UpdatingRuleStatus(UpdatingRuleKind.CONTRACTION, rule.q_step, rule.q_busy, rule.q_step)
 
     def after_interruption(self) -> int:
         """Return what one long solve takes."""
-        self._delivered = 0.0  # another load is another problem: its cost says nothing of contraction
-        return self.q_step
+        self.delivered = 0.0  # another load is another problem: its cost says nothing of contraction
+        return self.parameters.q_step
 
     def next(self, observation: Observation) -> tuple[int, Assessment]:
-        """Return q(t_{k+1}): about a dozen operations."""
-        o = observation
-        improvement = math.log(self._delivered / o.delivered) / o.period_s if self._delivered else 0.0
-        recent = self.memory**o.period_s * self._contraction
-        self._contraction = max(min(improvement, 2.0 * self.rate), recent)
-        self._delivered = o.delivered
-        assessment = assess(o)
-        if o.effective > self.surprise * o.delivered:
-            return self.q_step, assessment
-        busy = min(1.0, self._contraction / self.rate)
-        return round(self.q_quiet - (self.q_quiet - self.q_busy) * busy), assessment
+        """Return q(t_{k+1})."""
+        rule = self.parameters
+        self.contraction = recent_contraction(rule, self.contraction, self.delivered, observation)
+        self.delivered = observation.delivered
+        return by_contraction(rule, self.contraction, observation), assess(observation)

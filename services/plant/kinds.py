@@ -1,17 +1,21 @@
 """Makes the plant that a configuration asks for."""
 
 from functools import partial
+from typing import Final
 
 from coldloop.errors import ConfigurationError, ModelFileError
 from coldloop.model_file import COLD_BOX, ModelHeader
-from plant.cold_box import REFERENCE
+from plant.cold_box import REFERENCE, ColdBox
+from plant.components.valve import Valve
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.rack import MakePlant
 from plant.refrigerator_events import EventSchedule
 from plant.refrigerator_file import SHIPPED, RefrigeratorFile, read_refrigerator_file
 from plant.refrigerator_program import RefrigeratorProgram
-from plant.settings import PlantKind, PlantSection, SensorSettings
+from plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSettings
 from plant.station_settings import StationControlKind
+
+NO_MISMATCH: Final = MismatchSettings()
 
 
 def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
@@ -19,12 +23,14 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
 
     Raises:
         ModelFileError: The refrigerator's file cannot be used.
-        ConfigurationError: Its gains are not of the configured weights.
+        ConfigurationError: Its gains are not of the configured weights, or it is to differ from its model.
     """
     if section.kind is PlantKind.COLD_BOX:
         if header.plant != COLD_BOX:
             raise ModelFileError(f"model.file: a model of the {header.plant}; set plant.kind to that, or take another")
-        return partial(make_program, header, section.sensors)
+        return partial(make_program, header, section.sensors, mismatch=section.mismatch)
+    if section.mismatch != NO_MISMATCH:
+        raise ConfigurationError("plant.mismatch: of a cold box alone; set plant.kind to cold-box, or leave it out")
     path = section.refrigerator.file or SHIPPED
     file = read_refrigerator_file(path)
     if section.station.control is StationControlKind.LQ and section.station.weights != file.weights:
@@ -35,9 +41,30 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
     return partial(_make_refrigerator, header, section, file)
 
 
-def make_program(header: ModelHeader, sensors: SensorSettings, load: HeatLoad, seed: int) -> PlantProgram:
+def make_program(
+    header: ModelHeader,
+    sensors: SensorSettings,
+    load: HeatLoad,
+    seed: int,
+    mismatch: MismatchSettings = NO_MISMATCH,
+) -> PlantProgram:
     """Return the cold box at the operating point of its model file."""
-    return PlantProgram(box=REFERENCE, x0=header.x0, u0=header.u0, load=load, noise=_noise(sensors, seed))
+    return PlantProgram(box=_box(mismatch), x0=header.x0, u0=header.u0, load=load, noise=_noise(sensors, seed))
+
+
+def _box(mismatch: MismatchSettings) -> ColdBox:
+    box, ua = REFERENCE, mismatch.heat_transfer
+    turbine = box.turbine
+    return box._replace(
+        nef1=box.nef1._replace(UA=ua * box.nef1.UA),
+        nef2=box.nef2._replace(UA=ua * box.nef2.UA),
+        nef34=box.nef34._replace(UA=ua * box.nef34.UA),
+        jt_valve=Valve(mismatch.jt_valve * box.jt_valve.flow_area),
+        turbine=turbine._replace(
+            inlet_valve=Valve(mismatch.turbine_valve * turbine.inlet_valve.flow_area),
+            efficiency=mismatch.turbine_efficiency * turbine.efficiency,
+        ),
+    )
 
 
 def _make_refrigerator(
@@ -55,4 +82,5 @@ def _make_refrigerator(
 
 
 def _noise(sensors: SensorSettings, seed: int) -> MeasurementNoise | None:
-    return MeasurementNoise(sensors.deviations, seed) if any(sensors.deviations) else None
+    exact = not any(sensors.deviations + sensors.biases)
+    return None if exact else MeasurementNoise(sensors.deviations, seed, sensors.biases)

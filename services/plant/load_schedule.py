@@ -70,6 +70,6 @@ class LoadSchedule:
         return LoadStatus(self._watts[place], *coming, self._times[-1], min(upcoming, 0xFFFF), free)
 
     def from_tick(self, now: int) -> LoadProfile:
-        """Return the load from tick `now` on; what was before is told as what is held now."""
+        """Return the load from tick `now` on; what was before is given as what is held now."""
         place = self._place(now)
         return LoadProfile((0, *self._times[place + 1 :]), tuple(self._watts[place:]))

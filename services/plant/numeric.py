@@ -5,13 +5,13 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import kernel
+from coldloop.compiled import inlined
 
 RealArray: TypeAlias = NDArray[np.float64]
 Array: TypeAlias = NDArray[Any]  # float64 or complex128
 
 
-@kernel
+@inlined
 def at_least(value: float, bound: float) -> float:
     """Return `value`, or `bound` where the real part is below it."""
     if value.real < bound.real:
@@ -19,7 +19,7 @@ def at_least(value: float, bound: float) -> float:
     return value
 
 
-@kernel
+@inlined
 def at_most(value: float, bound: float) -> float:
     """Return `value`, or `bound` where the real part is above it."""
     if value.real > bound.real:

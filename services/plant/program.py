@@ -1,9 +1,10 @@
 """The plant as a program: inputs in, one tick forward, measurements out. No sockets, no clock."""
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import inf, isfinite, nan
 from typing import Any, Protocol
 
 import numpy as np
@@ -51,20 +52,24 @@ class LoadProfile:
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """White Gaussian noise on the outputs, one draw a tick whoever reads them.
+    """White Gaussian noise on the outputs, one draw a tick whoever reads them, and a bias.
 
     Raises:
-        ValueError: not one standard deviation per output, or one that is negative or not finite.
+        ValueError: not one standard deviation and one bias per output, or one that is negative or not finite.
     """
 
     deviations: tuple[float, ...]
     """Standard deviation of each output, in its unit; shape (22,)."""
     seed: int
     """Seed of the PCG64 generator, 0 or more."""
+    biases: tuple[float, ...] = (0.0,) * len(OUTPUT_NAMES)
+    """What each output shows too much, in its unit; shape (22,)."""
 
     def __post_init__(self) -> None:
         if len(self.deviations) != len(OUTPUT_NAMES) or not all(0.0 <= sigma < inf for sigma in self.deviations):
             raise ValueError(f"noise needs {len(OUTPUT_NAMES)} standard deviations, finite and not negative")
+        if len(self.biases) != len(OUTPUT_NAMES) or not all(map(isfinite, self.biases)):
+            raise ValueError(f"noise needs {len(OUTPUT_NAMES)} biases, all finite")
 
 
 class PlantProgram:
@@ -97,19 +102,28 @@ class PlantProgram:
         helium = load_helium()
         self.tick = 0
         self._tick_s = tick_s
+        self.box = box
         self._box, self._helium = plain_tuples(box), plain_tuples(helium)
         self._x = _vector(x0, STATE_NAMES, "states")
         self._u = _vector(u0, INPUT_NAMES, "inputs")
+        self._slope = np.empty_like(self._x)
+        self._held: tuple[float, ...] = (nan,) * 4
+        """Inputs and load that the slope of the state was computed with."""
         self._load = load
-        self._deviations = np.array(noise.deviations) if noise else None
+        self._noise = noise
+        nothing = (0.0,) * len(OUTPUT_NAMES)
+        self.biases = np.array(noise.biases if noise else nothing)
+        """What each output shows too much, shape (22,)."""
+        self.deviations = np.array(noise.deviations if noise else nothing)
+        """Standard deviation of the noise on each output, shape (22,)."""
         self._generator = np.random.Generator(np.random.PCG64(noise.seed if noise else 0))
         self._measured = self._sample(outputs(self._x, self._u, self.load, box, helium))
-        self._step()  # no session waits for the compiler
+        self._step(self.load, held=False)  # no session waits for the compiler
 
     def resume(
         self, tick: int, x: Sequence[float], u: Sequence[float], y: Sequence[float], noise_state: Mapping[str, Any]
     ) -> None:
-        """Go on from what `retained` told.
+        """Go on from what `retained` returned.
 
         Raises:
             ValueError: it is not of this plant.
@@ -117,6 +131,7 @@ class PlantProgram:
         self.tick = tick
         self._x = _vector(x, STATE_NAMES, "states")
         self._u = _vector(u, INPUT_NAMES, "inputs")
+        self._held = (nan,) * 4
         self._generator.bit_generator.state = noise_state
         self._measured = tuple(_vector(y, OUTPUT_NAMES, "outputs").tolist())
 
@@ -127,6 +142,29 @@ class PlantProgram:
             "tick": self.tick, "x": self._x.tolist(), "u": self._u.tolist(), "y": self._measured,
             "noise_state": noise_state,
         }  # fmt: skip
+
+    def between_ticks(self) -> tuple[RealArray, RealArray, RealArray, RealArray]:
+        """Return the state, its slope, the inputs and the load that the slope is for, and the outputs."""
+        return self._x.copy(), self._slope.copy(), np.array(self._held), np.array(self._measured)
+
+    def take_over(self, tick: int, x: RealArray, slope: RealArray, held: RealArray, y: RealArray) -> None:
+        """Go on at another tick with what `between_ticks` would have told there."""
+        self.tick, self._x, self._slope, self._u = tick, x.copy(), slope.copy(), held[:3].copy()
+        self._held, self._measured = tuple(held.tolist()), tuple(y.tolist())
+
+    @contextmanager
+    def noise(self, ticks: int) -> Iterator[RealArray]:
+        """Lend the draws of the next `ticks` ticks, shape (ticks, 22), or (0, 22) without noise; those used are gone.
+
+        How many were used is told by the tick afterwards.
+        """
+        before, start = self._generator.bit_generator.state, self.tick
+        outputs = len(OUTPUT_NAMES)
+        count = ticks if self._noise else 0
+        yield self._generator.standard_normal((count, outputs))
+        if count and self.tick - start < count:
+            self._generator.bit_generator.state = before
+            self._generator.standard_normal((self.tick - start, outputs))
 
     @property
     def state(self) -> tuple[float, ...]:
@@ -175,17 +213,20 @@ class PlantProgram:
 
     def advance(self) -> None:
         """Go one tick forward."""
-        self._x, y = self._step()
+        w = self.load
+        conditions = (*self._u.tolist(), w)
+        self._x, y = self._step(w, held=conditions == self._held)
+        self._held = conditions
         self.tick += 1
         self._measured = self._sample(y)
 
-    def _step(self) -> tuple[RealArray, RealArray]:
-        """Return the state and the outputs one tick ahead."""
-        return advance_and_read(self._x, self._u, self.load, self._tick_s, self._box, self._helium)
+    def _step(self, w: float, *, held: bool) -> tuple[RealArray, RealArray]:
+        """Return the state and the outputs one tick ahead; `held` are inputs and load if they were so before."""
+        return advance_and_read(self._x, self._slope, held, self._u, w, self._tick_s, self._box, self._helium)
 
     def _sample(self, y: RealArray) -> tuple[float, ...]:
-        if self._deviations is not None:
-            y = y + self._deviations * self._generator.standard_normal(len(y))
+        if self._noise:
+            y = y + self.biases + self.deviations * self._generator.standard_normal(len(y))
         return tuple(y.tolist())
 
 

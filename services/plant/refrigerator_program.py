@@ -132,7 +132,7 @@ class RefrigeratorProgram(PlantProgram):
         noise_state: Mapping[str, Any],
         warm: Mapping[str, Any] | None = None,
     ) -> None:
-        """Go on from what `retained` told (ValueError or KeyError if it is not of this plant)."""
+        """Go on from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
         if warm is None:
             raise ValueError("the retained state is that of a cold box, not of a refrigerator")
         full, signals = np.array(warm["x"], dtype=np.float64), np.array(warm["signals"], dtype=np.float64)

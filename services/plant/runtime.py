@@ -64,7 +64,7 @@ class PlantRuntime:
         self._clock: asyncio.Task[None] | None = None
         self._schedule: Schedule | None = None
         self._position: float | None = None
-        """While paused: where time stands, in ticks."""
+        """While paused: the present time, in ticks."""
         self._failure: asyncio.Future[None] | None = None
         self.registers = RackRegisters(settings, header, plant_maker(header, settings.plant), age=self._age)
 

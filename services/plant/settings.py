@@ -4,7 +4,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from coldloop.endpoints import PLANT_PORT
 from coldloop.metrics_server import MetricsSettings
@@ -19,7 +19,8 @@ from plant.refrigerator_events import RANGES, EventTarget, RefrigeratorEvent
 from plant.station_settings import StationSettings
 
 SHOWN: Final = (
-    "plant.kind", "plant.station", "plant.refrigerator", "plant.sensors", "plant.clock_error_ppm", "plant.watchdog",
+    "plant.kind", "plant.station", "plant.refrigerator", "plant.mismatch", "plant.sensors", "plant.clock_error_ppm",
+    "plant.watchdog",
 )  # fmt: skip
 """What of the configuration decides results: shown in the registers. Load and seed are those of a session."""
 
@@ -28,8 +29,25 @@ Percent = Annotated[float, Field(ge=0, le=100)]
 Power = Annotated[float, Field(ge=0, le=1000)]
 
 
+Factor = Annotated[float, Field(ge=0.5, le=1.4)]
+
+
+class MismatchSettings(BaseModel):
+    """What of the cold box is not as in its model: factors on parameters. It begins at the model's point of rest."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    heat_transfer: Factor = 1.0
+    """UA of the three heat exchangers."""
+    turbine_efficiency: Factor = 1.0
+    jt_valve: Factor = 1.0
+    """Flow area of CV155."""
+    turbine_valve: Factor = 1.0
+    """Flow area of CV156."""
+
+
 class SensorSettings(BaseModel):
-    """Standard deviations of the sensors' noise; 0 is an exact sensor."""
+    """Standard deviations of the sensors' noise, and what they show too much; 0 is an exact sensor."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -41,11 +59,22 @@ class SensorSettings(BaseModel):
     """K."""
     pressure: Deviation = 0.0
     """bar."""
+    level_bias: FiniteFloat = 0.0
+    """%: that much is shown too much, as by the next two."""
+    temperature_bias: FiniteFloat = 0.0
+    """K, at each of the ten."""
+    pressure_bias: FiniteFloat = 0.0
+    """bar, at each of the ten."""
 
     @property
     def deviations(self) -> tuple[float, ...]:
         """Standard deviation of each output."""
         return (self.level, self.speed, *[self.temperature] * 10, *[self.pressure] * 10)
+
+    @property
+    def biases(self) -> tuple[float, ...]:
+        """Bias of each output."""
+        return (self.level_bias, 0.0, *[self.temperature_bias] * 10, *[self.pressure_bias] * 10)
 
 
 class SafeAction(StrEnum):
@@ -63,7 +92,7 @@ class WatchdogSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     timeout_s: Annotated[float, Field(ge=0, le=16_000)] = 10.0
-    """Plant time without new outputs after which it expires; 0 is never. In lock-step plant time then stands."""
+    """Plant time without new outputs after which it expires; 0 is never. In lock-step plant time then stops."""
     action: SafeAction = SafeAction.HOLD
     safe_state: tuple[Percent, Power, Percent] = (43.0, 75.0, 36.0)
     """CV155 %, NCR22_A W, CV156 %."""
@@ -120,6 +149,8 @@ class PlantSection(BaseModel):
     """Named load or CSV file."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     """Seed of the sensors' noise."""
+    mismatch: MismatchSettings = MismatchSettings()
+    """Of a cold box alone."""
     sensors: SensorSettings = SensorSettings()
     clock_error_ppm: Annotated[float, Field(ge=-50_000, le=50_000)] = 0.0
     """How much too fast the rack's clock is in real time, in millionths: for tests of those who follow it."""

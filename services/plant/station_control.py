@@ -101,7 +101,7 @@ class StationControl:
         return [*self._integrals, self._nitrogen_integral]
 
     def resume(self, retained: list[float]) -> None:
-        """Go on from what `retained` told (ValueError if it is of something else)."""
+        """Go on from what `retained` returned (ValueError if it is of something else)."""
         hp, lp, self._nitrogen_integral = retained
         self._integrals = (hp, lp)
 

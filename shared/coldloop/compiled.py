@@ -20,12 +20,20 @@ import numba
 P = ParamSpec("P")
 R = TypeVar("R")
 
-COMPILED_PACKAGES = ("plant", "optimizer_plc")
+COMPILED_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc", "rig.compiled")
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile `function` in nopython mode on its first call for given types, or load it from the cache."""
     return cast("Callable[P, R]", numba.njit(cache=True, error_model="numpy")(function))
+
+
+def inlined(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile `function` as `kernel` does, and copy its code into each kernel that calls it.
+
+    For small functions in inner loops: a call that passes tables costs more than reading them. The bits are the same.
+    """
+    return cast("Callable[P, R]", numba.njit(cache=True, error_model="numpy", forceinline=True)(function))
 
 
 def _sources_digest() -> str:

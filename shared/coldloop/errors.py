@@ -69,7 +69,7 @@ class LinkError(ColdloopError):
 
 
 class PortInUseError(LinkError):
-    """A server cannot listen where it was told to."""
+    """A server cannot listen where it is to."""
 
 
 class PeerUnreachableError(LinkError):

@@ -67,7 +67,7 @@ class LineWriter:
         while (line := self._next()) is not None:
             try:
                 self._write(line)
-            except (OSError, ValueError):  # the reader has gone, or the stream is closed: nobody can be told
+            except (OSError, ValueError):  # the reader has gone, or the stream is closed: nobody reads it
                 with self._changed:
                     self.dropped += 1
             with self._changed:

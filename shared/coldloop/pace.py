@@ -10,4 +10,4 @@ class Pace(NamedTuple):
     factor: float
     """Seconds of plant time in one second of real time."""
     paused: bool = False
-    """In real time: plant time stands until it is to go on."""
+    """In real time: plant time does not go on until it is resumed."""

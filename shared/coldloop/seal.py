@@ -27,7 +27,7 @@ class Seal(Enum):
 
 
 def seal_of(codec: RecordCodec, data: bytes | bytearray | memoryview, offset: int = 0) -> Seal:
-    """Return what the seal says of the record that stands in `data` at `offset`."""
+    """Return what the seal says of the record in `data` at `offset`."""
     raw = codec.canonical(data, offset)
     crc = int.from_bytes(raw[-CRC_BYTES:], "big")
     if not crc:

@@ -16,7 +16,7 @@ class TimeMode(StrEnum):
 
 
 class SessionSettings(BaseModel):
-    """What a service does when it starts and nobody has told it anything yet."""
+    """What a service does when it starts, before the first command."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -7,7 +7,7 @@ class Watchdog:
     """Expires when it has not been triggered for `time` ticks; 0 is off. A trigger starts it again."""
 
     def __init__(self, time: int) -> None:
-        self._triggered = 0
+        self.triggered = 0
         self.trips = 0
         self.set(time, 0)
 
@@ -16,17 +16,17 @@ class Watchdog:
         self.time = time
         self.lowest = time
         self.expired = False
-        self._triggered = tick
+        self.triggered = tick
 
     def trigger(self, tick: int) -> None:
         """Note a sign of life at `tick`."""
         self.lowest = min(self.lowest, self._remaining(tick))
-        self._triggered = tick
+        self.triggered = tick
         self.expired = False
 
     def set_back(self, tick: int) -> None:
         """Go on at a tick before the present one."""
-        self._triggered = min(self._triggered, tick)
+        self.triggered = min(self.triggered, tick)
 
     def check(self, tick: int) -> bool:
         """Tell whether it expires at `tick`; once for each time that it does."""
@@ -38,7 +38,7 @@ class Watchdog:
         return True
 
     def _remaining(self, tick: int) -> int:
-        return min(self.time, max(0, self.time - (tick - self._triggered)))
+        return min(self.time, max(0, self.time - (tick - self.triggered)))
 
     def registers(self, tick: int) -> safety.WatchdogStatus:
         """Return what its registers show at `tick`."""

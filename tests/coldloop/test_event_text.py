@@ -40,7 +40,7 @@ def event(kind: int, subject: int = 0, cause: int = 0, value: float = 0.0, who: 
         (event(EventKind.SETPOINT, 1, value=75.5), "setpoint: NCR22_A, 75.5 W"),
         (event(EventKind.WATCHDOG_TIME, 0, 60), "watchdog time: off (was 15 s)"),
         (event(EventKind.WATCHDOG_EXPIRED), "watchdog expired"),
-        (event(EventKind.PLANT_LINK, PlantLinkState.FROZEN, LinkCause.STANDS), "plant link: frozen (stands)"),
+        (event(EventKind.PLANT_LINK, PlantLinkState.FROZEN, LinkCause.STOPPED), "plant link: frozen (stopped)"),
         (event(EventKind.LEASE, 2), "lease: a second writer was refused"),
         (event(EventKind.SENSOR_FAULT, 6, SensorFaultKind.NONE), "sensor fault: T5 (none)"),
         (event(EventKind.LOAD, 3, value=384), "load: row 3, 384 W"),

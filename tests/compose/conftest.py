@@ -18,6 +18,8 @@ from rig.ports import ReservedPorts
 
 ROOT = Path(__file__).parents[2]
 SERVICES = ("plant", "control-plc", "optimizer-plc")
+PORTS = ("PLANT", "CONTROL_PLC", "OPTIMIZER_PLC", "MQTT", "PAGE")
+WITH_PAGE = {"COMPOSE_PROFILES": "page"}
 HEALTHY_WITHIN_S = 420
 
 
@@ -30,6 +32,7 @@ class ComposedRig:
     control_plc: int
     optimizer_plc: int
     mqtt: int
+    page: int
 
     def compose(self, *arguments: str, check: bool = True) -> str:
         """Run `docker compose` and return what it prints."""
@@ -56,10 +59,9 @@ class ComposedRig:
 @contextmanager
 def composed(network: str, files: Sequence[str] = ("docker-compose.yml",), **environment: str) -> Iterator[ComposedRig]:
     """Bring a rig up, on networks whose addresses begin so; take it down with all that it has left."""
-    names = ("COLDLOOP_PLANT_PORT", "COLDLOOP_CONTROL_PLC_PORT", "COLDLOOP_OPTIMIZER_PLC_PORT", "COLDLOOP_MQTT_PORT")
-    with ReservedPorts(len(names)) as reserved:
+    with ReservedPorts(len(PORTS)) as reserved:
         own = {
-            **{name: str(port) for name, port in zip(names, reserved.numbers, strict=True)},
+            **{f"COLDLOOP_{name}_PORT": str(port) for name, port in zip(PORTS, reserved.numbers, strict=True)},
             "COMPOSE_PROJECT_NAME": f"coldloop-test-{os.getpid()}",
             "COMPOSE_FILE": os.pathsep.join(files),
             "COLDLOOP_NETWORK": network,
@@ -81,7 +83,7 @@ def _engine() -> Iterator[None]:
             pytest.fail("no container engine runs, or it has no `docker compose`", pytrace=False)
         pytest.skip("no container engine runs here")
     yield
-    names = [f"coldloop-test-{os.getpid()}-{service}" for service in SERVICES]
+    names = [f"coldloop-test-{os.getpid()}-{service}" for service in (*SERVICES, "page")]
     subprocess.run(["docker", "image", "rm", "--force", *names], check=False, capture_output=True)
 
 
@@ -96,7 +98,8 @@ def rig(_engine: None) -> Iterator[ComposedRig]:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Certificates for the rig; the containers' user can read the keys."""
     folder = tmp_path_factory.mktemp("certificates") / "site"
-    hosts = [f"--host={name}" for name in ("plant.field", "control-plc.control")]
+    asked_by_the_page = [f"{service}.operators" for service in SERVICES]
+    hosts = [f"--host={name}" for name in ("plant.field", "control-plc.control", *asked_by_the_page)]
     assert cli.main(["certificates", "--out", str(folder), *hosts]) == 0
     for file in folder.glob("*.key"):
         file.chmod(0o644)
@@ -105,16 +108,23 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def secured_rig(_engine: None, site: Path) -> Iterator[ComposedRig]:
-    """The rig with TLS."""
+    """The rig with TLS, and its page."""
     files = ("docker-compose.yml", "docker-compose.tls.yml")
-    with composed("172.29", files, COLDLOOP_CERTIFICATES=str(site)) as one:
+    with composed("172.29", files, COLDLOOP_CERTIFICATES=str(site), **WITH_PAGE) as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def refrigerator_rig(_engine: None) -> Iterator[ComposedRig]:
+    """The rig with the whole refrigerator, and its page."""
+    with composed("172.29", COLDLOOP_PLANT_KIND="refrigerator", **WITH_PAGE) as one:
         yield one
 
 
 def _bring_up(rig: ComposedRig) -> None:
     started = rig.compose("up", "--wait", "--wait-timeout", str(HEALTHY_WITHIN_S), check=False)
     states = rig.compose("ps", "--all", "--format", "{{.Service}}: {{.Status}}")
-    if states.count("(healthy)") != len(SERVICES) + 1:
+    if states.count("(healthy)") != len(SERVICES) + 1 + ("COMPOSE_PROFILES" in rig.environment):
         logs = rig.compose("logs", "--no-color", "--tail", "20")
         pytest.fail(f"not all became healthy\n{started}\n{states}\n{logs}", pytrace=False)
 

@@ -11,6 +11,7 @@ import pytest
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import client_context
 from coldloop.registers.plant import PLANT_MAP, Actuators, LoadStep
+from tests.compose.browser import assert_an_operator_changes_the_load
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -78,3 +79,8 @@ def test_a_run_attaches_with_the_certificates_of_the_site(
     endpoints = [f"127.0.0.1:{port}" for port in (rig.plant, rig.control_plc, rig.optimizer_plc)]
     scenario = ["--load", "a", "--duration", "1min", "--out", str(tmp_path / "run")]
     coldloop("--config", str(site / "tls.toml"), "--attach", *endpoints, *scenario)
+
+
+def test_the_page_reads_as_a_reader_and_commands_as_an_operator(secured_rig: "ComposedRig") -> None:
+    assert_an_operator_changes_the_load(secured_rig.page)
+    assert "client.key" in secured_rig.inside("page", "ls", "/run/secrets").split()

@@ -32,9 +32,9 @@ Array = NDArray[np.float64]
 SINGLE = real_of(Arithmetic.FLOAT32)
 
 ON_LINE = {
-    "apply", "augmented_cost", "begin", "cholesky", "cholesky_solve", "deviation_cost", "hold_at_bounds", "_inputs",
-    "_instance", "largest_violation", "quadratic_cost", "release", "respond", "stage_matrix", "step", "velocity",
-    "violation_cost",
+    "add_product", "apply", "augmented_cost", "begin", "cholesky", "cholesky_solve", "corrected", "cost_by_columns",
+    "descend", "deviation_cost", "hold_at_bounds", "inputs_of", "instance", "largest_violation", "predicted_indicators",
+    "quadratic_cost", "release", "respond", "shifted", "stage_matrix", "step", "velocity", "violation_cost",
 }  # fmt: skip
 
 
@@ -118,7 +118,7 @@ def test_an_instance_in_single_precision_is_that_in_double_rounded(
     model: LtiModel, problem: PredictiveProblem, situations: Callable[..., Any]
 ) -> None:
     program = single_program(model)
-    single = program._problem  # noqa: SLF001
+    single = program.problem
     rng = np.random.default_rng(21)
     for _ in range(20):
         situation = situations(rng)

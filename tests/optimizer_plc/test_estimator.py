@@ -5,9 +5,10 @@ from numpy.typing import NDArray
 
 from coldloop.lti_model import LtiModel
 from coldloop.registers.control_plc import Update
-from optimizer_plc.computing_settings import EstimatorSettings
+from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
 from optimizer_plc.estimator import KalmanFilter, StateFeedback
 from optimizer_plc.prediction import PredictionModel
+from optimizer_plc.settings import ProgramSettings
 
 Array = NDArray[np.float64]
 
@@ -159,3 +160,27 @@ def test_a_prediction_may_be_cut_into_segments_of_any_length(model: LtiModel, pr
         estimator.correct(World(model, 1, 0.0).measured(u, w, u)._replace(x=tuple((x + model.x0).tolist())))
         reached = estimator.predict([(u, ticks) for ticks in cut])
         assert np.allclose(reached, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_load_that_is_not_measured_is_estimated(model: LtiModel, prediction: PredictionModel) -> None:
+    """A plant as its model, with 100 W more that nobody tells: all of it becomes mismatch."""
+    settings = EstimatorSettings(load_known=False, load_walk_w=30.0)
+    kalman, deaf = KalmanFilter(prediction, settings), KalmanFilter(prediction, settings)
+    x, u = np.zeros(28), np.zeros(3)
+    for number in range(60):
+        y = prediction.output(x, u, 100.0)
+        estimate = kalman.correct(told(model, x, u, y, 100.0, number))
+        again = deaf.correct(told(model, x, u, y, -55.0, number))
+        assert estimate.w == estimate.mismatch == again.w
+        for one in (kalman, deaf):
+            one.predict([(u, 20)])
+        x = prediction.advance(x, u, 100.0, 20)
+    assert estimate.w == pytest.approx(100.0, rel=0.02)
+
+
+def test_a_load_that_is_not_measured_neither_interrupts_nor_goes_with_state_feedback() -> None:
+    unknown = EstimatorSettings(load_known=False)
+    with pytest.raises(ValueError, match="interrupting_load_step_w needs a load that is measured"):
+        ProgramSettings(estimator=unknown, interrupting_load_step_w=10.0)
+    with pytest.raises(ValueError, match="state-feedback estimates no load; choose kind = kalman"):
+        EstimatorSettings(kind=EstimatorKind.STATE_FEEDBACK, load_known=False)

@@ -102,10 +102,10 @@ def test_the_cholesky_factorisation_and_solve_are_counted_right(n: int) -> None:
     rng = np.random.default_rng(n)
     root = rng.normal(size=(n, n))
     M, b = counted(root @ root.T + np.eye(n)), counted(rng.normal(size=n))
-    linear_algebra.cholesky(M)
+    skyline = linear_algebra.cholesky(M)
     assert Counted.done == pytest.approx(operations.cholesky(n).flops)
     Counted.done = 0
-    linear_algebra.cholesky_solve(M, b)
+    linear_algebra.cholesky_solve(M, skyline, b)
     assert Counted.done == operations.cholesky_solve(n).flops
 
 
@@ -122,7 +122,7 @@ def test_a_step_of_the_ode_solver_is_counted_right(n: int, m: int, active: int) 
     flow = ode.Flow(*(Counted(value) for value in flow_in(OdeSettings(), np.float64)))  # type: ignore[arg-type]
     z = counted(rng.normal(size=n))
     before = [float(value) for value in z]
-    ode.step(qp, z, np.zeros(m), Counted(1e30), Counted(1e-6), flow)  # type: ignore[arg-type]
+    ode.step(costs.matrices_of(qp), qp, z, np.zeros(m), Counted(1e30), Counted(1e-6), flow)  # type: ignore[arg-type]
     assert [float(value) for value in z] != before, "the step was accepted"
     assert Counted.done == pytest.approx(operations.ode(n, m, active).flops)
 

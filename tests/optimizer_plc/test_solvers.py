@@ -72,10 +72,10 @@ def test_the_exact_ones_end_at_the_optimum(name: str, optimum: "Optimum", seed: 
     rng = np.random.default_rng(seed)
     qp = convex_problem(rng, n=int(rng.integers(1, 9)), m=int(rng.integers(1, 12)))
     z = answer(solver_named(name), qp, rng.normal(size=len(qp.phi)), CONVERGED[name])
-    assert z == pytest.approx(optimum(qp), abs=1e-5)
+    assert z == pytest.approx(optimum(qp), abs=1e-12)
 
 
-@pytest.mark.parametrize(("name", "accuracy"), [("ode", 5e-2), ("fast-gradient", 1e-4), ("interior-point", 1e-6)])
+@pytest.mark.parametrize(("name", "accuracy"), [("ode", 2e-2), ("fast-gradient", 1e-10), ("interior-point", 1e-11)])
 @repeatable
 @given(seed=seeds)
 def test_the_penalised_ones_end_at_the_penalised_optimum(
@@ -90,7 +90,7 @@ def test_the_penalised_ones_end_at_the_penalised_optimum(
     solver, at_best = solver_named(name), solver_named(name)
     answer(solver, qp, np.zeros(49), CONVERGED[name])
     at_best.start(qp, penalised_optimum(qp, solver.alpha))
-    assert solver.cost + qp.constant == pytest.approx(at_best.cost + qp.constant, rel=accuracy, abs=1e-2)
+    assert solver.cost + qp.constant == pytest.approx(at_best.cost + qp.constant, rel=accuracy, abs=1e-8)
 
 
 @pytest.mark.parametrize("name", ["qpoases", "daqp"])
@@ -103,11 +103,11 @@ def test_on_the_controllers_problem_residuals_and_gap_vanish_at_the_optimum(
     qp = problem.at(situations(rng))
     solver = solver_named(name)
     z = answer(solver, qp, np.zeros(49), CONVERGED[name])
-    assert z == pytest.approx(optimum(qp), abs=1e-5)
+    assert z == pytest.approx(optimum(qp), abs=1e-11)
     judged = solver.judged()
-    assert judged.primal_residual <= 1e-6
-    assert judged.dual_residual <= 1e-6 * max(1.0, float(np.abs(qp.phi).max()))
-    assert judged.gap <= 1e-6 * max(1.0, abs(judged.cost))
+    assert judged.primal_residual <= 1e-11
+    assert judged.dual_residual <= 1e-13 * max(1.0, float(np.abs(qp.phi).max()))
+    assert judged.gap <= 1e-10 * max(1.0, abs(judged.cost))
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -197,7 +197,7 @@ def test_rounding_in_the_data_hardly_changes_the_cost_of_answers(
         solver = solver_named(name)
         answer(solver, each, np.zeros(49), count)
         costs.append(solver.cost + qp.constant)
-    assert costs[0] == pytest.approx(costs[1], rel=1e-2)
+    assert costs[0] == pytest.approx(costs[1], rel=2e-4 if name == "ode" else 1e-10)
 
 
 # -- qpOASES ----------------------------------------------------------------------------------------------------------
@@ -245,7 +245,7 @@ def test_qpoases_goes_on_from_where_it_stopped(harsh_jumps: "list[Jump]", optimu
     qp, guess = harsh_jumps[1]
     distances = [float(np.abs(answer(solver, qp, guess, 5) - optimum(qp)).max()) for _ in range(20)]
     assert distances[0] > 1e-3
-    assert distances[-1] < 1e-6
+    assert distances[-1] < 1e-13
 
 
 def test_a_problem_without_solution_leaves_the_guess_and_the_next_one_is_solved(
@@ -257,7 +257,7 @@ def test_a_problem_without_solution_leaves_the_guess_and_the_next_one_is_solved(
     solver = QpoasesSolver(QpoasesSettings())
     answer(solver, qp, np.zeros(49), 1)
     answer(solver, impossible, np.zeros(49), 500)
-    assert answer(solver, qp, np.zeros(49), 500) == pytest.approx(optimum(qp), abs=1e-6)
+    assert answer(solver, qp, np.zeros(49), 500) == pytest.approx(optimum(qp), abs=1e-11)
     assert capfd.readouterr() == ("", "")
 
 
@@ -344,7 +344,7 @@ def test_single_precision_stays_single(make: Callable[[], Solver]) -> None:
     single = QuadraticProblem(*(np.asarray(v, np.float32) for v in qp[:-1]), constant=0.0)
     z = answer(make(), single, np.zeros(5, np.float32), 500)
     assert z.dtype == np.float32
-    assert z == pytest.approx(answer(make(), qp, np.zeros(5), 500), abs=1e-2)
+    assert z == pytest.approx(answer(make(), qp, np.zeros(5), 500), abs=1e-4)
 
 
 # -- the interior-point method ----------------------------------------------------------------------------------------
@@ -371,7 +371,7 @@ def test_after_eight_iterations_it_is_at_the_optimum_of_most_harsh_problems(
         at_best.start(qp, penalised_optimum(qp, solver.alpha))
         ratios.append((solver.cost + qp.constant + 1.0) / (at_best.cost + qp.constant + 1.0))
     assert min(ratios) > 1.0 - 1e-6, "nothing is below the optimum"
-    assert np.median(ratios) < 1.02
+    assert np.median(ratios) < 1.01
 
 
 def test_its_structure_changes_nothing_but_the_work(problem: PredictiveProblem, situations: "Situations") -> None:
@@ -379,7 +379,7 @@ def test_its_structure_changes_nothing_but_the_work(problem: PredictiveProblem, 
     qp = problem.at(situations(np.random.default_rng(27)))
     far = qp._replace(high=np.minimum(qp.high, 1e4))
     first, second = (answer(InteriorPointSolver(InteriorPointSettings()), each, np.zeros(49), 40) for each in (qp, far))
-    assert first == pytest.approx(second, abs=1e-3)
+    assert first == pytest.approx(second, abs=1e-7)
 
 
 # -- the loop ---------------------------------------------------------------------------------------------------------

@@ -1,11 +1,17 @@
 import math
-from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optimizer_plc.updating_period import Algorithm1, ContractionRule, FixedPeriod, Observation, assess
+from optimizer_plc.updating_period import (
+    Algorithm1,
+    ContractionParameters,
+    ContractionRule,
+    FixedPeriod,
+    Observation,
+    assess,
+)
 
 RULE = Algorithm1(q_first=9, q_min=2, q_max=19, delta=2)
 
@@ -38,7 +44,7 @@ def contracting(**changed: float) -> Observation:
         delivered=100.0,
         effective=90.0,
     )
-    return replace(base, **changed)  # type: ignore[arg-type]
+    return base._replace(**changed)  # type: ignore[arg-type]
 
 
 def test_the_quantities_are_those_that_the_paper_defines() -> None:
@@ -81,7 +87,7 @@ def test_a_contraction_of_exactly_1_counts_as_none() -> None:
     assert math.isinf(a.response_increment)
     assert a.gamma == a.contraction_increment == pytest.approx(0.5 * 1.0 / 4 - 2.0 * 0.02)
     assert q == 2
-    assert RULE.next(replace(at_one, last_but_one=180.0))[0] == 6
+    assert RULE.next(at_one._replace(last_but_one=180.0))[0] == 6
 
 
 def test_a_zero_gradient_changes_nothing() -> None:
@@ -154,7 +160,7 @@ def test_the_first_period_is_the_one_configured() -> None:
 
 
 def own_rule() -> ContractionRule:
-    return ContractionRule(q_busy=2, q_quiet=9, q_step=13, rate=0.05, memory=0.9, surprise=2.0)
+    return ContractionRule(ContractionParameters(q_busy=2, q_quiet=9, q_step=13, rate=0.05, memory=0.9, surprise=2.0))
 
 
 def delivered(cost: float, *, surprise: float = 1.0) -> Observation:

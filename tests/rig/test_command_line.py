@@ -15,7 +15,7 @@ from rig.chaos.plan import shipped_plans
 from rig.cli import COMMANDS, make_parser
 from rig.commands import choices
 from rig.register_listing import FORMATS, MAPS
-from rig.studies import STUDIES
+from rig.studies import APART, STUDIES
 from rig.tag_exports import EXPORTS
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def test_the_names_that_are_offered_are_those_that_exist() -> None:
     assert sorted(choices.SERVICES) == sorted(MAPS)
     assert sorted(choices.REGISTER_FORMATS) == sorted(FORMATS)
     assert sorted(choices.TAG_FORMATS) == sorted(EXPORTS)
-    assert tuple(STUDIES) == choices.STUDIES
+    assert (*STUDIES, *APART) == choices.STUDIES
     assert choices.plans() == [plan.name for plan in shipped_plans()]
 
 

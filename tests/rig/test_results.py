@@ -42,10 +42,10 @@ TICKS = 240
 
 SUMMARY = {
     "complete", "reason", "ticks", "updates", "trace_sha256", "J_dev", "J_cst", "J_BF", "c1", "c2", "tau_u_mean",
-    "iterations_total", "L1_outside_band_pct", "T5_outside_band_pct", "deadline_misses", "wall_seconds",
-    "realtime_factor",
+    "tau_u_mean_per_update", "iterations_total", "L1_outside_band_pct", "T5_outside_band_pct", "deadline_misses",
+    "wall_seconds", "realtime_factor",
 }  # fmt: skip
-PREDICTED = ("J_dev", "J_cst", "J_open_mean", "c1", "c2", "tau_u_mean")
+PREDICTED = ("J_dev", "J_cst", "J_open_mean", "c1", "c2", "tau_u_mean", "tau_u_mean_per_update")
 
 
 @pytest.fixture(scope="module")

@@ -1,14 +1,15 @@
 """Short runs that studies are made of, and workers to do them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
 from distributed import Client
 
+from rig.indicators import Indicators
 from rig.studies.execution import Store, Workers
-from rig.studies.request import RunRequest
-from rig.studies.study import StudyOptions, draw_of
+from rig.studies.request import UPDATE_COLUMNS, Outcome, RunRequest
+from rig.studies.study import Load, StudyOptions, draw_of
 
 Requests = Callable[[int], list[RunRequest]]
 
@@ -43,3 +44,42 @@ def client() -> Iterator[Client]:
 def running(client: Client) -> Workers:
     """The same two workers, for whoever names their scheduler."""
     return Workers(1, scheduler=client.scheduler.address)
+
+
+# -- outcomes that no run has given, to judge by hand ----------------------------------------------------------------
+
+MakeOutcome = Callable[..., Outcome]
+
+
+@pytest.fixture(scope="session")
+def made_up() -> MakeOutcome:
+    """Return an outcome with these columns of updates and of the trace; all indicators are 0 but those named."""
+
+    def make(
+        updates: Mapping[str, Sequence[float]] | None = None,
+        trace: Mapping[str, Sequence[float]] | None = None,
+        sha: str = "",
+        **named: float,
+    ) -> Outcome:
+        indicators = Indicators(*([0.0] * len(Indicators._fields)))._replace(**named)  # type: ignore[arg-type]
+        columns = {name: [float(value) for value in values] for name, values in (updates or {}).items()}
+        length = len(next(iter(columns.values()), ()))
+        columns = {name: columns.get(name, [0.0] * length) for name in UPDATE_COLUMNS} | columns
+        series = {name: [float(value) for value in values] for name, values in (trace or {}).items()}
+        return Outcome("", indicators, sha, 0, columns, series)
+
+    return make
+
+
+@pytest.fixture
+def stepped(tmp_path: Path) -> Load:
+    """A load of ten minutes that steps up at 100 s and down at 400 s, ticks 400 and 1600."""
+    file = tmp_path / "stepped.csv"
+    file.write_text("time_s,load_w\n0,385\n100,445\n400,385\n")
+    return draw_of(str(file), 1, StudyOptions(seeds=1, ticks=2400))
+
+
+@pytest.fixture
+def under(stepped: Load) -> StudyOptions:
+    """A quick study under that load alone."""
+    return StudyOptions(loads=(stepped.name,), ticks=2400, quick=True)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
+from distributed import Future
 
 from coldloop.errors import StudyError, UsageError
 from rig.studies.execution import Store, Workers, perform_all
@@ -73,6 +74,22 @@ def test_a_run_that_fails_is_one_line_and_loses_nothing(requests: "Requests", st
 def test_a_scheduler_that_is_not_there_is_one_line(requests: "Requests", store: Store) -> None:
     with pytest.raises(UsageError, match=r"--scheduler tcp://127\.0\.0\.1:1: .*; name one that is up"):
         perform_all(requests(1), store, Workers(1, scheduler="tcp://127.0.0.1:1"), "test")
+
+
+def test_a_run_that_the_scheduler_gives_up_is_one_line(requests: "Requests", store: Store, client: "Client") -> None:
+    asked = [replace(request, ticks=2400) for request in requests(4)]
+    last = Future(f"run-{asked[-1].digest}", client=client)  # type: ignore[no-untyped-call]
+
+    def give_up() -> None:
+        while not any(store.path(request).exists() for request in asked):
+            threading.Event().wait(0.01)
+        client.cancel([last], force=True)  # type: ignore[no-untyped-call]
+
+    canceller = threading.Thread(target=give_up)
+    canceller.start()
+    with pytest.raises(StudyError, match="the scheduler is gone, or has given up a run; what was done before is kept"):
+        perform_all(asked, store, Workers(1, scheduler=client.scheduler.address), "test")
+    canceller.join()
 
 
 def test_the_workers_of_a_client_are_two(client: "Client") -> None:

@@ -13,7 +13,8 @@ from rig import paper
 from rig.report.document import as_page, deviations, scorecard_table
 from rig.report.scorecard import FROM_POINTS, Claim, Verdict, as_json, claims, counts, judge, paper_values, verdict
 from rig.studies import STUDIES
-from rig.studies.solver_comparison import crossing, measures
+from rig.studies.crossing import crossing
+from rig.studies.solver_comparison import measures
 
 CLAIM = Claim(
     study="s", value="v", figure="f", says="it is so", of_paper="2", why="w", reproduced=(1.0, 3.0), partly=(0.0, 9.0)

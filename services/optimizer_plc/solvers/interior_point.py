@@ -269,7 +269,14 @@ def after(point: Point, change: Point, share: float) -> Point:
 
 @kernel
 def solve(
-    constant: Structure, U: Array, slope: Array, point: Point, away: Distances, products: Distances, softness: float
+    constant: Structure,
+    U: Array,
+    skyline: NDArray[np.uint64],
+    slope: Array,
+    point: Point,
+    away: Distances,
+    products: Distances,
+    softness: float,
 ) -> tuple[Point, Distances]:
     """Return the Newton step that changes the products by `products`, and how the distances change with it."""
     dz, of_rows, d_low, d_high = -slope, products.rows.copy(), products.low.copy(), products.high.copy()
@@ -282,7 +289,7 @@ def solve(
         if point.high[i] > 0:
             d_high[i] /= away.high[i]
             dz[i] -= d_high[i]
-    cholesky_solve(U, dz)
+    cholesky_solve(U, skyline, dz)
     d_away = np.empty_like(of_rows)
     multiply_rows(constant, dz, d_away)
     for r in range(of_rows.shape[0]):
@@ -351,13 +358,13 @@ def step(
         return point, False
     slope = gradient(constant, phi, point)
     U = newton_matrix(constant, point, away, softness)
-    cholesky(U)
+    skyline = cholesky(U)
     products = towards_zero(point, away)
-    change, moved = solve(constant, U, slope, point, away, products, softness)
+    change, moved = solve(constant, U, skyline, slope, point, away, products, softness)
     share = longest(point, away, change, moved, one)
     predicted = after(point, change, share)
     centring = mean_product(predicted, distances(constant, gamma, low, high, predicted, softness)) / mu
     correct(products, mu * centring * centring * centring, point, change, moved)
-    change, moved = solve(constant, U, slope, point, away, products, softness)
+    change, moved = solve(constant, U, skyline, slope, point, away, products, softness)
     share = min(one, real(SHORT_OF) * longest(point, away, change, moved, one / real(SHORT_OF)))
     return after(point, change, share), True

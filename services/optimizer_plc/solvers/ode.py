@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from coldloop.compiled import kernel
 from optimizer_plc.arithmetic import Real
 from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.costs import augmented_cost
-from optimizer_plc.linear_algebra import cholesky, cholesky_solve
+from optimizer_plc.costs import Matrices, cost_by_columns, matrices_of
+from optimizer_plc.linear_algebra import add_product, cholesky, cholesky_solve
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.solution import Solution, judge, penalty_multipliers
 
@@ -66,28 +66,30 @@ class OdeSolver:
         self.alpha = settings.alpha
         self.tau_1_s = settings.tau_1_s
         self._settings = settings
+        self._source: tuple[Array, Array] | None = None
 
     def reset(self) -> None:
-        """Nothing is kept from one problem to the next."""
+        """Only the matrices are kept from one problem to the next."""
 
     def start(self, problem: QuadraticProblem, guess: Array) -> None:
         """Begin with `guess` projected into the box, and with the paper's first step size sqrt(1 / |dz/dt|)."""
         self._problem = problem
-        self._real = problem.phi.dtype.type
-        self._flow = flow_in(self._settings, self._real)
+        if self._source is None or problem.Phi is not self._source[0] or problem.Gamma is not self._source[1]:
+            self._source, self._matrices = (problem.Phi, problem.Gamma), matrices_of(problem)
+            self._real = problem.phi.dtype.type
+            self._flow = flow_in(self._settings, self._real)
         self._stiff = np.zeros_like(problem.gamma)
-        self._z, self._cost, self._dt = begin(problem, guess, self._flow)
+        self._z, self._cost, self._dt = begin(self._matrices, problem, guess, self._flow)
         self._stalled = 0
 
     def iterate(self, count: int) -> int:
         """Take `count` steps, or fewer once the cost hardly falls any more."""
-        for done in range(count):
-            if self._stalled == STALLED:
-                return done
-            cost, dt = self._real(self._cost), self._real(self._dt)
-            self._dt, self._cost = step(self._problem, self._z, self._stiff, cost, dt, self._flow)
-            self._stalled = self._stalled + 1 if cost - self._cost <= HARDLY * abs(cost) else 0
-        return count
+        real = self._real
+        done, self._stalled, self._cost, self._dt = descend(
+            self._matrices, self._problem, self._z, self._stiff, real(self._cost), real(self._dt), self._stalled, count,
+            self._flow,
+        )  # fmt: skip
+        return done
 
     @property
     def solution(self) -> Array:
@@ -106,25 +108,26 @@ class OdeSolver:
 
 
 @kernel
-def velocity(qp: QuadraticProblem, z: Array, flow: Flow, result: Array, active: Array) -> None:
+def velocity(
+    constant: Matrices, qp: QuadraticProblem, z: Array, flow: Flow, result: Array, active: Array
+) -> None:  # fmt: skip
     """Write dz/dt = -cost_scale dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0."""
     n = z.shape[0]
     zero, one, two = z.dtype.type(0.0), z.dtype.type(1.0), z.dtype.type(2.0)
     for i in range(n):
-        slope = zero
-        for j in range(n):
-            slope += qp.Phi[i, j] * z[j]
-        result[i] = two * slope + qp.phi[i]
-    for r in range(qp.Gamma.shape[0]):
-        excess = -qp.gamma[r]
-        for j in range(n):
-            excess += qp.Gamma[r, j] * z[j]
+        result[i] = zero
+    add_product(constant.Phi, z, result)
+    for i in range(n):
+        result[i] = two * result[i] + qp.phi[i]
+    excess, rows = -qp.gamma, constant.rows
+    add_product(constant.Gamma, z, excess)
+    for r in range(excess.shape[0]):
         active[r] = zero
-        if excess > zero:
+        if excess[r] > zero:
             active[r] = one
-            factor = two * flow.alpha * excess
-            for j in range(n):
-                result[j] += factor * qp.Gamma[r, j]
+            factor = two * flow.alpha * excess[r]
+            for j in range(rows.first[r], rows.end[r]):
+                result[j] += factor * rows.transposed[r, j]
     for i in range(n):
         result[i] *= -flow.cost_scale
 
@@ -153,22 +156,22 @@ def release(M: Array, held: Array) -> None:
 
 
 @kernel
-def begin(qp: QuadraticProblem, guess: Array, flow: Flow) -> tuple[Array, float, float]:
+def begin(constant: Matrices, qp: QuadraticProblem, guess: Array, flow: Flow) -> tuple[Array, float, float]:
     """Return the guess inside the box, its cost, and the first step size sqrt(1 / |dz/dt|) there."""
     z = np.empty_like(guess)
     for i in range(z.shape[0]):
         z[i] = min(max(guess[i], qp.low[i]), qp.high[i])
     v = np.empty_like(z)
-    velocity(qp, z, flow, v, np.empty_like(qp.gamma))
+    velocity(constant, qp, z, flow, v, np.empty_like(qp.gamma))
     total = z.dtype.type(0.0)
     for i in range(v.shape[0]):
         total += v[i] * v[i]
     speed = max(math.sqrt(total), z.dtype.type(1e-12))
-    return z, augmented_cost(qp, z, flow.alpha), math.sqrt(z.dtype.type(1.0) / speed)
+    return z, cost_by_columns(constant, qp, z, flow.alpha), math.sqrt(z.dtype.type(1.0) / speed)
 
 
 @kernel
-def stage_matrix(qp: QuadraticProblem, stiff: Array, dt: float, flow: Flow) -> Array:
+def stage_matrix(constant: Matrices, qp: QuadraticProblem, stiff: Array, dt: float, flow: Flow) -> Array:
     """Return I + (gamma / 2) dt Hess(cost_scale J), upper triangle, with the rows that `stiff` (m,) names."""
     n = qp.phi.shape[0]
     M = np.empty((n, n), qp.phi.dtype)
@@ -180,39 +183,68 @@ def stage_matrix(qp: QuadraticProblem, stiff: Array, dt: float, flow: Flow) -> A
         M[i, i] += one
     for r in range(qp.Gamma.shape[0]):
         if stiff[r] > zero:
-            for i in range(n):
+            end = constant.rows.end[r]
+            for i in range(constant.rows.first[r], end):
                 factor = weight * flow.alpha * qp.Gamma[r, i]
                 if factor != zero:
-                    for j in range(i, n):
+                    for j in range(i, end):
                         M[i, j] += factor * qp.Gamma[r, j]
     return M
 
 
 @kernel
-def step(qp: QuadraticProblem, z: Array, stiff: Array, cost: float, dt: float, flow: Flow) -> tuple[float, float]:
+def descend(
+    constant: Matrices,
+    qp: QuadraticProblem,
+    z: Array,
+    stiff: Array,
+    cost: float,
+    dt: float,
+    stalled: int,
+    count: int,
+    flow: Flow,
+) -> tuple[int, int, float, float]:
+    """Move z by `count` steps, or fewer once J hardly falls any more.
+
+    Returns how many were done, how many in a row have hardly lowered J, the cost at z and the next step size.
+    """
+    hardly = z.dtype.type(HARDLY)
+    for done in range(count):
+        if stalled == STALLED:
+            return done, stalled, cost, dt
+        dt, reached = step(constant, qp, z, stiff, cost, dt, flow)
+        stalled = stalled + 1 if cost - reached <= hardly * abs(cost) else 0
+        cost = reached
+    return count, stalled, cost, dt
+
+
+@kernel
+def step(
+    constant: Matrices, qp: QuadraticProblem, z: Array, stiff: Array, cost: float, dt: float, flow: Flow
+) -> tuple[float, float]:
     """Move z by one TR-BDF2 step of size dt, or not at all; return the next step size and the cost at z."""
     n, real = z.shape[0], z.dtype.type
     v0, vg, v1 = np.empty_like(z), np.empty_like(z), np.empty_like(z)
     active, ahead = np.empty_like(qp.gamma), np.empty_like(qp.gamma)
-    velocity(qp, z, flow, v0, active)
+    velocity(constant, qp, z, flow, v0, active)
     for r in range(active.shape[0]):
         stiff[r] = max(stiff[r], active[r])
     held = hold_at_bounds(qp, z, v0)
-    M = stage_matrix(qp, stiff, dt, flow)
+    M = stage_matrix(constant, qp, stiff, dt, flow)
     release(M, held)
-    cholesky(M)
+    skyline = cholesky(M)
     change = real(G) * dt * v0
-    cholesky_solve(M, change)
+    cholesky_solve(M, skyline, change)
     zg = z + change
-    velocity(qp, zg, flow, vg, ahead)
+    velocity(constant, qp, zg, flow, vg, ahead)
     for r in range(active.shape[0]):
         stiff[r] = ahead[r]
     for i in range(n):
         vg[i] *= real(1.0) - held[i]
     change = real(C1) * zg - real(C0) * z - zg + real(D) * dt * vg
-    cholesky_solve(M, change)
+    cholesky_solve(M, skyline, change)
     candidate = zg + change
-    velocity(qp, candidate, flow, v1, active)
+    velocity(constant, qp, candidate, flow, v1, active)
     for i in range(n):
         v1[i] *= real(1.0) - held[i]
     error = real(0.0)
@@ -221,7 +253,7 @@ def step(qp: QuadraticProblem, z: Array, stiff: Array, cost: float, dt: float, f
         local = real(2.0 * ERROR_CONSTANT) * dt * curvature
         error = max(error, abs(local))
         candidate[i] = min(max(candidate[i], qp.low[i]), qp.high[i])
-    reached = augmented_cost(qp, candidate, flow.alpha)
+    reached = cost_by_columns(constant, qp, candidate, flow.alpha)
     if not reached <= cost:
         return dt * flow.rejection, cost
     for i in range(n):

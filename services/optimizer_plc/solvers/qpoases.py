@@ -131,7 +131,7 @@ class _Chain:
 
     def step(self) -> str:
         """Go one step; return the status that CasADi tells."""
-        with redirect_stdout(io.StringIO()):  # failures are told whatever the print level
+        with redirect_stdout(io.StringIO()):  # failures are printed whatever the print level
             self._evaluate()
         return str(self._buffer.stats()["unified_return_status"])
 

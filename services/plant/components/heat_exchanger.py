@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.compiled import kernel
+from coldloop.compiled import inlined, kernel
 from plant.helium.interpolation import Surface
 from plant.helium.properties import Helium, Saturation, saturation, supply_cell, vapour_enthalpy_and_cp
 from plant.numeric import Array, at_least, at_most
@@ -50,7 +50,7 @@ class LowPressureFlow(NamedTuple):
     """J/kg; carried along so that energy is conserved exactly, whatever the tables' error."""
 
 
-@kernel
+@inlined
 def driving_difference(T_before: float, T_cell: float, T_low: float) -> float:
     """Return the temperature difference (K) between the mean of a cell and the low-pressure gas that enters it.
 
@@ -62,7 +62,7 @@ def driving_difference(T_before: float, T_cell: float, T_low: float) -> float:
     return at_most(0.5 * (T_before + T_cell) - T_low, limit)
 
 
-@kernel
+@inlined
 def take_up(
     low: LowPressureFlow, cp: float, drive: float, UA: float, sat: Saturation, table: Surface
 ) -> tuple[float, float, float]:

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from coldloop.compiled import kernel
+from coldloop.compiled import inlined
 from plant.helium.properties import Helium, saturation, saturation_slopes
 from plant.numeric import at_least, at_most
 
@@ -14,13 +14,13 @@ class PhaseSeparator(NamedTuple):
     """m3."""
 
 
-@kernel
+@inlined
 def level(separator: PhaseSeparator, V_l: float) -> float:
     """Return the level (%, 0 to 100) of a liquid volume `V_l` (m3)."""
     return at_most(at_least(100.0 * V_l / separator.volume, 0.0), 100.0)
 
 
-@kernel
+@inlined
 def contents(separator: PhaseSeparator, P: float, V_l: float, helium: Helium) -> tuple[float, float]:
     """Return the mass (kg) and the internal energy (J) of the helium in the vessel."""
     sat = saturation(P, helium)
@@ -29,7 +29,7 @@ def contents(separator: PhaseSeparator, P: float, V_l: float, helium: Helium) ->
     return mass, sat.rho_l * sat.h_l * V_l + sat.rho_v * sat.h_v * V_v - P * separator.volume
 
 
-@kernel
+@inlined
 def separate(
     separator: PhaseSeparator,
     P: float,

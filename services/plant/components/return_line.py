@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.compiled import kernel
+from coldloop.compiled import inlined
 from plant.numeric import at_least
 
 
@@ -17,7 +17,7 @@ class ReturnLine(NamedTuple):
     """From the mixing point to the compressor, Pa s2/kg2."""
 
 
-@kernel
+@inlined
 def return_flow(line: ReturnLine, P_bath: float, P_suction: float, joining_flow: float) -> tuple[float, float]:
     """Return the mass flow of the vapour (kg/s) and the pressure at the mixing point (Pa).
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.compiled import kernel
+from coldloop.compiled import inlined
 from plant.components.valve import Valve, effective_area
 from plant.helium.properties import Helium, enthalpy_after_isentropic_expansion, entropy_before_expansion
 from plant.numeric import at_least
@@ -32,7 +32,7 @@ class Expansion(NamedTuple):
     """Shaft speed, Hz."""
 
 
-@kernel
+@inlined
 def turbine_flow(turbine: Turbine, opening: float, P_supply: float, T_in: float, density: float) -> tuple[float, float]:
     """Return the mass flow (kg/s) and the pressure between valve and nozzle (Pa).
 
@@ -47,7 +47,7 @@ def turbine_flow(turbine: Turbine, opening: float, P_supply: float, T_in: float,
     return flow, flow * root
 
 
-@kernel
+@inlined
 def expand(turbine: Turbine, h_in: float, P_in: float, P_out: float, helium: Helium) -> Expansion:
     """Return exhaust and speed for gas at `h_in` (J/kg) that expands from `P_in` to `P_out` (Pa).
 

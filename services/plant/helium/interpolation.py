@@ -7,7 +7,7 @@ four). Arguments outside the grid are held at its edge.
 
 from typing import NamedTuple
 
-from coldloop.compiled import kernel
+from coldloop.compiled import inlined
 from plant.numeric import RealArray
 
 # Weights of (left value, left slope, right value, right slope).
@@ -40,7 +40,7 @@ class Surface(NamedTuple):
     """Shape (rows, columns, 4): value, slope along the columns, slope along the rows, mixed slope."""
 
 
-@kernel
+@inlined
 def locate(position: float, start: float, step: float, count: int) -> tuple[int, float]:
     """Return the index of the node to the left of `position` and the fraction of the way to the next."""
     scaled = (position - start) / step
@@ -53,21 +53,21 @@ def locate(position: float, start: float, step: float, count: int) -> tuple[int,
     return index, fraction
 
 
-@kernel
+@inlined
 def hermite_weights(t: float) -> Weights:
     """Return the cubic Hermite weights at the fraction `t` of a step."""
     rest = 1.0 - t
     return (1.0 + 2.0 * t) * rest * rest, t * rest * rest, t * t * (3.0 - 2.0 * t), -t * t * rest
 
 
-@kernel
+@inlined
 def hermite_slope_weights(t: float) -> Weights:
     """Return the derivatives of the cubic Hermite weights with respect to `t`."""
     rest = 1.0 - t
     return -6.0 * t * rest, rest * (1.0 - 3.0 * t), 6.0 * t * rest, t * (3.0 * t - 2.0)
 
 
-@kernel
+@inlined
 def read_curve(nodes: RealArray, index: int, function: int, weights: Weights) -> float:
     """Return one function of a `Curves`, given the interval and the weights within it."""
     left: float = weights[0] * nodes[index, function, 0] + weights[1] * nodes[index, function, 1]
@@ -75,7 +75,7 @@ def read_curve(nodes: RealArray, index: int, function: int, weights: Weights) ->
     return left + right
 
 
-@kernel
+@inlined
 def read_surface(table: Surface, row: float, column: float) -> tuple[float, float]:
     """Return the function's value and its derivative along the columns."""
     nodes = table.nodes
@@ -90,7 +90,7 @@ def read_surface(table: Surface, row: float, column: float) -> tuple[float, floa
     return value, slope / table.column_step
 
 
-@kernel
+@inlined
 def _between_rows(nodes: RealArray, row: int, column: int, across: Weights) -> tuple[float, float]:
     """Return the value and the slope along the columns, at a column of nodes and between two rows."""
     value = across[0] * nodes[row, column, 0] + across[1] * nodes[row, column, 2]

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coldloop.compiled import kernel
+from coldloop.compiled import inlined
 from plant.helium.interpolation import (
     Curves,
     Surface,
@@ -94,7 +94,7 @@ def load_helium() -> Helium:
     )
 
 
-@kernel
+@inlined
 def helium_of(fields: Any) -> Helium:  # noqa: ANN401 - any nesting of tuples
     """Rebuild the tables from nested plain tuples, see `plant.integrator.advance_and_read`."""
     return Helium(
@@ -108,7 +108,7 @@ def helium_of(fields: Any) -> Helium:  # noqa: ANN401 - any nesting of tuples
     )
 
 
-@kernel
+@inlined
 def _departure(P: float, function: int, i: int, weights: Weights, helium: Helium) -> float:
     """Return by how much a function of the isobar differs at `P` (Pa, 5e5 to 19e5) from that at 16 bar."""
     bar = at_most(at_least((P - ISOBAR_PRESSURE) / 1e5, LOWEST_DEPARTURE), HIGHEST_DEPARTURE)
@@ -121,7 +121,7 @@ def _departure(P: float, function: int, i: int, weights: Weights, helium: Helium
     return cubic
 
 
-@kernel
+@inlined
 def supply_enthalpy_and_density(P: float, T: float, helium: Helium) -> tuple[float, float]:
     """Return h (J/kg) and rho (kg/m3) of the high-pressure gas at `P` (Pa, 5e5 to 19e5) and `T` (K, 4 to 350).
 
@@ -141,7 +141,7 @@ def supply_enthalpy_and_density(P: float, T: float, helium: Helium) -> tuple[flo
     return h, rho
 
 
-@kernel
+@inlined
 def supply_cell(P: float, T: float, helium: Helium) -> tuple[float, float, float]:
     """Return what an exchanger cell needs at `P` (Pa) and `T` (K): h (J/kg), rho cp (J/(m3 K)), c_Al (J/(kg K)).
 
@@ -162,7 +162,7 @@ def supply_cell(P: float, T: float, helium: Helium) -> tuple[float, float, float
     return h, rho_cp, c_wall
 
 
-@kernel
+@inlined
 def saturation(P: float, helium: Helium) -> Saturation:
     """Return the properties of boiling helium at `P` (Pa, 0.9e5 to 1.9e5)."""
     table = helium.saturation
@@ -179,7 +179,7 @@ def saturation(P: float, helium: Helium) -> Saturation:
     )
 
 
-@kernel
+@inlined
 def saturation_slopes(P: float, helium: Helium) -> Saturation:
     """Return the derivatives of `saturation` with respect to P, per Pa; outside the table those at its edge."""
     table = helium.saturation
@@ -196,7 +196,7 @@ def saturation_slopes(P: float, helium: Helium) -> Saturation:
     )
 
 
-@kernel
+@inlined
 def vapour_enthalpy_and_cp(P: float, T: float, T_sat: float, table: Surface) -> tuple[float, float]:
     """Return h (J/kg) and cp (J/(kg K)) of the vapour at `P` (Pa, 0.9e5 to 1.9e5) and `T` (K, T_sat to 350).
 
@@ -210,7 +210,7 @@ def vapour_enthalpy_and_cp(P: float, T: float, T_sat: float, table: Surface) -> 
     return h, slope / superheat
 
 
-@kernel
+@inlined
 def vapour_temperature(P: float, h: float, sat: Saturation, helium: Helium) -> float:
     """Return T (K) at `P` (Pa) and `h` (J/kg); with `h` below that of the saturated vapour, the boiling point."""
     if h.real <= sat.h_v.real:
@@ -222,7 +222,7 @@ def vapour_temperature(P: float, h: float, sat: Saturation, helium: Helium) -> f
     return T
 
 
-@kernel
+@inlined
 def enthalpy_after_isentropic_expansion(P: float, s: float, helium: Helium) -> float:
     """Return h (J/kg) at `P` (Pa, 0.9e5 to 1.9e5) and `s` (J/(kg K)); wet vapour follows dh = T ds."""
     sat = saturation(P, helium)
@@ -233,7 +233,7 @@ def enthalpy_after_isentropic_expansion(P: float, s: float, helium: Helium) -> f
     return h
 
 
-@kernel
+@inlined
 def entropy_before_expansion(P: float, h: float, helium: Helium) -> float:
     """Return s (J/(kg K)) at `P` (Pa, 1e5 to 16e5) and `h` (J/kg, 36e3 to 528e3, that is 10 to 100 K at 16 bar)."""
     log_pressure = np.log(at_least(P, 1.0))

@@ -33,7 +33,7 @@ def next_frame(buffer: bytearray, position: int) -> Frame | None:
     """Return the frame that begins at `position`, or None while it has not arrived whole.
 
     Raises:
-        MalformedFrameError: What stands there is no MBAP header.
+        MalformedFrameError: What is there is no MBAP header.
     """
     if len(buffer) - position < _PREFIX.size:
         return None

@@ -8,7 +8,7 @@ from pymodbus.pdu import DecodePDU, ModbusPDU
 
 
 class RawPdu(ModbusPDU):
-    """A request or response: `payload` is what stands behind the function code."""
+    """A request or response: `payload` is what follows the function code."""
 
     def __init__(self, function: int, payload: bytes) -> None:
         super().__init__(dev_id=1)

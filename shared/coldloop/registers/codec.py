@@ -12,7 +12,7 @@ R = TypeVar("R", bound=tuple[Any, ...])
 
 
 class WordOrder(StrEnum):
-    """Which half of a 32-bit value stands at the lower address."""
+    """Which half of a 32-bit value is at the lower address."""
 
     HIGH_FIRST = "high-first"
     LOW_FIRST = "low-first"  # the habit of Schneider's PLCs
@@ -70,7 +70,7 @@ class RecordCodec:
         return self._values.pack(record if self._flat else self._flattened(record))
 
     def decode(self, data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[Any, ...]:
-        """Return the record that stands in `data` at `offset` (bytes)."""
+        """Return the record in `data` at `offset` (bytes)."""
         values = self._values.unpack(data, offset)
         return self._record(*(values if self._flat else self._nested(values)))
 

@@ -21,7 +21,7 @@ class Mode(IntEnum):
     MPC = 1
     """A sequence, within the updating period that it was sent for."""
     CLASSICAL = 2
-    """Two PI loops; CV155 stands."""
+    """Two PI loops; CV155 is fixed."""
     REST = 3
     """The rest of a sequence: the next one is late."""
     MANUAL = 4
@@ -111,7 +111,7 @@ class LinkCause(IntEnum):
     """This program stood still for a tick or more."""
     LEAPT = 10
     """The tick of the rack leapt, or went back."""
-    STANDS = 11
+    STOPPED = 11
     """The tick of the rack does not move."""
     STARTED = 12
     PACE = 13
@@ -146,7 +146,7 @@ class Status(NamedTuple):
 
 
 class LadderStatus(NamedTuple):
-    """Where the fail-safe ladder stands, and what it knows of those it depends on."""
+    """Step of the fail-safe ladder, and what it knows of those it depends on."""
 
     mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops, 3 rest of a sequence, 4 manual", values=Mode)]
     cause: Annotated[
@@ -243,7 +243,7 @@ class Operator(NamedTuple):
 class SequenceHeader(NamedTuple):
     """Describes the sequence in the spare buffer; writing it commits the sequence.
 
-    It stands right before the buffer: header and rows of a short sequence fit into one request.
+    It is right before the buffer: header and rows of a short sequence fit into one request.
     """
 
     number: Annotated[int, u32("Number of the sequence, rising")]
@@ -278,7 +278,7 @@ class PlantLinkStatus(NamedTuple):
         int,
         u16(
             "0 none, 1 no answer, 2 damaged, 3 not finite, 4 wrong session, 5 untimely, 6 changed, 7 second master, "
-            "8 refused, 9 overslept, 10 leapt, 11 stands, 12 started, 13 pace",
+            "8 refused, 9 overslept, 10 leapt, 11 stopped, 12 started, 13 pace",
             values=LinkCause,
         ),
     ] = LinkCause.NONE

@@ -1,0 +1,243 @@
+"""The best sequence of updating periods in hindsight, by a beam search in the closed loop.
+
+A recorded hour is cut at its load steps and `SETTLING_S` after each. In each segment the updating period is one of
+`PERIODS_S`, and a load step always interrupts. A branch is the whole loop: plant, control PLC and optimiser. At the
+end of each segment every branch of the beam is continued with every period, and of those whose last period is the same
+the `WIDTH` of the lowest cost so far are kept: what a period does shows in the segment after it, so branches are not
+compared with each other before. It is dynamic programming with the last period for a state, which the loop's state is
+not: a search and no bound. What it gives is the cost of a sequence that exists, and another one may cost less.
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Final, Protocol, Self, TypeVar
+
+from coldloop.lti_model import load
+from coldloop.process import TICK_S, TICKS_PER_SAMPLE
+from coldloop.registers.codec import as_transmitted
+from coldloop.registers.control_plc import Verdict
+from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
+from coldloop.registers.plant import LoadStep, Measurement, PlantSample
+from control_plc.runtime import make_program as make_control_program
+from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.updating_period import Assessment, Observation, assess
+from plant.kinds import plant_maker
+from plant.program import LoadProfile
+from plant.runtime import own_header
+from rig.indicators import StageCost
+from rig.recording import Recorder, SampleBlock
+from rig.scenario import Scenario
+from rig.settings import Settings
+
+PERIODS_S: Final = (1.0, 1.5, 2.5, 5.0)
+SETTLING_S: Final = 20.0
+WIDTH: Final = 1
+
+
+class Objective(StrEnum):
+    """What is to be low."""
+
+    CLOSED_LOOP = "J_BF"
+    OPEN_LOOP = "J_open_mean"
+
+
+class Branch(Protocol):
+    """One way that a run may have gone so far."""
+
+    @property
+    def cost(self) -> float:
+        """What is to be low, so far."""
+
+    def fork(self) -> Self:
+        """Return a branch that goes on from here by itself."""
+
+    def advance(self, choice: int, until: int) -> None:
+        """Go on to the tick `until` with this choice."""
+
+
+B = TypeVar("B", bound=Branch)
+
+
+def beam_search(root: B, choices: int, boundaries: Sequence[int], width: int) -> tuple[tuple[int, ...], B]:
+    """Return the choices, one a segment, of the branch that costs least at the end, and this branch.
+
+    Args:
+        root: The beginning.
+        choices: How many there are in each segment.
+        boundaries: Tick at which each segment ends.
+        width: Branches kept for each last choice; of equal ones those with the lower choices.
+    """
+    beam: list[tuple[tuple[int, ...], B]] = [((), root)]
+    for until in boundaries:
+        longer = []
+        for choice in range(choices):
+            alike = [((*taken, choice), branch.fork()) for taken, branch in beam]
+            for _, branch in alike:
+                branch.advance(choice, until)
+            longer += sorted(alike, key=_cost_and_choices)[:width]
+        beam = longer
+    return min(beam, key=_cost_and_choices)
+
+
+def _cost_and_choices(one: tuple[tuple[int, ...], Branch]) -> tuple[float, tuple[int, ...]]:
+    return one[1].cost, one[0]
+
+
+def segment_ends(load_profile: LoadProfile, ticks: int) -> list[int]:
+    """Return the tick at which each segment ends: load steps, `SETTLING_S` after each, and the end of the run.
+
+    No segment is shorter than an updating period of 5 s may be.
+    """
+    settling = round(SETTLING_S / TICK_S)
+    steps = [tick for tick in load_profile.times if tick < ticks]
+    ends = sorted({*steps[1:], *(tick + settling for tick in steps)})
+    kept = [tick for tick in ends if tick in steps or all(abs(tick - step) >= TICKS_PER_SAMPLE for step in steps)]
+    return [*(tick for tick in kept if 0 < tick <= ticks - TICKS_PER_SAMPLE), ticks]
+
+
+@dataclass
+class ChosenIterations:
+    """A rule that does what it is told."""
+
+    iterations: int
+
+    @property
+    def first(self) -> int:
+        """What was chosen."""
+        return self.iterations
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """It shows as a fixed period."""
+        return UpdatingRuleStatus(UpdatingRuleKind.FIXED, self.iterations, self.iterations, self.iterations)
+
+    def after_interruption(self) -> int:
+        """Return what was chosen."""
+        return self.iterations
+
+    def next(self, observation: Observation) -> tuple[int, Assessment]:
+        """Return what was chosen."""
+        return self.iterations, assess(observation)
+
+
+class LoopBranch:
+    """The three programs in one process, with what they have cost so far; steps as `rig.one_process` does."""
+
+    def __init__(
+        self, settings: Settings, scenario: Scenario, objective: Objective, recorder: Recorder | None = None
+    ) -> None:
+        header, model = own_header(settings.model.file), load(settings.model.file)
+        program = settings.optimizer_plc.program
+        steps = [as_transmitted(LoadStep(*step)) for step in zip(scenario.load.times, scenario.load.watts, strict=True)]
+        profile = LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
+        self._recorder = recorder
+        self._plant = plant_maker(header, settings.plant)(profile, scenario.seed)
+        self._control = make_control_program(header, settings.control_plc, settings.limits)
+        self._optimizer = OptimizerProgram(model, program, settings.limits)
+        self._iterations = [self._optimizer.budget.iterations(round(period / TICK_S)) for period in PERIODS_S]
+        self._rule = ChosenIterations(self._iterations[0])
+        self._optimizer.restart(0.0, self._rule)
+        self._control.restart(session=1)
+        self._sums = CostSums(StageCost(model, program.design))
+        self._objective = objective
+        if recorder is not None:
+            recorder.begin()
+
+    @property
+    def cost(self) -> float:
+        """The objective, so far."""
+        return self._sums.closed_loop if self._objective is Objective.CLOSED_LOOP else self._sums.open_loop
+
+    def fork(self) -> Self:
+        """Return a copy."""
+        return copy.deepcopy(self)
+
+    def advance(self, choice: int, until: int) -> None:
+        """Go on to `until`; periods that begin from now on are of the choice."""
+        self._rule.iterations = self._iterations[choice]
+        while self._plant.tick < until:
+            if self._control.awaiting_sequence:
+                self._deliver()
+            self._scan()
+        self._sums.settle()
+
+    def _deliver(self) -> None:
+        answer = self._control.offer(self._optimizer.solve())
+        update = as_transmitted(self._optimizer.report(Verdict(answer.verdict)))
+        self._sums.update(update)
+        if self._recorder is not None:
+            self._recorder.update(update)
+
+    def _scan(self) -> None:
+        plant = self._plant
+        actuators = as_transmitted(self._control.begin_scan())
+        u = actuators[1:4]
+        plant.apply(u)
+        measurement = as_transmitted(
+            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session)
+        )
+        sample = PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x)
+        self._sums.sample(sample)
+        if self._recorder is not None:
+            self._recorder.sample(sample)
+        plant.advance()
+        update = self._control.end_scan(measurement)
+        if update is not None:
+            self._control.accept_plan(as_transmitted(self._optimizer.plan(as_transmitted(update))))
+
+
+class CostSums:
+    """J_BF and J_open_mean of a run so far, as `rig.indicators` sums them at its end."""
+
+    def __init__(self, stage_cost: StageCost) -> None:
+        self._stage_cost = stage_cost
+        self._samples: list[PlantSample] = []
+        self._stage_costs = self._weighted = 0.0
+        self._delivered = 0
+        self._pending: Optimization | None = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Return a copy; stage costs and records never change."""
+        twin = copy.copy(self)
+        twin._samples = self._samples.copy()  # noqa: SLF001 its own class
+        return twin
+
+    @property
+    def closed_loop(self) -> float:
+        """J_BF up to the last `settle`."""
+        return self._stage_costs / TICKS_PER_SAMPLE
+
+    @property
+    def open_loop(self) -> float:
+        """J_open_mean of the updates that were delivered and not cut off."""
+        return self._weighted / self._delivered if self._delivered else 0.0
+
+    def sample(self, sample: PlantSample) -> None:
+        """Take a tick."""
+        self._samples.append(sample)
+
+    def settle(self) -> None:
+        """Add up the ticks taken."""
+        if self._samples:
+            self._stage_costs += float(self._stage_cost.of(SampleBlock.of(self._samples)).sum())
+            self._samples = []
+
+    def update(self, update: Optimization) -> None:
+        """Take an update; it counts when the next one shows that it was not cut off."""
+        last, self._pending = self._pending, update
+        if last is not None and update.tick >= last.tick + last.tau_u:
+            end = last.tick + last.tau_u
+            self._weighted += (last.j_dev + last.j_cst) * (end - self._delivered)
+            self._delivered = end
+
+
+def run_best_in_hindsight(settings: Settings, scenario: Scenario, recorder: Recorder, objective: Objective) -> None:
+    """Search the best sequence of periods of a scenario, then do this run once more for the record."""
+    ends = segment_ends(scenario.load, scenario.ticks)
+    root = LoopBranch(settings, scenario, objective)
+    taken, _ = beam_search(root, len(PERIODS_S), ends, WIDTH)
+    best = LoopBranch(settings, scenario, objective, recorder)
+    for choice, until in zip(taken, ends, strict=True):
+        best.advance(choice, until)

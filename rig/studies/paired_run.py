@@ -1,0 +1,95 @@
+"""A solver and the problems of a converged loop, one after the other: what `rig.studies.open_loop` compares."""
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optimizer_plc.budget import PlcBudget
+from optimizer_plc.costs import indicators
+from optimizer_plc.settings import ProgramSettings, SolverName
+from optimizer_plc.solvers import Solver, make_solver
+from rig.indicators import Indicators
+from rig.studies.problem_sequence import ProblemSequence
+
+Array = NDArray[np.float64]
+Columns = dict[str, list[float]]
+
+INTERIOR_POINT_ITERATIONS: Final = (2, 4, 6, 8)
+"""Counts of the interior-point solver whose PLC time every solver gets on a harsh problem."""
+HARSH: Final = 10.0
+"""A problem is harsh when its guess costs more than this times the lowest cost."""
+FLOOR: Final = 1.0
+"""Cost added to both, as the program adds it: in quiet a ratio of nearly nothing to nearly nothing says nothing."""
+SETTLING: Final = {SolverName.QPOASES: 500, SolverName.OSQP: 400}
+"""Iterations after each problem for solvers that keep something of it, so that harsh problems find them settled."""
+
+
+def paired_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
+    """Let a solver go through all problems with its own hot starts; return costs as played, a row a problem."""
+    solver, problem = make_solver(program), sequence.problem
+    z = problem.hold(np.zeros(len(problem.design.input_scale)))
+    columns: Columns = {name: [] for name in ("iterations", "j_dev", "j_cst", "violation", "lowest")}
+    for (situation, _), lowest in zip(sequence.recorded, sequence.lowest.tolist(), strict=True):
+        qp, ticks = problem.at(situation), situation.elapsed_ticks
+        solver.start(qp, problem.shifted(z, ticks))
+        done = solver.iterate(PlcBudget(program.budget, solver.tau_1_s).iterations(ticks))
+        z = solver.solution
+        cost = sequence.profiles.cost(qp, z, situation)
+        violation = float(indicators(problem, qp, z, situation).violation)
+        for name, value in zip(columns, (done, *cost, violation, lowest), strict=True):
+            columns[name].append(float(value))
+    return columns
+
+
+def harsh_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
+    """Let a solver begin each harsh problem at the same guess; return its costs after equal PLC times.
+
+    The guess is the shifted profile that the converged loop played; `count_2` ... say how many iterations the time of
+    2, 4, 6 and 8 of the interior-point solver holds, `after_2` ... what the profile then costs.
+    """
+    solver, problem = make_solver(program), sequence.problem
+    counts = equal_counts(program, solver)
+    names = ("lowest", "guess", *(f"{what}_{k}" for k in counts for what in ("count", "after")))
+    columns: Columns = {name: [] for name in names}
+    before = problem.hold(np.zeros(len(problem.design.input_scale)))
+    for (situation, z), lowest in zip(sequence.recorded, sequence.lowest.tolist(), strict=True):
+        qp = problem.at(situation)
+        guess = problem.shifted(before, situation.elapsed_ticks)
+        at_guess = sequence.profiles.cost(qp, guess, situation).total
+        before, settling = z, SETTLING.get(program.solver, 0)
+        harsh = at_guess + FLOOR > HARSH * (lowest + FLOOR)
+        if not harsh and not settling:
+            continue
+        solver.start(qp, guess)
+        if harsh:
+            row = [lowest, at_guess]
+            done = 0
+            for count in counts.values():
+                solver.iterate(count - done)
+                done = count
+                row += [count, sequence.profiles.cost(qp, solver.solution, situation).total]
+            for name, value in zip(columns, row, strict=True):
+                columns[name].append(float(value))
+        solver.iterate(settling)
+    return columns
+
+
+def equal_counts(program: ProgramSettings, solver: Solver) -> dict[int, int]:
+    """Return the iterations of a solver that take as long as 2, 4, 6 and 8 of the interior-point solver."""
+    iteration_s = program.interior_point.tau_1_s
+    return {k: math.floor(k * iteration_s / solver.tau_1_s + 1e-9) for k in INTERIOR_POINT_ITERATIONS}
+
+
+def paired_indicators(columns: Columns, period_s: float) -> Indicators:
+    """Return the indicators that problems without a loop have; the others are not numbers."""
+    if not columns.get("j_dev"):
+        return Indicators._make(math.nan for _ in Indicators._fields)
+    j_dev, j_cst, violation = (np.array(columns[name]) for name in ("j_dev", "j_cst", "violation"))
+    known: dict[str, float] = {
+        "J_dev": float(j_dev.sum()), "J_cst": float(j_cst.sum()), "J_open_mean": float((j_dev + j_cst).mean()),
+        "c1": float(violation.max()), "c2": float(violation.mean()), "tau_u_mean": period_s,
+        "tau_u_mean_per_update": period_s, "iterations_total": round(sum(columns["iterations"])),
+    }  # fmt: skip
+    return Indicators._make(known.get(name, math.nan) for name in Indicators._fields)

@@ -1,0 +1,86 @@
+"""One sequence of problems for all solvers: those of a converged closed loop, with the lowest cost of each."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.config import load_configuration
+from coldloop.lti_model import load as load_model
+from coldloop.sequence import InputSequence
+from optimizer_plc.prediction import PredictionModel
+from optimizer_plc.problem import PredictiveProblem, Situation
+from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.updating_period import UpdatingRule
+from rig.one_process import OneProcessRig
+from rig.recording import Recorder
+from rig.scenario import Scenario
+from rig.settings import Settings
+from rig.studies.played_profiles import PlayedProfiles
+
+Array = NDArray[np.float64]
+
+OF_THE_SOLVER: Final = ("optimizer_plc.program.solver=", "optimizer_plc.program.budget.")
+"""Settings that differ between the requests that one sequence serves."""
+CONVERGED: Final = ("optimizer_plc.program.solver=daqp", "optimizer_plc.program.budget.preparation_slots=0")
+
+
+class Recorded(NamedTuple):
+    """A problem of the converged loop."""
+
+    situation: Situation
+    z: Array
+    """The profile that the loop delivered: the optimum of the quadratic problem."""
+
+
+class ProblemSequence(NamedTuple):
+    """Problems in their order."""
+
+    problem: PredictiveProblem
+    profiles: PlayedProfiles
+    recorded: Sequence[Recorded]
+    lowest: Array
+    """The lowest cost of a profile that can be played, for each problem."""
+
+
+class _ListeningOptimizer(OptimizerProgram):
+    """Keeps the situation and the profile of every problem."""
+
+    def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
+        """Begin anew."""
+        self.heard: list[Recorded] = []
+        super().restart(updating_period_s, rule)
+
+    def solve(self) -> InputSequence:
+        """Solve, and keep what was solved."""
+        sequence = super().solve()
+        if self.state.sent is not None:
+            self.heard.append(Recorded(self.state.sent.situation, self.state.sent.z))
+        return sequence
+
+
+def problem_sequence(scenario: Scenario, assignments: tuple[str, ...]) -> ProblemSequence:
+    """Return the problems of a scenario, whichever solver is asked for; a worker keeps those of its last two."""
+    return _recorded(scenario, tuple(one for one in assignments if not one.startswith(OF_THE_SOLVER)))
+
+
+@lru_cache(maxsize=2)
+def _recorded(scenario: Scenario, assignments: tuple[str, ...]) -> ProblemSequence:
+    settings = load_configuration(Settings, environment={}, assignments=(*assignments, *CONVERGED)).settings
+    program = settings.optimizer_plc.program
+    model = load_model(settings.model.file)
+    rig = OneProcessRig(settings, compiled=False)
+    listening = rig.optimizer = _ListeningOptimizer(model, program, settings.limits)
+    rig.run(scenario, Recorder(scenario.ticks, []))
+    problem = PredictiveProblem(PredictionModel(model), program.design, settings.limits)
+    profiles = PlayedProfiles(problem)
+    return ProblemSequence(problem, profiles, listening.heard, np.array([
+        _lowest(problem, profiles, recorded.situation) for recorded in listening.heard
+    ]))  # fmt: skip
+
+
+def _lowest(problem: PredictiveProblem, profiles: PlayedProfiles, situation: Situation) -> float:
+    qp = problem.at(situation)
+    return profiles.cost(qp, profiles.optimum(qp, situation), situation).total

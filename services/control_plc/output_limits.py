@@ -1,0 +1,175 @@
+"""The arithmetic of the output guard: bounds, rate window, slew limit, on numbers and sequences of numbers.
+
+Plain Python, for the control PLC has no numba; the rig compiles these very functions. Outputs are in the order
+(CV155 %, NCR22_A W, CV156 %).
+"""
+
+import math
+from collections.abc import MutableSequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from coldloop.limits import InputLimits, RateReference
+from coldloop.process import TICKS_PER_SAMPLE
+from coldloop.single_precision import neighbour, single
+from control_plc.numbers import Numbers, Rows
+
+TOLERANCE: Final = 1e-5
+"""Share of an input's range by which a sequence may miss a limit: single precision cannot tell it apart. The guard
+itself allows nothing."""
+ROUNDING_STEPS: Final = 4
+"""Neighbours that are tried when rounding to single precision has crossed a limit; one or two will do."""
+NEVER: Final = -(2**40)
+"""Tick of a change that did not happen."""
+
+
+class Limits(NamedTuple):
+    """`InputLimits` as plain numbers."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    rate: tuple[float, float, float]
+    """Largest change in a sampling period of 5 s."""
+    slack: tuple[float, float, float]
+    """By which a sequence may miss a bound or a rate."""
+    slew_ticks: int
+    """Within fewer ticks than this an output moves by at most its rate."""
+    elapsed: bool
+    """The rate of an update is scaled by the time since the outputs last moved."""
+
+
+def plain(limits: InputLimits) -> Limits:
+    """Return limits as plain numbers."""
+    slack = [TOLERANCE * (high - low) for low, high in zip(limits.low, limits.high, strict=True)]
+    elapsed = limits.rate_reference is RateReference.ELAPSED
+    return Limits(limits.low, limits.high, limits.rate, (slack[0], slack[1], slack[2]), limits.slew_ticks, elapsed)
+
+
+@dataclass(slots=True)
+class GuardState:
+    """What the guard remembers.
+
+    The rate window: outputs may stray from `anchor` by `share` of the rate until it ends, one sampling period of 5 s
+    after `start` or when the next sequence begins.
+    """
+
+    applied: MutableSequence[float]
+    """Outputs applied, shape (3,)."""
+    anchor: MutableSequence[float]
+    """Outputs applied before the window began, shape (3,)."""
+    moves: MutableSequence[int]
+    """Tick of each of the last changes, in turn, shape (slew_ticks,)."""
+    before: MutableSequence[MutableSequence[float]]
+    """What was applied before each of them, shape (slew_ticks, 3)."""
+    start: int = 0
+    share: float = 1.0
+    """Depends on how long before the window the outputs last moved."""
+    moved: int = -TICKS_PER_SAMPLE
+    """Tick of the last change."""
+    changes: int = 0
+    """Number of changes so far."""
+    astray: bool = False
+    """What was applied when the guard began is outside the bounds."""
+
+
+def beginning(limits: Limits, applied: Numbers) -> GuardState:
+    """Return the state in which `applied` has stood for ever."""
+    slots = range(limits.slew_ticks)
+    return GuardState(list(applied), list(applied), [NEVER for _ in slots], [list(applied) for _ in slots])
+
+
+def copy_state(source: GuardState, target: GuardState, limits: Limits) -> None:
+    """Make `target` the same as `source`."""
+    for i in range(3):
+        target.applied[i], target.anchor[i] = source.applied[i], source.anchor[i]
+    for slot in range(limits.slew_ticks):
+        target.moves[slot] = source.moves[slot]
+        for i in range(3):
+            target.before[slot][i] = source.before[slot][i]
+    target.start, target.share = source.start, source.share
+    target.moved, target.changes, target.astray = source.moved, source.changes, source.astray
+
+
+def rate_share(limits: Limits, elapsed_ticks: int) -> float:
+    """Return the share of the rate that an update may use so many ticks after the one before."""
+    return min(1.0, elapsed_ticks / TICKS_PER_SAMPLE) if limits.elapsed else 1.0
+
+
+def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update: bool) -> None:  # noqa: FBT001 compiled
+    """Apply `wanted` (3) at `tick` as far as it may be; `update` tells that a sequence begins there."""
+    applied = state.applied
+    if update or tick - state.start >= TICKS_PER_SAMPLE:
+        state.share = rate_share(limits, tick - state.moved)
+        state.start = tick
+        for i in range(3):
+            state.anchor[i] = applied[i]
+    same = wanted[0] == applied[0] and wanted[1] == applied[1] and wanted[2] == applied[2]
+    if same and not state.astray:  # it was admitted before, and a new window begins with it
+        return
+    a, b, c = (
+        nearest(state, limits, tick, wanted[0], 0),
+        nearest(state, limits, tick, wanted[1], 1),
+        nearest(state, limits, tick, wanted[2], 2),
+    )
+    if not (a == applied[0] and b == applied[1] and c == applied[2]):
+        slot = state.changes % limits.slew_ticks
+        state.moves[slot] = state.moved = tick
+        for i in range(3):
+            state.before[slot][i] = applied[i]
+        state.changes += 1
+        applied[0], applied[1], applied[2] = a, b, c
+    if state.astray:
+        state.astray = not in_range(limits, applied)
+
+
+def nearest(state: GuardState, limits: Limits, tick: int, wanted: float, i: int) -> float:
+    """Return the single-precision value of output `i` nearest to `wanted` inside its bounds and within reach.
+
+    A value that is not finite asks for the window's anchor. From an anchor outside the bounds it goes towards them, as
+    far as it may.
+    """
+    anchor, applied = state.anchor[i], state.applied[i]
+    if not math.isfinite(wanted):
+        wanted = anchor
+    reach, rate = limits.rate[i] * state.share, limits.rate[i]
+    down, up = max(anchor - reach, applied - reach), min(anchor + reach, applied + reach)
+    for slot in range(limits.slew_ticks):
+        if tick - state.moves[slot] < limits.slew_ticks:
+            down, up = max(down, state.before[slot][i] - rate), min(up, state.before[slot][i] + rate)
+    low, high = limits.low[i], limits.high[i]
+    lowest, highest = min(max(low, down), up), max(min(high, up), down)
+    inside = low <= anchor <= high
+    value = single(min(max(wanted, lowest), highest))
+    for _ in range(ROUNDING_STEPS):
+        if (low <= value <= high or not inside) and is_reached(state, limits, tick, value, i):
+            return value
+        value = neighbour(value, anchor)  # rounding has crossed a limit
+    return applied
+
+
+def is_reached(state: GuardState, limits: Limits, tick: int, value: float, i: int) -> bool:
+    """Tell whether a value of output `i` is within reach of all that it counts from."""
+    reach, rate = limits.rate[i] * state.share, limits.rate[i]
+    reached = abs(value - state.anchor[i]) <= reach and abs(value - state.applied[i]) <= reach
+    for slot in range(limits.slew_ticks):
+        if tick - state.moves[slot] < limits.slew_ticks:
+            reached = reached and abs(value - state.before[slot][i]) <= rate
+    return reached
+
+
+def in_range(limits: Limits, row: Numbers) -> bool:
+    """Tell whether the outputs (3) are finite and inside the bounds, but for the slack."""
+    inside = True
+    for i in range(3):
+        inside = inside and limits.low[i] - limits.slack[i] <= row[i] <= limits.high[i] + limits.slack[i]
+    return inside
+
+
+def admits(state: GuardState, limits: Limits, first_tick: int, rows: Rows, length: int) -> bool:
+    """Tell whether a sequence of `length` rows, one a tick, would be applied as it is; `state` moves along with it."""
+    for k in range(length):
+        admit(state, limits, first_tick + k, rows[k], k == 0)
+        for i in range(3):
+            if abs(state.applied[i] - rows[k][i]) > limits.slack[i]:
+                return False
+    return True

@@ -1,0 +1,168 @@
+"""The compiled loop and the programs leave the same trace, the same updates and the same events."""
+
+import math
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import rig.compiled.portable  # noqa: F401 lets numba compile what is plain Python
+from coldloop.config import load_configuration
+from coldloop.limits import InputLimits, RateReference
+from coldloop.single_precision import neighbour, single
+from control_plc.output_limits import admit, beginning, plain
+from plant.load import find_load
+from plant.program import LoadProfile
+from rig.compiled.control import guard_records
+from rig.compiled.stretches import CompiledStretches, Stretch
+from rig.one_process import OneProcessRig
+from rig.recording import MemorySink, Recorder
+from rig.scenario import Scenario
+from rig.settings import Settings
+
+PROGRAM = "optimizer_plc.program."
+NOISE = ("plant.sensors.level=0.02", "plant.sensors.speed=0.5", "plant.sensors.temperature=0.02")
+COMPILED = {
+    "adaptive": (),
+    "fixed": (f"{PROGRAM}updating_period_s=2.5",),
+    "contraction": (f'{PROGRAM}adaptive.rule="contraction"',),
+    "noise": NOISE,
+    "state-feedback": (f'{PROGRAM}estimator.kind="state-feedback"',),
+    "rates that count elapsed time": ('limits.rate_reference="elapsed"',),
+    "long sequences": (f"{PROGRAM}sequence_ticks=240",),
+    "a fast PLC": (f"{PROGRAM}budget.power=10",),
+}
+"""Whose updates are compiled too."""
+LEFT_TO_PROGRAMS = {
+    "single precision": (f'{PROGRAM}arithmetic="float32"',),
+    "fast gradient": (f'{PROGRAM}solver="fast-gradient"',),
+    "interior point": (f'{PROGRAM}solver="interior-point"', f"{PROGRAM}updating_period_s=5"),
+    "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
+    "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
+    "qpoases": (f'{PROGRAM}solver="qpoases"',),
+    "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
+}
+"""Whose ticks alone are compiled, where that is worth while."""
+UNUSUAL = {
+    "narrow alarm bands": ("control_plc.alarms.level_band=[59.9,60.1]", "control_plc.alarms.t5_band=[12,13]"),
+    "sensors out of range": ("control_plc.sensors.level=[59.9,60.1]",),
+    "sensors that freeze soon": ("control_plc.sensors.frozen_s=0.5",),
+    "sequences that are refused": ("limits.slew_s=4",),
+    "an impatient watchdog": ("control_plc.ladder.optimizer_timeout_s=2",),
+    "the classical loops": ('control_plc.driver="classical"',),
+}
+"""What leads back to the programs in some of the ticks, or in all of them."""
+
+
+class Left(NamedTuple):
+    """What a run leaves behind."""
+
+    trace: str
+    updates: list[Any]
+    events: list[Any]
+
+
+@pytest.fixture(scope="module")
+def lively(mean_load: float) -> LoadProfile:
+    """A load that moves from the first minute on."""
+    e = find_load("e", mean_load)
+    return LoadProfile((0, *(time - e.times[1] + 60 for time in e.times[1:])), e.watts)
+
+
+def left_by(assignments: tuple[str, ...], load: LoadProfile, ticks: int, *, compiled: bool) -> Left:
+    chosen = load_configuration(Settings, environment={}, assignments=assignments).settings
+    sink = MemorySink()
+    recorder = Recorder(ticks, [sink])
+    period_s = chosen.optimizer_plc.program.updating_period_s
+    OneProcessRig(chosen, compiled=compiled).run(Scenario(ticks, load, period_s, seed=3), recorder)
+    recorder.close()
+    recording = sink.recording(recorder.link)
+    events = [(service, event.tick, event.kind, event.subject, event.cause) for service, event in sink.events]
+    return Left(recording.trace_sha256, recording.updates, events)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*COMPILED, *LEFT_TO_PROGRAMS, *UNUSUAL])
+def test_the_compiled_loop_leaves_what_the_programs_leave(name: str, lively: LoadProfile) -> None:
+    assignments = (COMPILED | LEFT_TO_PROGRAMS | UNUSUAL)[name]
+    assert left_by(assignments, lively, 1500, compiled=True) == left_by(assignments, lively, 1500, compiled=False)
+
+
+def done_by_the_loop(monkeypatch: pytest.MonkeyPatch, assignments: tuple[str, ...], load: LoadProfile) -> int:
+    """Return how many of 600 ticks the compiled loop did."""
+    ticks = 0
+    original = CompiledStretches.ahead
+
+    def counted(self: CompiledStretches, until: int) -> Stretch | None:
+        nonlocal ticks
+        stretch = original(self, until)
+        ticks += len(stretch.block.load) if stretch else 0
+        return stretch
+
+    monkeypatch.setattr(CompiledStretches, "ahead", counted)
+    left_by(assignments, load, 600, compiled=True)
+    return ticks
+
+
+def test_nearly_all_ticks_of_an_ordinary_run_are_compiled(monkeypatch: pytest.MonkeyPatch, lively: LoadProfile) -> None:
+    assert done_by_the_loop(monkeypatch, (), lively) > 550
+
+
+def test_nothing_is_compiled_while_the_classical_loops_drive(
+    monkeypatch: pytest.MonkeyPatch, lively: LoadProfile
+) -> None:
+    assert not done_by_the_loop(monkeypatch, UNUSUAL["the classical loops"], lively)
+
+
+# -- arithmetic that is plain Python in the control PLC ----------------------------------------------------------------
+
+
+@numba.njit
+def compiled_single(value: float) -> float:
+    return single(value)
+
+
+@numba.njit
+def compiled_neighbour(value: float, target: float) -> float:
+    return neighbour(value, target)
+
+
+@numba.njit
+def compiled_admit(guard: Any, limits: Any, tick: int, wanted: Any, update: bool) -> None:  # noqa: ANN401, FBT001 a kernel
+    admit(guard[0], limits, tick, wanted, update)
+
+
+values = st.floats(-1e30, 1e30) | st.floats(0.0, 200.0, width=32) | st.just(0.0)
+
+
+@given(value=values, target=values)
+def test_single_precision_is_the_same_compiled(value: float, target: float) -> None:
+    assert compiled_single(value) == single(value)
+    own = single(value)
+    assert compiled_neighbour(own, target) == neighbour(own, target)
+    assert math.copysign(1.0, compiled_neighbour(own, target)) == math.copysign(1.0, neighbour(own, target))
+
+
+anything = st.floats(-20.0, 180.0) | st.floats(allow_nan=True, allow_infinity=True)
+scans = st.lists(st.tuples(st.tuples(anything, anything, anything), st.booleans(), st.integers(1, 30)), max_size=30)
+
+
+@settings(max_examples=100)
+@given(history=scans, slew_s=st.sampled_from([0.25, 0.5, 2.0, 5.0]), reference=st.sampled_from(RateReference))
+def test_the_guard_is_the_same_compiled(
+    history: list[tuple[tuple[float, float, float], bool, int]], slew_s: float, reference: RateReference
+) -> None:
+    limits = plain(InputLimits(slew_s=slew_s, rate_reference=reference))
+    state = beginning(limits, (43.0, 75.0, 36.0))
+    records, tick = guard_records(state), 0
+    for wanted, update, ticks in history:
+        for repetition in range(ticks):
+            began = update and repetition == 0
+            admit(state, limits, tick, wanted, began)
+            compiled_admit(records, limits, tick, np.array(wanted), began)
+            assert records[0]["applied"].tolist() == list(state.applied)
+            assert (records[0]["share"], records[0]["moved"]) == (state.share, state.moved)
+            tick += 1

@@ -1,0 +1,153 @@
+"""The indicators of a run, computed by hand: costs of what was reached, of what was predicted, bands and periods."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coldloop.lti_model import LtiModel, load
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process import L1, STATE_NAMES, T5
+from coldloop.registers.control_plc import Verdict
+from coldloop.registers.optimizer_plc import Optimization
+from optimizer_plc.design import ControlDesign
+from rig.indicators import Indicators, RunEvaluation, StageCost
+from rig.recording import SampleBlock
+
+DESIGN = ControlDesign()
+PRESSURE, VOLUME, FIRST_TEMPERATURE = 0, 1, 2
+
+
+@pytest.fixture(scope="module")
+def model() -> LtiModel:
+    return load(DEFAULT_MODEL_FILE)
+
+
+def at_rest(model: LtiModel, ticks: int) -> SampleBlock:
+    """Return ticks at the operating point, the level at 60 % and T5 in its band."""
+
+    def rows(value: NDArray[np.float64]) -> NDArray[np.float32]:
+        return np.tile(value.astype(np.float32), (ticks, 1))
+
+    block = SampleBlock(0, np.full(ticks, model.w0, np.float32), rows(model.u0), rows(model.y0), rows(model.x0))
+    block.y[:, L1], block.y[:, T5] = 60.0, 12.0
+    return block
+
+
+def update(tick: int, tau_u: int, j_dev: float, j_cst: float = 0.0, violation: float = 0.0) -> Optimization:
+    """Return an update of which only what indicators read has a meaning; it did 5 iterations."""
+    costs = dict.fromkeys(
+        ("j_effective", "j_hot_start", "j_delivered", "efficiency", "mismatch", "contraction", "gamma"), math.nan
+    )
+    return Optimization(
+        update=tick, tick=tick, tau_u=tau_u, iterations=5, verdict=Verdict.ACCEPTED, j_dev=j_dev, j_cst=j_cst,
+        violation=violation, load_mismatch=0.0, **costs,
+    )  # fmt: skip
+
+
+def evaluated(model: LtiModel, block: SampleBlock, *updates: Optimization) -> Indicators:
+    evaluation = RunEvaluation(model, DESIGN)
+    evaluation.block(block)
+    for each in updates:
+        evaluation.update(each)
+    return evaluation.indicators
+
+
+# -- what was reached -------------------------------------------------------------------------------------------------
+
+
+def test_at_the_operating_point_nothing_costs_anything(model: LtiModel) -> None:
+    assert StageCost(model, DESIGN).of(at_rest(model, 3)) == pytest.approx([0.0] * 3, abs=1e-9)
+
+
+def test_deviations_cost_what_their_weights_say(model: LtiModel) -> None:
+    block = at_rest(model, 8)
+    block.x[0, PRESSURE] += 2000.0  # one unit of pressure: Q = 0.1
+    block.x[1, VOLUME] += 1.0 / model.C[L1, VOLUME]  # as much liquid as 1 % of level: 0.1
+    block.x[2, FIRST_TEMPERATURE] += 1.0  # one of the 26 temperatures: 0.1 / 26
+    block.x[3, FIRST_TEMPERATURE:] += 2.0  # all of them by 2 K: 0.1 * 2^2
+    block.u[4, 0] += 10.0  # CV155: 10^2 / 10^2
+    block.u[5, 1] -= 50.0  # the heater: 50^2 / 50^2
+    block.u[6, 2] += 5.0  # CV156: 5^2 / 10^2
+    cost = StageCost(model, DESIGN).of(block)
+    assert len(STATE_NAMES) == 28
+    assert cost == pytest.approx([0.1, 0.1, 0.1 / 26, 0.4, 1.0, 1.0, 0.25, 0.0], rel=1e-4, abs=1e-9)
+
+
+def test_outside_its_band_an_output_costs_a_hundred_times_the_square_of_the_distance(model: LtiModel) -> None:
+    block = at_rest(model, 6)
+    block.y[:, L1] = [58.5, 59.0, 60.0, 61.0, 61.25, 60.0]  # below by 0.5 %, above by 0.25 %
+    block.y[5, T5] = 8.0  # below by 1 K
+    cost = StageCost(model, DESIGN).of(block)
+    assert cost == pytest.approx([25.0, 0.0, 0.0, 0.0, 6.25, 100.0], abs=1e-4)
+
+
+def test_j_bf_sums_over_sampling_periods_and_bands_count_ticks(model: LtiModel) -> None:
+    block = at_rest(model, 40)  # 10 s: two sampling periods
+    block.y[:10, L1] = 61.5  # 2.5 s at a cost of 25
+    block.y[36:, T5] = 18.0  # 1 s at a cost of 400
+    found = evaluated(model, block)
+    assert pytest.approx((10 * 25.0 + 4 * 400.0) / 20) == found.J_BF
+    assert (found.L1_outside_band_pct, found.T5_outside_band_pct) == (25.0, 10.0)
+
+
+def test_on_the_edge_of_a_band_is_inside(model: LtiModel) -> None:
+    block = at_rest(model, 4)
+    block.y[:, L1] = [59.0, 61.0, 58.999, 61.001]
+    block.y[:, T5] = [9.0, 16.0, 9.0, 16.001]
+    found = evaluated(model, block)
+    assert (found.L1_outside_band_pct, found.T5_outside_band_pct) == (50.0, 25.0)
+
+
+def test_ticks_of_which_nothing_is_known_count_neither_as_inside_nor_as_outside(model: LtiModel) -> None:
+    block = at_rest(model, 8)
+    block.y[0, L1] = 62.0
+    for series in (block.load, block.u, block.y, block.x):
+        series[4:] = np.nan
+    found = evaluated(model, block)
+    assert pytest.approx(100.0 / 20) == found.J_BF
+    assert found.L1_outside_band_pct == 25.0, "one of the four that are known"
+    assert found.T5_outside_band_pct == 0.0
+
+
+# -- what was predicted -----------------------------------------------------------------------------------------------
+
+
+def test_sums_run_over_the_problems_and_the_mean_over_time(model: LtiModel) -> None:
+    """Three problems, delivered after 4, 10 and 20 ticks: they weigh as 4, 6 and 10."""
+    found = evaluated(model, at_rest(model, 20), update(0, 4, 10.0, 1.0), update(4, 6, 20.0), update(10, 10, 5.0, 5.0))
+    assert (found.J_dev, found.J_cst) == (35.0, 6.0)
+    assert found.J_open_mean == pytest.approx((11.0 * 4 + 20.0 * 6 + 10.0 * 10) / 20)
+    assert found.iterations_total == 15
+
+
+def test_a_problem_after_an_interruption_weighs_by_the_time_lost_too(model: LtiModel) -> None:
+    """The update at tick 4 was cut off at tick 7 and left no row: the one from there was delivered at tick 11."""
+    found = evaluated(model, at_rest(model, 11), update(0, 4, 10.0), update(7, 4, 30.0))
+    assert found.J_open_mean == pytest.approx((10.0 * 4 + 30.0 * 7) / 11)
+
+
+def test_c1_is_the_largest_violation_and_c2_the_mean_over_the_problems(model: LtiModel) -> None:
+    found = evaluated(
+        model, at_rest(model, 12), update(0, 4, 1.0, violation=0.5), update(4, 4, 1.0, violation=3.0),
+        update(8, 4, 1.0, violation=0.1),
+    )  # fmt: skip
+    assert found.c1 == 3.0
+    assert found.c2 == pytest.approx(3.6 / 3)
+
+
+def test_the_mean_period_is_that_over_time_and_the_one_per_update_is_beside_it(model: LtiModel) -> None:
+    """A period of 5 s and five of 1 s: half of the time has the one, five of six updates the other."""
+    updates = [update(0, 20, 1.0), *(update(20 + 4 * k, 4, 1.0) for k in range(5))]
+    found = evaluated(model, at_rest(model, 40), *updates)
+    assert found.tau_u_mean == 3.0
+    assert found.tau_u_mean_per_update == pytest.approx(10 / 6)
+
+
+def test_what_does_not_exist_is_not_a_number(model: LtiModel) -> None:
+    found = evaluated(model, at_rest(model, 4))
+    of_updates = (found.J_dev, found.J_open_mean, found.c2, found.tau_u_mean, found.tau_u_mean_per_update)
+    assert all(map(math.isnan, of_updates))
+    nothing = RunEvaluation(model, DESIGN).indicators
+    assert all(map(math.isnan, (nothing.J_BF, nothing.L1_outside_band_pct, nothing.T5_outside_band_pct)))

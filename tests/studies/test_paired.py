@@ -1,0 +1,329 @@
+"""The paired part of the solver comparison: profiles as they are played, the lowest cost, and what is made of them."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import daqp
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coldloop.errors import StudyError
+from coldloop.limits import InputLimits
+from coldloop.lti_model import load as load_model
+from coldloop.model_settings import DEFAULT_MODEL_FILE
+from optimizer_plc.computing_settings import QpoasesSettings
+from optimizer_plc.design import ControlDesign
+from optimizer_plc.prediction import PredictionModel
+from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
+from optimizer_plc.settings import ProgramSettings, SolverName
+from optimizer_plc.solvers import make_solver
+from plant.load import find_load
+from rig.scenario import Scenario
+from rig.studies import STUDIES
+from rig.studies.harsh_problems import harsh_request, harsh_table, harsh_values
+from rig.studies.intervals import interval_of_mean, over_draws
+from rig.studies.open_loop import LABELS, OpenLoop, open_loop_table, paired_request, powers_of, watch
+from rig.studies.paired_run import equal_counts, harsh_run, paired_indicators, paired_run
+from rig.studies.played_profiles import PlayedProfiles
+from rig.studies.problem_sequence import ProblemSequence, problem_sequence
+from rig.studies.request import Outcome, perform
+from rig.studies.study import StudyOptions, draw_of
+
+if TYPE_CHECKING:
+    from tests.studies.conftest import MakeOutcome
+
+Array = NDArray[np.float64]
+
+UNBOUNDED = 1e30
+
+
+@pytest.fixture(scope="module")
+def problem() -> PredictiveProblem:
+    return PredictiveProblem(PredictionModel(load_model(DEFAULT_MODEL_FILE)), ControlDesign(), InputLimits())
+
+
+@pytest.fixture(scope="module")
+def profiles(problem: PredictiveProblem) -> PlayedProfiles:
+    return PlayedProfiles(problem)
+
+
+def situation(rng: np.random.Generator) -> Situation:
+    """Return a state some kPa, % and K away, and any load and input in reach."""
+    model = load_model(DEFAULT_MODEL_FILE)
+    scale = np.full(len(model.x0), 1.0)
+    scale[0], scale[1] = 2000.0, 1.0 / model.C[0, 1]
+    return Situation(
+        scale * rng.normal(size=len(scale)), float(rng.uniform(-150, 200)), rng.uniform([-8, -60, -8], [8, 60, 8])
+    )
+
+
+@pytest.fixture(scope="module")
+def sequence() -> ProblemSequence:
+    """The problems of five minutes of load e, the first load steps among them."""
+    load = find_load("e", load_model(DEFAULT_MODEL_FILE).w0)
+    return problem_sequence(Scenario(1200, load, 5.0, seed=1), ())
+
+
+# -- as played --------------------------------------------------------------------------------------------------------
+
+
+def test_each_knot_is_moved_to_within_the_rate_of_the_one_before(
+    problem: PredictiveProblem, profiles: PlayedProfiles
+) -> None:
+    """Knots at 1, 2, 4, 8, 16, 50 and 100 periods; CV155 moves by 0.5 % a period, 0.05 when scaled by 10 %."""
+    qp = problem.at(Situation(np.zeros(28), 0.0, np.zeros(3)))
+    knots = np.zeros((7, 3))
+    knots[:, 0] = [0.05, 0.30, 0.30, 0.05, 0.05, 2.0, 2.0]
+    knots[:, 1] = [0.1, 0.5, 0.5, -5.0, -1.0, 0.0, 0.0]  # the heater moves by 10 W a period, 0.2 when scaled by 50 W
+    z = np.concatenate([knots.ravel(), np.ones(28)])
+    played = profiles.played(qp, z)
+    found = played[:21].reshape(7, 3)
+    assert found[:, 0] == pytest.approx([0.05, 0.10, 0.20, 0.05, 0.05, 1.75, 2.0])
+    assert found[:, 1] == pytest.approx([0.1, 0.3, 0.5, -0.3, -1.0, 0.0, 0.0])
+    assert (played[21:] == 0).all()
+    assert (z[21:] == 1).all(), "the profile that was handed in is not touched"
+
+
+def test_for_ten_seconds_it_is_what_the_optimiser_sends(problem: PredictiveProblem, profiles: PlayedProfiles) -> None:
+    rng = np.random.default_rng(41)
+    for _ in range(20):
+        qp = problem.at(situation(rng))
+        z = np.clip(np.concatenate([rng.normal(size=21), np.zeros(28)]), qp.low, qp.high)
+        assert problem.inputs(profiles.played(qp, z), 2) == pytest.approx(problem.inputs(z, 2), abs=1e-12)
+
+
+def test_what_keeps_its_rates_is_played_as_it_is(problem: PredictiveProblem, profiles: PlayedProfiles) -> None:
+    rng = np.random.default_rng(42)
+    for _ in range(10):
+        where = situation(rng)
+        qp = problem.at(where)
+        best = profiles.optimum(qp, where)
+        assert profiles.played(qp, best) == pytest.approx(best, abs=1e-9)
+
+
+# -- the lowest cost --------------------------------------------------------------------------------------------------
+
+
+def lowest_by_daqp(problem: PredictiveProblem, qp: QuadraticProblem, where: Situation) -> float:
+    """Minimise the played cost as one quadratic problem: a slack for each output, side and sample, 421 variables."""
+    n, samples = problem.n_inputs, problem.design.horizon
+    Y, y0 = problem.stacked_outputs_z[:n].T, problem.outputs(np.zeros(49), where).ravel()
+    low, high, weight = (np.tile(row, samples) for row in problem.bands)
+    m = len(Y)
+    H = np.zeros((n + 2 * m, n + 2 * m))
+    H[:n, :n] = 2.0 * problem.Phi[:n, :n]
+    H[n:, n:] = np.diag(2.0 * np.concatenate([weight, weight]))
+    f = np.concatenate([qp.phi[:n], np.zeros(2 * m)])
+    one = np.eye(m)
+    rates = qp.Gamma[56:, :n]
+    rows = np.vstack([
+        np.hstack([Y, -one, 0 * one]), np.hstack([-Y, 0 * one, -one]), np.hstack([rates, np.zeros((len(rates), 2 * m))])
+    ])  # fmt: skip
+    upper = np.concatenate([qp.high[:n], np.full(2 * m, UNBOUNDED), high - y0, y0 - low, qp.gamma[56:]])
+    lower = np.concatenate([qp.low[:n], np.zeros(2 * m), np.full(len(rows), -UNBOUNDED)])
+    _, found, flag, _ = daqp.solve(H, f, rows, upper, lower, np.zeros(len(upper), np.int32), primal_tol=1e-9)
+    assert flag == 1
+    return float(found) + qp.constant
+
+
+def test_the_lowest_cost_is_that_of_one_large_quadratic_problem(
+    problem: PredictiveProblem, profiles: PlayedProfiles
+) -> None:
+    rng = np.random.default_rng(43)
+    for _ in range(3):
+        where = situation(rng)
+        qp = problem.at(where)
+        found = profiles.cost(qp, profiles.optimum(qp, where), where).total
+        assert found == pytest.approx(lowest_by_daqp(problem, qp, where), rel=1e-7)
+
+
+def test_no_profile_that_can_be_played_costs_less(problem: PredictiveProblem, profiles: PlayedProfiles) -> None:
+    rng = np.random.default_rng(44)
+    for _ in range(20):
+        where = situation(rng)
+        qp = problem.at(where)
+        best = profiles.optimum(qp, where)
+        lowest = profiles.cost(qp, best, where).total
+        for size in (1e-6, 1e-3, 0.1, 1.0):
+            other = np.clip(best + size * rng.normal(size=49), qp.low, qp.high)
+            assert profiles.cost(qp, other, where).total >= lowest * (1 - 1e-12)
+
+
+@pytest.mark.parametrize("name", [name.value for name in SolverName])
+@pytest.mark.parametrize("power", [0.2, 1.0, 10.0])
+def test_no_solver_at_any_power_gets_below_the_lowest_cost(name: str, power: float, sequence: ProblemSequence) -> None:
+    program = ProgramSettings(solver=SolverName(name))
+    budget = program.budget.model_copy(update={"power": power, "preparation_slots": 0})
+    columns = paired_run(sequence, program.model_copy(update={"budget": budget}))
+    total, lowest = np.array(columns["j_dev"]) + np.array(columns["j_cst"]), np.array(columns["lowest"])
+    assert len(total) == len(sequence.recorded) == 59
+    assert (total >= lowest - 1e-9 * (1 + lowest)).all()
+    if name in ("qpoases", "daqp") and power == 10.0:
+        assert total.sum() < 1.02 * lowest.sum(), "a converged solver is near it: its slacks bend at the knots only"
+
+
+# -- what a solver is given, and what is kept of it --------------------------------------------------------------------
+
+
+def test_a_solver_starts_each_problem_from_its_own_last_profile(sequence: ProblemSequence) -> None:
+    """Replayed here, solver, shifts and costs by hand."""
+    program = ProgramSettings(
+        solver=SolverName.INTERIOR_POINT,
+        budget=ProgramSettings().budget.model_copy(update={"power": 0.2, "preparation_slots": 0}),
+    )
+    columns = paired_run(sequence, program)
+    solver, z = make_solver(program), np.zeros(49)
+    for row, (where, _) in enumerate(sequence.recorded[:20]):
+        qp = sequence.problem.at(where)
+        solver.start(qp, sequence.problem.shifted(z, 20))
+        assert columns["iterations"][row] == solver.iterate(5), "5 s at P = 0.2 over 0.17 s"
+        z = solver.solution
+        cost = sequence.profiles.cost(qp, z, where)
+        assert (columns["j_dev"][row], columns["j_cst"][row]) == (cost.j_dev, cost.j_cst)
+
+
+def test_equal_plc_times_hold_these_iterations() -> None:
+    program = ProgramSettings()
+    counts = {
+        name: tuple(equal_counts(program, make_solver(ProgramSettings(solver=name))).values()) for name in SolverName
+    }
+    # 0.34, 0.68, 1.02 and 1.36 s over 0.25, 0.475, 0.05, 0.03, 0.17 and 4.75 s
+    assert counts == {
+        "ode": (1, 2, 4, 5), "qpoases": (0, 1, 2, 2), "osqp": (6, 13, 20, 27), "fast-gradient": (11, 22, 34, 45),
+        "interior-point": (2, 4, 6, 8), "daqp": (0, 0, 0, 0),
+    }  # fmt: skip
+    assert QpoasesSettings().tau_1_s == 0.475
+
+
+def test_on_harsh_problems_all_begin_at_the_same_guess(sequence: ProblemSequence) -> None:
+    found = {name: harsh_run(sequence, ProgramSettings(solver=SolverName(name))) for name in ("ode", "qpoases", "daqp")}
+    assert len(found["ode"]["guess"]) >= 2, "the first load steps"
+    assert found["ode"]["guess"] == found["qpoases"]["guess"] == found["daqp"]["guess"]
+    assert found["daqp"]["after_8"] == found["daqp"]["guess"], "no solve of DAQP is as short"
+    for columns in found.values():
+        guess, lowest = np.array(columns["guess"]), np.array(columns["lowest"])
+        assert (guess + 1 > 10 * (lowest + 1)).all()
+        assert (np.array(columns["after_8"]) >= lowest * (1 - 1e-9)).all()
+
+
+def test_indicators_of_problems_are_sums_and_means() -> None:
+    found = paired_indicators(
+        {
+            "j_dev": [1.0, 3.0],
+            "j_cst": [0.0, 8.0],
+            "violation": [0.5, 0.1],
+            "iterations": [3.0, 4.0],
+            "lowest": [1.0] * 2,
+        },
+        5.0,
+    )
+    assert (found.J_dev, found.J_cst, found.J_open_mean, found.c1, found.c2) == (4.0, 8.0, 6.0, 0.5, 0.3)
+    assert (found.tau_u_mean, found.iterations_total) == (5.0, 7)
+    assert np.isnan(found.J_BF)
+
+
+def test_a_request_gives_the_problems_and_no_trace() -> None:
+    load = draw_of("e", 1, StudyOptions(seeds=1, ticks=400))
+    outcome = Outcome.from_json(perform(paired_request(load, "ode", 1.0)))
+    assert len(outcome.column("lowest")) == 19
+    assert outcome.trace == {}
+    assert set(outcome.column("iterations")) == {20.0}
+    harsh = Outcome.from_json(perform(harsh_request(load, "ode")))
+    assert len(harsh.column("guess")) <= 19
+
+
+# -- what is made of outcomes -----------------------------------------------------------------------------------------
+
+
+def test_a_profile_below_the_optimum_ends_the_study(made_up: "MakeOutcome") -> None:
+    run = made_up({"lowest": [1.0, 100.0]})
+    watch(run, "lowest", np.array([1.0 - 1e-10, 100.0 - 1e-8]), "rounding")
+    with pytest.raises(
+        StudyError, match=r"^ode at P = 1: problem 1 costs 99.9, less than the optimum of 100; "
+    ) as caught:
+        watch(run, "lowest", np.array([1.0, 99.9]), "ode at P = 1")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_interval_is_made_of_draws_drawn_again() -> None:
+    """Of the draws 0 and 1, a mean over two drawn again is 0, 0.5 or 1 with probabilities 1/4, 1/2 and 1/4."""
+    values = np.array([0.0, 1.0])
+    found = over_draws(lambda which: float(values[which].mean()), 2)
+    assert found == (0.5, 0.0, 1.0, 0.0)
+    assert found == over_draws(lambda which: float(values[which].mean()), 2), "the same every time"
+    assert interval_of_mean([3.0, 3.0, np.nan]).brief() == "3 [3 to 3]"
+    assert interval_of_mean([4.0]).brief() == "4", "one draw has no interval"
+    assert interval_of_mean([np.nan]).brief() == "none"
+    half = over_draws(lambda which: np.nan if which[0] == 0 else 7.0, 2)
+    assert half.missing == pytest.approx(0.5, abs=0.05)
+    assert half.brief() == f"none [7 to 7; none in {100 * half.missing:.0f} %]"
+
+
+@pytest.fixture
+def short() -> StudyOptions:
+    """A quick study of two named draws."""
+    return StudyOptions(loads=("e", "e@2"), ticks=120, quick=True)
+
+
+def test_totals_are_pooled_before_they_are_divided(short: StudyOptions, made_up: "MakeOutcome") -> None:
+    """Over lowest costs of 10 and 30, qpOASES costs 100 / P more, and the ODE-based solver always 10 more."""
+    outcomes = {}
+    for load, lowest in ((draw_of("e", 1, short), 10.0), (draw_of("e@2", 1, short), 30.0)):
+        for solver in LABELS:
+            for power in powers_of(solver, short):
+                cost = lowest + 10.0 if solver == "ode" else lowest + 100.0 / power
+                outcomes[paired_request(load, solver, power)] = made_up(
+                    {"j_dev": [cost - 1.0], "j_cst": [1.0], "lowest": [lowest]},
+                    J_dev=cost - 1.0,
+                    J_cst=1.0,
+                    c1=0.5,
+                    c2=0.25,
+                )
+    found = OpenLoop.of(short, outcomes)
+    assert found.relative("ode", 0, [0, 1]) == 1.5, "60 / 40"
+    assert found.relative("qpoases", 1, [0, 1]) == 6.0, "(110 + 130) / 40"
+    assert found.interval("ode", 0)[:3] == (1.5, pytest.approx(40 / 30), 2.0)
+    # between P = 1 and 25 the ratio to the ODE-based solver falls from 240 / 60 to 48 / 60
+    share = np.log(4.0) / (np.log(4.0) - np.log(0.8))
+    assert found.crossing("qpoases", "ode").value == pytest.approx(25**share)
+    text = open_loop_table(found)
+    assert "| ODE | 1.5 [1.33 to 2] |" in text
+    assert "qpOASES costs no more than ODE from P = " in text
+
+
+def test_harsh_problems_of_all_loads_are_counted_together(short: StudyOptions, made_up: "MakeOutcome") -> None:
+    outcomes = {}
+    for name, ratios in (("e", [1.0, 2.0]), ("e@2", [9.0])):
+        for solver in LABELS:
+            columns = {"lowest": [10.0] * len(ratios), "guess": [500.0] * len(ratios)}
+            for k in (2, 4, 6, 8):
+                columns |= {f"count_{k}": [float(k)] * len(ratios), f"after_{k}": [10.0 * ratio for ratio in ratios]}
+            outcomes[harsh_request(draw_of(name, 1, short), solver)] = made_up(columns)
+    text = harsh_table(short, outcomes)
+    assert text.startswith("**Harsh problems**: 3 problems of 2 hours")
+    assert "| interior point | 2 (9) [2] | 2 (9) [4] | 2 (9) [6] | 2 (9) [8] |" in text
+    values = harsh_values({"ode": {2: np.array([1.0, 2.0, 9.0])}})
+    assert values == {
+        "J over the lowest of harsh problems, median: ODE, in the time of 2 interior-point iterations": [2.0],
+        "J over the lowest of harsh problems, worst: ODE, in the time of 2 interior-point iterations": [9.0],
+        "number of harsh problems": [3.0],
+    }
+
+
+@pytest.mark.slow
+def test_a_short_study_from_requests_to_report() -> None:
+    study, options = STUDIES["solver-comparison"], StudyOptions(loads=("e",), ticks=600, quick=True)
+    outcomes = {request: Outcome.from_json(perform(request)) for request in study.requests(options)}
+    result = study.evaluate(options, outcomes)
+    assert set(result.figures) == {"indicators", "paired open loop"}
+    assert {row[0] for row in result.rows} == {"paired", "closed"}
+    assert all(row[-1] >= 1 - 1e-9 for row in result.rows if row[0] == "paired")
+    assert len(result.values["crossing in total cost"]) == len(result.values["crossing in J_BF"]) == 1
+    assert [remark.splitlines()[0][:9] for remark in result.remarks] == ["**Paired,", "**Harsh p"]
+
+
+def test_draws_are_the_studys_own_unless_the_command_says() -> None:
+    usual, asked, quick = StudyOptions(), StudyOptions(seeds=2), StudyOptions(quick=True)
+    assert [len(options.drawn(10)) for options in (usual, asked, quick)] == [10, 2, 1]
+    assert [len(options.draws) for options in (usual, asked, replace(asked, quick=True))] == [3, 2, 1]
