@@ -15,9 +15,8 @@ import numpy as np
 from coldloop.config import load_configuration
 from coldloop.lti_model import load as load_model
 from coldloop.process import TICK_S
-from coldloop.registers.plant import PlantSample
 from plant.load import HOUR_TICKS, HOURS, concatenated, telegraph
-from rig.recording import Sink
+from rig.recording import SampleBlock, Sink
 from rig.results import claim_folder
 from rig.running import Job, Way, make_scenario, run_into
 from rig.settings import Settings
@@ -34,11 +33,13 @@ class MemoryLog(Sink):
     def __init__(self, file: Path) -> None:
         self._file = file
         self.rows: list[tuple[float, float, int]] = []
+        self._next = 0
 
-    def sample(self, sample: PlantSample) -> None:
+    def block(self, block: SampleBlock) -> None:
         """Look, once an hour."""
-        if sample.tick % HOUR_TICKS == 0:
-            self.rows.append((sample.tick * TICK_S / 3600, resident_mb(), len(gc.get_objects())))
+        if block.first >= self._next:
+            self._next += HOUR_TICKS
+            self.rows.append((block.first * TICK_S / 3600, resident_mb(), len(gc.get_objects())))
             with self._file.open("w", newline="", encoding="utf-8") as file:
                 csv.writer(file).writerows([("hour", "resident_mb", "objects"), *self.rows])
 

@@ -1,4 +1,4 @@
-"""Compile the numerical kernels of one service, so that its image has them: `python precompile.py SERVICE`."""  # noqa: INP001 a program
+"""Compile the numerical kernels of a service or of the rig before they are needed: `python precompile.py SERVICE`."""  # noqa: INP001 a program
 
 import sys
 from typing import TYPE_CHECKING
@@ -64,5 +64,12 @@ def hmi() -> None:
     """Compile nothing: the page has no kernels."""
 
 
+def rig() -> None:
+    """Let a minute pass in one process: compiled loops, and the programs for what is unusual."""
+    from rig import simulate  # noqa: PLC0415 not in the images
+
+    simulate(load="a", duration_s=60)
+
+
 if __name__ == "__main__":
-    {"plant": plant, "control_plc": control_plc, "optimizer_plc": optimizer_plc, "hmi": hmi}[sys.argv[1]]()
+    {"plant": plant, "control_plc": control_plc, "optimizer_plc": optimizer_plc, "hmi": hmi, "rig": rig}[sys.argv[1]]()

@@ -30,6 +30,8 @@ NO_CONTRACTION = ContractionParameters(0, 0, 0, 1.0, 0.0, 1.0)
 
 def is_compiled(program: OptimizerProgram) -> bool:
     """Tell whether the program's updates have a compiled form: double precision, ODE-based solver, a rule of ours."""
+    if type(program) is not OptimizerProgram:  # who has made another kind of it wants to be asked
+        return False
     if program.problem.Phi.dtype != np.float64 or program.settings.interrupting_load_step_w:
         return False
     known_rule = isinstance(program.rule, FixedPeriod | Algorithm1 | ContractionRule)

@@ -60,7 +60,7 @@ class CompiledStretches:
             return None
         answered = self._control.player.has_answer
         whole = self._constants is not None and not answered and optimizer.is_ordinary(self._optimizer)
-        until = min(until, self._control.tick + BLOCK_TICKS)
+        until = min(until, (self._control.tick // BLOCK_TICKS + 1) * BLOCK_TICKS)
         with self._plant.noise(until - self._control.tick) as noise:
             plant = PlantState(*self._plant.between_ticks(), noise)
             stretch = self._updates_too(plant, until) if whole else self._ticks_alone(plant, until)

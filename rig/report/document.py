@@ -10,7 +10,8 @@ from typing import Final
 
 from markdown_it import MarkdownIt
 
-from rig.report.scorecard import Claim, Judged, Verdict, counts
+from rig.report.scorecard import Claim, Judged, Verdict, counted, counts
+from rig.studies.intervals import interval_of_mean
 
 STYLE: Final = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c2733; max-width: 76rem; margin: 2rem auto; padding: 0 1.5rem; }
@@ -34,26 +35,46 @@ def verdict_counts(judged: Sequence[Judged]) -> str:
 def scorecard_table(judged: Sequence[Judged], commands: Mapping[str, str]) -> str:
     """Return a row for each claim; `commands` says how each study is repeated."""
     lines = [
-        "| figure | claim | paper's value | ours (spread over draws) | tolerance and why | verdict | command |",
+        "| figure | claim | paper's value | ours | tolerance and why | verdict | command |",
         "|---|---|---|---|---|---|---|",
     ]
     lines += [
-        f"| {j.claim.figure} | {j.claim.says}<br>*{j.claim.value}* | {_of_paper(j)} | {_ours(j.values)} "
-        f"| {_tolerance(j.claim)} | {j.verdict} | `{commands[j.claim.study]}` |"
+        f"| {j.claim.figure} | {j.claim.says}<br>*{j.claim.value}*{_marks(j.claim)} | {_of_paper(j)} "
+        f"| {_ours(j.values)} | {_tolerance(j.claim)} | {j.verdict} | `{commands[j.claim.study]}` |"
         for j in judged
     ]
     return "\n".join(lines)
 
 
-def deviations(judged: Sequence[Judged], explanations: Mapping[str, str]) -> str:
-    """Return what does not reproduce, each with what is known of why."""
+PLACEHOLDER: Final = re.compile(r"\{([^{}]+)\}")
+"""The name of a value in an explanation: its number is put there from the results."""
+
+
+def explained(text: str, values: Mapping[str, Sequence[float]]) -> str:
+    """Return an explanation with the means of the values that it names; what was not run is said to be so."""
+    return PLACEHOLDER.sub(lambda found: _mean(values.get(found[1], ())), text)
+
+
+def _mean(values: Sequence[float]) -> str:
+    there = [value for value in values if math.isfinite(value)]
+    return _number(sum(there) / len(there)) if there else "(not run)"
+
+
+def deviations(judged: Sequence[Judged], explanations: Mapping[str, str], values: Mapping[str, Sequence[float]]) -> str:
+    """Return what does not reproduce among what counts, each with what is known of why and the numbers for it."""
     lines = []
-    for j in judged:
+    for j in counted(judged):
         if j.verdict in (Verdict.PARTLY, Verdict.NOT_REPRODUCED):
-            why = explanations.get(j.claim.value, "Not explained yet.")
+            why = explained(explanations.get(j.claim.value, "Not explained yet."), values)
             lines.append(f"- **{j.verdict}: {j.claim.value}** ({j.claim.figure}): ours {_ours(j.values)}, "
                          f"paper {_of_paper(j)}. {why}")  # fmt: skip
     return "\n".join(lines) or "Everything that has data in the paper is reproduced."
+
+
+def _marks(claim: Claim) -> str:
+    """Return what a reader must know of a claim before its verdict."""
+    calibrated = f"<br>**calibrated**: {claim.calibrated}" if claim.calibrated else ""
+    return calibrated + (f"<br>changed {claim.changed}: {claim.because}" if claim.changed else "")
 
 
 def _of_paper(judged: Judged) -> str:
@@ -61,12 +82,15 @@ def _of_paper(judged: Judged) -> str:
 
 
 def _ours(values: Sequence[float]) -> str:
+    """Return the mean over the draws with its percentile interval, their range and their number."""
     there = [value for value in values if math.isfinite(value)]
     if not there:
         return "none"
-    spread = f" ({_number(min(there))} to {_number(max(there))})" if len(there) > 1 else ""
-    missing = f", none in {len(values) - len(there)} draws" if len(there) < len(values) else ""
-    return _number(sum(there) / len(there)) + spread + missing
+    if len(values) == 1:
+        return _number(there[0])
+    spread = f" ({_number(min(there))} to {_number(max(there))} in {len(there)} draws)"
+    missing = f", none in {len(values) - len(there)}" if len(there) < len(values) else ""
+    return interval_of_mean(there).brief() + spread + missing
 
 
 def _number(value: float) -> str:

@@ -3,13 +3,14 @@
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
+from datetime import date
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple, Self
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
 
 from optimizer_plc.operations import cholesky
 from optimizer_plc.reference_plc import cholesky_times
@@ -43,19 +44,51 @@ class Verdict(StrEnum):
     NOT_RUN = "not run"
 
 
-class Claim(BaseModel):
-    """A claim of the paper, or an aim of this project."""
+class Kind(StrEnum):
+    """What a claim is, and whether its verdict counts."""
+
+    CLAIM = "claim"
+    """The paper's."""
+    AIM = "aim"
+    """This project's own."""
+    CHECK = "check"
+    """Arithmetic, or fitted to the paper's own numbers: it holds unless something is broken, and does not count."""
+    VARIANT = "variant"
+    """A milder form of a claim; it does not count."""
+
+
+COUNTED: Final = (Kind.CLAIM, Kind.AIM)
+
+
+class Change(BaseModel):
+    """When something was added, changed or withdrawn after a report, and why; a claim as it was at first has none."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    study: str
     value: str
+    changed: date | None = None
+    because: str = ""
+
+    @model_validator(mode="after")
+    def _dated_with_a_reason(self) -> Self:
+        if (self.changed is None) != (not self.because):
+            raise ValueError(f"{self.value}: a change has a date (`changed`) and a reason (`because`)")
+        return self
+
+
+class Claim(Change):
+    """A claim of the paper, an aim of this project, or what stands beside them."""
+
+    study: str
+    kind: Kind = Kind.CLAIM
     figure: str
     says: str
     of_paper: str
     why: str
     reproduced: Range | None = None
     partly: Range | None = None
+    calibrated: str = ""
+    """What was chosen with this value in view; empty if nothing was."""
 
 
 class Judged(NamedTuple):
@@ -72,7 +105,17 @@ class Judged(NamedTuple):
 @cache
 def claims() -> tuple[Claim, ...]:
     """Return all claims, in the order of the paper."""
-    return tuple(Claim.model_validate(one) for one in tomllib.loads(TOLERANCES.read_text(encoding="utf-8"))["claim"])
+    return tuple(Claim.model_validate(one) for one in _document()["claim"])
+
+
+@cache
+def withdrawn() -> tuple[Change, ...]:
+    """Return what was claimed in an earlier report."""
+    return tuple(Change.model_validate(one) for one in _document()["withdrawn"])
+
+
+def _document() -> dict[str, Any]:
+    return tomllib.loads(TOLERANCES.read_text(encoding="utf-8"))
 
 
 def judge(values: Mapping[str, Sequence[float]]) -> list[Judged]:
@@ -144,14 +187,21 @@ def _cholesky() -> dict[str, float]:
     return {SPEED: float(speed[size >= 50].mean()), SLOW_DOWN: float((plc_s / laptop_s)[size >= 40].mean())}
 
 
-OWN_AIM: Final = "not in the paper"
+def counted(judged: Sequence[Judged]) -> list[Judged]:
+    """Return those whose verdicts count."""
+    return [j for j in judged if j.claim.kind in COUNTED]
 
 
 def counts(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
-    """Return how often each verdict was given, to claims of the paper and to aims of this project."""
+    """Return how often each verdict was given, to claims of the paper and to aims of this project; nothing else counts.
+
+    Calibrated claims are among them, and counted once more by themselves.
+    """
+    some = counted(judged)
     groups = {
-        "claims of the paper": [j for j in judged if j.claim.of_paper != OWN_AIM],
-        "aims of this project": [j for j in judged if j.claim.of_paper == OWN_AIM],
+        "claims of the paper": [j for j in some if j.claim.kind is Kind.CLAIM],
+        "among them calibrated": [j for j in some if j.claim.kind is Kind.CLAIM and j.claim.calibrated],
+        "aims of this project": [j for j in some if j.claim.kind is Kind.AIM],
     }
     return {
         name: {one.value: sum(j.verdict is one for j in group) for one in Verdict} for name, group in groups.items()
@@ -162,7 +212,7 @@ def as_json(judged: Sequence[Judged]) -> list[dict[str, Any]]:
     """Return the scorecard as plain data."""
     return [
         {
-            **j.claim.model_dump(exclude={"reproduced", "partly"}),
+            **j.claim.model_dump(mode="json", exclude={"reproduced", "partly"}),
             "reproduced": _plain(j.claim.reproduced),
             "partly": _plain(j.claim.partly),
             "paper": j.of_paper,

@@ -91,7 +91,7 @@ def harsh_table(options: StudyOptions, outcomes: Outcomes) -> str:
     for solver, by_count in ratios.items():
         counts = _counts(outcomes, first, solver)
         cells = [
-            f"{np.median(found):.3g} ({found.max():.3g}) [{counts[k]:.0f}]" for k, found in by_count.items()
+            f"{np.median(found):.4g} ({found.max():.3g}) [{counts[k]:.0f}]" for k, found in by_count.items()
         ]  # fmt: skip
         lines.append(f"| {LABELS[solver]} | " + " | ".join(cells) + " |")
     return "\n".join(lines)

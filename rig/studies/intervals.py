@@ -27,13 +27,13 @@ class Interval(NamedTuple):
             return f"{self.value:.{digits}f}"
         return f"{self.value:.{digits}f} [{self.low:.{digits}f}, {self.high:.{digits}f}]"
 
-    def brief(self) -> str:
-        """Write value and interval with three digits, and how often there is none."""
-        value = f"{self.value:.3g}" if np.isfinite(self.value) else "none"
+    def brief(self, digits: int = 3) -> str:
+        """Write value and interval with so many significant digits, and how often there is none."""
+        value = f"{self.value:.{digits}g}" if np.isfinite(self.value) else "none"
         if not np.isfinite(self.low):
             return value
         absent = f"; none in {100 * self.missing:.0f} %" if self.missing else ""
-        return f"{value} [{self.low:.3g} to {self.high:.3g}{absent}]"
+        return f"{value} [{self.low:.{digits}g} to {self.high:.{digits}g}{absent}]"
 
 
 def resampled(statistic: Callable[[Series], float], hours: Series) -> Interval:

@@ -28,6 +28,8 @@ LABELS: Final = {
     "ode": "ODE", "qpoases": "qpOASES", "interior-point": "interior point", "osqp": "OSQP",
     "fast-gradient": "fast gradient", "daqp": "DAQP, one solve",
 }  # fmt: skip
+LEAST_DRAWN: Final = 1e-5
+"""Share above the lowest cost below which it is drawn here: the axis is logarithmic."""
 BELOW: Final = 1e-9
 """Share of the lowest cost, or of 1, by which rounding may let a cost be below it."""
 
@@ -141,7 +143,7 @@ def open_loop_table(found: OpenLoop) -> str:
     """Return total costs over the lowest with their intervals, and where solvers cross, as Markdown."""
     some = [power for power in FEW_POWERS if any(power in powers for powers in found.powers.values())]
     caption = (
-        f"**Paired, open loop**: total cost of {len(found.tables)} draws together over the lowest cost of any profile "
+        f"**Paired, open loop**: total cost of all draws ({len(found.tables)}) over the lowest cost of any profile "
         "that can be played [95 % percentile interval over the draws]. All solvers have the same problems, each with "
         "its own hot starts, and are judged by what the control PLC would play; no ratio can be below 1."
     )
@@ -153,29 +155,33 @@ def open_loop_table(found: OpenLoop) -> str:
     ]
     for solver, powers in found.powers.items():
         cells = [
-            found.interval(solver, powers.tolist().index(power)).brief() if power in powers else "" for power in some
+            found.interval(solver, powers.tolist().index(power)).brief(4) if power in powers else "" for power in some
         ]
         lines.append(f"| {LABELS[solver]} | " + " | ".join(cells) + " |")
     for other in ("ode", "interior-point"):
-        lines += [
-            "",
-            f"qpOASES costs no more than {LABELS[other]} from P = {found.crossing('qpoases', other).brief()} on.",
-        ]
+        lines += ["", _crossing_text(found.crossing("qpoases", other), LABELS[other])]
     return "\n".join(lines)
 
 
+def _crossing_text(power: Interval, other: str) -> str:
+    if np.isnan(power.value):
+        return f"At no power does qpOASES cost as little as {other}, all draws together."
+    return f"qpOASES costs no more than {other} from P = {power.brief()} on."
+
+
 def open_loop_figure(found: OpenLoop) -> Figure:
-    """Draw the total cost over the lowest against power, with intervals."""
+    """Draw by which share the total cost is above the lowest, against power, with intervals."""
     with panels(1, 1, (8.0, 4.2)) as (figure, (place,)):
         for (solver, powers), colour in zip(found.powers.items(), COLOURS, strict=False):
             intervals = [found.interval(solver, number) for number in range(len(powers))]
-            place.plot(powers, [one.value for one in intervals], color=colour, marker=".", label=LABELS[solver])
-            place.fill_between(powers, [one.low for one in intervals], [one.high for one in intervals], color=colour,
-                               alpha=0.18, linewidth=0)  # fmt: skip
-        place.axhline(1.0, color="#888888", linewidth=0.8)
+            value, low, high = (
+                np.maximum(np.array(series) - 1.0, LEAST_DRAWN) for series in list(zip(*intervals, strict=True))[:3]
+            )
+            place.plot(powers, value, color=colour, marker=".", label=LABELS[solver])
+            place.fill_between(powers, low, high, color=colour, alpha=0.18, linewidth=0)
         place.set_xscale("log")
         place.set_yscale("log")
         place.set_xlabel("normalised power $P$ (1)")
-        place.set_ylabel("total cost over the lowest (1)")
+        place.set_ylabel("total cost above the lowest, share of it (1)")
         legend_outside(figure, place)
     return figure

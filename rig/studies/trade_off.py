@@ -10,15 +10,19 @@ from typing import Final
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from rig.plot import COLOURS, legend_above
 from rig.studies.drawing import panels, spread
-from rig.studies.request import Outcome, RunRequest
+from rig.studies.request import Outcome, RunRequest, Series
 from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
 from rig.studies.trajectories import follows_step
 
 PERIODS_S: Final = (1.0, 2.0, 3.0, 4.0, 5.0)
 SOLVERS: Final = {"ode": "ODE", "qpoases": "qpOASES", "fast-gradient": "fast gradient", "osqp": "OSQP"}
+
+
+COLUMNS: Final = ("load", "solver", "tau_u (s)", "E", "D", "share of load steps with E > D")
 
 
 class TradeOff:
@@ -39,25 +43,24 @@ class TradeOff:
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Average E and D over the events of each run."""
         periods = _periods(options)
-        result = StudyResult(("load", "solver", "tau_u (s)", "E", "D", "E > D"), [], {})
+        result = StudyResult(COLUMNS, [], {})
         curves: dict[str, list[list[tuple[float, float]]]] = {solver: [] for solver in SOLVERS}
         for load in _loads(options):
             for solver, label in SOLVERS.items():
                 points = [won_and_lost(outcomes[_request(load, solver, period)], load) for period in periods]
                 curves[solver].append(points)
                 result.rows += [
-                    (load.name, label, period, won, lost, int(won > lost))
+                    (load.name, label, period, won, lost, share_falling(outcomes[_request(load, solver, period)], load))
                     for period, (won, lost) in zip(periods, points, strict=True)
                 ]
-                judged = [won > lost for won, lost in points if np.isfinite(won)]
-                share = float(np.mean(judged)) if judged else float("nan")
-                result.values.setdefault(f"share of the periods at which E > D: {label}", []).append(share)
+            for what, value in _discriminating(load, periods, outcomes).items():
+                result.values.setdefault(what, []).append(value)
         result.figures["efficiency and degradation"] = _figure(periods, curves)
         return result
 
 
 def _loads(options: StudyOptions) -> list[Load]:
-    return [draws[0] for draws in loads(options, "c").values()]
+    return [load for draws in loads(options, "c").values() for load in draws]
 
 
 def _periods(options: StudyOptions) -> tuple[float, ...]:
@@ -68,12 +71,39 @@ def _request(load: Load, solver: str, period_s: float) -> RunRequest:
     return load.request(period_s, f"{PROGRAM}solver={solver}")
 
 
+def after_steps(run: Outcome, load: Load) -> tuple[Series, Series]:
+    """Return E_k and D_k of the first updates after load steps."""
+    played, hot_start, delivered = (run.column(name) for name in ("j_effective", "j_hot_start", "j_delivered"))
+    event: NDArray[np.bool_] = follows_step(run, load)
+    return (hot_start - delivered)[event], (hot_start - played)[event]
+
+
 def won_and_lost(run: Outcome, load: Load) -> tuple[float, float]:
     """Return the mean of E_k and of D_k over the first updates after load steps."""
-    played, hot_start, delivered = (run.column(name) for name in ("j_effective", "j_hot_start", "j_delivered"))
-    event = follows_step(run, load)
-    won, lost = hot_start - delivered, hot_start - played
-    return (float(won[event].mean()), float(lost[event].mean())) if event.any() else (float("nan"), float("nan"))
+    won, lost = after_steps(run, load)
+    return (float(won.mean()), float(lost.mean())) if len(won) else (float("nan"), float("nan"))
+
+
+def share_falling(run: Outcome, load: Load) -> float:
+    """Return after which share of the load steps E_k > D_k: the cost falls in the first period."""
+    won, lost = after_steps(run, load)
+    return float((won > lost).mean()) if len(won) else float("nan")
+
+
+def _discriminating(load: Load, periods: tuple[float, ...], outcomes: Outcomes) -> dict[str, float]:
+    """Return how solvers and periods differ in the share of load steps after which the cost falls at once."""
+    share = {
+        (solver, period): share_falling(outcomes[_request(load, solver, period)], load)
+        for solver in ("ode", "qpoases")
+        for period in (periods[0], periods[-1])
+    }
+    short, long = f"{periods[0]:g} s", f"{periods[-1]:g} s"
+    return {
+        f"share of load steps after which E > D at {short}: ODE less qpOASES":
+            share["ode", periods[0]] - share["qpoases", periods[0]],
+        f"share of load steps after which E > D at {long} less that at {short}: qpOASES":
+            share["qpoases", periods[-1]] - share["qpoases", periods[0]],
+    }  # fmt: skip
 
 
 def _figure(periods: tuple[float, ...], curves: dict[str, list[list[tuple[float, float]]]]) -> Figure:

@@ -14,9 +14,10 @@ from coldloop.registers.audit import Event
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Process
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
+from coldloop.registers.plant import StationStatus
 from coldloop.registers.safety import Alarm, AlarmKind
 from hmi.signals import MAPS, values_of
-from hmi.trends import TrendStore
+from hmi.trends import NO_STATION, TrendStore, station_values
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -103,7 +104,9 @@ class Model:
             self._identity(service, record)
         elif isinstance(record, Process):
             self._moved(source, record.tick)
-            self.trends.add(record, self.mode, self.bad_sensors)
+            station = self.record("plant", StationStatus)
+            values = station_values(station.signals) if station else NO_STATION
+            self.trends.add(record, self.mode, self.bad_sensors, values)
         elif isinstance(record, Prediction):
             self._predicted(record)
 

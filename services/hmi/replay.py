@@ -20,6 +20,7 @@ from hmi.model import Model, Told
 from hmi.page_server import Exhibit, PageServer
 from hmi.settings import HmiSection
 from hmi.signals import MAPS
+from hmi.trends import NO_STATION, station_values
 
 STEP_S: Final = 0.1
 MOST_AT_ONCE: Final = 400
@@ -36,6 +37,11 @@ class Frame(NamedTuple):
     """A bit for each output that the control PLC substituted. The process has the true value."""
     station: StationSample | None = None
     """Of a whole refrigerator."""
+
+    @property
+    def pressures(self) -> tuple[float, ...]:
+        """What trends have of the station."""
+        return station_values(self.station.signals) if self.station else NO_STATION
 
 
 class RecordedRun(Protocol):
@@ -172,11 +178,11 @@ class Replay:
         every = max(1, math.ceil((tick - before) / points))
         for each in range(before + 1, tick, every):
             frame = run.frame(each)
-            model.trends.add(frame.process, frame.mode, frame.bad_sensors)
+            model.trends.add(frame.process, frame.mode, frame.bad_sensors, frame.pressures)
         self._tick = tick
         newest = run.frame(tick)
         # after a step back the newest record may be the one known
-        model.trends.add(newest.process, newest.mode, newest.bad_sensors)
+        model.trends.add(newest.process, newest.mode, newest.bad_sensors, newest.pressures)
         self._put(newest)
         updates, events = run.updates, run.events
         first, last = (bisect_right(updates, one, key=lambda update: update.tick) for one in (before, tick))

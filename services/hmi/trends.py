@@ -1,15 +1,20 @@
 """What the trends are drawn from: samples by tick in a bounded store, thinned without losing an excursion."""
 
+import math
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.control_plc import Mode, Process
 
-NAMES: Final = ("load", *INPUT_NAMES, *OUTPUT_NAMES, "mode")
+STATION_NAMES: Final = ("P12", "P11")
+"""Signals of a refrigerator's station that are kept: high and low pressure."""
+NAMES: Final = ("load", *INPUT_NAMES, *OUTPUT_NAMES, "mode", *STATION_NAMES)
 """Columns of the store; `mode` is that of the fail-safe ladder."""
+NO_STATION: Final = (math.nan,) * len(STATION_NAMES)
+_PLACES: Final = tuple(STATION_SIGNAL_NAMES.index(name) for name in STATION_NAMES)
 MOST_ROWS: Final = 65_536
 SPARE_ROWS: Final = 4096
 """Rows that are removed at a time, so that removing costs little."""
@@ -54,13 +59,14 @@ class TrendStore:
         for column in self._columns.values():
             del column[:]
 
-    def add(self, process: Process, mode: int, bad_sensors: int = 0) -> None:
+    def add(self, process: Process, mode: int, bad_sensors: int = 0, station: tuple[float, ...] = NO_STATION) -> None:
         """Add a sample; one that is not newer than the last one is left out."""
         if process.tick <= self.last_tick:
             return
         self.ticks.append(process.tick)
         self._bad.append(bad_sensors)
-        for name, value in zip(NAMES, (process.load, *process.u, *process.y, float(mode)), strict=True):
+        values = (process.load, *process.u, *process.y, float(mode), *station)
+        for name, value in zip(NAMES, values, strict=True):
             self._columns[name].append(value)
         self._trim()
 
@@ -134,6 +140,11 @@ def _stretches(times: Sequence[float], bad: Sequence[int], mask: int) -> Iterato
             start = None
     if start is not None:
         yield Substitution(start, times[-1] + TICK_S)
+
+
+def station_values(signals: Sequence[float]) -> tuple[float, ...]:
+    """Return what is kept of the station's signals; nothing of a cold box alone, whose signals are all 0."""
+    return tuple(signals[place] for place in _PLACES) if any(signals) else NO_STATION
 
 
 def thin(

@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import kernel
+from coldloop.compiled import kept, kernel
 from coldloop.errors import ConfigurationError
 from coldloop.process import SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
 from coldloop.registers.control_plc import Update
@@ -126,15 +126,21 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
     drift = np.array([*(by_unit[unit] for unit in prediction.model.state_units), settings.load_walk_w])
     sensors = np.full(C.shape[0], settings.temperature_sensor)
     sensors[0], sensors[1], sensors[12:] = settings.level_sensor, settings.speed_sensor, settings.pressure_sensor
-    P = np.diag(100.0 * drift**2)
-    gains = {}
-    for ticks, step in prediction.transitions.items():
-        A = np.eye(nx + 1)
-        A[:nx, :nx], A[:nx, nx] = step.A, step.F[:, 0]
-        process = drift**2 * (ticks * TICK_S / SAMPLING_PERIOD_S)
-        gain = stationary_gain(A, C, process, sensors**2, P, settings.longest_riccati)
-        gains[ticks] = np.ascontiguousarray(gain.T)
-    return gains
+
+    def computed() -> Array:
+        P = np.diag(100.0 * drift**2)
+        gains = []
+        for ticks, step in prediction.transitions.items():
+            A = np.eye(nx + 1)
+            A[:nx, :nx], A[:nx, nx] = step.A, step.F[:, 0]
+            process = drift**2 * (ticks * TICK_S / SAMPLING_PERIOD_S)
+            gains.append(stationary_gain(A, C, process, sensors**2, P, settings.longest_riccati).T)
+        return np.array(gains)
+
+    tick = prediction.transitions[1]
+    decided_by = (tick.A, tick.F, C, drift, sensors, np.array(settings.longest_riccati))
+    found = kept("kalman", b"".join(part.tobytes() for part in decided_by), computed)
+    return {ticks: np.ascontiguousarray(gain) for ticks, gain in zip(prediction.transitions, found, strict=True)}
 
 
 @kernel

@@ -4,9 +4,11 @@ Kernels are compiled without fast-math and without contraction of multiply-add, 
 written: the same inputs give the same bits in every process and on every processor.
 
 The cache lives in `COLDLOOP_CACHE_DIR`, or in the user's cache directory, in a folder named after a digest of the
-sources of all compiled modules: numba itself does not notice that a kernel called from another file has changed.
+sources of all compiled modules: numba itself does not notice that a kernel called from another file has changed. What
+takes long to compute and depends on those sources is kept there too.
 """
 
+import contextlib
 import hashlib
 import os
 import tempfile
@@ -16,11 +18,18 @@ from pathlib import Path
 from typing import ParamSpec, TypeVar, cast
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-COMPILED_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc", "rig.compiled")
+COMPILED_PACKAGES = ("plant", "optimizer_plc")
+COMPILED_MODULES = (
+    "coldloop.compiled", "coldloop.process", "coldloop.single_precision", "control_plc.output_limits",
+    "control_plc.sensors", "rig.compiled.loops", "rig.compiled.portable", "rig.compiled.records",
+)  # fmt: skip
+"""What kernels call from other packages."""
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -39,11 +48,32 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
 def _sources_digest() -> str:
     digest = hashlib.sha256(numba.__version__.encode())
     for package in COMPILED_PACKAGES:
-        spec = find_spec(package)
-        for folder in (spec.submodule_search_locations or ()) if spec else ():
-            for source in sorted(Path(folder).rglob("*.py")):
-                digest.update(source.read_bytes())
+        for source in sorted(source for folder in _folders(package) for source in folder.rglob("*.py")):
+            digest.update(source.read_bytes())
+    for module in COMPILED_MODULES:
+        package, *path = module.split(".")
+        for folder in _folders(package):
+            digest.update(folder.joinpath(*path).with_suffix(".py").read_bytes())
     return digest.hexdigest()[:16]
+
+
+def _folders(package: str) -> list[Path]:
+    """Return where a package is installed, without importing it; not every service has all of them."""
+    spec = find_spec(package)
+    return [Path(folder) for folder in (spec.submodule_search_locations or ())] if spec else []
+
+
+def kept(name: str, of: bytes, compute: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return what `compute` returns for `of`, from the cache where it is there and whole."""
+    path = Path(str(numba.config.CACHE_DIR)) / f"{name}-{hashlib.sha256(of).hexdigest()[:24]}.npy"  # type: ignore[attr-defined]
+    try:
+        found: NDArray[np.float64] = np.load(path)
+    except (OSError, ValueError, EOFError):
+        found = compute()
+        with contextlib.suppress(OSError), tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as draft:
+            np.save(draft, found)
+            Path(draft.name).replace(path)
+    return found
 
 
 def _cache_directory() -> Path:

@@ -108,6 +108,15 @@ def test_values_of_the_station_are_crossed_out_with_the_plant(page: "Page", refr
     eventually(lambda: page.locator(f"{tags}.stale").count() == 0, "they come back", 60)
 
 
+def test_both_pressures_are_drawn_over_time(page: "Page", refrigerator: Site) -> None:
+    trend = refrigerator.ask("/api/trend?names=P12,P11&seconds=20").document["series"]
+    assert all(5 < value < 20 for value in trend["P12"][-10:]), "in bar, on the way back from the trip"
+    assert all(0.8 < value < 2 for value in trend["P11"][-10:])
+    page.click("nav a[href='#trends']")
+    for name in ("P12", "P11", "L1", "cost"):
+        page.wait_for_selector(f"#chart-{name} canvas")
+
+
 def test_the_drawing_is_that_of_the_plant(browser: "Browser", site: Site, refrigerator: Site) -> None:
     for one, names in ((site, 0), (refrigerator, len(SHOWN))):
         with opened(browser, one.address) as page:
@@ -128,6 +137,8 @@ def test_a_recorded_refrigerator_is_replayed_with_its_station(
     try:
         with opened(browser, served.address) as page:
             assert page.locator("#mimic .compressor").count() == 2
+            pressures = served.ask("/api/trend?names=P12&seconds=60")["series"]["P12"]
+            assert all(15 < value < 17 for value in pressures)
             readings = page.locator("#mimic .tag[data-signal='plant.station.signals.P12'] .reading")
             assert re.fullmatch(r"1[56]\.\d+ bar", readings.text_content() or "")
             asked = page.locator("#mimic .tag[data-signal='plant.station.commands.CV956'] .reading")

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ import pytest
 import rig.disk_reserve
 import rig.file_sinks
 from coldloop.errors import LinkError
+from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
 from rig.one_process import OneProcessRig
 from rig.recording import BLOCK_TICKS, KEPT_TICKS, Recorder, SampleBlock, Sink
@@ -83,28 +85,28 @@ def test_ctrl_c_before_there_is_anything_to_record_leaves_nothing(delay_s: float
         assert "Traceback" not in complaints
 
 
-def fail_at(tick: int, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the recorder of the next run raise an error in the middle."""
-    take = Recorder.sample
+def fail_after(ticks: int, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the recorder of the next run raise an error in the middle, when it has taken so many ticks."""
+    take = Recorder.stretch
 
-    def sample(recorder: Recorder, one: PlantSample) -> None:
-        take(recorder, one)
-        if one.tick == tick:
+    def stretch(recorder: Recorder, block: SampleBlock, updates: Sequence[Optimization]) -> None:
+        take(recorder, block, updates)
+        if recorder.next_tick >= ticks:
             raise error
 
-    monkeypatch.setattr(Recorder, "sample", sample)
+    monkeypatch.setattr(Recorder, "stretch", stretch)
 
 
 def test_a_failure_in_the_middle_leaves_what_was_recorded(
     coldloop: "Coldloop", results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fail_at(399, LinkError("the plant is gone"), monkeypatch)
+    fail_after(BLOCK_TICKS, LinkError("the plant is gone"), monkeypatch)
     outcome = coldloop("run", "--in-process", "--duration", "5min", "--out", results)
     assert outcome.code == 1
     assert outcome.complaints[-1] == (
-        f"coldloop: the plant is gone; 400 of 1200 ticks are recorded in {results}"
+        f"coldloop: the plant is gone; {BLOCK_TICKS} of 1200 ticks are recorded in {results}"
     )  # fmt: skip
-    assert assert_incomplete_but_readable(results, "the plant is gone") == 400
+    assert assert_incomplete_but_readable(results, "the plant is gone") == BLOCK_TICKS
 
 
 def test_a_failure_before_the_first_tick_leaves_no_folder(

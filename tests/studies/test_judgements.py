@@ -12,6 +12,7 @@ from rig.studies.cholesky import SLOW_DOWN, SPEED
 from rig.studies.coupling import CASES as PLANTS
 from rig.studies.solver_comparison import measures
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult
+from rig.studies.trade_off import share_falling, won_and_lost
 from rig.studies.trajectories import furthest_outside, iterations_by_event, load_steps
 
 if TYPE_CHECKING:
@@ -120,6 +121,44 @@ def test_single_precision_is_judged_by_its_cost_and_by_the_largest_difference_of
         "largest difference of NCR22_A (W) in single precision": [3.0],
         "largest difference of CV156 (%) in single precision": [0.0],
     }
+
+
+# -- winning and losing ----------------------------------------------------------------------------------------------
+
+
+def test_what_a_period_wins_and_loses_counts_right_after_load_steps(
+    under: StudyOptions, stepped: Load, made_up: "MakeOutcome"
+) -> None:
+    """E = J+ - J-hat and D = J+ - J; the steps are at ticks 400 and 1600, and other updates say nothing."""
+
+    def run(delivered: tuple[float, float], effective: tuple[float, float]) -> "Outcome":
+        return made_up({
+            "tick": [0, 396, 400, 404, 1604], "j_hot_start": [9.0, 9.0, 100.0, 9.0, 50.0],
+            "j_delivered": [0.0, 0.0, delivered[0], 0.0, delivered[1]],
+            "j_effective": [0.0, 0.0, effective[0], 0.0, effective[1]],
+        })  # fmt: skip
+
+    falls, rises, mixed = (
+        run((40.0, 10.0), (70.0, 30.0)),
+        run((90.0, 45.0), (50.0, 20.0)),
+        run((40.0, 45.0), (70.0, 20.0)),
+    )
+    assert won_and_lost(falls, stepped) == (50.0, 25.0), "E = 60 and 40, D = 30 and 20"
+    assert [share_falling(one, stepped) for one in (falls, rises, mixed)] == [1.0, 0.0, 0.5]
+    # ODE, qpOASES, fast gradient and OSQP at 1, 2.5 and 5 s
+    result = evaluated("trade-off", under, [falls, rises, mixed, rises, rises, mixed, *[falls] * 6])
+    assert result.values == {
+        "share of load steps after which E > D at 1 s: ODE less qpOASES": [1.0],
+        "share of load steps after which E > D at 5 s less that at 1 s: qpOASES": [0.5],
+    }
+    assert [row[-1] for row in result.rows[:6]] == [1.0, 0.0, 0.5, 0.0, 0.0, 0.5]
+
+
+@pytest.mark.parametrize(("name", "runs"), [("single-precision", 2), ("trade-off", 20)])
+def test_all_draws_are_taken(name: str, runs: int) -> None:
+    asked = STUDIES[name].requests(StudyOptions(seeds=3))
+    assert len(asked) == 3 * runs
+    assert {request.draw for request in asked} == {1, 2, 3}
 
 
 # -- the refrigerator -------------------------------------------------------------------------------------------------

@@ -31,6 +31,8 @@ from rig.studies.request import Outcome, perform
 from rig.studies.study import StudyOptions, draw_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tests.studies.conftest import MakeOutcome
 
 Array = NDArray[np.float64]
@@ -288,7 +290,7 @@ def test_totals_are_pooled_before_they_are_divided(short: StudyOptions, made_up:
     share = np.log(4.0) / (np.log(4.0) - np.log(0.8))
     assert found.crossing("qpoases", "ode").value == pytest.approx(25**share)
     text = open_loop_table(found)
-    assert "| ODE | 1.5 [1.33 to 2] |" in text
+    assert "| ODE | 1.5 [1.333 to 2] |" in text
     assert "qpOASES costs no more than ODE from P = " in text
 
 
@@ -321,6 +323,17 @@ def test_a_short_study_from_requests_to_report() -> None:
     assert all(row[-1] >= 1 - 1e-9 for row in result.rows if row[0] == "paired")
     assert len(result.values["crossing in total cost"]) == len(result.values["crossing in J_BF"]) == 1
     assert [remark.splitlines()[0][:9] for remark in result.remarks] == ["**Paired,", "**Harsh p"]
+
+
+@pytest.mark.slow
+def test_under_a_load_that_never_steps_nothing_is_compared_and_nothing_fails(tmp_path: "Path") -> None:
+    (tmp_path / "quiet.csv").write_text("time_s,load_w\n0,384.74\n")
+    study, options = STUDIES["solver-comparison"], StudyOptions(loads=(f"{tmp_path}/quiet.csv",), ticks=240, quick=True)
+    outcomes = {request: Outcome.from_json(perform(request)) for request in study.requests(options)}
+    result = study.evaluate(options, outcomes)
+    assert result.values["number of harsh problems"] == [0.0]
+    assert result.remarks[1] == "No problem was harsh."
+    assert "At no power does qpOASES cost as little as ODE" in result.remarks[0]
 
 
 def test_draws_are_the_studys_own_unless_the_command_says() -> None:

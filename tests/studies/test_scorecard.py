@@ -1,20 +1,48 @@
-"""The scorecard cannot flatter: what is asked stands in one file, and verdicts follow from it."""
+"""The scorecard cannot flatter: what is asked is in one file with its history, and verdicts follow from it."""
 
 import json
 import math
+import re
+import subprocess
+import tomllib
+from datetime import date, timedelta
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from rig import paper
-from rig.report.document import as_page, deviations, scorecard_table
-from rig.report.scorecard import FROM_POINTS, Claim, Verdict, as_json, claims, counts, judge, paper_values, verdict
+from rig.report.document import PLACEHOLDER, as_page, deviations, explained, scorecard_table
+from rig.report.reproduction import EXPLANATIONS, circumstances
+from rig.report.scorecard import (
+    FROM_POINTS,
+    TOLERANCES,
+    Claim,
+    Kind,
+    Verdict,
+    as_json,
+    claims,
+    counted,
+    counts,
+    judge,
+    paper_values,
+    verdict,
+    withdrawn,
+)
 from rig.studies import STUDIES
 from rig.studies.crossing import crossing
+from rig.studies.load_response import response
 from rig.studies.solver_comparison import measures
+from rig.studies.study import StudyOptions
+
+ROOT = Path(__file__).parents[2]
+FIRST = Path(__file__).with_name("tolerances-before-the-first-report.toml")
+"""The file as it was set before any run."""
 
 CLAIM = Claim(
     study="s", value="v", figure="f", says="it is so", of_paper="2", why="w", reproduced=(1.0, 3.0), partly=(0.0, 9.0)
@@ -40,6 +68,155 @@ def test_a_verdict_needs_all_draws(values: tuple[float, ...], expected: Verdict)
 
 def test_without_data_in_the_paper_there_is_no_verdict() -> None:
     assert verdict(CLAIM.model_copy(update={"reproduced": None}), (2.0,)) is Verdict.NO_DATA
+
+
+# -- the file and its history -----------------------------------------------------------------------------------------
+
+
+def asked(claim: dict[str, Any]) -> tuple[object, ...]:
+    """Return what makes a claim easier or harder, as plain data."""
+    return tuple(str(claim.get(name)) for name in ("study", "kind", "of_paper", "reproduced", "partly"))
+
+
+def claimed(text: str) -> dict[str, dict[str, Any]]:
+    return {one["value"]: one for one in tomllib.loads(text)["claim"]}
+
+
+def undated(before: dict[str, dict[str, Any]], after: dict[str, dict[str, Any]], day: date) -> list[str]:
+    """Return which claims were added or changed from one version to another without a date from that day on."""
+    new = [value for value, claim in after.items() if value not in before or asked(claim) != asked(before[value])]
+    return [value for value in new if after[value].get("changed", date.min) < day]
+
+
+def test_what_was_added_or_changed_since_before_the_first_report_has_its_date_and_reason() -> None:
+    before, now = claimed(FIRST.read_text("utf-8")), claimed(TOLERANCES.read_text("utf-8"))
+    aims = [value for value, claim in now.items() if claim.get("kind") == "aim"]
+    assert all(before[value]["of_paper"] == "not in the paper" for value in aims), (
+        "an aim was called one from the start"
+    )
+    unchanged_aims = [v for v in aims if asked({**now[v], "kind": None}) == asked(before[v])]
+    assert set(undated(before, now, date(2026, 11, 21))) == set(unchanged_aims)
+    assert set(before) - set(now) <= {one.value for one in withdrawn()}
+    assert all(one.changed and one.because for one in withdrawn())
+    assert not {one.value for one in withdrawn()} & set(now), "what is withdrawn is not claimed"
+
+
+def test_the_history_shows_a_change_that_has_no_date() -> None:
+    one = {"study": "s", "value": "v", "of_paper": "2", "reproduced": [1, 2], "partly": [0, 3]}
+    day = date(2026, 12, 1)
+    assert undated({"v": one}, {"v": one}, day) == []
+    assert undated({"v": one}, {"v": {**one, "reproduced": [1, 2.5]}}, day) == ["v"]
+    assert undated({"v": one}, {"v": {**one, "kind": "variant"}}, day) == ["v"]
+    assert undated({"v": one}, {"v": {**one, "partly": [0, 4], "changed": date(2026, 11, 30)}}, day) == ["v"], (
+        "an older change"
+    )
+    assert undated({"v": one}, {"v": {**one, "partly": [0, 4], "changed": day}}, day) == []
+    assert undated({}, {"v": one}, day) == ["v"]
+
+
+def git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="an unpacked source distribution has no history")
+def test_each_change_in_the_history_of_the_file_was_dated_when_it_was_made() -> None:
+    """From the version before the first report on; a clone without its whole history shows what it has."""
+    log = git("log", "--reverse", "--format=%H %as", "--", "rig/report/tolerances.toml").split()
+    versions = [
+        (git("show", f"{commit}:rig/report/tolerances.toml"), day)
+        for commit, day in zip(log[::2], log[1::2], strict=True)
+    ]
+    shallow = git("rev-parse", "--is-shallow-repository").strip() == "true"
+    assert shallow or FIRST.read_text("utf-8") in [text for text, _ in versions], "the first version is what it was"
+    versions.append((TOLERANCES.read_text("utf-8"), versions[-1][1]))
+    for (before, _), (after, day) in pairwise(versions):
+        if date.fromisoformat(day) > date(2026, 11, 21):  # from then on, changes are dated
+            bad = set(undated(claimed(before), claimed(after), date.fromisoformat(day) - timedelta(days=1)))
+            assert bad <= UNDATED_AIMS | BEFORE_DATES, (day, bad)
+
+
+UNDATED_AIMS = {claim.value for claim in claims() if claim.kind is Kind.AIM}
+"""They were aims from the start, and are called so by another key since."""
+BEFORE_DATES = {
+    "tau_u 0 to 30 s after a load step over that in quiet, by time, Algorithm 1",
+    "adaptive-2h: tau_u 0 to 30 s after a load step over that in quiet, by time, adaptive",
+}
+"""Added on the day that dates came in, a version before them; they have theirs now."""
+
+
+@pytest.mark.parametrize("one", [{"changed": date(2026, 1, 1)}, {"because": "why not"}])
+def test_a_date_without_a_reason_or_a_reason_without_a_date_is_refused(one: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match=r"v: a change has a date \(`changed`\) and a reason \(`because`\)"):
+        Claim.model_validate({**CLAIM.model_dump(), **one})
+
+
+def test_what_cannot_fail_or_is_a_milder_form_does_not_count() -> None:
+    apart = {claim.value for claim in claims() if claim.kind in (Kind.CHECK, Kind.VARIANT)}
+    assert {claim.value for claim in claims() if claim.study == "cholesky"} <= apart
+    assert {"plc-2h: same trace, 5 s", "adaptive-2h: same trace, adaptive"} <= apart
+    milder = {claim.value for claim in claims() if claim.kind is Kind.VARIANT}
+    assert milder == {
+        "crossing in J_BF within 2 %", "interior optimum from 0.5 to 5 s, share of hours",
+        "worst end over best from 0.5 to 5 s, smallest of hours",
+    }  # fmt: skip
+    judged = judge({claim.value: [1.0] for claim in claims()})
+    assert {j.claim.value for j in judged} - {j.claim.value for j in counted(judged)} == apart
+    by_group = counts(judged)
+    assert sum(by_group["claims of the paper"].values()) == sum(claim.kind is Kind.CLAIM for claim in claims())
+    assert sum(by_group["among them calibrated"].values()) == 3
+
+
+def test_where_a_value_can_be_too_good_the_tolerance_has_two_sides() -> None:
+    one_sided = {
+        claim.value for claim in claims()
+        if claim.kind is Kind.CLAIM and claim.reproduced and any(map(math.isinf, claim.reproduced))
+    }  # fmt: skip
+    assert one_sided == {
+        "unlimited: iterations", "qpOASES from P = 10 on, largest distance from converged",
+        "qpOASES, largest rise of total cost with P", "interior optimum from 1 to 5 s, share of hours",
+        "worst end over best from 1 to 5 s, smallest of hours",
+        "better than the mean fixed period, share: Algorithm 1, hours",
+        "tau_u 0 to 30 s after a load step over that in quiet, by time, Algorithm 1",
+        "plc-2h: time outside the bands, 5 s",
+        "adaptive-2h: tau_u 0 to 30 s after a load step over that in quiet, by time, adaptive",
+        "share of load steps after which E > D at 1 s: ODE less qpOASES",
+        "share of load steps after which E > D at 5 s less that at 1 s: qpOASES",
+    }, "shares that end at 1, distances that end at 0, and directions without a size in the paper"  # fmt: skip
+
+
+# -- explanations and header ------------------------------------------------------------------------------------------
+
+
+def test_explanations_have_their_numbers_from_the_results() -> None:
+    values = {"a, b: c": [1.0, 3.0], "d (s)": [math.nan, 0.12345], "e": [math.nan]}
+    text = explained("{a, b: c} and {d (s)}, {e}, {f}", values)
+    assert text == "2 and 0.123, (not run), (not run)"
+
+
+def test_explanations_name_values_that_there_are_and_write_no_numbers() -> None:
+    known = {claim.value for claim in claims()} | set(paper_values())
+    known |= set(response([], "Algorithm 1")) | {f"adaptive-2h: {name}" for name in response([], "adaptive")}
+    known |= {
+        f"cost over that of the best fixed period, geometric mean: contraction rule, interrupt, {h}" for h in ("hours",)
+    }
+    for value, text in tomllib.loads(EXPLANATIONS.read_text("utf-8")).items():
+        assert value in {claim.value for claim in claims()}, value
+        assert set(PLACEHOLDER.findall(text)) <= known, value
+        assert not re.search(r"\d+[.,]\d|\d ?%|per cent", PLACEHOLDER.sub("", text)), value
+
+
+def test_the_line_below_the_title_is_the_programs() -> None:
+    line = circumstances(StudyOptions(), "7 min with 2 workers")
+    pattern = (
+        r"Coldloop \S+, Python \S+, \d{4}-\d\d-\d\d; [^;]*draw[^;]*; \d+ min with \d+ workers, what was kept from "
+        r"before included\."
+    )
+    assert re.fullmatch(pattern, line)
+    kept = (ROOT / "docs" / "report" / "report.md").read_text("utf-8").splitlines()[2]
+    assert re.fullmatch(pattern, kept), "the report that is kept has it too"
+
+
+# -- values of the paper ----------------------------------------------------------------------------------------------
 
 
 def test_every_claim_is_of_a_study_and_its_value_unique() -> None:
@@ -107,7 +284,9 @@ def test_from_a_crossing_on_the_one_is_never_above_the_other(base: list[float], 
 def test_the_scorecard_is_plain_json_and_counts_every_verdict() -> None:
     judged = judge({claim.value: [1.0, math.nan] for claim in claims()})
     assert len(judged) == len(claims())
-    assert sum(sum(numbers.values()) for numbers in counts(judged).values()) == len(judged)
+    by_group = counts(judged)
+    total = sum(sum(by_group[group].values()) for group in ("claims of the paper", "aims of this project"))
+    assert total == len(counted(judged)) < len(judged)
     text = json.dumps(as_json(judged), allow_nan=False)
     assert json.loads(text)[0]["verdict"] in set(Verdict)
 
@@ -116,7 +295,7 @@ def test_the_page_holds_its_pictures_and_colours_its_verdicts(tmp_path: Path) ->
     (tmp_path / "p.png").write_bytes(b"\x89PNG")
     judged = judge({claim.value: [1.0] for claim in claims()})
     markdown = (
-        f"{scorecard_table(judged, dict.fromkeys(STUDIES, 'coldloop'))}\n\n![p](p.png)\n\n{deviations(judged, {})}"
+        f"{scorecard_table(judged, dict.fromkeys(STUDIES, 'coldloop'))}\n\n![p](p.png)\n\n{deviations(judged, {}, {})}"
     )
     page = as_page("t & t", markdown, tmp_path)
     assert 'src="data:image/png;base64,' in page

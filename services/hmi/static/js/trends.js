@@ -12,6 +12,12 @@ const LAYOUT = [
   { id: "tau", title: "τu s, click to see why", lines: [{ label: "tau_u", stroke: "trend", from: "updates", stepped: true }], spread: 1 },
   { id: "cost", title: "(cost)", tall: true, lines: [{ label: "J", name: "J reached", stroke: "trend", from: "updates" }, { label: "J_predicted", name: "J predicted", stroke: "trend-2", from: "updates", dash: [4, 3] }], log: true },
 ];
+// Of a whole refrigerator the pressures too, between the inputs and the updating period.
+const PRESSURES = [["P12", "HP bar"], ["P11", "LP bar"]].map(([name, title]) => ({ id: name, title, lines: [{ label: name, stroke: "trend", from: "series" }], station: name, spread: name === "P12" ? 0.4 : 0.04 }));
+const isRefrigerator = () => state.plant.kind === "refrigerator";
+const layout = () => (isRefrigerator() ? [...LAYOUT.slice(0, 4), ...PRESSURES, ...LAYOUT.slice(4)] : LAYOUT);
+const names = () => (isRefrigerator() ? `${NAMES},${PRESSURES.map((one) => one.id).join(",")}` : NAMES);
+const stationBand = (name) => { const [low, high] = (state.plant.bands || {})[`plant.station.signals.${name}`] || []; return Number.isFinite(low) && Number.isFinite(high) ? [low, high] : null; };
 const REFRESH_MS = 500;
 
 let seconds = 300, zoom = null, held = false, newest = null, onPick = () => {};
@@ -26,11 +32,11 @@ function range() {
 function build() {
   const holder = document.getElementById("charts");
   holder.replaceChildren();
-  charts = LAYOUT.map((one, place) => {
+  charts = layout().map((one, place, all) => {
     const box = element("div", { class: `chart${one.tall ? " tall" : ""}`, id: `chart-${one.id}` });
     holder.append(box);
     const made = makeChart(box, one.lines, {
-      title: one.title, spread: one.spread, log: one.log, sync: "trends", axis: place === LAYOUT.length - 1, range,
+      title: one.title, spread: one.spread, log: one.log, sync: "trends", axis: place === all.length - 1, range,
       onZoom: (from, to) => { zoom = [from, to]; document.getElementById("unzoom").hidden = false; refresh(); },
       onCursor: readout, onPick: one.id === "tau" || one.id === "cost" ? (time) => onPick(time) : null,
     });
@@ -54,7 +60,7 @@ function show(one) {
   const times = one.lines[0].from === "updates" ? newest.updates.time : newest.time;
   const predictions = one.ahead ? newest.predictions.map((each) => ({ time: one.ahead[0].startsWith("CV") ? each.input_time : each.time, curves: one.ahead.map((name) => each[name]) })) : [];
   one.show([times, ...one.lines.map(source)], {
-    band: one.band ? newest.bands[one.band] : one.bounds ? newest.bounds[one.bounds] : null,
+    band: one.band ? newest.bands[one.band] : one.station ? stationBand(one.station) : one.bounds ? newest.bounds[one.bounds] : null,
     predictions, substituted: newest.substituted, marks: newest.marks, modes: newest.modes, now: newest.now_s, ribbon: one.ribbon,
   });
 }
@@ -64,7 +70,7 @@ async function refresh() {
   const end = zoom ? Math.min(zoom[1], state.tick * state.catalog.tick_s) : null;
   const span = zoom ? Math.max(1, end - zoom[0]) : seconds;
   if (held && newest && !zoom) return;
-  const query = `names=${NAMES}&seconds=${span}&points=900${zoom ? `&end=${end}` : ""}`;
+  const query = `names=${names()}&seconds=${span}&points=900${zoom ? `&end=${end}` : ""}`;
   try { newest = await ask(`api/trend?${query}`); } catch { return; }
   if (!charts) build();
   charts.forEach(show);

@@ -1,0 +1,144 @@
+"""Coldloop beside general co-simulation frameworks: exchanges a second of the same data between two processes.
+
+Each exchange carries what plant and control PLC tell each other in a tick: 51 numbers one way and 4 the other. Neither
+side computes anything, so a framework's figure is its upper limit; Coldloop's lock-step (`lockstep.py`, of the same
+run) has plant, control PLC and solver in it. Needs the packages of `peers.txt`, in an environment of their own:
+`python -m venv peers && peers/bin/pip install -r peers.txt && peers/bin/python peers.py`.
+"""
+
+import argparse
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+PLANT_NUMBERS: Final = 51
+CONTROL_NUMBERS: Final = 4
+OWN_PYTHON: Final = Path(__file__).parents[1] / ".venv" / "bin" / "python"
+CORES: Final = ("tcp", "zmq", "ipc")
+
+
+# -- HELICS ------------------------------------------------------------------------------------------------------------
+
+
+def helics_federate(core: str, name: str, other: str, numbers: int, exchanges: int) -> float:
+    """Exchange vectors once a second of simulated time; return exchanges a second of real time."""
+    import helics as h  # noqa: PLC0415 in its own environment
+
+    info = h.helicsCreateFederateInfo()
+    h.helicsFederateInfoSetCoreTypeFromString(info, core)
+    h.helicsFederateInfoSetCoreInitString(info, "--federates=1")
+    h.helicsFederateInfoSetTimeProperty(info, h.HELICS_PROPERTY_TIME_DELTA, 1.0)
+    federate = h.helicsCreateValueFederate(name, info)
+    output = h.helicsFederateRegisterGlobalPublication(federate, name, h.HELICS_DATA_TYPE_VECTOR, "")
+    received = h.helicsFederateRegisterSubscription(federate, other, "")
+    h.helicsFederateEnterExecutingMode(federate)
+    start = time.perf_counter()
+    for tick in range(1, exchanges + 1):
+        h.helicsPublicationPublishVector(output, [float(tick)] * numbers)
+        h.helicsFederateRequestTime(federate, float(tick))
+        if h.helicsInputGetVector(received) != [float(tick)] * (PLANT_NUMBERS + CONTROL_NUMBERS - numbers):
+            raise RuntimeError("what the other side has sent for this tick did not arrive")
+    elapsed = time.perf_counter() - start
+    h.helicsFederateDisconnect(federate)
+    h.helicsFederateFree(federate)
+    return exchanges / elapsed
+
+
+def helics_exchanges(core: str, exchanges: int) -> float:
+    """Return exchanges a second between two processes and a broker."""
+    import helics as h  # noqa: PLC0415
+
+    broker = h.helicsCreateBroker(core, "", "-f 2")
+    command = [sys.executable, __file__, "--helics-control", core, "--exchanges", str(exchanges)]
+    with subprocess.Popen(command) as control:
+        rate = helics_federate(core, "plant", "control", PLANT_NUMBERS, exchanges)
+        control.wait(60)
+    h.helicsBrokerWaitForDisconnect(broker, 10_000)
+    h.helicsCloseLibrary()
+    return rate
+
+
+# -- mosaik ------------------------------------------------------------------------------------------------------------
+
+
+def mosaik_side(numbers: int) -> Any:  # noqa: ANN401 a class of a package that may not be there
+    """Return a simulator that tells so many numbers in each step."""
+    import mosaik_api_v3  # noqa: PLC0415
+
+    model = {"public": True, "params": [], "attrs": ["told", "heard"]}
+
+    class Side(mosaik_api_v3.Simulator):  # type: ignore[misc]
+        """One side of the exchange."""
+
+        def __init__(self) -> None:
+            super().__init__({"api_version": "3.0", "type": "time-based", "models": {"Side": model}})
+            self.tick = 0
+
+        def create(self, num: int, model: str, **_: object) -> list[dict[str, str]]:
+            """Make the entity."""
+            return [{"eid": f"side{number}", "type": model} for number in range(num)]
+
+        def step(self, time: int, inputs: object, max_advance: int) -> int:  # noqa: ARG002
+            """Do nothing for a step."""
+            self.tick = time
+            return time + 1
+
+        def get_data(self, outputs: dict[str, list[str]]) -> dict[str, dict[str, list[float]]]:
+            """Tell the numbers."""
+            return {entity: {"told": [float(self.tick)] * numbers} for entity in outputs}
+
+    return Side()
+
+
+def mosaik_exchanges(exchanges: int) -> float:
+    """Return exchanges a second between two simulators in processes of their own."""
+    import mosaik  # noqa: PLC0415
+
+    command = f"{sys.executable} {__file__} --mosaik-side {{}} %(addr)s"
+    sides = {name: {"cmd": command.format(count)} for name, count in
+             (("Plant", PLANT_NUMBERS), ("Control", CONTROL_NUMBERS))}  # fmt: skip
+    with mosaik.World(sides) as world:
+        plant, control = (world.start(name).Side() for name in sides)
+        world.connect(plant, control, ("told", "heard"))
+        world.connect(
+            control, plant, ("told", "heard"), time_shifted=True, initial_data={"told": [0.0] * CONTROL_NUMBERS}
+        )
+        start = time.perf_counter()
+        world.run(until=exchanges, print_progress=False)
+        return exchanges / (time.perf_counter() - start)
+
+
+def main() -> None:
+    """Measure and print, or be one side of a measurement."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--exchanges", type=int, default=3000)
+    parser.add_argument("--coldloop", type=Path, default=OWN_PYTHON, help="an interpreter that has Coldloop")
+    parser.add_argument("--helics-control", choices=CORES, help=argparse.SUPPRESS)
+    parser.add_argument("--mosaik-side", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("address", nargs="?", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.helics_control:
+        helics_federate(options.helics_control, "control", "plant", CONTROL_NUMBERS, options.exchanges)
+        return
+    if options.mosaik_side:
+        import mosaik_api_v3  # noqa: PLC0415
+
+        sys.argv = [sys.argv[0], options.address]
+        mosaik_api_v3.start_simulation(mosaik_side(options.mosaik_side))
+        return
+    if options.coldloop.is_file():
+        lockstep = [options.coldloop, Path(__file__).with_name("lockstep.py"), "--ticks", str(options.exchanges)]
+        print(
+            "Coldloop:", subprocess.run(lockstep, check=True, capture_output=True, text=True).stdout.strip(), flush=True
+        )
+    peers: dict[str, Callable[[], float]] = {"mosaik": lambda: mosaik_exchanges(options.exchanges)}
+    peers |= {f"HELICS {core}": lambda core=core: helics_exchanges(core, options.exchanges) for core in CORES}
+    for name, measure in peers.items():
+        print(f"{name}: {measure():.0f} exchanges/s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""Each benchmark that measures speed runs in a short form, and prints figures of the right order."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+PATIENCE_S = 600.0
+"""The first one may have to compile the kernels."""
+
+
+def printed_by(*command: str) -> str:
+    """Return what a benchmark prints."""
+    done = subprocess.run(
+        [sys.executable, *command], cwd=FOLDER, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def numbers(pattern: str, text: str) -> list[float]:
+    return [float(found.replace(",", "")) for found in re.findall(pattern, text)]
+
+
+@pytest.mark.slow
+def test_an_ode_iteration_costs_some_cholesky_factorisations() -> None:
+    text = printed_by("ode_iteration.py", "--problems", "20", "--minutes", "2", "--repeat", "1")
+    (ratio,) = numbers(r"ratio ([0-9.]+)", text)
+    assert 0.3 < ratio < 30, text
+
+
+@pytest.mark.slow
+def test_a_run_takes_a_multiple_of_the_sum_of_its_kernels() -> None:
+    text = printed_by("limits.py", "--ticks", "2400", "--repeat", "1", "--calls", "300")
+    ratios = numbers(r"([0-9.]+) times the sum", text)
+    assert len(ratios) == 3
+    assert all(0.5 < ratio < 20 for ratio in ratios), text
+    assert all(speed > 50 for speed in numbers(r": ([0-9,]+) times real time", text)), text
+
+
+@pytest.mark.slow
+def test_all_solvers_take_part_in_the_comparison() -> None:
+    text = printed_by("qp_solvers.py", "--hours", "e", "--minutes", "3", "--iterations", "5")
+    for name in ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "daqp"):
+        assert len(re.findall(rf"^{name} ", text, re.MULTILINE)) == 2, text
+
+
+@pytest.mark.slow
+def test_one_process_and_three_leave_one_trace_in_the_speed_benchmark() -> None:
+    text = printed_by("run_speed.py", "--load", "a", "--duration", "20s", "--repeat", "1")
+    assert text.count("one trace: True") == 2, text
+
+
+@pytest.mark.slow
+def test_lock_step_is_a_share_of_the_bare_exchanges() -> None:
+    text = printed_by("lockstep.py", "--ticks", "200")
+    (ratio,) = numbers(r"ratio ([0-9.]+)", text)
+    assert 0.01 < ratio < 1, text
