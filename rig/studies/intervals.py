@@ -32,7 +32,7 @@ class Interval(NamedTuple):
         value = f"{self.value:.{digits}g}" if np.isfinite(self.value) else "none"
         if not np.isfinite(self.low):
             return value
-        absent = f"; none in {100 * self.missing:.0f} %" if self.missing else ""
+        absent = f"; none in {100 * self.missing:.0f} %" if self.missing >= 0.005 else ""
         return f"{value} [{self.low:.{digits}g} to {self.high:.{digits}g}{absent}]"
 
 
