@@ -45,7 +45,6 @@ def test_a_double_click_on_a_command_asks_once_and_does_nothing_by_itself(operat
     operated.fill("#load-number", "444")
     operated.dblclick("#load-set")
     operated.wait_for_selector("#confirm[open]")
-    assert operated.is_disabled("#confirm-yes"), "nobody has read it yet"
     operated.click("#confirm-no")
     operated.wait_for_selector("#confirm[open]", state="detached")
     operated.wait_for_selector("body:not(.commanding)")
@@ -268,7 +267,7 @@ def test_a_substituted_value_is_no_line_like_others(operated: "Page", site: Site
     operated.click("#alarm-table tr[data-alarm='sensor bad'] button:has-text('Acknowledge')")
 
 
-BLANK = "document.querySelector('#chart-T5').dataset.substituted > 0"
+BLANK = "document.querySelector('#chart-T5')?.dataset.substituted > 0"
 
 
 def test_shelving_says_that_it_counts_plant_time(operated: "Page") -> None:
