@@ -108,7 +108,7 @@ def _told(run: Outcome) -> tuple[str | float, ...]:
 def _courses(runs: list[Outcome]) -> Figure:
     shown = (
         ("load", "load (W)"), ("L1", "L1 (%)"), ("T5", "T5 (K)"), ("P12", "HP (bar)"), ("P11", "LP (bar)"),
-        ("L_N2", "nitrogen (%)"), ("T9", "T9 (K)"), ("mode", "mode"),
+        ("L_N2", "nitrogen (%)"), ("T9", "T9 (K)"), ("mode", "station"),
     )  # fmt: skip
     with panels(len(shown), 1, (9.0, 11.0), sharex=True) as (figure, axes):
         for (pair, run), colour in zip(zip(_pairs(), runs, strict=True), COLOURS, strict=False):
@@ -118,6 +118,7 @@ def _courses(runs: list[Outcome]) -> Figure:
                 )
         for (_, label), place in zip(shown, axes, strict=True):
             place.set_ylabel(label)
+        axes[-1].set_yticks(list(StationMode), [mode.name.lower().replace("_", " ") for mode in StationMode])
         axes[-1].set_xlabel("plant time (min)")
         legend_outside(figure, axes[0])
         figure.align_ylabels(axes)
