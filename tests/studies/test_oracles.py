@@ -82,8 +82,8 @@ def test_robustness_compares_under_the_same_condition() -> None:
     }  # fmt: skip
     ratios = ratio_table(costs)
     for row in ratios.values():
-        assert row[REFERENCE] == pytest.approx((1.0, 1.0, 1.0))
-        assert row["Algorithm 1"] == pytest.approx((4.0, 2.0, 8.0))
+        assert row[REFERENCE][:3] == pytest.approx((1.0, 1.0, 1.0))
+        assert row["Algorithm 1"][:3] == pytest.approx((4.0, 2.0, 8.0))
 
 
 @pytest.mark.slow
