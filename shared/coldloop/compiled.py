@@ -70,10 +70,21 @@ def kept(name: str, of: bytes, compute: Callable[[], NDArray[np.float64]]) -> ND
         found: NDArray[np.float64] = np.load(path)
     except (OSError, ValueError, EOFError):
         found = compute()
-        with contextlib.suppress(OSError), tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as draft:
-            np.save(draft, found)
-            Path(draft.name).replace(path)
+        with contextlib.suppress(OSError):
+            _keep(path, found)
     return found
+
+
+def _keep(path: Path, found: NDArray[np.float64]) -> None:
+    """Write a file that appears whole or not at all; every user reads it, as the other files of the cache."""
+    handle, draft = tempfile.mkstemp(dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.save(file, found)
+        Path(draft).chmod(0o644)
+        Path(draft).replace(path)
+    finally:
+        Path(draft).unlink(missing_ok=True)
 
 
 def _cache_directory() -> Path:
