@@ -10,23 +10,21 @@ not: a search and no bound. What it gives is the cost of a sequence that exists,
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final, Protocol, Self, TypeVar
 
 from coldloop.lti_model import load
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
-from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Verdict
-from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
-from coldloop.registers.plant import LoadStep, Measurement, PlantSample
+from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.plant import PlantSample, StationSample
 from control_plc.runtime import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.updating_period import Assessment, Observation, assess
+from optimizer_plc.updating_period import FixedPeriod
 from plant.kinds import plant_maker
 from plant.program import LoadProfile
 from plant.runtime import own_header
 from rig.indicators import StageCost
+from rig.one_process import Programs, load_table
 from rig.recording import Recorder, SampleBlock
 from rig.scenario import Scenario
 from rig.settings import Settings
@@ -97,50 +95,24 @@ def segment_ends(load_profile: LoadProfile, ticks: int) -> list[int]:
     return [*(tick for tick in kept if 0 < tick <= ticks - TICKS_PER_SAMPLE), ticks]
 
 
-@dataclass
-class ChosenIterations:
-    """A rule that does what it is told."""
-
-    iterations: int
-
-    @property
-    def first(self) -> int:
-        """What was chosen."""
-        return self.iterations
-
-    @property
-    def status(self) -> UpdatingRuleStatus:
-        """It shows as a fixed period."""
-        return UpdatingRuleStatus(UpdatingRuleKind.FIXED, self.iterations, self.iterations, self.iterations)
-
-    def after_interruption(self) -> int:
-        """Return what was chosen."""
-        return self.iterations
-
-    def next(self, observation: Observation) -> tuple[int, Assessment]:
-        """Return what was chosen."""
-        return self.iterations, assess(observation)
-
-
 class LoopBranch:
-    """The three programs in one process, with what they have cost so far; steps as `rig.one_process` does."""
+    """The three programs in one process, with what they have cost so far."""
 
     def __init__(
         self, settings: Settings, scenario: Scenario, objective: Objective, recorder: Recorder | None = None
     ) -> None:
         header, model = own_header(settings.model.file), load(settings.model.file)
         program = settings.optimizer_plc.program
-        steps = [as_transmitted(LoadStep(*step)) for step in zip(scenario.load.times, scenario.load.watts, strict=True)]
-        profile = LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
-        self._recorder = recorder
-        self._plant = plant_maker(header, settings.plant)(profile, scenario.seed)
-        self._control = make_control_program(header, settings.control_plc, settings.limits)
-        self._optimizer = OptimizerProgram(model, program, settings.limits)
-        self._iterations = [self._optimizer.budget.iterations(round(period / TICK_S)) for period in PERIODS_S]
-        self._rule = ChosenIterations(self._iterations[0])
-        self._optimizer.restart(0.0, self._rule)
-        self._control.restart(session=1)
-        self._sums = CostSums(StageCost(model, program.design))
+        self._programs = Programs(
+            plant_maker(header, settings.plant)(load_table(scenario.load), scenario.seed),
+            make_control_program(header, settings.control_plc, settings.limits),
+            OptimizerProgram(model, program, settings.limits),
+        )
+        optimizer = self._programs.optimizer
+        self._rules = [FixedPeriod(optimizer.budget.iterations(round(period / TICK_S))) for period in PERIODS_S]
+        optimizer.restart(0.0, self._rules[0])
+        self._programs.control.restart(session=1)
+        self._sums = CostSums(StageCost(model, program.design), recorder)
         self._objective = objective
         if recorder is not None:
             recorder.begin()
@@ -156,43 +128,18 @@ class LoopBranch:
 
     def advance(self, choice: int, until: int) -> None:
         """Go on to `until`; periods that begin from now on are of the choice."""
-        self._rule.iterations = self._iterations[choice]
-        while self._plant.tick < until:
-            if self._control.awaiting_sequence:
-                self._deliver()
-            self._scan()
+        self._programs.optimizer.rule = self._rules[choice]
+        while self._programs.plant.tick < until:
+            self._programs.tick(self._sums)
         self._sums.settle()
-
-    def _deliver(self) -> None:
-        answer = self._control.offer(self._optimizer.solve())
-        update = as_transmitted(self._optimizer.report(Verdict(answer.verdict)))
-        self._sums.update(update)
-        if self._recorder is not None:
-            self._recorder.update(update)
-
-    def _scan(self) -> None:
-        plant = self._plant
-        actuators = as_transmitted(self._control.begin_scan())
-        u = actuators[1:4]
-        plant.apply(u)
-        measurement = as_transmitted(
-            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session)
-        )
-        sample = PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x)
-        self._sums.sample(sample)
-        if self._recorder is not None:
-            self._recorder.sample(sample)
-        plant.advance()
-        update = self._control.end_scan(measurement)
-        if update is not None:
-            self._control.accept_plan(as_transmitted(self._optimizer.plan(as_transmitted(update))))
 
 
 class CostSums:
     """J_BF and J_open_mean of a run so far, as `rig.indicators` sums them at its end."""
 
-    def __init__(self, stage_cost: StageCost) -> None:
+    def __init__(self, stage_cost: StageCost, recorder: Recorder | None = None) -> None:
         self._stage_cost = stage_cost
+        self._recorder = recorder
         self._samples: list[PlantSample] = []
         self._stage_costs = self._weighted = 0.0
         self._delivered = 0
@@ -217,6 +164,13 @@ class CostSums:
     def sample(self, sample: PlantSample) -> None:
         """Take a tick."""
         self._samples.append(sample)
+        if self._recorder is not None:
+            self._recorder.sample(sample)
+
+    def station(self, sample: StationSample) -> None:
+        """Pass on what the compression station does: it costs nothing here."""
+        if self._recorder is not None:
+            self._recorder.station(sample)
 
     def settle(self) -> None:
         """Add up the ticks taken."""
@@ -231,6 +185,8 @@ class CostSums:
             end = last.tick + last.tau_u
             self._weighted += (last.j_dev + last.j_cst) * (end - self._delivered)
             self._delivered = end
+        if self._recorder is not None:
+            self._recorder.update(update)
 
 
 def run_best_in_hindsight(settings: Settings, scenario: Scenario, recorder: Recorder, objective: Objective) -> None:
