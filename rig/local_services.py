@@ -135,10 +135,10 @@ class LocalServices:
         death = asyncio.ensure_future(self._ended.get())
         try:
             await asyncio.wait({task, death}, return_when=asyncio.FIRST_COMPLETED)
-            if task.done():
-                return task.result()
-            dead = death.result()
-            raise LinkError(f"the {dead} service has ended: {self._last_words(dead)} (log: {self.log(dead)})")
+            if death.done():  # first: work that needs the service may fail in the same turn
+                dead = death.result()
+                raise LinkError(f"the {dead} service has ended: {self._last_words(dead)} (log: {self.log(dead)})")
+            return task.result()
         finally:
             for pending in (task, death):
                 pending.cancel()

@@ -4,6 +4,7 @@ import json
 import os
 import socket
 import tempfile
+import threading
 from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -54,7 +55,8 @@ def require_regular_file(path: Path) -> None:
 def whole_file(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` make the file under another name, then give it its own; others may do so at the same time."""
     require_regular_file(path)
-    draft = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.draft")
+    writer = f"{socket.gethostname()}.{os.getpid()}.{threading.get_native_id()}"
+    draft = path.with_name(f".{path.name}.{writer}.draft")
     try:
         write(draft)
         draft.replace(path)

@@ -3,6 +3,8 @@
 import json
 import math
 import re
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -216,6 +218,20 @@ def test_a_file_that_cannot_be_written_whole_leaves_the_old_one(tmp_path: Path) 
     with pytest.raises(DiskFullError):
         whole_file(path, fail_halfway)
     assert [file.name for file in tmp_path.iterdir()] == ["summary.json"]
+    assert read(path) == {"run": 1}
+
+
+def test_threads_may_write_the_same_file_at_once(tmp_path: Path) -> None:
+    path, together = tmp_path / "record.json", threading.Barrier(2)
+
+    def write(draft: Path) -> None:
+        draft.write_text('{"run": 1}')
+        together.wait(10)
+
+    with ThreadPoolExecutor(2) as pool:
+        for writer in [pool.submit(whole_file, path, write) for _ in range(2)]:
+            writer.result()
+    assert [file.name for file in tmp_path.iterdir()] == ["record.json"]
     assert read(path) == {"run": 1}
 
 
