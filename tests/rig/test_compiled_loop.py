@@ -34,6 +34,13 @@ COMPILED = {
     "rates that count elapsed time": ('limits.rate_reference="elapsed"',),
     "long sequences": (f"{PROGRAM}sequence_ticks=240",),
     "a fast PLC": (f"{PROGRAM}budget.power=10",),
+    "as printed": (f'{PROGRAM}preset="as-printed"',),
+    "as printed, elapsed time": (f'{PROGRAM}preset="as-printed"', 'limits.rate_reference="elapsed"'),
+    "soft rows": (f"{PROGRAM}penalties.output_rows=1", f"{PROGRAM}penalties.rate_rows=[1, 2, 3]"),
+    "a box penalty alone": (f"{PROGRAM}penalties.box=2",),
+    "first knot as rows": (f"{PROGRAM}penalties.first_knot_in_box=false",),
+    "no look-ahead rows": (f"{PROGRAM}ode.look_ahead_rows=false",),
+    "not held at bounds": (f"{PROGRAM}ode.hold_at_bounds=false",),
 }
 """Whose updates are compiled too."""
 LEFT_TO_PROGRAMS = {
