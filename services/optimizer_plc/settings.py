@@ -27,6 +27,7 @@ from optimizer_plc.computing_settings import (
     QpoasesSettings,
 )
 from optimizer_plc.design import ControlDesign
+from optimizer_plc.penalties import PRESETS, PenaltySettings, Preset, alpha_of, completed
 
 SHOWN: Final = ("limits", "optimizer_plc.program")
 """What of the configuration decides results: shown in the registers."""
@@ -117,6 +118,9 @@ class ProgramSettings(BaseModel):
     updating periods: one to be played, one in case the next sequence is late."""
     adaptive: AdaptiveSettings = AdaptiveSettings()
     design: ControlDesign = ControlDesign()
+    preset: Preset = Preset.TUNED
+    """Penalties and start of the ODE-based solver, as far as they are not set themselves."""
+    penalties: PenaltySettings = PenaltySettings()
     budget: BudgetSettings = BudgetSettings()
     estimator: EstimatorSettings = EstimatorSettings()
     ode: OdeSettings = OdeSettings()
@@ -132,6 +136,17 @@ class ProgramSettings(BaseModel):
         if value % TICK_S or 0 < value < 2 * TICK_S:
             raise ValueError("an updating period is a multiple of 0.25 s from 0.5 s on, or 0 for adaptive")
         return value
+
+    @model_validator(mode="after")
+    def _completed(self) -> Self:
+        """Take what was not set from the preset, and alpha of the solvers from the penalties."""
+        for name, values in PRESETS[self.preset].items():
+            self.__dict__[name] = completed(getattr(self, name), values)  # before anybody sees it: it is frozen then
+        alpha = alpha_of(self.penalties, self.design)
+        for name in type(self).model_fields:
+            if "alpha" in getattr(type(getattr(self, name)), "model_fields", ()):
+                self.__dict__[name] = completed(getattr(self, name), {"alpha": alpha})
+        return self
 
     @model_validator(mode="after")
     def _load_steps_are_seen(self) -> Self:

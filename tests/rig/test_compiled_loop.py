@@ -46,6 +46,13 @@ COMPILED = {
         "model.file=refrigerator",
         f"{PROGRAM}updating_period_s=2.5",
     ),
+    "as printed": (f'{PROGRAM}preset="as-printed"',),
+    "as printed, elapsed time": (f'{PROGRAM}preset="as-printed"', 'limits.rate_reference="elapsed"'),
+    "soft rows": (f"{PROGRAM}penalties.output_rows=1", f"{PROGRAM}penalties.rate_rows=[1, 2, 3]"),
+    "a box penalty alone": (f"{PROGRAM}penalties.box=2",),
+    "first knot as rows": (f"{PROGRAM}penalties.first_knot_in_box=false",),
+    "no look-ahead rows": (f"{PROGRAM}ode.look_ahead_rows=false",),
+    "not held at bounds": (f"{PROGRAM}ode.hold_at_bounds=false",),
 }
 """Whose updates are compiled too."""
 LEFT_TO_PROGRAMS = {

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Solver", "make_solver"]
 
 _MAKERS: "dict[str, Callable[[ProgramSettings], Solver]]" = {
-    "ode": lambda settings: OdeSolver(settings.ode),
+    "ode": lambda settings: OdeSolver(settings.ode, settings.penalties),
     "qpoases": lambda settings: QpoasesSolver(settings.qpoases),
     "osqp": lambda settings: OsqpSolver(settings.osqp),
     "fast-gradient": lambda settings: FastGradientSolver(settings.fast_gradient),
