@@ -16,7 +16,7 @@ from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, LadderStatus, Mode, Status
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, STATION_ROWS, PlantSession, SensorFault, Surroundings
-from plant.runtime import own_header
+from plant.own_model import own_header
 from rig.driving import CONTROL, PLANT
 from rig.load_stream import LoadStream, write_table
 from rig.recording import LinkStatistics, Recorder
