@@ -25,6 +25,11 @@ from rig.settings import Settings
 
 PROGRAM = "optimizer_plc.program."
 NOISE = ("plant.sensors.level=0.02", "plant.sensors.speed=0.5", "plant.sensors.temperature=0.02")
+REFRIGERATOR = "plant.kind=refrigerator"
+TRIP = (
+    'plant.refrigerator.events=[{at_s=90, target="nc1", value=0}, {at_s=120, target="nc1", value=1}, '
+    '{at_s=150.25, target="leak", value=2.0}]'
+)
 COMPILED = {
     "adaptive": (),
     "fixed": (f"{PROGRAM}updating_period_s=2.5",),
@@ -34,6 +39,13 @@ COMPILED = {
     "rates that count elapsed time": ('limits.rate_reference="elapsed"',),
     "long sequences": (f"{PROGRAM}sequence_ticks=240",),
     "a fast PLC": (f"{PROGRAM}budget.power=10",),
+    "refrigerator": (REFRIGERATOR, TRIP, *NOISE),
+    "refrigerator with PI and a model of its own": (
+        REFRIGERATOR,
+        "plant.station.control=pi",
+        "model.file=refrigerator",
+        f"{PROGRAM}updating_period_s=2.5",
+    ),
 }
 """Whose updates are compiled too."""
 LEFT_TO_PROGRAMS = {
@@ -43,6 +55,7 @@ LEFT_TO_PROGRAMS = {
     "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
     "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
     "qpoases": (f'{PROGRAM}solver="qpoases"',),
+    "qpoases and a refrigerator": (f'{PROGRAM}solver="qpoases"', REFRIGERATOR),
     "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
 }
 """Whose ticks alone are compiled, where that is worth while."""
@@ -109,6 +122,10 @@ def done_by_the_loop(monkeypatch: pytest.MonkeyPatch, assignments: tuple[str, ..
 
 def test_nearly_all_ticks_of_an_ordinary_run_are_compiled(monkeypatch: pytest.MonkeyPatch, lively: LoadProfile) -> None:
     assert done_by_the_loop(monkeypatch, (), lively) > 550
+
+
+def test_nearly_all_ticks_of_a_refrigerator_are_compiled(monkeypatch: pytest.MonkeyPatch, lively: LoadProfile) -> None:
+    assert done_by_the_loop(monkeypatch, (REFRIGERATOR, TRIP), lively) > 550
 
 
 def test_nothing_is_compiled_while_the_classical_loops_drive(
