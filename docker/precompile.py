@@ -37,7 +37,7 @@ def optimizer_plc() -> None:
 def _answer_two_updates(settings: "ProgramSettings") -> None:
     from coldloop.limits import InputLimits  # noqa: PLC0415
     from coldloop.lti_model import load  # noqa: PLC0415
-    from control_plc.runtime import make_program  # noqa: PLC0415
+    from control_plc.program import make_program  # noqa: PLC0415
     from control_plc.settings import ControlSection  # noqa: PLC0415
     from optimizer_plc.computing_settings import Arithmetic  # noqa: PLC0415
     from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415

@@ -93,8 +93,9 @@ class Simulation:
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Return the figure of the run; with a path it is written there too, as .png, .pdf or .svg."""
+        (batch,) = self.trace.arrow.select(["time_s", *DRAWN]).to_batches()
         curves = RunCurves(
-            batch_series(self.trace.arrow.select(["time_s", *DRAWN])),
+            batch_series(batch),
             self.events.arrow.to_pylist(),
             Bounds.of(self.configuration),
             title_of(self.configuration),

@@ -17,12 +17,12 @@ from coldloop.lti_model import load
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample
-from control_plc.runtime import make_program as make_control_program
+from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.updating_period import FixedPeriod
 from plant.kinds import plant_maker
+from plant.own_model import own_header
 from plant.program import LoadProfile
-from plant.runtime import own_header
 from rig.indicators import StageCost
 from rig.one_process import Programs, load_table
 from rig.recording import Recorder, SampleBlock

@@ -7,14 +7,14 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from coldloop.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.limits import InputLimits
-from coldloop.metrics_server import MetricsSettings
+from coldloop.metrics_settings import MetricsSettings
 from coldloop.modbus.settings import ServerSettings
 from coldloop.model_settings import ModelSettings
 from coldloop.process import TICK_S
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.session import SessionSettings
-from coldloop.telemetry import TelemetrySettings
+from coldloop.telemetry_settings import TelemetrySettings
 from optimizer_plc.budget import MAX_PERIOD_TICKS, BudgetSettings
 from optimizer_plc.computing_settings import (
     Arithmetic,

@@ -59,3 +59,11 @@ def test_lock_step_is_a_share_of_the_bare_exchanges() -> None:
     text = printed_by("lockstep.py", "--ticks", "200")
     (ratio,) = numbers(r"ratio ([0-9.]+)", text)
     assert 0.01 < ratio < 1, text
+
+
+@pytest.mark.slow
+def test_programs_start_in_seconds() -> None:
+    text = printed_by("start.py", "--repeat", "1")
+    seconds = numbers(r"warm: ([0-9.]+) s", text)
+    assert len(seconds) == 4, text
+    assert all(0.05 < each < 60 for each in seconds), text
