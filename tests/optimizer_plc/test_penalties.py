@@ -182,7 +182,7 @@ def test_a_first_knot_that_is_no_box_is_moved_within_its_rate_before_it_is_sent(
 
 
 def test_the_box_is_penalised_as_it_is_printed(problem: PredictiveProblem, situations: "Situations") -> None:
-    """A solver that only looks is slowed down where its middle stage leaves the box; the penalty ends elsewhere."""
+    """It acts where the middle stage of a step is outside the box; iterates are inside, so J has nothing of it."""
     qp = problem.at(situations(np.random.default_rng(8)))
     reached = []
     for box in (0.0, 1.0):
