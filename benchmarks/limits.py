@@ -16,7 +16,7 @@ from coldloop.lti_model import load
 from coldloop.process import TICK_S
 from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.costs import matrices_of
-from optimizer_plc.solvers.ode import begin, descend, flow_in
+from optimizer_plc.solvers.ode import descend, flow_in, warm_start
 from plant.cold_box import REFERENCE, evaluate
 from plant.helium.properties import load_helium
 from plant.integrator import advance_along
@@ -55,7 +55,7 @@ def solves(matrices, qp, guess, flow, iterations, count):  # noqa: ANN001, ANN20
     """Solve a problem so many times with so many iterations."""
     total = 0.0
     for _ in range(count):
-        z, cost, dt = begin(matrices, qp, guess, flow)
+        z, cost, dt = warm_start(matrices, qp, guess, flow)
         _, _, cost, _ = descend(matrices, qp, z, np.zeros_like(qp.gamma), cost, dt, 0, iterations, flow)
         total += cost
     return total

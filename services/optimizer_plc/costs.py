@@ -1,4 +1,8 @@
-"""What a profile costs: the augmented cost J that solvers decrease, and the indicators of section V."""
+"""What a profile costs: the augmented cost J that solvers decrease, its gradient, and the indicators of section V.
+
+Gamma z - gamma and the gradient are computed here for all solvers, except by the interior-point method, which has its
+variables in an order of its own.
+"""
 
 from typing import NamedTuple
 
@@ -6,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.compiled import kernel
-from optimizer_plc.linear_algebra import Columns, add_product, apply, by_columns
+from optimizer_plc.linear_algebra import Columns, add_product, add_transposed_product, by_columns
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 
 Array = NDArray[np.float64]
@@ -27,15 +31,28 @@ def quadratic_cost(Phi: Array, phi: Array, z: Array) -> float:
 @kernel
 def augmented_cost(qp: QuadraticProblem, z: Array, alpha: float) -> float:
     """Return J(z) = J_0(z) + alpha sum max(Gamma z - gamma, 0)^2, without the constant, for z inside its box."""
-    zero = z.dtype.type(0.0)
-    penalty = zero
-    for i in range(qp.Gamma.shape[0]):
-        excess = -qp.gamma[i]
+    return quadratic_cost(qp.Phi, qp.phi, z) + alpha * positive_squares(row_excess(qp, z))
+
+
+@kernel
+def row_excess(qp: QuadraticProblem, z: Array) -> Array:
+    """Return Gamma z - gamma, shape (m,)."""
+    excess = -qp.gamma
+    for r in range(excess.shape[0]):
         for j in range(z.shape[0]):
-            excess += qp.Gamma[i, j] * z[j]
-        if excess > zero:
-            penalty += excess * excess
-    return quadratic_cost(qp.Phi, qp.phi, z) + alpha * penalty
+            excess[r] += qp.Gamma[r, j] * z[j]
+    return excess
+
+
+@kernel
+def positive_squares(excess: Array) -> float:
+    """Return sum max(excess, 0)^2 over `excess` (m,)."""
+    zero = excess.dtype.type(0.0)
+    total = zero
+    for r in range(excess.shape[0]):
+        if excess[r] > zero:
+            total += excess[r] * excess[r]
+    return total
 
 
 class Matrices(NamedTuple):
@@ -57,17 +74,42 @@ def matrices_of(qp: QuadraticProblem) -> Matrices:
 @kernel
 def cost_by_columns(constant: Matrices, qp: QuadraticProblem, z: Array, alpha: float) -> float:
     """Return what `augmented_cost` does, to the bit, for a problem with these matrices."""
-    zero = z.dtype.type(0.0)
-    slope, excess = qp.phi.copy(), -qp.gamma
+    slope = qp.phi.copy()
     add_product(constant.Phi, z, slope)
-    add_product(constant.Gamma, z, excess)
-    total, penalty = zero, zero
+    total = z.dtype.type(0.0)
     for i in range(z.shape[0]):
         total += slope[i] * z[i]
+    return total + alpha * positive_squares(excess_by_columns(constant, qp, z))
+
+
+@kernel
+def excess_by_columns(constant: Matrices, qp: QuadraticProblem, z: Array) -> Array:
+    """Return what `row_excess` does, to the bit, for a problem with these matrices."""
+    excess = -qp.gamma
+    add_product(constant.Gamma, z, excess)
+    return excess
+
+
+@kernel
+def gradient(
+    constant: Matrices, qp: QuadraticProblem, z: Array, alpha: float, result: Array, active: Array
+) -> None:  # fmt: skip
+    """Write dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0."""
+    n = z.shape[0]
+    zero, one, two = z.dtype.type(0.0), z.dtype.type(1.0), z.dtype.type(2.0)
+    for i in range(n):
+        result[i] = zero
+    add_product(constant.Phi, z, result)
+    for i in range(n):
+        result[i] = two * result[i] + qp.phi[i]
+    excess, rows = excess_by_columns(constant, qp, z), constant.rows
     for r in range(excess.shape[0]):
+        active[r] = zero
         if excess[r] > zero:
-            penalty += excess[r] * excess[r]
-    return total + alpha * penalty
+            active[r] = one
+            factor = two * alpha * excess[r]
+            for j in range(rows.first[r], rows.end[r]):
+                result[j] += factor * rows.transposed[r, j]
 
 
 class Indicators(NamedTuple):
@@ -118,8 +160,8 @@ def predicted_indicators(
 ) -> Indicators:
     """Return the indicators of profile z (n,) at the state x (n_x,) under the load w (W), both as deviations."""
     outputs = maps.resting.copy()
-    apply(maps.of_z, z, outputs)
-    apply(maps.of_x, x, outputs)
+    add_transposed_product(maps.of_z, z, outputs)
+    add_transposed_product(maps.of_x, x, outputs)
     j_cst = violation_cost(outputs, maps.of_w, w, maps.bands)
     j_dev = deviation_cost(qp, z, n_inputs) + qp.constant
     return Indicators(j_dev, j_cst, largest_violation(qp, z, maps.row_gains))
@@ -152,9 +194,7 @@ def violation_cost(outputs: Array, through_w: Array, w: float, bands: Array) -> 
 def largest_violation(qp: QuadraticProblem, z: Array, gains: Array) -> float:
     """Return max(Gamma z - gamma, 0) over the rows, each divided by its gain."""
     largest = z.dtype.type(0.0)
-    for r in range(qp.Gamma.shape[0]):
-        excess = -qp.gamma[r]
-        for j in range(z.shape[0]):
-            excess += qp.Gamma[r, j] * z[j]
-        largest = max(largest, excess / gains[r])
+    excess = row_excess(qp, z)
+    for r in range(excess.shape[0]):
+        largest = max(largest, excess[r] / gains[r])
     return largest

@@ -11,7 +11,7 @@ from coldloop.process import SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
 from coldloop.registers.control_plc import Update
 from optimizer_plc.arithmetic import DOUBLE, Real
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
-from optimizer_plc.linear_algebra import apply, multiply, respond
+from optimizer_plc.linear_algebra import add_transposed_product, multiply, respond
 from optimizer_plc.prediction import PredictionModel, Transition
 
 Array = NDArray[np.float64]
@@ -154,7 +154,7 @@ def corrected(
     """
     innovation = y - respond(outputs.A, outputs.B, outputs.F, x, u, w + mismatch)
     correction = np.zeros(gain.shape[1], gain.dtype)
-    apply(gain, innovation, correction)
+    add_transposed_product(gain, innovation, correction)
     return x + correction[:-1], mismatch + correction[-1]
 
 

@@ -40,7 +40,7 @@ def by_columns(A: Array) -> Columns:
 
 @kernel
 def add_product(A: Columns, x: Array, result: Array) -> None:
-    """Add A x to `result` (n,), for x (k,): each element is summed in the order of the columns."""
+    """Add A x to `result` (n,), for x (k,): gemv; each element is summed in the order of the columns."""
     for j in range(x.shape[0]):
         factor = x[j]
         for i in range(A.first[j], A.end[j]):
@@ -62,8 +62,8 @@ def multiply(A: Array, B: Array) -> Array:
 
 
 @kernel
-def apply(A: Array, x: Array, result: Array) -> None:
-    """Add A x to `result` for the transposed storage A (k, n), x (k), result (n)."""
+def add_transposed_product(A: Array, x: Array, result: Array) -> None:
+    """Add A' x to `result` (n,), for A (k, n) and x (k,): gemv with a transposed matrix; zeros of x are skipped."""
     zero = A.dtype.type(0.0)
     for k in range(A.shape[0]):
         factor = x[k]

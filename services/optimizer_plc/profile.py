@@ -6,6 +6,9 @@ Instants count sampling periods: u_j holds during the j-th one, from (j - 1) to 
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.compiled import kernel
+from optimizer_plc.design import N_INPUTS, N_SLACKS
+
 Array = NDArray[np.float64]
 
 
@@ -30,3 +33,37 @@ def shift(knots: tuple[int, ...], periods: float) -> Array:
     The value behind the horizon is the last knot's.
     """
     return interpolation(knots, np.asarray(knots, dtype=float) + periods)
+
+
+@kernel
+def shifted(S: Array, z: Array) -> Array:
+    """Return the profile z (n,) whose values at the knots are combined by S (knots, knots), inputs and slacks alike."""
+    result = np.zeros_like(z)
+    knots, start = S.shape[0], 0
+    for width in (N_INPUTS, N_SLACKS):
+        for old in range(knots):
+            for new in range(knots):
+                if S[new, old] != z.dtype.type(0.0):
+                    for i in range(width):
+                        result[start + width * new + i] += S[new, old] * z[start + width * old + i]
+        start += width * knots
+    return result
+
+
+@kernel
+def inputs_of(weights: Array, z: Array, scale: Array, u0: Array, rate: Array) -> Array:
+    """Return the inputs (samples, 3) of a profile z (n,), for the knots' weights (samples, knots) in each sample.
+
+    They are in physical units, `u0` + `scale` z, and from one sample to the next within `rate`.
+    """
+    samples, m = weights.shape[0], scale.shape[0]
+    u = np.empty((samples, m), z.dtype)
+    for sample in range(samples):
+        for i in range(m):
+            value = z.dtype.type(0.0)
+            for knot in range(weights.shape[1]):
+                value += weights[sample, knot] * z[m * knot + i]
+            u[sample, i] = value * scale[i] + u0[i]
+            if sample:
+                u[sample, i] = min(max(u[sample, i], u[sample - 1, i] - rate[i]), u[sample - 1, i] + rate[i])
+    return u

@@ -87,7 +87,8 @@ class OptimizerProgram:
         elapsed = update.tick - self.state.last.update.tick if self.state.last else 0
         if not 0 <= elapsed <= LONGEST_GAP_TICKS or not self._knows_what_is_played(update):
             self._begin_again(update)
-        interrupted = self._return_to(update)
+        self._predict_to(update)
+        interrupted = self._is_interrupted(update)
         estimate = self.estimator.correct(update)
         self._follow(update)
         self.state.sequences = max(self.state.sequences, update.playing)
@@ -117,14 +118,18 @@ class OptimizerProgram:
         self.state.playing = Delivery(self.problem.hold(u), situation, update.tick, None)
         self.state.sent = self.state.last = None
 
-    def _return_to(self, update: Update) -> bool:
-        """Predict to this instant if another one was planned; tell whether a load step has cut the period off."""
+    def _predict_to(self, update: Update) -> None:
+        """Predict to this instant if another one was planned."""
+        last = self.state.last
+        if last is not None and 0 < (elapsed := update.tick - last.update.tick) != last.ticks:
+            self.estimator.predict(self._segments(last.update, elapsed))
+
+    def _is_interrupted(self, update: Update) -> bool:
+        """Tell whether a load step has cut the last period off."""
         last = self.state.last
         if last is None:
             return False
         elapsed = update.tick - last.update.tick
-        if 0 < elapsed != last.ticks:
-            self.estimator.predict(self._segments(last.update, elapsed))
         stepped = abs(update.load - last.update.load) > self.settings.interrupting_load_step_w > 0
         return stepped and 0 < elapsed < last.ticks
 
@@ -188,7 +193,7 @@ class OptimizerProgram:
         sequence = self._sequence(period, z)
         self.state.sent = Delivery(
             z, situation, sequence.header.first_tick, sequence, qp,
-            self._whole(hot_start, qp), self._whole(last_but_one, qp), self._whole(self.solver.cost, qp),
+            self._with_floor(hot_start, qp), self._with_floor(last_but_one, qp), self._with_floor(self.solver.cost, qp),
             done,
         )  # fmt: skip
         return sequence
@@ -228,9 +233,9 @@ class OptimizerProgram:
         return with_checksum(header, rows)
 
     def _cost(self, qp: QuadraticProblem, z: Array) -> float:
-        return self._whole(augmented_cost(qp, z, self._real(self.solver.alpha)), qp)
+        return self._with_floor(augmented_cost(qp, z, self._real(self.solver.alpha)), qp)
 
-    def _whole(self, cost: float, qp: QuadraticProblem) -> float:
+    def _with_floor(self, cost: float, qp: QuadraticProblem) -> float:
         """Return J with its constant and its floor; rounding, in single precision, must not take it below the floor."""
         floor = self._real(self.settings.adaptive.cost_floor)
         return max(self._real(cost) + (qp.constant + floor), floor)

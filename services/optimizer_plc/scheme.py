@@ -13,10 +13,12 @@ from coldloop.compiled import kernel
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from optimizer_plc.costs import Matrices, OutputMaps, augmented_cost, predicted_indicators
 from optimizer_plc.estimator import corrected
+from optimizer_plc.instance import Maps, instance
 from optimizer_plc.linear_algebra import respond
 from optimizer_plc.prediction import Transition
-from optimizer_plc.problem import Maps, QuadraticProblem, inputs_of, instance, shifted
-from optimizer_plc.solvers.ode import Flow, begin, descend
+from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.profile import inputs_of, shifted
+from optimizer_plc.solvers.ode import Flow, descend, warm_start
 from optimizer_plc.updating_period import (
     Assessment,
     ContractionParameters,
@@ -124,7 +126,7 @@ class Memory(NamedTuple):
 
 
 @kernel
-def whole(cost: float, constant: float, floor: float) -> float:
+def with_floor(cost: float, constant: float, floor: float) -> float:
     """Return J with its constant and its floor."""
     return max(cost + (constant + floor), floor)
 
@@ -153,13 +155,13 @@ def solve(c: Constants, m: Memory) -> int:
     s.played_w, s.played_share, s.played_ticks = s.w, c.rate_shares[ticks], ticks
     m.u_before[:] = u
     qp = problem_at(c, m.predicted, s.w, u, c.rate_shares[ticks])
-    z, cost, dt = begin(c.matrices, qp, shifted(c.shifts[ticks], m.z), c.flow)
-    s.hot_start = whole(cost, qp.constant, c.floor)
+    z, cost, dt = warm_start(c.matrices, qp, shifted(c.shifts[ticks], m.z), c.flow)
+    s.hot_start = with_floor(cost, qp.constant, c.floor)
     active = np.zeros_like(qp.gamma)
     done, stalled, cost, dt = descend(c.matrices, qp, z, active, cost, dt, 0, s.iterations - 1, c.flow)
-    s.last_but_one = whole(cost, qp.constant, c.floor)
+    s.last_but_one = with_floor(cost, qp.constant, c.floor)
     last, stalled, cost, dt = descend(c.matrices, qp, z, active, cost, dt, stalled, 1, c.flow)
-    s.delivered = whole(cost, qp.constant, c.floor)
+    s.delivered = with_floor(cost, qp.constant, c.floor)
     s.done = done + last
     s.j_dev, s.j_cst, s.violation = predicted_indicators(c.predicted, qp, z, m.predicted, s.w, c.n_inputs)
     m.answer[:] = z
@@ -210,7 +212,7 @@ def plan(c: Constants, m: Memory, tick: int, u_before: Array, load: float, y: Ar
     s, rule = m.numbers[0], c.rule
     estimate(c, m, u_before, load, y, x)
     qp = problem_at(c, m.x, s.w, m.u_before, s.played_share)
-    effective = whole(augmented_cost(qp, m.z, c.flow.alpha), qp.constant, c.floor)
+    effective = with_floor(augmented_cost(qp, m.z, c.flow.alpha), qp.constant, c.floor)
     o = Observation(s.iterations, s.ticks * TICK_S, s.effective, s.hot_start, s.last_but_one, s.delivered, effective)
     assessment = _assess(o)
     wanted = s.iterations

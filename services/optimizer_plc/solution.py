@@ -46,8 +46,8 @@ def judge(problem: QuadraticProblem, z: Array, alpha: float, multipliers: Array)
     base_cost = float(z @ problem.Phi @ z + problem.phi @ z)
     slope = 2.0 * problem.Phi @ z + problem.phi + problem.Gamma.T @ multipliers
     at_low, at_high = z <= problem.low + CONTACT, z >= problem.high - CONTACT
-    left = np.where(at_low, np.minimum(slope, 0.0), slope)
-    left = np.where(at_high, np.maximum(left, 0.0), left)
+    stationarity = np.where(at_low, np.minimum(slope, 0.0), slope)
+    stationarity = np.where(at_high, np.maximum(stationarity, 0.0), stationarity)
     return Solution(
         z=z,
         multipliers=multipliers,
@@ -55,7 +55,7 @@ def judge(problem: QuadraticProblem, z: Array, alpha: float, multipliers: Array)
         cost=base_cost + alpha * float(np.sum(np.maximum(excess, 0.0) ** 2)),
         violation=violation,
         primal_residual=max(violation, outside),
-        dual_residual=float(np.max(np.abs(left), initial=0.0)),
+        dual_residual=float(np.max(np.abs(stationarity), initial=0.0)),
         gap=abs(float(multipliers @ excess)),
     )
 

@@ -32,9 +32,10 @@ Array = NDArray[np.float64]
 SINGLE = real_of(Arithmetic.FLOAT32)
 
 ON_LINE = {
-    "add_product", "apply", "augmented_cost", "begin", "cholesky", "cholesky_solve", "corrected", "cost_by_columns",
-    "descend", "deviation_cost", "hold_at_bounds", "inputs_of", "instance", "largest_violation", "predicted_indicators",
-    "quadratic_cost", "release", "respond", "shifted", "stage_matrix", "step", "velocity", "violation_cost",
+    "add_product", "add_transposed_product", "augmented_cost", "cholesky", "cholesky_solve", "corrected",
+    "cost_by_columns", "decouple", "descend", "deviation_cost", "excess_by_columns", "gradient", "hold_at_bounds",
+    "inputs_of", "instance", "largest_violation", "positive_squares", "predicted_indicators", "quadratic_cost",
+    "respond", "row_excess", "shifted", "stage_matrix", "step", "velocity", "violation_cost", "warm_start",
 }  # fmt: skip
 
 

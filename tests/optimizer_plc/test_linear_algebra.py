@@ -6,7 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from optimizer_plc.linear_algebra import add_product, apply, by_columns, cholesky, cholesky_solve, multiply
+from optimizer_plc.linear_algebra import (
+    add_product,
+    add_transposed_product,
+    by_columns,
+    cholesky,
+    cholesky_solve,
+    multiply,
+)
 
 Array = NDArray[Any]
 Precision = type[np.float64] | type[np.float32]
@@ -43,7 +50,7 @@ def test_applying_a_transposed_matrix_adds_to_the_result(
     x: Array = np.asarray(rng.normal(size=k), dtype=precision)
     start: Array = np.asarray(rng.normal(size=n), dtype=precision)
     result = start.copy()
-    apply(A, x, result)
+    add_transposed_product(A, x, result)
     assert np.allclose(result, start + A.T @ x, rtol=tolerance, atol=tolerance)
 
 

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from coldloop.limits import InputLimits, RateReference
 from coldloop.lti_model import LtiModel
 from coldloop.process import L1, T5
-from optimizer_plc.costs import augmented_cost, indicators, quadratic_cost
+from optimizer_plc import costs
+from optimizer_plc.constraints import RATE_ROW_GAIN
+from optimizer_plc.costs import augmented_cost, indicators, matrices_of, quadratic_cost
 from optimizer_plc.design import ControlDesign, trivial_design
 from optimizer_plc.prediction import PredictionModel
-from optimizer_plc.problem import RATE_ROW_GAIN, PredictiveProblem, Situation
+from optimizer_plc.problem import PredictiveProblem, Situation
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Optimum, Situations
@@ -293,6 +295,10 @@ def test_the_gradient_of_the_augmented_cost_is_that_of_its_formula(
     z, direction = random_profile(rng), rng.normal(size=49)
     alpha, h = 3000.0, 1e-6
     gradient = 2 * qp.Phi @ z + qp.phi + 2 * alpha * qp.Gamma.T @ np.maximum(qp.Gamma @ z - qp.gamma, 0)
+    computed, active = np.empty_like(z), np.empty_like(qp.gamma)
+    costs.gradient(matrices_of(qp), qp, z, alpha, computed, active)
+    assert computed == pytest.approx(gradient, rel=1e-9, abs=1e-9 * np.abs(gradient).max())
+    assert (active > 0).tolist() == (qp.Gamma @ z > qp.gamma).tolist()
     ahead, behind = (augmented_cost(qp, z + step * direction, alpha) for step in (h, -h))
     assert (ahead - behind) / (2 * h) == pytest.approx(gradient @ direction, rel=1e-4, abs=1e-6 * abs(ahead))
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from coldloop.compiled import kernel
 from optimizer_plc.computing_settings import FastGradientSettings
-from optimizer_plc.costs import augmented_cost
+from optimizer_plc.costs import Matrices, augmented_cost, gradient, matrices_of
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.solution import Solution, judge, penalty_multipliers
 
@@ -31,8 +31,8 @@ BOUND_MARGIN = 1.02
 class Momentum(NamedTuple):
     """What is carried from one iteration to the next besides z."""
 
-    ahead: Array
-    """Extrapolated point, shape (n,)."""
+    extrapolated: Array
+    """Point at which the gradient is taken, shape (n,)."""
     t: Array
     """Nesterov's sequence t_k, shape (1,)."""
 
@@ -44,7 +44,7 @@ class FastGradientSolver:
         self.alpha = settings.alpha
         self.tau_1_s = settings.tau_1_s
         self._adaptive_restart = settings.adaptive_restart
-        self._matrices: tuple[Array, Array] | None = None
+        self._source: tuple[Array, Array] | None = None
 
     def reset(self) -> None:
         """Only the step sizes are kept, which depend on the matrices alone."""
@@ -53,15 +53,18 @@ class FastGradientSolver:
         """Begin with `guess` projected into the box, without momentum."""
         self._problem = problem
         self._alpha = problem.phi.dtype.type(self.alpha)
-        if self._matrices is None or problem.Phi is not self._matrices[0] or problem.Gamma is not self._matrices[1]:
-            self._matrices = problem.Phi, problem.Gamma
+        if self._source is None or problem.Phi is not self._source[0] or problem.Gamma is not self._source[1]:
+            self._source, self._matrices = (problem.Phi, problem.Gamma), matrices_of(problem)
             self._steps = step_sizes(problem.Phi, problem.Gamma, self._alpha)
         self._z = np.clip(guess, problem.low, problem.high)
         self._momentum = Momentum(self._z.copy(), np.ones_like(self._z[:1]))
 
     def iterate(self, count: int) -> int:
         """Take `count` steps."""
-        descend(self._problem, self._z, self._momentum, self._steps, self._alpha, self._adaptive_restart, count)
+        descend(
+            self._matrices, self._problem, self._z, self._momentum, self._steps, self._alpha, self._adaptive_restart,
+            count,
+        )  # fmt: skip
         return count
 
     @property
@@ -122,26 +125,8 @@ def step_sizes(Phi: Array, Gamma: Array, alpha: float) -> Array:
 
 
 @kernel
-def gradient(qp: QuadraticProblem, z: Array, alpha: float, result: Array) -> None:
-    """Write the gradient of J at z into `result` (n,)."""
-    n, two = z.shape[0], z.dtype.type(2)
-    for i in range(n):
-        slope = qp.phi[i]
-        for j in range(n):
-            slope += two * qp.Phi[i, j] * z[j]
-        result[i] = slope
-    for r in range(qp.Gamma.shape[0]):
-        excess = -qp.gamma[r]
-        for j in range(n):
-            excess += qp.Gamma[r, j] * z[j]
-        if excess > 0:
-            factor = two * alpha * excess
-            for j in range(n):
-                result[j] += factor * qp.Gamma[r, j]
-
-
-@kernel
 def descend(
+    constant: Matrices,
     qp: QuadraticProblem,
     z: Array,
     momentum: Momentum,
@@ -152,14 +137,15 @@ def descend(
 ) -> None:
     """Move z and its momentum by `count` iterations."""
     n, half, one, four = z.shape[0], z.dtype.type(0.5), z.dtype.type(1), z.dtype.type(4)
-    ahead, t, slope, moved = momentum.ahead, momentum.t, np.empty_like(z), np.empty_like(z)
+    point, t, slope, moved = momentum.extrapolated, momentum.t, np.empty_like(z), np.empty_like(z)
+    active = np.empty_like(qp.gamma)
     for _ in range(count):
-        gradient(qp, ahead, alpha, slope)
+        gradient(constant, qp, point, alpha, slope, active)
         uphill = z.dtype.type(0)
         for i in range(n):
-            reached = min(max(ahead[i] - steps[i] * slope[i], qp.low[i]), qp.high[i])
+            reached = min(max(point[i] - steps[i] * slope[i], qp.low[i]), qp.high[i])
             moved[i] = reached - z[i]
-            uphill += (ahead[i] - reached) / steps[i] * moved[i]
+            uphill += (point[i] - reached) / steps[i] * moved[i]
             z[i] = reached
         if adaptive_restart and uphill > 0:
             t[0] = 1
@@ -167,4 +153,4 @@ def descend(
         weight = (t[0] - one) / t_next
         t[0] = t_next
         for i in range(n):
-            ahead[i] = z[i] + weight * moved[i]
+            point[i] = z[i] + weight * moved[i]

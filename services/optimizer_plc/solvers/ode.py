@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from coldloop.compiled import kernel
 from optimizer_plc.arithmetic import Real
 from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.costs import Matrices, cost_by_columns, matrices_of
-from optimizer_plc.linear_algebra import add_product, cholesky, cholesky_solve
+from optimizer_plc.costs import Matrices, cost_by_columns, gradient, matrices_of
+from optimizer_plc.linear_algebra import cholesky, cholesky_solve
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.solution import Solution, judge, penalty_multipliers
 
@@ -28,11 +28,10 @@ C0 = (1.0 - G) ** 2 * C1
 D = G / 2.0
 ERROR_CONSTANT = (-3.0 * G * G + 4.0 * G - 2.0) / (12.0 * (2.0 - G))
 
-
-STALLED = 20
-"""Steps in a row that hardly lower J after which there is nothing left to win."""
-HARDLY = 1e-6
-"""Of |J|."""
+STATIONARITY = 1e-6
+"""A step that lowers J by no more than this share of |J| has stalled."""
+STALLED_STEPS = 20
+"""Stalled steps in a row after which z counts as stationary."""
 
 
 class Flow(NamedTuple):
@@ -78,16 +77,16 @@ class OdeSolver:
             self._source, self._matrices = (problem.Phi, problem.Gamma), matrices_of(problem)
             self._real = problem.phi.dtype.type
             self._flow = flow_in(self._settings, self._real)
-        self._stiff = np.zeros_like(problem.gamma)
-        self._z, self._cost, self._dt = begin(self._matrices, problem, guess, self._flow)
+        self._look_ahead_rows = np.zeros_like(problem.gamma)
+        self._z, self._cost, self._dt = warm_start(self._matrices, problem, guess, self._flow)
         self._stalled = 0
 
     def iterate(self, count: int) -> int:
-        """Take `count` steps, or fewer once the cost hardly falls any more."""
+        """Take `count` steps, or fewer once z is stationary."""
         real = self._real
         done, self._stalled, self._cost, self._dt = descend(
-            self._matrices, self._problem, self._z, self._stiff, real(self._cost), real(self._dt), self._stalled, count,
-            self._flow,
+            self._matrices, self._problem, self._z, self._look_ahead_rows, real(self._cost), real(self._dt),
+            self._stalled, count, self._flow,
         )  # fmt: skip
         return done
 
@@ -112,23 +111,8 @@ def velocity(
     constant: Matrices, qp: QuadraticProblem, z: Array, flow: Flow, result: Array, active: Array
 ) -> None:  # fmt: skip
     """Write dz/dt = -cost_scale dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0."""
-    n = z.shape[0]
-    zero, one, two = z.dtype.type(0.0), z.dtype.type(1.0), z.dtype.type(2.0)
-    for i in range(n):
-        result[i] = zero
-    add_product(constant.Phi, z, result)
-    for i in range(n):
-        result[i] = two * result[i] + qp.phi[i]
-    excess, rows = -qp.gamma, constant.rows
-    add_product(constant.Gamma, z, excess)
-    for r in range(excess.shape[0]):
-        active[r] = zero
-        if excess[r] > zero:
-            active[r] = one
-            factor = two * flow.alpha * excess[r]
-            for j in range(rows.first[r], rows.end[r]):
-                result[j] += factor * rows.transposed[r, j]
-    for i in range(n):
+    gradient(constant, qp, z, flow.alpha, result, active)
+    for i in range(z.shape[0]):
         result[i] *= -flow.cost_scale
 
 
@@ -145,7 +129,7 @@ def hold_at_bounds(qp: QuadraticProblem, z: Array, v: Array) -> Array:
 
 
 @kernel
-def release(M: Array, held: Array) -> None:
+def decouple(M: Array, held: Array) -> None:
     """Make the rows and columns of held components those of the identity, so that a solve leaves them alone."""
     n = M.shape[0]
     zero, one = M.dtype.type(0.0), M.dtype.type(1.0)
@@ -156,7 +140,7 @@ def release(M: Array, held: Array) -> None:
 
 
 @kernel
-def begin(constant: Matrices, qp: QuadraticProblem, guess: Array, flow: Flow) -> tuple[Array, float, float]:
+def warm_start(constant: Matrices, qp: QuadraticProblem, guess: Array, flow: Flow) -> tuple[Array, float, float]:
     """Return the guess inside the box, its cost, and the first step size sqrt(1 / |dz/dt|) there."""
     z = np.empty_like(guess)
     for i in range(z.shape[0]):
@@ -171,8 +155,8 @@ def begin(constant: Matrices, qp: QuadraticProblem, guess: Array, flow: Flow) ->
 
 
 @kernel
-def stage_matrix(constant: Matrices, qp: QuadraticProblem, stiff: Array, dt: float, flow: Flow) -> Array:
-    """Return I + (gamma / 2) dt Hess(cost_scale J), upper triangle, with the rows that `stiff` (m,) names."""
+def stage_matrix(constant: Matrices, qp: QuadraticProblem, in_matrix: Array, dt: float, flow: Flow) -> Array:
+    """Return I + (gamma / 2) dt Hess(cost_scale J), upper triangle, with the rows that are 1.0 in `in_matrix` (m,)."""
     n = qp.phi.shape[0]
     M = np.empty((n, n), qp.phi.dtype)
     zero, one = M.dtype.type(0.0), M.dtype.type(1.0)
@@ -182,7 +166,7 @@ def stage_matrix(constant: Matrices, qp: QuadraticProblem, stiff: Array, dt: flo
             M[i, j] = weight * qp.Phi[i, j]
         M[i, i] += one
     for r in range(qp.Gamma.shape[0]):
-        if stiff[r] > zero:
+        if in_matrix[r] > zero:
             end = constant.rows.end[r]
             for i in range(constant.rows.first[r], end):
                 factor = weight * flow.alpha * qp.Gamma[r, i]
@@ -197,48 +181,52 @@ def descend(
     constant: Matrices,
     qp: QuadraticProblem,
     z: Array,
-    stiff: Array,
+    look_ahead_rows: Array,
     cost: float,
     dt: float,
     stalled: int,
     count: int,
     flow: Flow,
 ) -> tuple[int, int, float, float]:
-    """Move z by `count` steps, or fewer once J hardly falls any more.
+    """Move z by `count` steps, or fewer once it is stationary.
 
-    Returns how many were done, how many in a row have hardly lowered J, the cost at z and the next step size.
+    `look_ahead_rows` (m,) are those that `step` has left for the next step, `stalled` is the number of stalled steps
+    in a row up to here. Returns how many were done, the new number of stalled ones, the cost at z and the next step
+    size.
     """
-    hardly = z.dtype.type(HARDLY)
+    stationarity = z.dtype.type(STATIONARITY)
     for done in range(count):
-        if stalled == STALLED:
+        if stalled == STALLED_STEPS:
             return done, stalled, cost, dt
-        dt, reached = step(constant, qp, z, stiff, cost, dt, flow)
-        stalled = stalled + 1 if cost - reached <= hardly * abs(cost) else 0
+        dt, reached = step(constant, qp, z, look_ahead_rows, cost, dt, flow)
+        stalled = stalled + 1 if cost - reached <= stationarity * abs(cost) else 0
         cost = reached
     return count, stalled, cost, dt
 
 
 @kernel
 def step(
-    constant: Matrices, qp: QuadraticProblem, z: Array, stiff: Array, cost: float, dt: float, flow: Flow
+    constant: Matrices, qp: QuadraticProblem, z: Array, look_ahead_rows: Array, cost: float, dt: float, flow: Flow
 ) -> tuple[float, float]:
-    """Move z by one TR-BDF2 step of size dt, or not at all; return the next step size and the cost at z."""
+    """Move z by one TR-BDF2 step of size dt, or not at all; return the next step size and the cost at z.
+
+    The matrix has the rows that are active at z or in `look_ahead_rows` (m,): those that were active at the middle
+    stage of the step before, which is overwritten by those of this one.
+    """
     n, real = z.shape[0], z.dtype.type
     v0, vg, v1 = np.empty_like(z), np.empty_like(z), np.empty_like(z)
-    active, ahead = np.empty_like(qp.gamma), np.empty_like(qp.gamma)
+    active = np.empty_like(qp.gamma)
     velocity(constant, qp, z, flow, v0, active)
     for r in range(active.shape[0]):
-        stiff[r] = max(stiff[r], active[r])
+        active[r] = max(look_ahead_rows[r], active[r])
     held = hold_at_bounds(qp, z, v0)
-    M = stage_matrix(constant, qp, stiff, dt, flow)
-    release(M, held)
+    M = stage_matrix(constant, qp, active, dt, flow)
+    decouple(M, held)
     skyline = cholesky(M)
     change = real(G) * dt * v0
     cholesky_solve(M, skyline, change)
     zg = z + change
-    velocity(constant, qp, zg, flow, vg, ahead)
-    for r in range(active.shape[0]):
-        stiff[r] = ahead[r]
+    velocity(constant, qp, zg, flow, vg, look_ahead_rows)
     for i in range(n):
         vg[i] *= real(1.0) - held[i]
     change = real(C1) * zg - real(C0) * z - zg + real(D) * dt * vg

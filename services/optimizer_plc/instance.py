@@ -1,0 +1,65 @@
+"""How the vectors of an instance of the problem follow from the state, the load and the input before."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.compiled import kernel
+from optimizer_plc.linear_algebra import add_transposed_product
+
+Array = NDArray[np.float64]
+
+
+class Maps(NamedTuple):
+    """How an instance follows from a situation; the state and the load are stacked as s = (x, w)."""
+
+    phi: Array
+    """Shape (n_s, n)."""
+    constant: Array
+    """Shape (n_s, n_s)."""
+    outputs: Array
+    """Shape (n_s, 56)."""
+    output_bounds: Array
+    rate_bounds: Array
+    rate_first: Array
+    """1.0 for the rows of the interval before the first knot."""
+    rate_before: Array
+    """Shape (3, 38)."""
+    low: Array
+    high: Array
+    rate: Array
+    """Rates of the inputs, scaled."""
+    input_scale: Array
+
+
+@kernel
+def instance(maps: Maps, x: Array, w: float, u_before: Array, share: float) -> tuple[Array, Array, Array, Array, float]:
+    """Return phi, gamma, low, high and the constant of the cost."""
+    zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
+    s = np.empty(x.shape[0] + 1, x.dtype)
+    for i in range(x.shape[0]):
+        s[i] = x[i]
+    s[x.shape[0]] = w
+    phi = np.zeros(maps.phi.shape[1], x.dtype)
+    add_transposed_product(maps.phi, s, phi)
+    outputs, rates = maps.output_bounds.shape[0], maps.rate_bounds.shape[0]
+    gamma = np.empty(outputs + rates, x.dtype)
+    for r in range(outputs):
+        gamma[r] = maps.output_bounds[r]
+    for r in range(rates):
+        gamma[outputs + r] = maps.rate_bounds[r] * (share if maps.rate_first[r] > zero else one)
+    add_transposed_product(maps.outputs, s, gamma[:outputs])
+    add_transposed_product(maps.rate_before, u_before, gamma[outputs:])
+    low, high = maps.low.copy(), maps.high.copy()
+    for i in range(u_before.shape[0]):  # the first knot stays within its rate of the input before it
+        start = u_before[i] / maps.input_scale[i]
+        reach = maps.rate[i] * share
+        low[i] = min(max(start - reach, maps.low[i]), maps.high[i])
+        high[i] = min(max(start + reach, maps.low[i]), maps.high[i])
+    weighted = np.zeros(s.shape[0], x.dtype)
+    add_transposed_product(maps.constant, s, weighted)
+    constant = zero
+    for i in range(s.shape[0]):
+        constant += s[i] * weighted[i]
+    return phi, gamma, low, high, constant
