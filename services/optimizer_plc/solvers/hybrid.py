@@ -68,12 +68,8 @@ class HybridSolver:
         before, chosen = self._slots, self._present
         self._slots += count
         allowed = iterations_in(self._slots, self.tau_1_s, chosen.tau_1_s)
-        wanted = allowed - self._done
-        done = chosen.iterate(wanted)
-        self._done += done
-        if done == wanted:
-            return count
-        return max(0, math.ceil(self._done * chosen.tau_1_s / self.tau_1_s - 1e-9) - before)
+        self._done += chosen.iterate(allowed - self._done)
+        return slots_passed(self._done, allowed, before, count, self.tau_1_s, chosen.tau_1_s)
 
     @property
     def _present(self) -> Solver:
@@ -85,6 +81,10 @@ class HybridSolver:
     def is_far(self) -> bool:
         """Whether the present problem was taken for one far from its optimum."""
         return self._chosen is self._far
+
+    def go_on_after(self, guessed: float, delivered: float) -> None:
+        """Go on as after a problem with these costs of guess and answer, constant and floor included."""
+        self._chosen, self.guessed, self.delivered = None, guessed, delivered
 
     @property
     def solution(self) -> Array:
@@ -112,3 +112,10 @@ def is_far(switch: float, guessed: float, guessed_before: float, delivered_befor
 def iterations_in(slots: int, slot_s: float, tau_1_s: float) -> int:
     """Return the iterations of `tau_1_s` that fit into the time of some slots."""
     return math.floor(slots * slot_s / tau_1_s + 1e-9)
+
+
+def slots_passed(done: int, allowed: int, before: int, count: int, slot_s: float, tau_1_s: float) -> int:  # noqa: PLR0917 a kernel
+    """Return how many of `count` slots passed after the first `before`: fewer when fewer iterations than allowed were done."""
+    if done == allowed:
+        return count
+    return max(0, math.ceil(done * tau_1_s / slot_s - 1e-9) - before)
