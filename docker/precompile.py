@@ -28,9 +28,9 @@ def control_plc() -> None:
 
 def optimizer_plc() -> None:
     """Let each solver that has kernels of its own answer two updates of a plant that stands still."""
-    from optimizer_plc.settings import ProgramSettings, SolverName  # noqa: PLC0415
+    from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings  # noqa: PLC0415
 
-    for solver in (SolverName.ODE, SolverName.FAST_GRADIENT, SolverName.INTERIOR_POINT):
+    for solver in SINGLE_PRECISION_SOLVERS:
         _answer_two_updates(ProgramSettings(solver=solver))
 
 

@@ -121,7 +121,7 @@ def simulate(
 
     Args:
         load: Named load such as `a`, or a CSV file with the columns time_s and load_w.
-        solver: `ode`, `qpoases`, `osqp`, `fast-gradient` or `daqp`.
+        solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`.
         updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`.
         duration_s: Plant time in multiples of 0.25 s; that of the load if not given.
         seed: Seed of the sensors' noise.

@@ -7,7 +7,7 @@ from importlib.resources import files
 from typing import Final
 
 MODES: Final = ("lockstep", "realtime")
-SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "daqp")
+SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "hybrid", "daqp")
 PRESETS: Final = ("tuned", "as-printed")
 LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h", "pulses")
 SERVICES: Final = ("control_plc", "optimizer_plc", "plant")

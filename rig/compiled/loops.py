@@ -167,7 +167,7 @@ def latch(
     a = scheme.plan(c, m, tick, u_before, np.float64(trace.load[row]), y, x)
     of_update = reports.assessment
     of_update[0], of_update[1], of_update[2], of_update[3] = a.efficiency, a.mismatch, a.contraction, a.gamma
-    s.next_update = tick + m.numbers[0].ticks
+    s.next_update, s.load_step = tick + m.numbers[0].ticks, c.load_step
     trigger(w, s, tick + 1)
 
 

@@ -146,3 +146,12 @@ class InteriorPointSettings(BaseModel):
     """Share of the box's width by which the guess is at least moved away from its bounds."""
     tau_1_s: PositiveFloat = 0.17
     """87,700 operations at 0.529 Mflop/s are 0.166 s (`docs/budget.md`)."""
+
+
+class HybridSettings(BaseModel):
+    """Settings of the choice between the interior-point method and the ODE-based solver."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    switch: Annotated[float, Field(gt=1.0)] = 2.0
+    """Cost of a guess over that of the last answer from which on the interior-point method gets the problem."""

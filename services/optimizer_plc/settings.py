@@ -21,6 +21,7 @@ from optimizer_plc.computing_settings import (
     DaqpSettings,
     EstimatorSettings,
     FastGradientSettings,
+    HybridSettings,
     InteriorPointSettings,
     OdeSettings,
     OsqpSettings,
@@ -42,10 +43,11 @@ class SolverName(StrEnum):
     OSQP = "osqp"
     FAST_GRADIENT = "fast-gradient"
     INTERIOR_POINT = "interior-point"
+    HYBRID = "hybrid"
     DAQP = "daqp"
 
 
-SINGLE_PRECISION_SOLVERS = (SolverName.ODE, SolverName.FAST_GRADIENT, SolverName.INTERIOR_POINT)
+SINGLE_PRECISION_SOLVERS = (SolverName.ODE, SolverName.FAST_GRADIENT, SolverName.INTERIOR_POINT, SolverName.HYBRID)
 """Those that are kernels of our own."""
 
 
@@ -128,6 +130,7 @@ class ProgramSettings(BaseModel):
     osqp: OsqpSettings = OsqpSettings()
     fast_gradient: FastGradientSettings = FastGradientSettings()
     interior_point: InteriorPointSettings = InteriorPointSettings()
+    hybrid: HybridSettings = HybridSettings()
     daqp: DaqpSettings = DaqpSettings()
 
     @field_validator("updating_period_s")

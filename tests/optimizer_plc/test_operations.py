@@ -149,9 +149,9 @@ def test_a_step_of_the_interior_point_method_is_counted_right(
         np.diag(rng.uniform(1.0, 2.0, size=n)), rng.normal(size=n), Gamma, np.ones(m), np.full(n, -1.0),
         np.where(np.arange(n) < slacks, np.inf, 1.0), 0.0,
     )  # fmt: skip
-    _, constant = interior_point.structure_of(qp)
-    point = interior_point.begin(constant, qp.gamma, qp.low, qp.high, np.zeros(n), 1e-3, 1.0, 0.1)
-    counting = interior_point.Structure(counted(constant.hessian), counted(constant.Gamma), constant.columns)
+    constant = interior_point.structure_of(qp)
+    point = interior_point.near(constant, qp.gamma, qp.low, qp.high, np.zeros(n), 1e-3, 1.0, 0.1)
+    counting = constant._replace(hessian=counted(constant.hessian), Gamma=counted(constant.Gamma))
     vectors = counted(qp.phi), counted(qp.gamma), counted(qp.low), counted(qp.high)
     begun = interior_point.Point(*map(counted, point))
     Counted.done = 0

@@ -53,17 +53,25 @@ COMPILED = {
     "first knot as rows": (f"{PROGRAM}penalties.first_knot_in_box=false",),
     "no look-ahead rows": (f"{PROGRAM}ode.look_ahead_rows=false",),
     "not held at bounds": (f"{PROGRAM}ode.hold_at_bounds=false",),
+    "interior point": (f'{PROGRAM}solver="interior-point"', f"{PROGRAM}updating_period_s=5"),
+    "interior point, cut off": (f'{PROGRAM}solver="interior-point"', f'{PROGRAM}adaptive.rule="contraction"'),
+    "hybrid": (f'{PROGRAM}solver="hybrid"', f"{PROGRAM}updating_period_s=1.5"),
+    "hybrid on a fast PLC": (f'{PROGRAM}solver="hybrid"', f"{PROGRAM}budget.power=10"),
+    "fast gradient": (f'{PROGRAM}solver="fast-gradient"',),
+    "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
+    "load steps that interrupt a rule": (
+        f'{PROGRAM}adaptive.rule="contraction"',
+        f"{PROGRAM}interrupting_load_step_w=10",
+        f'{PROGRAM}solver="hybrid"',
+    ),
 }
 """Whose updates are compiled too."""
 LEFT_TO_PROGRAMS = {
     "single precision": (f'{PROGRAM}arithmetic="float32"',),
-    "fast gradient": (f'{PROGRAM}solver="fast-gradient"',),
-    "interior point": (f'{PROGRAM}solver="interior-point"', f"{PROGRAM}updating_period_s=5"),
     "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
     "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
     "qpoases": (f'{PROGRAM}solver="qpoases"',),
     "qpoases and a refrigerator": (f'{PROGRAM}solver="qpoases"', REFRIGERATOR),
-    "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
 }
 """Whose ticks alone are compiled, where that is worth while."""
 UNUSUAL = {
