@@ -34,7 +34,7 @@ STATION_AHEAD: Final = STATION_ROWS - 32
 """The same where the history of the station counts too."""
 SHORTEST_PAUSE_S: Final = 0.001
 LONGEST_PAUSE_S: Final = 0.2
-LONGEST_LOCKSTEP_PAUSE_S: Final = 0.02
+LONGEST_LOCKSTEP_PAUSE_S: Final = 0.01
 """A rig that does not move is looked at so often."""
 QUIET_S: Final = 20.0
 """A rig on which nothing happens for this long is given up."""

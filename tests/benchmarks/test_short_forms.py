@@ -1,5 +1,6 @@
 """Each benchmark that measures speed runs in a short form, and prints figures of the right order."""
 
+import json
 import re
 import subprocess
 import sys
@@ -67,3 +68,12 @@ def test_programs_start_in_seconds() -> None:
     seconds = numbers(r"warm: ([0-9.]+) s", text)
     assert len(seconds) == 4, text
     assert all(0.05 < each < 60 for each in seconds), text
+
+
+@pytest.mark.slow
+def test_the_problem_for_peers_costs_less_where_every_sample_is_free() -> None:
+    told = json.loads(printed_by("peer_problem.py"))
+    assert len(told["problem"]["A"]) == 28
+    (slow, free), (fast, seven) = told["own"]["every sample"], told["own"]["seven instants"]
+    assert 0 < free < seven < 2 * free
+    assert 0 < fast < slow

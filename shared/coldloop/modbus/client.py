@@ -21,7 +21,7 @@ from coldloop.modbus.transport import REQUESTS_AT_ONCE, NoAnswerError, Transport
 from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.seal import Seal, seal_of, sealed
+from coldloop.seal import Seal, seal_of, sealed_bytes
 
 R = TypeVar("R", bound=tuple[Any, ...])
 S = TypeVar("S", bound=tuple[Any, ...])
@@ -299,4 +299,4 @@ def _secured(tls: TlsSettings, name: str) -> ssl.SSLContext:
 
 
 def _encoded(block: Block, codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
-    return codec.encode(sealed(record) if block.sealed else record)
+    return sealed_bytes(codec, record) if block.sealed else codec.encode(record)
