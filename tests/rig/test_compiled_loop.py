@@ -25,6 +25,11 @@ from rig.settings import Settings
 
 PROGRAM = "optimizer_plc.program."
 NOISE = ("plant.sensors.level=0.02", "plant.sensors.speed=0.5", "plant.sensors.temperature=0.02")
+REFRIGERATOR = "plant.kind=refrigerator"
+TRIP = (
+    'plant.refrigerator.events=[{at_s=90, target="nc1", value=0}, {at_s=120, target="nc1", value=1}, '
+    '{at_s=150.25, target="leak", value=2.0}]'
+)
 COMPILED = {
     "adaptive": (),
     "fixed": (f"{PROGRAM}updating_period_s=2.5",),
@@ -41,6 +46,13 @@ COMPILED = {
     "first knot as rows": (f"{PROGRAM}penalties.first_knot_in_box=false",),
     "no look-ahead rows": (f"{PROGRAM}ode.look_ahead_rows=false",),
     "not held at bounds": (f"{PROGRAM}ode.hold_at_bounds=false",),
+    "refrigerator": (REFRIGERATOR, TRIP, *NOISE),
+    "refrigerator with PI and a model of its own": (
+        REFRIGERATOR,
+        "plant.station.control=pi",
+        "model.file=refrigerator",
+        f"{PROGRAM}updating_period_s=2.5",
+    ),
 }
 """Whose updates are compiled too."""
 LEFT_TO_PROGRAMS = {
@@ -50,6 +62,7 @@ LEFT_TO_PROGRAMS = {
     "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
     "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
     "qpoases": (f'{PROGRAM}solver="qpoases"',),
+    "qpoases and a refrigerator": (f'{PROGRAM}solver="qpoases"', REFRIGERATOR),
     "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
 }
 """Whose ticks alone are compiled, where that is worth while."""
@@ -116,6 +129,10 @@ def done_by_the_loop(monkeypatch: pytest.MonkeyPatch, assignments: tuple[str, ..
 
 def test_nearly_all_ticks_of_an_ordinary_run_are_compiled(monkeypatch: pytest.MonkeyPatch, lively: LoadProfile) -> None:
     assert done_by_the_loop(monkeypatch, (), lively) > 550
+
+
+def test_nearly_all_ticks_of_a_refrigerator_are_compiled(monkeypatch: pytest.MonkeyPatch, lively: LoadProfile) -> None:
+    assert done_by_the_loop(monkeypatch, (REFRIGERATOR, TRIP), lively) > 550
 
 
 def test_nothing_is_compiled_while_the_classical_loops_drive(
