@@ -15,16 +15,11 @@ from rig.studies.penalty_variants import Variant
 from rig.studies.request import Series
 from rig.studies.results import markdown_table
 from rig.studies.study import Cell, Load
-from rig.studies.updating_period import TUNING_DRAWS
+from rig.studies.updating_period import TUNING_DRAWS, is_inside
 
 COSTS: Final = {"J_open_mean": "open loop", "J_BF": "J_BF"}
 PeriodCosts = dict[Load, Mapping[str, Series]]
 """By hour: costs of the periods, by kind of cost."""
-
-
-def is_inside(costs: Series) -> bool:
-    """Tell whether the least of some costs (periods,) is neither the first nor the last."""
-    return 0 < int(np.argmin(costs)) < len(costs) - 1
 
 
 def groups(costs: PeriodCosts) -> dict[str, list[Load]]:

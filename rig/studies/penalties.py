@@ -1,8 +1,7 @@
 """What penalties, start and devices of the ODE-based solver do to costs, to violations and to the best period."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,113 +11,32 @@ from rig import paper as published
 from rig.studies.best_periods import PeriodCosts, period_figure, period_remarks, period_values
 from rig.studies.crossing import crossing
 from rig.studies.drawing import legend_outside, panels, paper
-from rig.studies.intervals import Interval, interval_of_mean, mean_ratio, over_draws
-from rig.studies.open_loop import LEAST_DRAWN, paired_loads, watch
+from rig.studies.intervals import mean_ratio, over_draws
+from rig.studies.open_loop import LEAST_DRAWN
+from rig.studies.penalty_sums import QPOASES, Paired
 from rig.studies.penalty_variants import (
     PRESETS,
+    SETTLED,
+    START_POWERS,
     Variant,
     closed,
     closed_loads,
     hours,
     of_period,
-    paired,
     periods,
-    powers_of,
     requests,
     timed_variants,
     variants,
 )
 from rig.studies.request import RunRequest, Series
 from rig.studies.results import markdown_table
-from rig.studies.study import Cell, Load, Outcomes, StudyOptions, StudyResult
+from rig.studies.study import Cell, Outcomes, StudyOptions, StudyResult
 
-QPOASES: Final = "qpOASES"
 COLOURS: Final = {QPOASES: "#888888", Preset.TUNED.value: "#1f5fa8", Preset.AS_PRINTED.value: "#b3261e"}
 NOMINAL: Final = 1.0
 COLUMNS: Final = (
     "part", "load", "preset", "change", "power or period", "J_dev", "J_cst", "c1", "c2", "lowest", "J per time", "J_BF",
 )  # fmt: skip
-
-
-class Sums(NamedTuple):
-    """Of one solver at one power on the problems of one draw."""
-
-    J_dev: float
-    J_cst: float
-    c1: float
-    c2: float
-    lowest: float
-
-    @property
-    def total(self) -> float:
-        """What is compared with the lowest."""
-        return self.J_dev + self.J_cst
-
-
-class Paired:
-    """Sums of all draws, by variant (qpOASES is none), power and draw.
-
-    Raises:
-        StudyError: A profile costs less than the optimum.
-    """
-
-    def __init__(self, options: StudyOptions, outcomes: Outcomes) -> None:
-        self.loads = paired_loads(options)
-        self.sums: dict[tuple[Variant | None, float], list[Sums]] = {
-            (variant, power): [_sums(load, variant, power, outcomes) for load in self.loads]
-            for variant in (None, *variants(options))
-            for power in powers_of(variant, options)
-        }
-
-    def powers(self, variant: Variant | None) -> list[float]:
-        """Return the powers of a variant, rising."""
-        return sorted(power for one, power in self.sums if one == variant)
-
-    def over_lowest(self, variant: Variant | None, power: float, which: Sequence[int]) -> float:
-        """Return the total cost of some draws together over the lowest there is."""
-        some = [self.sums[variant, power][draw] for draw in which]
-        return sum(one.total for one in some) / sum(one.lowest for one in some)
-
-    def interval(self, variant: Variant | None, power: float) -> Interval:
-        """Return the interval of `over_lowest`."""
-        return over_draws(partial(self.over_lowest, variant, power), len(self.loads))
-
-    def over_converged(self, part: str, variant: Variant, power: float) -> Interval:
-        """Return the interval of a part of the cost over that of qpOASES at the largest power."""
-        converged = self.sums[None, self.powers(None)[-1]]
-
-        def ratio(which: Sequence[int]) -> float:
-            mine, theirs = (
-                sum(getattr(sums[draw], part) for draw in which) for sums in (self.sums[variant, power], converged)
-            )
-            return float(mine / theirs) if theirs else np.nan
-
-        return over_draws(ratio, len(self.loads))
-
-    def mean(self, what: str, variant: Variant, power: float) -> Interval:
-        """Return the interval of the mean over the draws of c1 or c2."""
-        return interval_of_mean([getattr(one, what) for one in self.sums[variant, power]])
-
-    def crossing(self, variant: Variant) -> Interval:
-        """Return from which power on qpOASES costs no more than a preset."""
-        return over_draws(partial(self._crossing, variant), len(self.loads))
-
-    def crossings(self, variant: Variant) -> list[float]:
-        """Return the same of each draw by itself."""
-        return [self._crossing(variant, [draw]) for draw in range(len(self.loads))]
-
-    def _crossing(self, variant: Variant, which: Sequence[int]) -> float:
-        powers = self.powers(variant)
-        curves = (np.array([self.over_lowest(one, power, which) for power in powers]) for one in (None, variant))
-        return crossing(np.array(powers), *curves)
-
-
-def _sums(load: Load, variant: Variant | None, power: float, outcomes: Outcomes) -> Sums:
-    run = outcomes[paired(load, variant, power)]
-    label = variant.label if variant else QPOASES
-    watch(run, "lowest", run.column("j_dev") + run.column("j_cst"), f"{label} at P = {power:g}, load {load.name}")
-    i = run.indicators
-    return Sums(i.J_dev, i.J_cst, i.c1, i.c2, float(run.column("lowest").sum()))
 
 
 class PenaltiesStudy:
@@ -228,7 +146,6 @@ def _of_paper(what: str) -> float:
 
 def _table(preset: Preset, options: StudyOptions, found: Paired, loops: Mapping[Variant, Series]) -> str:
     """Return what one change at a time does to a preset, and the paper's points."""
-    largest = 10.0
     rows: list[tuple[Cell, ...]] = [(
         "the paper's points", f"{_of_paper('J_total'):.3f}", "", f"{_of_paper('J_dev'):.3f}",
         f"{_of_paper('J_cst'):.3f}", f"{_of_paper('c1'):.2f}", f"{_of_paper('c2'):.2f}", "",
@@ -239,8 +156,7 @@ def _table(preset: Preset, options: StudyOptions, found: Paired, loops: Mapping[
         closed_loop = mean_ratio(loops[variant], loops[PRESETS[Preset.TUNED]])
         rows.append((
             variant.change or f"**{preset}**",
-            found.interval(variant, NOMINAL).brief(4), found.interval(variant, largest).brief(4),
-            *(found.over_converged(part, variant, largest).brief() for part in ("J_dev", "J_cst")),
+            found.interval(variant, NOMINAL).brief(4), *_settled(found, variant),
             found.mean("c1", variant, NOMINAL).brief(), found.mean("c2", variant, NOMINAL).brief(),
             closed_loop.brief(4),
         ))  # fmt: skip
@@ -255,6 +171,15 @@ def _table(preset: Preset, options: StudyOptions, found: Paired, loops: Mapping[
     return f"{caption}\n\n{markdown_table(header, rows)}"
 
 
+def _settled(found: Paired, variant: Variant) -> tuple[str, str, str]:
+    """Return total, J_dev and J_cst of a solver that has converged, if it was run to there."""
+    if (variant, SETTLED) not in found.sums:
+        return "", "", ""
+    total = found.interval(variant, SETTLED).brief(4)
+    dev, cst = (found.over_converged(part, variant, SETTLED).brief() for part in ("J_dev", "J_cst"))
+    return total, dev, cst
+
+
 def misfit(ours: Series, theirs: Series) -> float:
     """Return the root mean square of ln(ours / theirs)."""
     return float(np.sqrt(np.mean(np.log(ours / theirs) ** 2)))
@@ -267,22 +192,21 @@ def _start_table(options: StudyOptions, found: Paired) -> list[str]:
         return []
     points = published.solver_comparison()["ode"]
     theirs = points["J_total"] / points["J_total"][-1]
-    some = [power for power in found.powers(starts[-1]) if power < found.powers(starts[-1])[-1]]
+    some = list(START_POWERS)
     places = [int(np.argmin(np.abs(points["normalized_power"] - power))) for power in some]
     rows: list[tuple[Cell, ...]] = [("the paper's points", *(f"{theirs[place]:.3f}" for place in places), "")]
     for variant in starts:
-        settled = found.powers(variant)[-1]
         every = list(range(len(found.loads)))
 
-        def curve(which: Sequence[int], variant: Variant = variant, settled: float = settled) -> Series:
-            base = found.over_lowest(variant, settled, which)
+        def curve(which: Sequence[int], variant: Variant = variant) -> Series:
+            base = found.over_lowest(PRESETS[variant.preset], SETTLED, which)
             return np.array([found.over_lowest(variant, power, which) / base for power in some])
 
         distance = over_draws(_misfit_of(curve, theirs[places]), len(found.loads))
         rows.append((variant.label, *(f"{value:.3f}" for value in curve(every)), distance.brief()))
     caption = (
-        "**Starts**: total cost at few iterations over that of the same solver at the largest power, all draws "
-        "together, and how far that is from the paper's points: root mean square of the logarithm of the ratio."
+        "**Starts**: total cost at few iterations over that of the same preset at P = 10, all draws together, and how "
+        "far that is from the paper's points, over theirs at P = 25: root mean square of the logarithm of the ratio."
     )
     return [f"{caption}\n\n{markdown_table(('start', *(f'P = {p:g}' for p in some), 'misfit'), rows)}"]
 

@@ -32,16 +32,21 @@ class Variant(NamedTuple):
         return self.change.startswith(COST_SCALE)
 
     @property
+    def is_weight(self) -> bool:
+        """Whether it changes what breaking a row costs."""
+        return self.change.startswith(("alpha", "rate rows"))
+
+    @property
     def is_timed(self) -> bool:
         """Whether its periods are compared, too."""
         return not self.change or self.change in TIMED
 
 
 COST_SCALE: Final = "cost_scale"
-TIMED: Final = (f"{COST_SCALE} 0.0001", f"{COST_SCALE} 1e-06", f"{COST_SCALE} 1e-08")
-"""Starts whose best periods are looked for."""
+TIMED: Final = (f"{COST_SCALE} 0.0001", f"{COST_SCALE} 1e-08")
+"""Starts whose best periods are looked for: that of the other preset."""
 RATES: Final = {"x 16": (16, 16, 16), "x 160": (160, 160, 160), "in % and W": (100, 2500, 100)}
-_CHANGES: Final = {
+CHANGES: Final = {
     **{f"alpha = {factor:g} rho": f"penalties.output_rows={factor}" for factor in (0.3, 1.0, 3.0, 10.0, 30.0)},
     **{f"rate rows {name}": f"penalties.rate_rows={list(weights)}" for name, weights in RATES.items()},
     **{f"{COST_SCALE} {scale:g}": f"ode.cost_scale={scale}" for scale in (1.0, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10)},
@@ -51,7 +56,7 @@ _CHANGES: Final = {
     "first knot as rows": "penalties.first_knot_in_box=false",
     "box penalty": "penalties.box=1", "no box penalty": "penalties.box=0",
 }  # fmt: skip
-_OWN: Final = {
+OWN: Final = {
     Preset.TUNED: ("alpha = 30 rho", "rate rows x 16", f"{COST_SCALE} 0.0001", "with look-ahead rows",
                    "held at bounds", "first knot as a box", "no box penalty"),
     Preset.AS_PRINTED: ("alpha = 1 rho", "rate rows in % and W", f"{COST_SCALE} 1e-08", "without look-ahead rows",
@@ -73,17 +78,21 @@ VARIANTS: Final = tuple(
         PRESETS[preset],
         *(
             Variant(preset, change, (*_preset(preset), PROGRAM + assignment))
-            for change, assignment in _CHANGES.items()
-            if change not in _OWN[preset]
+            for change, assignment in CHANGES.items()
+            if change not in OWN[preset]
         ),
     )
 )
 
 POWERS: Final = (0.2, 0.4, 0.6, 1.0, 2.0, 3.2, 4.0, 5.0, 7.0, 10.0, 15.0, 25.0)
 """Of the paper's, those that the presets and qpOASES are compared at."""
-SOME_POWERS: Final = (1.0, 10.0)
-"""Those that every variant is compared at."""
-START_POWERS: Final = (0.2, 0.4, 0.6, 1.0, 10.0)
+SETTLED: Final = 10.0
+"""At which a solver has converged."""
+WEIGHT_POWERS: Final = (1.0, SETTLED)
+"""Those of other weights, which have another optimum."""
+DEVICE_POWERS: Final = (1.0,)
+"""Those of all else, which has an effect on few iterations, and none on the optimum."""
+START_POWERS: Final = (0.2, 0.4, 0.6, 1.0)
 """Those of other starts, which are all about few iterations."""
 QUICK_POWERS: Final = (0.2, 1.0, 10.0, 25.0)
 CLOSED_DRAWS: Final = 6
@@ -102,7 +111,9 @@ def powers_of(variant: Variant | None, options: StudyOptions) -> tuple[float, ..
         return QUICK_POWERS
     if variant is None or not variant.change:
         return POWERS
-    return START_POWERS if variant.is_start else SOME_POWERS
+    if variant.is_start:
+        return START_POWERS
+    return WEIGHT_POWERS if variant.is_weight else DEVICE_POWERS
 
 
 def _with(request: RunRequest, variant: Variant) -> RunRequest:
