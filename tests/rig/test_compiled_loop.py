@@ -50,6 +50,7 @@ LEFT_TO_PROGRAMS = {
     "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
     "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
     "qpoases": (f'{PROGRAM}solver="qpoases"',),
+    "osqp and load steps that interrupt": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}interrupting_load_step_w=10"),
 }
 """Whose ticks alone are compiled, where that is worth while."""
 UNUSUAL = {
@@ -57,6 +58,9 @@ UNUSUAL = {
     "sensors out of range": ("control_plc.sensors.level=[59.9,60.1]",),
     "sensors that freeze soon": ("control_plc.sensors.frozen_s=0.5",),
     "sequences that are refused": ("limits.slew_s=4",),
+    "sequences that are refused, and load steps that interrupt": (
+        "limits.slew_s=4", f"{PROGRAM}interrupting_load_step_w=10",
+    ),
     "an impatient watchdog": ("control_plc.ladder.optimizer_timeout_s=2",),
     "the classical loops": ('control_plc.driver="classical"',),
 }
@@ -113,8 +117,11 @@ def done_by_the_loop(monkeypatch: pytest.MonkeyPatch, assignments: tuple[str, ..
     return ticks
 
 
-def test_nearly_all_ticks_of_an_ordinary_run_are_compiled(monkeypatch: pytest.MonkeyPatch, lively: LoadProfile) -> None:
-    assert done_by_the_loop(monkeypatch, (), lively) > 550
+@pytest.mark.parametrize("assignments", [(), COMPILED["hybrid"], COMPILED["load steps that interrupt"]])
+def test_nearly_all_ticks_of_an_ordinary_run_are_compiled(
+    monkeypatch: pytest.MonkeyPatch, assignments: tuple[str, ...], lively: LoadProfile
+) -> None:
+    assert done_by_the_loop(monkeypatch, assignments, lively) > 500
 
 
 def test_nothing_is_compiled_while_the_classical_loops_drive(
