@@ -65,10 +65,12 @@ def hmi() -> None:
 
 
 def rig() -> None:
-    """Let a minute pass in one process: compiled loops, and the programs for what is unusual."""
+    """Let a minute pass in one process with each plant: compiled loops, and the programs for what is unusual."""
+    from plant.settings import PlantKind  # noqa: PLC0415 not in every image
     from rig import simulate  # noqa: PLC0415 not in the images
 
-    simulate(load="a", duration_s=60)
+    for kind in PlantKind:
+        simulate(load="a", duration_s=60, plant={"kind": kind})
 
 
 if __name__ == "__main__":

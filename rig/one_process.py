@@ -13,7 +13,6 @@ from optimizer_plc.program import OptimizerProgram
 from plant.kinds import plant_maker
 from plant.program import LoadProfile, PlantProgram
 from plant.runtime import own_header
-from plant.settings import PlantKind
 from rig.compiled.stretches import CompiledStretches
 from rig.recording import Recorder
 from rig.scenario import Scenario
@@ -79,14 +78,14 @@ class OneProcessRig:
 
     Args:
         settings: Configuration.
-        compiled: Ordinary ticks of a cold box alone are done in compiled loops, with the same bits.
+        compiled: Ordinary ticks are done in compiled loops, with the same bits.
     """
 
     def __init__(self, settings: Settings, *, compiled: bool = True) -> None:
         header = own_header(settings.model.file)
         self._settings = settings
         self._header = header
-        self._compiled = compiled and settings.plant.kind is PlantKind.COLD_BOX
+        self._compiled = compiled
         program = settings.optimizer_plc.program
         self.optimizer = OptimizerProgram(load_model(settings.model.file), program, settings.limits)
         self.control = make_control_program(header, settings.control_plc, settings.limits)

@@ -105,8 +105,11 @@ class PendingTicks:
     def put_block(self, block: SampleBlock) -> None:
         """Put ticks in a row where they belong."""
         rows = slice(block.first - self.first, block.first - self.first + len(block.load))
-        load, u, y, x, _ = self._parts
+        load, u, y, x, warm = self._parts
         load[rows, 0], u[rows], y[rows], x[rows] = block.load, block.u, block.y, block.x
+        if block.station.size:
+            self._has_station = True
+            warm[rows] = block.station
 
     def take(self, ticks: int) -> SampleBlock:
         """Take the oldest ticks away."""

@@ -11,13 +11,12 @@ import numpy as np
 
 import rig.compiled.portable  # noqa: F401 it lets kernels call what is plain Python
 from coldloop.compiled import kernel
-from coldloop.process import L1, T5, TICK_S
+from coldloop.process import L1, T5
 from control_plc.output_limits import admit, admits, copy_state, in_range
 from control_plc.sensors import CONTROLLED, are_inside, watch_standing
 from optimizer_plc import scheme
 from optimizer_plc.scheme import Constants, Memory
-from plant.cold_box import evaluate
-from plant.integrator import advance_along
+from rig.compiled.plants import advance_plant
 from rig.compiled.records import NOT, Alarms, Array, PlantState, Reports, Trace, World
 
 DONE: Final = 0
@@ -33,7 +32,7 @@ def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> b
     while s.load_index + 1 < w.load_ticks.shape[0] and w.load_ticks[s.load_index + 1] <= s.tick:
         s.load_index += 1
     load = w.load_watts[s.load_index]
-    trace.load[row], trace.y[row], trace.x[row] = load, plant.y, plant.x
+    trace.load[row], trace.y[row], trace.x[row], trace.station[row] = load, plant.y, plant.x, plant.station
     y, x = trace.y[row], trace.x[row]
     known = 0.0 <= load <= w.largest_load
     for i in range(x.shape[0]):
@@ -73,30 +72,15 @@ def scan(
     admit(guard, w.limits, tick, rows[tick - s.first_tick], tick == s.first_tick)
     u, load = guard.applied, w.load_watts[s.load_index]
     trace.u[row] = u
-    advance_plant(w, plant, u, load, row)
+    advance_plant(w.plant, plant, u, load, row)
+    if plant.noise.shape[0]:
+        for i in range(plant.y.shape[0]):
+            plant.y[i] = plant.y[i] + w.biases[i] + w.deviations[i] * plant.noise[row, i]
     y = trace.y[row]
     watch_standing(s.stands, s.seen, y, 1)
     s.level_since = pending(alarms.level_band, alarms.level_active, s.level_since, tick, y[L1])
     s.t5_since = pending(alarms.t5_band, alarms.t5_active, s.t5_since, tick, y[T5])
     s.tick = tick + 1
-
-
-@kernel
-def advance_plant(w: World, plant: PlantState, u: Array, load: float, row: int) -> None:
-    """Go one tick forward with the plant; `row` is that of the noise on what is measured there."""
-    held = plant.held[3] == load
-    for i in range(3):
-        held = held and plant.held[i] == u[i]
-        plant.held[i] = u[i]
-    plant.held[3] = load
-    inputs = plant.held[:3]
-    if not held:
-        evaluate(plant.x, inputs, load, w.box, w.helium, plant.slope, plant.y)
-    plant.x[:] = advance_along(plant.x, plant.slope, inputs, load, TICK_S, w.box, w.helium)
-    evaluate(plant.x, inputs, load, w.box, w.helium, plant.slope, plant.y)
-    if plant.noise.shape[0]:
-        for i in range(plant.y.shape[0]):
-            plant.y[i] = plant.y[i] + w.biases[i] + w.deviations[i] * plant.noise[row, i]
 
 
 @kernel

@@ -10,6 +10,9 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS
 from control_plc.output_limits import Limits
 from plant.cold_box import ColdBox
 from plant.helium.properties import Helium
+from plant.refrigerator import Refrigerator
+from plant.refrigerator_tick import RefrigeratorMemory
+from plant.station_law import StationLaw
 
 Array = NDArray[np.float64]
 
@@ -41,11 +44,62 @@ triggered, lowest: the optimiser's watchdog. level_since, t5_since: since when a
 seen: of the sensor check. load_index: step of the load that holds. solved: reports made."""
 
 
-class World(NamedTuple):
-    """What does not change in a run."""
+class BoxConstants(NamedTuple):
+    """A cold box alone."""
 
     box: ColdBox
     helium: Helium
+
+
+class BoxState(NamedTuple):
+    """A cold box alone between two ticks."""
+
+    x: Array
+    """Shape (28,)."""
+    y: Array
+    """Outputs, shape (22,)."""
+    station: Array
+    """Nothing, shape (0,)."""
+    noise: Array
+    """Draws for the sensors, a row for each tick of the trace, shape (N, 22) or (0, 22)."""
+    slope: Array
+    """dx/dt at x under `held`, shape (28,)."""
+    held: Array
+    """Inputs and load of the tick before, shape (4,); NaN where they are not known."""
+
+
+class RefrigeratorConstants(NamedTuple):
+    """The whole refrigerator and its station's controller."""
+
+    plant: Refrigerator
+    helium: Helium
+    law: StationLaw
+
+
+class RefrigeratorState(NamedTuple):
+    """A refrigerator between two ticks."""
+
+    x: Array
+    """States of the cold box, the first 28 of `memory.x`."""
+    y: Array
+    """As in `BoxState`."""
+    station: Array
+    """Signals, mode and alarms of the station, shape (21,)."""
+    noise: Array
+    """As in `BoxState`."""
+    memory: RefrigeratorMemory
+    ahead: Array
+    """Disturbances at each tick of the trace and at the one behind it, without load, shape (N + 1, 6)."""
+
+
+PlantConstants = BoxConstants | RefrigeratorConstants
+PlantState = BoxState | RefrigeratorState
+
+
+class World(NamedTuple):
+    """What does not change in a run."""
+
+    plant: PlantConstants
     biases: Array
     """What the sensors show too much, shape (22,)."""
     deviations: Array
@@ -75,21 +129,6 @@ class Alarms(NamedTuple):
     t5_delay: int
 
 
-class PlantState(NamedTuple):
-    """The cold box between two ticks."""
-
-    x: Array
-    """Shape (28,)."""
-    slope: Array
-    """dx/dt at x under `held`, shape (28,)."""
-    held: Array
-    """Inputs and load of the tick before, shape (4,); NaN where they are not known."""
-    y: Array
-    """Outputs, shape (22,)."""
-    noise: Array
-    """Draws for the sensors, a row for each tick of the trace, shape (N, 22) or (0, 22)."""
-
-
 class Trace(NamedTuple):
     """N ticks in a row as they are recorded."""
 
@@ -97,6 +136,8 @@ class Trace(NamedTuple):
     u: NDArray[np.float32]
     y: NDArray[np.float32]
     x: NDArray[np.float32]
+    station: NDArray[np.float32]
+    """Signals, mode and alarms of the compression station, no columns for a cold box alone."""
 
 
 class Reports(NamedTuple):
@@ -110,9 +151,9 @@ class Reports(NamedTuple):
     """Of the update under way: E, D, K, Gamma."""
 
 
-def empty_trace() -> Trace:
-    """Return room for a block."""
-    sizes = (len(INPUT_NAMES), len(OUTPUT_NAMES), len(STATE_NAMES))
+def empty_trace(station: int) -> Trace:
+    """Return room for a block, with so many columns of the station."""
+    sizes = (len(INPUT_NAMES), len(OUTPUT_NAMES), len(STATE_NAMES), station)
     return Trace(np.empty(BLOCK_TICKS, np.float32), *(np.empty((BLOCK_TICKS, size), np.float32) for size in sizes))
 
 

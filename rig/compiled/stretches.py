@@ -9,11 +9,10 @@ from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import MAX_LOAD_W
 from control_plc.program import ControlProgram
 from optimizer_plc.program import OptimizerProgram
-from plant.helium.properties import load_helium
 from plant.program import LoadProfile, PlantProgram
-from rig.compiled import control, loops, optimizer
-from rig.compiled.records import BLOCK_TICKS, PlantState, Trace, World, empty_reports, empty_rows, empty_trace
-from rig.recorded import SampleBlock
+from rig.compiled import control, loops, optimizer, plants
+from rig.compiled.records import BLOCK_TICKS, PlantState, World, empty_reports, empty_rows, empty_trace
+from rig.recorded import NO_STATION, STATION_COLUMNS, SampleBlock
 
 SHORTEST: Final = 6
 """Ticks to an updating instant below which the programs are as quick."""
@@ -30,7 +29,7 @@ class CompiledStretches:
     """Runs the programs of one session ahead as long as nothing unusual happens.
 
     Args:
-        plant: Of a cold box alone.
+        plant: Of either kind.
         control: The control PLC.
         optimizer: The optimiser, in its session.
         load: What the plant's load follows.
@@ -45,11 +44,11 @@ class CompiledStretches:
         self._constants = (
             optimizer.constants_of(optimizer_plc, limits) if optimizer.is_compiled(optimizer_plc) else None
         )
-        self._trace, self._reports = empty_trace(), empty_reports()
+        self._trace, self._reports = empty_trace(STATION_COLUMNS if plant.station else 0), empty_reports()
         self._pause_until = 0
         sensors = control_plc.sensors
         self._world = World(
-            plant.box, load_helium(), plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
+            plants.constants_of(plant), plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
             control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), sensors.frozen_ticks, MAX_LOAD_W,
             control_plc.watchdog.time,
         )  # fmt: skip
@@ -63,8 +62,9 @@ class CompiledStretches:
         if not whole and not answered and self._control.player.load_step:
             return None  # the programs deliver at once what a load step may cut off
         until = min(until, (self._control.tick // BLOCK_TICKS + 1) * BLOCK_TICKS)
-        with self._plant.noise(until - self._control.tick) as noise:
-            plant = PlantState(*self._plant.between_ticks(), noise)
+        ticks = until - self._control.tick
+        with self._plant.noise(ticks) as noise:
+            plant = plants.state_of(self._plant, noise, ticks)
             stretch = self._updates_too(plant, until) if whole else self._ticks_alone(plant, until)
         if stretch is None:  # the programs go on alone to the next updating instant
             self._pause_until = self._control.player.next_update_tick
@@ -106,8 +106,9 @@ class CompiledStretches:
 
     def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:
         """Let plant and control PLC go on from what the loop has left; return the ticks it has done."""
-        self._plant.take_over(int(s["tick"]), plant.x, plant.slope, plant.held, plant.y)
+        plants.give_back(self._plant, plant, int(s["tick"]), guard["applied"])
         control.give_back_guard(self._control, guard)
         control.give_back_scan(self._control, s, self._trace)
         ticks = int(s["tick"]) - int(s["first"])
-        return SampleBlock(int(s["first"]), *(part[:ticks].copy() for part in Trace(*self._trace)))
+        load, u, y, x, station = (part[:ticks].copy() for part in self._trace)
+        return SampleBlock(int(s["first"]), load, u, y, x, station if self._plant.station else NO_STATION)

@@ -40,6 +40,7 @@ RIG_MODULES = (
     "rig.compiled.control",
     "rig.compiled.loops",
     "rig.compiled.optimizer",
+    "rig.compiled.plants",
     "rig.compiled.portable",
     "rig.compiled.records",
     "rig.compiled.stretches",

@@ -23,7 +23,8 @@ from plant.refrigerator import (
     read,
 )
 from plant.refrigerator_file import SHIPPED, RefrigeratorFile, read_refrigerator_file
-from plant.station_control import StationControl, StationMeasurement
+from plant.station_control import StationControl
+from plant.station_law import StationMeasurement
 from plant.station_settings import StationControlKind, StationSettings
 
 LOAD: Final = "load"

@@ -118,7 +118,11 @@ class PlantProgram:
         """Standard deviation of the noise on each output, shape (22,)."""
         self._generator = np.random.Generator(np.random.PCG64(noise.seed if noise else 0))
         self._measured = self._sample(outputs(self._x, self._u, self.load, box, helium))
-        self._step(self.load, held=False)  # no session waits for the compiler
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        """Have the kernel of a tick compiled: no session waits for that."""
+        self._step(self.load, held=False)
 
     def resume(
         self, tick: int, x: Sequence[float], u: Sequence[float], y: Sequence[float], noise_state: Mapping[str, Any]
@@ -143,12 +147,12 @@ class PlantProgram:
             "noise_state": noise_state,
         }  # fmt: skip
 
-    def between_ticks(self) -> tuple[RealArray, RealArray, RealArray, RealArray]:
-        """Return the state, its slope, the inputs and the load that the slope is for, and the outputs."""
-        return self._x.copy(), self._slope.copy(), np.array(self._held), np.array(self._measured)
+    def between_ticks(self) -> tuple[RealArray, RealArray, RealArray]:
+        """Return the state, its slope, and the inputs and the load that the slope is for."""
+        return self._x.copy(), self._slope.copy(), np.array(self._held)
 
     def take_over(self, tick: int, x: RealArray, slope: RealArray, held: RealArray, y: RealArray) -> None:
-        """Go on at another tick with what `between_ticks` would have told there."""
+        """Go on at another tick with what `between_ticks` and `measure` would have told there."""
         self.tick, self._x, self._slope, self._u = tick, x.copy(), slope.copy(), held[:3].copy()
         self._held, self._measured = tuple(held.tolist()), tuple(y.tolist())
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from coldloop.registers.plant import StationSample, StationStatus, Surroundings
+from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
 from plant.helium.properties import load_helium
 from plant.integrator import plain_tuples
 from plant.numeric import RealArray
@@ -13,19 +13,15 @@ from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.refrigerator import (
     BOX_STATES,
     REFERENCE_REFRIGERATOR,
-    SIGNAL_NAMES,
-    STATE_NAMES,
-    advance_and_read_refrigerator,
     check_refrigerator,
     read,
 )
 from plant.refrigerator_events import EventSchedule
 from plant.refrigerator_file import RefrigeratorFile
-from plant.station_control import Commands, StationControl, StationMeasurement
+from plant.refrigerator_tick import ALARMS, MODE, RefrigeratorMemory, advance_program_tick, control_tick
+from plant.station_control import station_law
+from plant.station_law import Commands
 from plant.station_settings import StationSettings
-
-HP, LP, BUFFER, NITROGEN, LOST = (SIGNAL_NAMES.index(name) for name in ("P12", "P11", "P13", "L_N2", "lost"))
-CV956, CV952, CV953 = (STATE_NAMES.index(name) for name in ("CV956", "CV952", "CV953"))
 
 
 class RefrigeratorProgram(PlantProgram):
@@ -58,29 +54,32 @@ class RefrigeratorProgram(PlantProgram):
     ) -> None:
         check_refrigerator(REFERENCE_REFRIGERATOR)
         self._plant, self._tables = plain_tuples(REFERENCE_REFRIGERATOR), plain_tuples(load_helium())
-        self._control = StationControl(station, file.reference, REFERENCE_REFRIGERATOR.station)
+        self.law = station_law(station, file.reference, REFERENCE_REFRIGERATOR.station)
+        """Of the station's controller."""
         self._events = events
-        self._full = np.array(file.x0)
-        self.tick = 0
-        self._signals = self._read_at(np.array(u0, dtype=np.float64), np.array(file.v0), load.value(0))
-        self._commands = self._controlled()
+        x, v = np.array(file.x0, dtype=np.float64), np.array(file.v0, dtype=np.float64)
+        d = self._disturbances(0, load.value(0))
+        y, signals = read(x, np.array(u0, dtype=np.float64), v, d, REFERENCE_REFRIGERATOR, load_helium())
+        self._memory = RefrigeratorMemory(x, y, signals, v, np.zeros(3), np.zeros(2, np.int64))
+        control_tick(self._memory, d, self.law)
         super().__init__(box=REFERENCE_REFRIGERATOR.box, x0=file.x0[:BOX_STATES], u0=u0, load=load, noise=noise)
 
-    def _read_at(self, u: RealArray, v: RealArray, w: float) -> RealArray:
-        d = self._disturbances(0, w)
-        _, signals = read(self._full, u, v, d, REFERENCE_REFRIGERATOR, load_helium())
-        return signals
+    def _warm_up(self) -> None:
+        d = self._disturbances(0, self.load)
+        advance_program_tick(self.memory, self._u, d, d, self._plant, self._tables, self.law)
 
     @property
     def station(self) -> StationSample:
         """Compression station and nitrogen at the current tick, with mode and alarms of its controller."""
-        return StationSample(self.tick, tuple(self._signals.tolist()), self._control.mode, self._control.alarms)
+        m = self._memory
+        mode, alarms = StationMode(int(m.status[MODE])), StationAlarm(int(m.status[ALARMS]))
+        return StationSample(self.tick, tuple(m.signals.tolist()), mode, alarms)
 
     @property
     def station_status(self) -> StationStatus:
         """The same for the registers, with what its controller asks for."""
         sample = self.station
-        return StationStatus(sample.tick, sample.mode, sample.alarms, sample.signals, tuple(self._commands))
+        return StationStatus(sample.tick, sample.mode, sample.alarms, sample.signals, self.commands)
 
     @property
     def surroundings(self) -> Surroundings:
@@ -94,34 +93,36 @@ class RefrigeratorProgram(PlantProgram):
     @property
     def commands(self) -> Commands:
         """Openings that the station's controller asks for from the current tick on, %."""
-        return self._commands
+        return Commands(*self._memory.commands.tolist())
 
     def advance(self) -> None:
         """Go one tick forward."""
-        d = self._disturbances(self.tick, self.load)
-        v = np.array(self._commands)
-        self._full, y, self._signals = advance_and_read_refrigerator(
-            self._full, self._u, v, d, self._tick_s, self._plant, self._tables
-        )
-        self._x = self._full[:BOX_STATES]
+        d, ahead = self._disturbances(self.tick, self.load), self._disturbances(self.tick + 1, 0.0)
+        advance_program_tick(self._memory, self._u, d, ahead, self._plant, self._tables, self.law)
+        self._x = self._memory.x[:BOX_STATES]
         self.tick += 1
-        self._commands = self._controlled()
-        self._measured = self._sample(y)
+        self._measured = self._sample(self._memory.y)
 
     def _disturbances(self, tick: int, w: float) -> RealArray:
         given, ambient = self._events.at(tick), self._events.ambient(tick)
         return np.array([w, ambient, 1e-3 * given.leak, given.nitrogen, given.nc1, given.nc2], dtype=np.float64)
 
-    def _controlled(self) -> Commands:
-        """Return what the station's controller asks for at the present tick."""
-        signals, x, now = self._signals, self._full, self._events.at(self.tick)
-        return self._control.step(
-            StationMeasurement(
-                float(signals[HP]), float(signals[LP]), float(signals[BUFFER]),
-                float(x[CV956]), float(x[CV952]), float(x[CV953]),
-                float(signals[NITROGEN]), float(signals[LOST]), bool(now.nc1), bool(now.nc2),
-            )
-        )  # fmt: skip
+    def ahead(self, ticks: int) -> RealArray:
+        """Return the disturbances, without load, of `ticks` ticks and of the one behind them, shape (ticks + 1, 6)."""
+        return np.array([self._disturbances(self.tick + later, 0.0) for later in range(ticks + 1)])
+
+    @property
+    def memory(self) -> RefrigeratorMemory:
+        """A copy of what a tick changes."""
+        m = self._memory
+        return RefrigeratorMemory(
+            m.x.copy(), m.y.copy(), m.signals.copy(), m.commands.copy(), m.integrals.copy(), m.status.copy()
+        )
+
+    def take_over_whole(self, tick: int, u: RealArray, memory: RefrigeratorMemory, y: RealArray) -> None:
+        """Go on at another tick with what `memory` and `measure` would tell there; `u` was held up to it."""
+        self.tick, self._u, self._memory = tick, u.copy(), memory
+        self._x, self._measured = memory.x[:BOX_STATES], tuple(y.tolist())
 
     def resume(
         self,
@@ -135,20 +136,24 @@ class RefrigeratorProgram(PlantProgram):
         """Go on from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
         if warm is None:
             raise ValueError("the retained state is that of a cold box, not of a refrigerator")
-        full, signals = np.array(warm["x"], dtype=np.float64), np.array(warm["signals"], dtype=np.float64)
-        if full.shape != self._full.shape or signals.shape != self._signals.shape:
-            raise ValueError(f"expected {len(STATE_NAMES)} states and {len(SIGNAL_NAMES)} signals")
+        names = {"x": "x", "signals": "signals", "commands": "commands", "integrals": "control"}
+        kept = {name: np.array(warm[field], dtype=np.float64) for name, field in names.items()}
+        for name, values in kept.items():
+            if values.shape != getattr(self._memory, name).shape:
+                raise ValueError(f"{name}: expected {len(getattr(self._memory, name))} numbers")
         super().resume(tick, x, u, y, noise_state)
-        self._control.resume(list(warm["control"]))
         for since, put in warm["given"]:
             self._events.put(int(since), Surroundings(*put))
-        self._full, self._signals, self._commands = full, signals, Commands(*warm["commands"])
+        self._memory = self._memory._replace(
+            x=kept["x"], signals=kept["signals"], commands=kept["commands"], integrals=kept["integrals"]
+        )
 
     def retained(self) -> dict[str, Any]:
         """Return what `resume` needs, as plain data."""
+        m = self._memory
         warm = {
-            "x": self._full.tolist(), "signals": self._signals.tolist(),
-            "control": self._control.retained(), "commands": list(self._commands),
+            "x": m.x.tolist(), "signals": m.signals.tolist(),
+            "control": m.integrals.tolist(), "commands": m.commands.tolist(),
             "given": [(tick, list(put)) for tick, put in self._events.puts],
         }  # fmt: skip
         return {**super().retained(), "warm": warm}

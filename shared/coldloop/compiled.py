@@ -27,7 +27,7 @@ R = TypeVar("R")
 COMPILED_PACKAGES = ("plant", "optimizer_plc")
 COMPILED_MODULES = (
     "coldloop.compiled", "coldloop.process", "coldloop.single_precision", "control_plc.output_limits",
-    "control_plc.sensors", "rig.compiled.loops", "rig.compiled.portable", "rig.compiled.records",
+    "control_plc.sensors", "rig.compiled.loops", "rig.compiled.plants", "rig.compiled.portable", "rig.compiled.records",
 )  # fmt: skip
 """What kernels call from other packages."""
 

@@ -17,7 +17,8 @@ from plant.refrigerator_events import EventSchedule, RefrigeratorEvent
 from plant.refrigerator_file import SHIPPED, read_refrigerator_file
 from plant.refrigerator_program import RefrigeratorProgram
 from plant.settings import PlantSection
-from plant.station_control import StationControl, StationMeasurement
+from plant.station_control import StationControl
+from plant.station_law import StationMeasurement
 from plant.station_settings import StationSettings
 
 FILE = read_refrigerator_file(SHIPPED)

@@ -25,6 +25,11 @@ from rig.settings import Settings
 
 PROGRAM = "optimizer_plc.program."
 NOISE = ("plant.sensors.level=0.02", "plant.sensors.speed=0.5", "plant.sensors.temperature=0.02")
+REFRIGERATOR = "plant.kind=refrigerator"
+TRIP = (
+    'plant.refrigerator.events=[{at_s=90, target="nc1", value=0}, {at_s=120, target="nc1", value=1}, '
+    '{at_s=150.25, target="leak", value=2.0}]'
+)
 COMPILED = {
     "adaptive": (),
     "fixed": (f"{PROGRAM}updating_period_s=2.5",),
@@ -34,6 +39,7 @@ COMPILED = {
     "rates that count elapsed time": ('limits.rate_reference="elapsed"',),
     "long sequences": (f"{PROGRAM}sequence_ticks=240",),
     "a fast PLC": (f"{PROGRAM}budget.power=10",),
+<<<<<<< HEAD
     "interior point": (f'{PROGRAM}solver="interior-point"', f"{PROGRAM}updating_period_s=5"),
     "interior point, cut off": (f'{PROGRAM}solver="interior-point"', f'{PROGRAM}adaptive.rule="contraction"'),
     "hybrid": (f'{PROGRAM}solver="hybrid"', f"{PROGRAM}updating_period_s=1.5"),
@@ -42,6 +48,14 @@ COMPILED = {
     "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
     "load steps that interrupt a rule": (
         f'{PROGRAM}adaptive.rule="contraction"', f"{PROGRAM}interrupting_load_step_w=10", f'{PROGRAM}solver="hybrid"',
+=======
+    "refrigerator": (REFRIGERATOR, TRIP, *NOISE),
+    "refrigerator with PI and a model of its own": (
+        REFRIGERATOR,
+        "plant.station.control=pi",
+        "model.file=refrigerator",
+        f"{PROGRAM}updating_period_s=2.5",
+>>>>>>> main
     ),
 }
 """Whose updates are compiled too."""
@@ -50,7 +64,12 @@ LEFT_TO_PROGRAMS = {
     "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
     "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
     "qpoases": (f'{PROGRAM}solver="qpoases"',),
+<<<<<<< HEAD
     "osqp and load steps that interrupt": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}interrupting_load_step_w=10"),
+=======
+    "qpoases and a refrigerator": (f'{PROGRAM}solver="qpoases"', REFRIGERATOR),
+    "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
+>>>>>>> main
 }
 """Whose ticks alone are compiled, where that is worth while."""
 UNUSUAL = {
@@ -122,6 +141,10 @@ def test_nearly_all_ticks_of_an_ordinary_run_are_compiled(
     monkeypatch: pytest.MonkeyPatch, assignments: tuple[str, ...], lively: LoadProfile
 ) -> None:
     assert done_by_the_loop(monkeypatch, assignments, lively) > 500
+
+
+def test_nearly_all_ticks_of_a_refrigerator_are_compiled(monkeypatch: pytest.MonkeyPatch, lively: LoadProfile) -> None:
+    assert done_by_the_loop(monkeypatch, (REFRIGERATOR, TRIP), lively) > 550
 
 
 def test_nothing_is_compiled_while_the_classical_loops_drive(
