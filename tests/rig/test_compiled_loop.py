@@ -39,7 +39,6 @@ COMPILED = {
     "rates that count elapsed time": ('limits.rate_reference="elapsed"',),
     "long sequences": (f"{PROGRAM}sequence_ticks=240",),
     "a fast PLC": (f"{PROGRAM}budget.power=10",),
-<<<<<<< HEAD
     "interior point": (f'{PROGRAM}solver="interior-point"', f"{PROGRAM}updating_period_s=5"),
     "interior point, cut off": (f'{PROGRAM}solver="interior-point"', f'{PROGRAM}adaptive.rule="contraction"'),
     "hybrid": (f'{PROGRAM}solver="hybrid"', f"{PROGRAM}updating_period_s=1.5"),
@@ -48,14 +47,13 @@ COMPILED = {
     "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
     "load steps that interrupt a rule": (
         f'{PROGRAM}adaptive.rule="contraction"', f"{PROGRAM}interrupting_load_step_w=10", f'{PROGRAM}solver="hybrid"',
-=======
+    ),
     "refrigerator": (REFRIGERATOR, TRIP, *NOISE),
     "refrigerator with PI and a model of its own": (
         REFRIGERATOR,
         "plant.station.control=pi",
         "model.file=refrigerator",
         f"{PROGRAM}updating_period_s=2.5",
->>>>>>> main
     ),
 }
 """Whose updates are compiled too."""
@@ -64,12 +62,8 @@ LEFT_TO_PROGRAMS = {
     "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
     "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
     "qpoases": (f'{PROGRAM}solver="qpoases"',),
-<<<<<<< HEAD
     "osqp and load steps that interrupt": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}interrupting_load_step_w=10"),
-=======
     "qpoases and a refrigerator": (f'{PROGRAM}solver="qpoases"', REFRIGERATOR),
-    "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
->>>>>>> main
 }
 """Whose ticks alone are compiled, where that is worth while."""
 UNUSUAL = {
