@@ -16,6 +16,7 @@ from coldloop.lti_model import load
 from coldloop.process import TICK_S
 from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.costs import matrices_of
+from optimizer_plc.penalties import DEFAULT_PENALTIES
 from optimizer_plc.solvers.ode import descend, flow_in, warm_start
 from plant.cold_box import REFERENCE, evaluate
 from plant.helium.properties import load_helium
@@ -70,7 +71,11 @@ def seconds(call, *arguments) -> float:  # noqa: ANN001, ANN002 of any function
 
 def floors(problems: list[Recorded], count: int) -> Floors:
     """Return the times of the kernels; `count` calls of the plant's, and each problem ten times."""
-    model, helium, flow = load(Settings().model.file), load_helium(), flow_in(OdeSettings(), np.float64)
+    model, helium, flow = (
+        load(Settings().model.file),
+        load_helium(),
+        flow_in(OdeSettings(), DEFAULT_PENALTIES, np.float64),
+    )
     state = np.array(model.x0) * 1.001, np.array(model.u0), model.w0, REFERENCE, helium
     steps(*state, 0, 1)
     held, first = (seconds(steps, *state, anew, count) / count for anew in (0, 1))

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import daqp
 import numpy as np
 from numpy.typing import NDArray
-
 from qp_peers import TO_THE_END, installed_peers, peer_answer
 
 from coldloop.errors import ConfigurationError

@@ -42,8 +42,8 @@ def budget_tables(settings: Settings, power: float | None, period_s: float | Non
     program = settings.optimizer_plc.program
     prediction = PredictionModel(load(settings.model.file))
     real = real_of(Arithmetic.FLOAT32)
-    problem = PredictiveProblem(prediction, program.design, settings.limits, real)
-    trivial = PredictiveProblem(prediction, trivial_design(program.design), settings.limits, real)
+    problem = PredictiveProblem(prediction, program.design, settings.limits, real, program.penalties)
+    trivial = PredictiveProblem(prediction, trivial_design(program.design), settings.limits, real, program.penalties)
     curve = fitted(cholesky_times())
     estimator = estimator_memory(prediction, program.estimator)
     parts = [

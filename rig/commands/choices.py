@@ -8,6 +8,7 @@ from typing import Final
 
 MODES: Final = ("lockstep", "realtime")
 SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "hybrid", "daqp")
+PRESETS: Final = ("tuned", "as-printed")
 LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h", "pulses")
 SERVICES: Final = ("control_plc", "optimizer_plc", "plant")
 REGISTER_FORMATS: Final = ("csv", "json", "markdown", "table")
@@ -16,7 +17,7 @@ FIGURE_FORMATS: Final = ("png", "pdf", "svg")
 STUDIES: Final = (
     "cholesky", "unlimited", "limited", "solver-comparison", "trajectories", "updating-period", "plc-2h", "adaptive-2h",
     "trade-off", "classical", "single-precision", "coupling", "disturbances",
-    "oracles", "robustness", "contest",
+    "oracles", "robustness", "contest", "penalties",
 )  # fmt: skip
 
 

@@ -23,6 +23,7 @@ KEYS = {
     "load": ("plant.load", "--load"),
     "seed": ("plant.seed", "--seed"),
     "solver": ("optimizer_plc.program.solver", "--solver"),
+    "preset": ("optimizer_plc.program.preset", "--preset"),
     "updating_period": ("optimizer_plc.program.updating_period_s", "--updating-period"),
     "mode": ("session.mode", "--mode"),
     "factor": ("session.factor", "--factor"),

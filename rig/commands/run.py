@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from coldloop.command_line import add_configuration_options
 from coldloop.errors import UsageError
-from rig.commands.choices import FIGURE_FORMATS, LOADS, MODES, SOLVERS
+from rig.commands.choices import FIGURE_FORMATS, LOADS, MODES, PRESETS, SOLVERS
 from rig.commands.options import (
     OWN_PORTS,
     PLACES,
@@ -40,6 +40,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
+    parser.add_argument("--preset", choices=PRESETS, help="penalties and start of the solver (default: tuned)")
     parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
                         help="default: adaptive")  # fmt: skip
     parser.add_argument("--seed", type=int, help="seed of the sensors' noise (default: 1)")

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from coldloop.command_line import add_configuration_options
-from rig.commands.choices import LOADS, SOLVERS
+from rig.commands.choices import LOADS, PRESETS, SOLVERS
 from rig.commands.options import PLACES, check_load, port_base, refuse_ineffective, updating_period
 
 
@@ -17,6 +17,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     )
     load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
+    parser.add_argument("--preset", choices=PRESETS, help="penalties and start of the solver (default: tuned)")
     parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
                         help="default: adaptive")  # fmt: skip
     parser.add_argument("--seed", type=int, help="seed of the sensors' noise (default: 1)")

@@ -63,6 +63,7 @@ def constants_of(program: OptimizerProgram, limits: InputLimits) -> Constants:
         Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps, shifts=problem.shifts,
         predicted=output_maps(problem),
         weights=problem.knots_to_samples, input_scale=problem.input_scale, rate=problem.rate,
+        scaled_rate=problem.scaled_rate,
         rate_shares=np.array([limits.rate_share(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)]),
         n_inputs=problem.n_inputs,
         solver=solver_constants(program.solver, program.settings, qp),

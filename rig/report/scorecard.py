@@ -171,6 +171,9 @@ def _updating_period() -> dict[str, float]:
         "interior optimum from 1 to 5 s, share of hours": float(
             ((argbest > 0) & (argbest < fixed.shape[1] - 1)).mean()
         ),
+        "interior optimum from 1 to 5 s, share of hours, as printed": float(
+            ((argbest > 0) & (argbest < fixed.shape[1] - 1)).mean()
+        ),
         "worst end over best from 1 to 5 s, smallest of hours": float((ends / best).min()),
         f"better than the mean fixed period, share: {literal}": float((adaptive < fixed.mean(axis=1)).mean()),
         f"best of all, share: {literal}": float((adaptive < best).mean()),

@@ -9,6 +9,7 @@ from rig.studies.coupling import CouplingStudy
 from rig.studies.disturbances import DisturbancesStudy
 from rig.studies.experiments import ADAPTIVE_2H, PLC_2H
 from rig.studies.oracles import OraclesStudy
+from rig.studies.penalties import PenaltiesStudy
 from rig.studies.robustness import RobustnessStudy
 from rig.studies.single_precision import SinglePrecision
 from rig.studies.solver_comparison import SolverComparison
@@ -36,6 +37,6 @@ _ALL: Final[tuple[Study, ...]] = (
 STUDIES: Final = {study.name: study for study in _ALL}
 """Those of the report, in the order of the paper."""
 
-_APART: Final[tuple[Study, ...]] = (OraclesStudy(), RobustnessStudy(), ContestStudy())
+_APART: Final[tuple[Study, ...]] = (OraclesStudy(), RobustnessStudy(), ContestStudy(), PenaltiesStudy())
 APART: Final = {study.name: study for study in _APART}
 """Those that are too long for the report."""

@@ -59,8 +59,8 @@ class ContestStudy:
                 ratios = {key: _ratios(values[:, column], costs[REFERENCE][:, column]) for key, values in costs.items()}
                 result.remarks.append(_table(f"{title}, {cost}", ratios, len(hours)))
                 result.figures[f"{title}, {cost}"] = _figure(ratios, cost)
-                for (solver, way), (mean, _) in ratios.items():
-                    result.values[f"{cost} over ODE, Algorithm 1, {title}: {solver}, {way}"] = [mean.value]
+                for (solver, label), (mean, _) in ratios.items():
+                    result.values[f"{cost} over ODE, Algorithm 1, {title}: {solver}, {label}"] = [mean.value]
         return result
 
 

@@ -23,7 +23,6 @@ from optimizer_plc.updating_period import FixedPeriod
 from plant.kinds import plant_maker
 from plant.program import LoadProfile
 from plant.runtime import own_header
-from plant.settings import PlantKind
 from rig.compiled.stretches import CompiledStretches
 from rig.indicators import StageCost
 from rig.one_process import Programs, load_table
@@ -123,7 +122,7 @@ class LoopBranch:
         self._sums = CostSums(StageCost(model, program.design), recorder)
         self._objective = objective
         self._load, self._limits = load_table(scenario.load), settings.limits
-        self._compiled = compiled and settings.plant.kind is PlantKind.COLD_BOX
+        self._compiled = compiled
         if recorder is not None:
             recorder.begin()
 

@@ -28,14 +28,14 @@ SETTLING: Final = {SolverName.QPOASES: 500, SolverName.OSQP: 400}
 
 def paired_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
     """Let a solver go through all problems with its own hot starts; return costs as played, a row a problem."""
-    solver, problem = make_solver(program), sequence.problem
+    solver, problem, penalised = make_solver(program), sequence.problem, sequence.solved_with(program)
     z = problem.hold(np.zeros(len(problem.design.input_scale)))
     columns: Columns = {name: [] for name in ("iterations", "j_dev", "j_cst", "violation", "lowest")}
     for (situation, _), lowest in zip(sequence.recorded, sequence.lowest.tolist(), strict=True):
         qp, ticks = problem.at(situation), situation.elapsed_ticks
-        solver.start(qp, problem.shifted(z, ticks))
+        solver.start(penalised.at(situation), problem.shifted(z, ticks))
         done = solver.iterate(PlcBudget(program.budget, solver.tau_1_s).iterations(ticks))
-        z = solver.solution
+        z = penalised.within_first_rate(solver.solution, situation)
         cost = sequence.profiles.cost(qp, z, situation)
         violation = float(indicators(problem, qp, z, situation).violation)
         for name, value in zip(columns, (done, *cost, violation, lowest), strict=True):
@@ -49,7 +49,7 @@ def harsh_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
     The guess is the shifted profile that the converged loop played; `count_2` ... say how many iterations the time of
     2, 4, 6 and 8 of the interior-point solver holds, `after_2` ... what the profile then costs.
     """
-    solver, problem = make_solver(program), sequence.problem
+    solver, problem, penalised = make_solver(program), sequence.problem, sequence.solved_with(program)
     counts = equal_counts(program, solver)
     names = ("lowest", "guess", *(f"{what}_{k}" for k in counts for what in ("count", "after")))
     columns: Columns = {name: [] for name in names}
@@ -62,7 +62,7 @@ def harsh_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
         harsh = at_guess + FLOOR > HARSH * (lowest + FLOOR)
         if not harsh and not settling:
             continue
-        solver.start(qp, guess)
+        solver.start(penalised.at(situation), guess)
         if harsh:
             row = [lowest, at_guess]
             done = 0

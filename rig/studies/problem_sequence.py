@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
+from coldloop.limits import InputLimits
 from coldloop.lti_model import load as load_model
 from coldloop.sequence import InputSequence
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, Situation
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.settings import ProgramSettings, SolverName
 from optimizer_plc.updating_period import UpdatingRule
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder
@@ -22,8 +24,12 @@ from rig.studies.played_profiles import PlayedProfiles
 
 Array = NDArray[np.float64]
 
-OF_THE_SOLVER: Final = ("optimizer_plc.program.solver=", "optimizer_plc.program.budget.")
-"""Settings that differ between the requests that one sequence serves."""
+OF_THE_SOLVER: Final = (
+    "optimizer_plc.program.solver=", "optimizer_plc.program.budget.", "optimizer_plc.program.preset=",
+    "optimizer_plc.program.penalties.", *(f"optimizer_plc.program.{name.replace('-', '_')}." for name in SolverName),
+)  # fmt: skip
+"""Settings that differ between the requests that one sequence serves. The loop that it is recorded in solves exactly,
+so that no penalty has an effect there."""
 CONVERGED: Final = ("optimizer_plc.program.solver=daqp", "optimizer_plc.program.budget.preparation_slots=0")
 
 
@@ -38,11 +44,18 @@ class Recorded(NamedTuple):
 class ProblemSequence(NamedTuple):
     """Problems in their order."""
 
+    prediction: PredictionModel
+    limits: InputLimits
     problem: PredictiveProblem
+    """With the default penalties: what profiles are judged by."""
     profiles: PlayedProfiles
     recorded: Sequence[Recorded]
     lowest: Array
     """The lowest cost of a profile that can be played, for each problem."""
+
+    def solved_with(self, program: ProgramSettings) -> PredictiveProblem:
+        """Return the same problems with the penalties of a program, for its solver."""
+        return PredictiveProblem(self.prediction, program.design, self.limits, penalties=program.penalties)
 
 
 class _ListeningOptimizer(OptimizerProgram):
@@ -74,9 +87,10 @@ def _recorded(scenario: Scenario, assignments: tuple[str, ...]) -> ProblemSequen
     rig = OneProcessRig(settings, compiled=False)
     listening = rig.optimizer = _ListeningOptimizer(model, program, settings.limits)
     rig.run(scenario, Recorder(scenario.ticks, []))
-    problem = PredictiveProblem(PredictionModel(model), program.design, settings.limits)
+    prediction = PredictionModel(model)
+    problem = PredictiveProblem(prediction, program.design, settings.limits)
     profiles = PlayedProfiles(problem)
-    return ProblemSequence(problem, profiles, listening.heard, np.array([
+    return ProblemSequence(prediction, settings.limits, problem, profiles, listening.heard, np.array([
         _lowest(problem, profiles, recorded.situation) for recorded in listening.heard
     ]))  # fmt: skip
 

@@ -1,6 +1,6 @@
 """Cost against updating period, fixed and adapted (paper, figure `tu_opt`), and what the literal rule needs to work."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,6 +12,7 @@ from rig.plot import ACCENT, INK, THIRD
 from rig.studies.drawing import legend_outside, panels
 from rig.studies.load_response import response, response_figure, response_table
 from rig.studies.request import Outcome, RunRequest, Series
+from rig.studies.results import markdown_table
 from rig.studies.study import NOISE, PROGRAM, Cell, Load, Outcomes, StudyOptions, StudyResult, loads
 
 NINE: Final = tuple(published.updating_period()["a"]["tau_u_s"].tolist())
@@ -55,6 +56,7 @@ class Variant:
 
 
 SLOW: Final = (1.0, 2.5)
+AS_PRINTED: Final = Variant("as printed", (f"{PROGRAM}preset=as-printed",), NINE)
 VARIANTS: Final = (
     Variant(
         "rate limit scaled by tau_u / 5 s",
@@ -64,6 +66,7 @@ VARIANTS: Final = (
     Variant("measurement noise", NOISE, policies=(LITERAL, OWN_INTERRUPT, CONTROL)),
     Variant("fast gradient", (f"{PROGRAM}solver=fast-gradient", f"{PROGRAM}fast_gradient.tau_1_s=0.25"), SLOW),
     Variant("ODE starting slowly", (f"{PROGRAM}ode.cost_scale=1e-8", f"{PROGRAM}ode.growth=2.0"), SLOW),
+    AS_PRINTED,
 )
 
 
@@ -107,6 +110,11 @@ class UpdatingPeriodStudy:
         _judge(result, "hours", first)
         if fresh:
             _judge(result, "fresh hours", fresh)
+        if AS_PRINTED in _variants(options):
+            printed = [_variant_runs(load, AS_PRINTED)[: len(NINE)] for load in _hours(options) if load.draw == 1]
+            result.values["interior optimum from 1 to 5 s, share of hours, as printed"] = [
+                _share(is_inside([outcomes[one].indicators.J_open_mean for one in runs]) for runs in printed)
+            ]
         for policy in (LITERAL, OWN_INTERRUPT):
             found = response(responses[policy.label], policy.label)
             result.values |= {name: [value] for name, value in found.items()}
@@ -187,8 +195,7 @@ def _judge(result: StudyResult, which: str, hours: Mapping[str, _Hour]) -> None:
     if all(period in h.fixed for h in some for period in SHORTER):
         grids["0.5 to 5 s"] = [h.every("J_open_mean") for h in some]
     for grid, costs_by_hour in grids.items():
-        interior = (0 < int(np.argmin(costs)) < len(costs) - 1 for costs in costs_by_hour)
-        values[f"interior optimum from {grid}, share of {which}"] = [_share(interior)]
+        values[f"interior optimum from {grid}, share of {which}"] = [_share(map(is_inside, costs_by_hour))]
         ends = [max(costs[0], costs[-1]) / costs.min() for costs in costs_by_hour]
         values[f"worst end over best from {grid}, smallest of {which}"] = [float(min(ends))]
     for policy in POLICIES:
@@ -207,6 +214,11 @@ def _judge(result: StudyResult, which: str, hours: Mapping[str, _Hour]) -> None:
         values[f"J_BF over that of the best fixed period, geometric mean: {of}"] = [
             _geometric_mean(closed / closed_best)
         ]
+
+
+def is_inside(costs: Sequence[float] | Series) -> bool:
+    """Tell whether the least is neither the first nor the last."""
+    return 0 < int(np.argmin(costs)) < len(costs) - 1
 
 
 def _share(which: Iterable[bool]) -> float:
@@ -262,12 +274,7 @@ def _table(title: str, hours: Mapping[str, _Hour]) -> str:
         f"**{title}**: open-loop cost per unit time over that of the best of the nine fixed periods (rank among the "
         "nine and the policy), then J_BF over that of the best of the nine."
     )
-    lines = [
-        caption,
-        "",
-        "| hour | best fixed (s) | mean of nine | " + " | ".join(labels) + " |",
-        "|---|---|---|" + "---|" * len(labels),
-    ]
+    rows: list[tuple[Cell, ...]] = []
     for name, hour in hours.items():
         nine, closed = hour.nine("J_open_mean"), hour.nine("J_BF")
         runs = {"fixed 2.5 s": hour.fixed[2.5], **hour.policies}
@@ -279,8 +286,8 @@ def _table(title: str, hours: Mapping[str, _Hour]) -> str:
         ]
         periods = [period for period in hour.fixed if period in NINE]
         best = periods[int(np.argmin(nine))]
-        lines.append(f"| {name} | {best:g} | {nine.mean() / nine.min():.3f} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        rows.append((name, f"{best:g}", f"{nine.mean() / nine.min():.3f}", *cells))
+    return f"{caption}\n\n{markdown_table(('hour', 'best fixed (s)', 'mean of nine', *labels), rows)}"
 
 
 def _variant_table(result: StudyResult) -> str:
@@ -288,7 +295,7 @@ def _variant_table(result: StudyResult) -> str:
     caption = (
         "**Variants** (first draws): costs over those of the best fixed period tried, geometric mean of the hours."
     )
-    lines = [caption, "", "| variant | policy | open loop | J_BF | mean tau_u, by time (s) |", "|---|---|---|---|---|"]
+    lines: list[tuple[Cell, ...]] = []
     rows = [row for row in result.rows if row[0]]
     for variant in dict.fromkeys(row[0] for row in rows):
         mine = [row for row in rows if row[0] == variant]
@@ -302,5 +309,6 @@ def _variant_table(result: StudyResult) -> str:
             ratios = np.array([[float(row[4]) / best[row[1], 4], float(row[5]) / best[row[1], 5], float(row[3])]
                                for row in mine if row[2] == policy])  # fmt: skip
             open_loop, closed = np.exp(np.log(ratios[:, :2]).mean(axis=0))
-            lines.append(f"| {variant} | {policy} | {open_loop:.3f} | {closed:.3f} | {ratios[:, 2].mean():.2f} |")
-    return "\n".join(lines)
+            lines.append((variant, policy, f"{open_loop:.3f}", f"{closed:.3f}", f"{ratios[:, 2].mean():.2f}"))
+    header = ("variant", "policy", "open loop", "J_BF", "mean tau_u, by time (s)")
+    return f"{caption}\n\n{markdown_table(header, lines)}"

@@ -6,7 +6,8 @@ from typing import Annotated, Self
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
 PENALTY_WEIGHT = 3000.0
-"""alpha that all solvers are judged by unless set otherwise: 30 times the weight of a band violation."""
+"""alpha that all solvers are judged by with the default weights. In a program's settings it follows from `penalties`
+and `design.violation_weight` wherever it is not set."""
 
 
 class Arithmetic(StrEnum):
@@ -70,8 +71,8 @@ class OdeSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    alpha: PositiveFloat = 3000.0
-    """Penalty weight: 30 times the weight of a band violation."""
+    alpha: PositiveFloat = PENALTY_WEIGHT
+    """Penalty weight."""
     cost_scale: PositiveFloat = 1e-4
     """The flow is that of cost_scale * J: the rule for the first step size is not scale invariant."""
     tolerance: PositiveFloat = 1.0
@@ -80,6 +81,12 @@ class OdeSettings(BaseModel):
     """Largest growth of the step size from one iteration to the next."""
     rejection: PositiveFloat = 0.5
     """Factor on the step size after a rejected step."""
+    look_ahead_rows: bool = True
+    """Whether rows that are active at the middle stage of a step are in the matrix of the next step, too. Not in the
+    paper."""
+    hold_at_bounds: bool = True
+    """Whether variables pressed against a bound are held during a step, instead of being projected after it only. Not
+    in the paper."""
     tau_1_s: PositiveFloat = 0.25
 
 

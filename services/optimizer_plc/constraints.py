@@ -8,12 +8,9 @@ from numpy.typing import NDArray
 from coldloop.limits import InputLimits
 from optimizer_plc.condensing import Condensed, slack_map
 from optimizer_plc.design import N_INPUTS, N_SLACKS, ControlDesign
+from optimizer_plc.penalties import PenaltySettings
 
 Array = NDArray[np.float64]
-
-RATE_ROW_GAIN = 4.0
-"""Rate rows are divided by their largest coefficient and multiplied by this: with a softer penalty a truncated or
-penalised solution undercuts the optimum by breaking the rate limits."""
 
 
 class OutputRows(NamedTuple):
@@ -25,6 +22,8 @@ class OutputRows(NamedTuple):
     """gamma at the operating point, shape (rows,)."""
     states: Array
     """How gamma depends on s = (x, w), shape (n_x + 1, rows)."""
+    gains: Array
+    """What the rows were multiplied by, shape (rows,): 1 for the output of the larger rho."""
 
 
 class RateRows(NamedTuple):
@@ -47,7 +46,8 @@ class RateRows(NamedTuple):
 
 def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0: Array) -> OutputRows:
     """Return the rows of the bands; `weights` (N, knots) are those of the knots, `y0` L1 and T5 at rest."""
-    rows, states, bounds = [], [], []
+    rho = np.array(design.violation_weight)
+    rows, states, bounds, gains = [], [], [], []
     for instant in design.constraint_instants:
         slack_of_z = slack_map(weights[instant - 1])
         for output in range(2):
@@ -56,14 +56,22 @@ def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0:
             rows += [-y_z - slack_of_z[2 * output], y_z - slack_of_z[2 * output + 1]]
             states += [y_s, -y_s]
             bounds += [-low, high]
-    return OutputRows(np.array(rows), np.array(bounds), np.ascontiguousarray(np.array(states).T))
+            gains += 2 * [np.sqrt(rho[output] / rho.max())]
+    gain = np.array(gains)
+    return OutputRows(
+        Gamma=np.array(rows) * gain[:, None],
+        bounds=np.array(bounds) * gain,
+        states=np.ascontiguousarray((np.array(states) * gain[:, None]).T),
+        gains=gain,
+    )
 
 
-def rate_rows(design: ControlDesign, limits: InputLimits) -> RateRows:
-    """Return the rows of the rates."""
+def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySettings) -> RateRows:
+    """Return the rows of the rates, scaled by what breaking them costs."""
     ranges = np.asarray(limits.high) - np.asarray(limits.low)
     size = (N_INPUTS + N_SLACKS) * len(design.decision_instants)
-    rows, bounds, before, first = [], [], [], []
+    gains_of_inputs = np.sqrt(penalties.rate_rows) / np.array(design.input_scale)
+    rows, bounds, before, first, gained = [], [], [], [], []
     starts = (design.decision_instants[0] - 1, *design.decision_instants[:-1])
     for knot, (start, end) in enumerate(zip(starts, design.decision_instants, strict=True)):
         for i in range(N_INPUTS):
@@ -79,7 +87,8 @@ def rate_rows(design: ControlDesign, limits: InputLimits) -> RateRows:
                 bounds.append(limit)
                 first.append(float(knot == 0))
                 before.append(sign * np.eye(N_INPUTS)[i] * (knot == 0))
-    gains = RATE_ROW_GAIN / np.abs(rows).max(axis=1)
+                gained.append(gains_of_inputs[i])
+    gains = np.array(gained)
     return RateRows(
         Gamma=np.array(rows) * gains[:, None],
         bounds=np.array(bounds) * gains,

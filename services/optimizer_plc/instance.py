@@ -28,9 +28,25 @@ class Maps(NamedTuple):
     """Shape (3, 38)."""
     low: Array
     high: Array
-    rate: Array
-    """Rates of the inputs, scaled."""
+    first_rate: Array
+    """Rates of the inputs, scaled, where they bound the first knot as a box; infinite where they do not."""
     input_scale: Array
+
+
+@kernel
+def first_knot_range(maps: Maps, rate: Array, u_before: Array, share: float, i: int) -> tuple[float, float]:
+    """Return the range of input i at the first knot, within a share of its rate (3,) of the input before it, scaled."""
+    start = u_before[i] / maps.input_scale[i]
+    reach = rate[i] * share
+    return min(max(start - reach, maps.low[i]), maps.high[i]), min(max(start + reach, maps.low[i]), maps.high[i])
+
+
+@kernel
+def keep_first_rate(maps: Maps, rate: Array, u_before: Array, share: float, z: Array) -> None:
+    """Move the inputs of the first knot of z (n,) to within their rate (3,), scaled, of the input before it (3,)."""
+    for i in range(u_before.shape[0]):
+        low, high = first_knot_range(maps, rate, u_before, share, i)
+        z[i] = min(max(z[i], low), high)
 
 
 @kernel
@@ -52,11 +68,8 @@ def instance(maps: Maps, x: Array, w: float, u_before: Array, share: float) -> t
     add_transposed_product(maps.outputs, s, gamma[:outputs])
     add_transposed_product(maps.rate_before, u_before, gamma[outputs:])
     low, high = maps.low.copy(), maps.high.copy()
-    for i in range(u_before.shape[0]):  # the first knot stays within its rate of the input before it
-        start = u_before[i] / maps.input_scale[i]
-        reach = maps.rate[i] * share
-        low[i] = min(max(start - reach, maps.low[i]), maps.high[i])
-        high[i] = min(max(start + reach, maps.low[i]), maps.high[i])
+    for i in range(u_before.shape[0]):
+        low[i], high[i] = first_knot_range(maps, maps.first_rate, u_before, share, i)
     weighted = np.zeros(s.shape[0], x.dtype)
     add_transposed_product(maps.constant, s, weighted)
     constant = zero

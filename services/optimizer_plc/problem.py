@@ -16,8 +16,9 @@ from optimizer_plc.arithmetic import DOUBLE, Real
 from optimizer_plc.condensing import Condensed, condense, transposed
 from optimizer_plc.constraints import OutputRows, RateRows, output_rows, rate_rows
 from optimizer_plc.design import N_INPUTS, N_SLACKS, ControlDesign
-from optimizer_plc.instance import Maps, instance
+from optimizer_plc.instance import Maps, instance, keep_first_rate
 from optimizer_plc.linear_algebra import add_transposed_product
+from optimizer_plc.penalties import DEFAULT_PENALTIES, PenaltySettings
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.profile import inputs_of, interpolation, shift, shifted
 
@@ -53,11 +54,18 @@ class Situation(NamedTuple):
 class PredictiveProblem:
     """Builds instances of the QP for one design and one prediction model.
 
+    Penalties scale the rows: a problem that is solved exactly is the same whatever they are.
+
     Sizes: n = 7 decision instants x 7 = 49 variables; m = 56 output rows and 38 rate rows with the paper's instants.
     """
 
     def __init__(
-        self, prediction: PredictionModel, design: ControlDesign, limits: InputLimits, real: Real = DOUBLE
+        self,
+        prediction: PredictionModel,
+        design: ControlDesign,
+        limits: InputLimits,
+        real: Real = DOUBLE,
+        penalties: PenaltySettings = DEFAULT_PENALTIES,
     ) -> None:
         self.design = design
         self.limits = limits
@@ -69,12 +77,16 @@ class PredictiveProblem:
         weights = interpolation(design.decision_instants, np.arange(1.0, design.horizon + 1))
         y0 = prediction.model.y0[list(prediction.constrained)]
         condensed = condense(prediction, design, weights)
-        outputs, rates = output_rows(condensed, design, weights, y0), rate_rows(design, limits)
+        outputs, rates = output_rows(condensed, design, weights, y0), rate_rows(design, limits, penalties)
         n_states = prediction.n_states
         self.Phi = self._rounded(condensed.Phi)
         self.Gamma = self._rounded(np.ascontiguousarray(np.vstack([outputs.Gamma, rates.Gamma])))
-        self.row_gains = self._rounded(np.concatenate([np.ones(len(outputs.Gamma)), rates.gains]))
-        self.maps = Maps(*map(self._rounded, self._maps(condensed, outputs, rates, np.array(prediction.model.u0))))
+        self.row_gains = self._rounded(np.concatenate([outputs.gains, rates.gains]))
+        scaled_rate = np.asarray(limits.rate) / np.asarray(design.input_scale)
+        first_rate = scaled_rate if penalties.first_knot_in_box else np.full(N_INPUTS, np.inf)
+        u0 = np.array(prediction.model.u0)
+        self.maps = Maps(*map(self._rounded, self._maps(condensed, outputs, rates, u0, first_rate)))
+        self.scaled_rate = self._rounded(scaled_rate)
         self.knots_to_samples = self._rounded(weights)
         self.shifts = self._rounded(
             np.array([shift(design.decision_instants, ticks / TICKS_PER_SAMPLE) for ticks in range(SHIFTS + 1)])
@@ -87,13 +99,15 @@ class PredictiveProblem:
         self.stacked_outputs_w = self._rounded(np.array(stacked[:, n_states]))
         self.input_scale = self._rounded(np.asarray(design.input_scale))
         self.rate = self._rounded(np.asarray(limits.rate))
-        self._u0 = self._rounded(np.array(prediction.model.u0))
+        self._u0 = self._rounded(u0)
 
     def _rounded(self, values: Array) -> Array:
         """Return an array in the type of the on-line arithmetic."""
         return values.astype(self._real, copy=False)
 
-    def _maps(self, condensed: Condensed, outputs: OutputRows, rates: RateRows, u0: Array) -> Maps:
+    def _maps(
+        self, condensed: Condensed, outputs: OutputRows, rates: RateRows, u0: Array, first_rate: Array
+    ) -> Maps:  # fmt: skip
         scale = np.asarray(self.design.input_scale)
         low_u, high_u = (np.asarray(self.limits.low) - u0) / scale, (np.asarray(self.limits.high) - u0) / scale
         slacks = N_SLACKS * self.n_knots
@@ -107,7 +121,7 @@ class PredictiveProblem:
             rate_before=rates.before,
             low=np.concatenate([np.tile(low_u, self.n_knots), np.zeros(slacks)]),
             high=np.concatenate([np.tile(high_u, self.n_knots), np.full(slacks, np.inf)]),
-            rate=np.asarray(self.limits.rate) / scale,
+            first_rate=first_rate,
             input_scale=scale,
         )
 
@@ -130,6 +144,13 @@ class PredictiveProblem:
         if ticks <= SHIFTS:
             return shifted(self.shifts[ticks], z)
         return shifted(self._rounded(shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE)), z)
+
+    def within_first_rate(self, z: Array, situation: Situation) -> Array:
+        """Return the profile z with its first knot within the rate of the input before it, as it can be sent."""
+        share = self._real(self.limits.rate_share(situation.elapsed_ticks))
+        result = z.copy()
+        keep_first_rate(self.maps, self.scaled_rate, situation.u_before, share, result)
+        return result
 
     def inputs(self, z: Array, samples: int) -> Array:
         """Return the inputs of the first `samples` sampling periods, shape (samples, 3), in physical units.

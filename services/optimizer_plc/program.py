@@ -49,7 +49,7 @@ class OptimizerProgram:
         self.model_digest = model.short_digest
         self._real = real_of(settings.arithmetic)
         self.model = PredictionModel(model)
-        self.problem = PredictiveProblem(self.model, settings.design, limits, self._real)
+        self.problem = PredictiveProblem(self.model, settings.design, limits, self._real, settings.penalties)
         self.solver = make_solver(settings)
         self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
         self.estimator = make_estimator(self.model, settings.estimator, self._real)
@@ -189,7 +189,7 @@ class OptimizerProgram:
         done = self.solver.iterate(period.iterations - 1)
         last_but_one = self.solver.cost
         done += self.solver.iterate(1)
-        z = self.solver.solution
+        z = self.problem.within_first_rate(self.solver.solution, situation)
         sequence = self._sequence(period, z)
         self.state.sent = Delivery(
             z, situation, sequence.header.first_tick, sequence, qp,

@@ -13,7 +13,7 @@ from coldloop.compiled import kernel
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from optimizer_plc.costs import OutputMaps, augmented_cost, predicted_indicators
 from optimizer_plc.estimator import corrected
-from optimizer_plc.instance import Maps, instance
+from optimizer_plc.instance import Maps, instance, keep_first_rate
 from optimizer_plc.linear_algebra import respond
 from optimizer_plc.prediction import Transition
 from optimizer_plc.problem import QuadraticProblem
@@ -93,6 +93,8 @@ class Constants(NamedTuple):
     """Of the knots in each sample, shape (horizon, knots)."""
     input_scale: Array
     rate: Array
+    scaled_rate: Array
+    """Over `input_scale`, shape (3,)."""
     rate_shares: Array
     """Share of the rate limit after 0, 1, ... ticks, shape (ticks + 1,)."""
     n_inputs: int
@@ -164,6 +166,7 @@ def solve(c: Constants, m: Memory) -> int:
     s.last_but_one = with_floor(answer.last_but_one, qp.constant, c.floor)
     s.delivered = with_floor(answer.delivered, qp.constant, c.floor)
     s.done = answer.slots
+    keep_first_rate(c.maps, c.scaled_rate, u, c.rate_shares[ticks], answer.z)
     s.j_dev, s.j_cst, s.violation = predicted_indicators(c.predicted, qp, answer.z, m.predicted, s.w, c.n_inputs)
     m.answer[:] = answer.z
     return write_rows(c, answer.z, ticks, m.answer_rows)

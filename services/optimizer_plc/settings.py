@@ -28,6 +28,7 @@ from optimizer_plc.computing_settings import (
     QpoasesSettings,
 )
 from optimizer_plc.design import ControlDesign
+from optimizer_plc.penalties import PRESETS, PenaltySettings, Preset, alpha_of, completed
 
 SHOWN: Final = ("limits", "optimizer_plc.program")
 """What of the configuration decides results: shown in the registers."""
@@ -119,6 +120,9 @@ class ProgramSettings(BaseModel):
     updating periods: one to be played, one in case the next sequence is late."""
     adaptive: AdaptiveSettings = AdaptiveSettings()
     design: ControlDesign = ControlDesign()
+    preset: Preset = Preset.TUNED
+    """Penalties and start of the ODE-based solver, as far as they are not set themselves."""
+    penalties: PenaltySettings = PenaltySettings()
     budget: BudgetSettings = BudgetSettings()
     estimator: EstimatorSettings = EstimatorSettings()
     ode: OdeSettings = OdeSettings()
@@ -137,9 +141,26 @@ class ProgramSettings(BaseModel):
         return value
 
     @model_validator(mode="after")
+    def _completed(self) -> Self:
+        """Take what was not set from the preset, and alpha of the solvers from the penalties."""
+        for name, values in PRESETS[self.preset].items():
+            self.__dict__[name] = completed(getattr(self, name), values)  # before anybody sees it: it is frozen then
+        alpha = alpha_of(self.penalties, self.design)
+        for name in type(self).model_fields:
+            if "alpha" in getattr(type(getattr(self, name)), "model_fields", ()):
+                self.__dict__[name] = completed(getattr(self, name), {"alpha": alpha})
+        return self
+
+    @model_validator(mode="after")
     def _load_steps_are_seen(self) -> Self:
         if self.interrupting_load_step_w and not self.estimator.load_known:
             raise ValueError("interrupting_load_step_w needs a load that is measured, estimator.load_known = true")
+        return self
+
+    @model_validator(mode="after")
+    def _one_cost(self) -> Self:
+        if self.solver is SolverName.HYBRID and self.ode.alpha != self.interior_point.alpha:
+            raise ValueError("hybrid needs one cost for both of its solvers: set ode.alpha = interior_point.alpha")
         return self
 
     @model_validator(mode="after")

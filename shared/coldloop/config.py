@@ -18,6 +18,7 @@ from coldloop.errors import ConfigurationError
 
 PREFIX = "COLDLOOP__"
 DEFAULT = "default"
+DERIVED = "follows from other settings"
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -32,7 +33,11 @@ class Configuration(Generic[M]):
     def effective(self) -> list[tuple[str, Any, str]]:
         """Return (dotted key, value, source) of every value."""
         rows = flattened(self.settings.model_dump(mode="json"))
-        return [(key, value, self.sources.get(key, DEFAULT)) for key, value in rows.items()]
+        usual = flattened(type(self.settings)().model_dump(mode="json"))
+        return [
+            (key, value, self.sources.get(key, DEFAULT if value == usual.get(key) else DERIVED))
+            for key, value in rows.items()
+        ]
 
 
 class _Layers:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from optimizer_plc import costs, linear_algebra, operations, problem
 from optimizer_plc.computing_settings import OdeSettings
+from optimizer_plc.penalties import DEFAULT_PENALTIES
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.reference_plc import ACTIVE_ROWS, QPOASES_ON_LAPTOP_S, cholesky_times, fitted, residuals, slow_down
 from optimizer_plc.solvers import interior_point, ode
@@ -119,7 +120,8 @@ def test_a_step_of_the_ode_solver_is_counted_right(n: int, m: int, active: int) 
         counted(root @ root.T + np.eye(n)), counted(rng.normal(size=n)), counted(rng.normal(size=(m, n)) * 1e-2),
         counted(gamma), np.full(n, -1e9), np.full(n, 1e9), 0.0,
     )  # fmt: skip
-    flow = ode.Flow(*(Counted(value) for value in flow_in(OdeSettings(), np.float64)))  # type: ignore[arg-type]
+    constants = flow_in(OdeSettings(), DEFAULT_PENALTIES, np.float64)
+    flow = ode.Flow(*(value if isinstance(value, bool) else Counted(value) for value in constants))  # type: ignore[arg-type]
     z = counted(rng.normal(size=n))
     before = [float(value) for value in z]
     ode.step(costs.matrices_of(qp), qp, z, np.zeros(m), Counted(1e30), Counted(1e-6), flow)  # type: ignore[arg-type]

@@ -14,7 +14,6 @@ from coldloop.limits import InputLimits, RateReference
 from coldloop.lti_model import LtiModel
 from coldloop.process import L1, T5
 from optimizer_plc import costs
-from optimizer_plc.constraints import RATE_ROW_GAIN
 from optimizer_plc.costs import augmented_cost, indicators, matrices_of, quadratic_cost
 from optimizer_plc.design import ControlDesign, trivial_design
 from optimizer_plc.prediction import PredictionModel
@@ -28,6 +27,8 @@ Array = NDArray[np.float64]
 KNOTS = np.array([1, 2, 4, 8, 16, 50, 100])
 INSTANTS = (1, 2, 3, 4, 6, 8, 16, 24, 32, 48, 60, 72, 84, 100)
 SAMPLES = 100
+GAIN = 4.0
+"""Of a rate row, per scaled input: the square root of its weight over alpha."""
 CONSTRAINED = [L1, T5]
 INPUT_SCALE = np.array([10.0, 50.0, 10.0])
 R = np.array([1e-2, 4e-4, 1e-2])
@@ -98,7 +99,7 @@ def test_only_the_heaters_rate_rows_of_the_last_two_intervals_are_left_out(probl
     expected = np.full((7, 3), 2)
     expected[5:, 1] = 0
     assert (concerned == expected).all()
-    assert np.allclose(np.abs(rate_rows).max(axis=1), RATE_ROW_GAIN)
+    assert np.allclose(np.abs(rate_rows).max(axis=1), GAIN)
 
 
 @pytest.mark.parametrize("shorter", [10, 25])
@@ -344,8 +345,8 @@ def test_the_rate_limit_of_an_update_is_whole_or_shrinks_with_the_time_that_pass
         centre = (qp.high + qp.low)[:3] * INPUT_SCALE / 2
         assert np.allclose(centre, situation.u_before)
         first, later = qp.gamma[56:62], qp.gamma[62:68]
-        assert np.allclose(first[::2] + first[1::2], 2 * RATE * used / INPUT_SCALE * RATE_ROW_GAIN)
-        assert np.allclose(later, np.repeat(RATE / INPUT_SCALE, 2) * RATE_ROW_GAIN), "rates between knots stay"
+        assert np.allclose(first[::2] + first[1::2], 2 * RATE * used / INPUT_SCALE * GAIN)
+        assert np.allclose(later, np.repeat(RATE / INPUT_SCALE, 2) * GAIN), "rates between knots stay"
 
 
 # -- profiles ---------------------------------------------------------------------------------------------------------

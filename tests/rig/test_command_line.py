@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.session import TimeMode
+from optimizer_plc.penalties import Preset
 from optimizer_plc.settings import SolverName
 from plant.load import NAMED
 from rig.chaos.plan import shipped_plans
@@ -33,6 +34,7 @@ def python(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[
 def test_the_names_that_are_offered_are_those_that_exist() -> None:
     assert tuple(mode.value for mode in TimeMode) == choices.MODES
     assert tuple(solver.value for solver in SolverName) == choices.SOLVERS
+    assert tuple(preset.value for preset in Preset) == choices.PRESETS
     assert tuple(NAMED) == choices.LOADS
     assert sorted(choices.SERVICES) == sorted(MAPS)
     assert sorted(choices.REGISTER_FORMATS) == sorted(FORMATS)

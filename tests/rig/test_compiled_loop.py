@@ -46,7 +46,9 @@ COMPILED = {
     "fast gradient": (f'{PROGRAM}solver="fast-gradient"',),
     "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
     "load steps that interrupt a rule": (
-        f'{PROGRAM}adaptive.rule="contraction"', f"{PROGRAM}interrupting_load_step_w=10", f'{PROGRAM}solver="hybrid"',
+        f'{PROGRAM}adaptive.rule="contraction"',
+        f"{PROGRAM}interrupting_load_step_w=10",
+        f'{PROGRAM}solver="hybrid"',
     ),
     "refrigerator": (REFRIGERATOR, TRIP, *NOISE),
     "refrigerator with PI and a model of its own": (
@@ -55,6 +57,13 @@ COMPILED = {
         "model.file=refrigerator",
         f"{PROGRAM}updating_period_s=2.5",
     ),
+    "as printed": (f'{PROGRAM}preset="as-printed"',),
+    "as printed, elapsed time": (f'{PROGRAM}preset="as-printed"', 'limits.rate_reference="elapsed"'),
+    "soft rows": (f"{PROGRAM}penalties.output_rows=1", f"{PROGRAM}penalties.rate_rows=[1, 2, 3]"),
+    "a box penalty alone": (f"{PROGRAM}penalties.box=2",),
+    "first knot as rows": (f"{PROGRAM}penalties.first_knot_in_box=false",),
+    "no look-ahead rows": (f"{PROGRAM}ode.look_ahead_rows=false",),
+    "not held at bounds": (f"{PROGRAM}ode.hold_at_bounds=false",),
 }
 """Whose updates are compiled too."""
 LEFT_TO_PROGRAMS = {
@@ -72,7 +81,8 @@ UNUSUAL = {
     "sensors that freeze soon": ("control_plc.sensors.frozen_s=0.5",),
     "sequences that are refused": ("limits.slew_s=4",),
     "sequences that are refused, and load steps that interrupt": (
-        "limits.slew_s=4", f"{PROGRAM}interrupting_load_step_w=10",
+        "limits.slew_s=4",
+        f"{PROGRAM}interrupting_load_step_w=10",
     ),
     "an impatient watchdog": ("control_plc.ladder.optimizer_timeout_s=2",),
     "the classical loops": ('control_plc.driver="classical"',),

@@ -18,13 +18,15 @@ if TYPE_CHECKING:
 __all__ = ["Solver", "make_solver"]
 
 _MAKERS: "dict[str, Callable[[ProgramSettings], Solver]]" = {
-    "ode": lambda settings: OdeSolver(settings.ode),
+    "ode": lambda settings: OdeSolver(settings.ode, settings.penalties),
     "qpoases": lambda settings: QpoasesSolver(settings.qpoases),
     "osqp": lambda settings: OsqpSolver(settings.osqp),
     "fast-gradient": lambda settings: FastGradientSolver(settings.fast_gradient),
     "interior-point": lambda settings: InteriorPointSolver(settings.interior_point),
     "hybrid": lambda settings: HybridSolver(
-        settings.hybrid, InteriorPointSolver(settings.interior_point), OdeSolver(settings.ode),
+        settings.hybrid,
+        InteriorPointSolver(settings.interior_point),
+        OdeSolver(settings.ode, settings.penalties),
         settings.adaptive.cost_floor,
     ),
     "daqp": lambda settings: DaqpSolver(settings.daqp),

@@ -63,7 +63,7 @@ def solver_constants(solver: Solver, settings: ProgramSettings, qp: QuadraticPro
         switch=settings.hybrid.switch,
         floor=settings.adaptive.cost_floor,
         matrices=matrices_of(qp),
-        flow=flow_in(settings.ode, np.float64),
+        flow=flow_in(settings.ode, settings.penalties, np.float64),
         structure=structure_of(qp),
         path=path_in(settings.interior_point, len(qp.phi) + len(qp.gamma), np.float64),
         steps=step_sizes(qp.Phi, qp.Gamma, fast.alpha),
@@ -152,4 +152,8 @@ def by_fast_gradient(c: SolverConstants, qp: QuadraticProblem, guess: Array, cou
     return Answer(z, guessed, last_but_one, augmented_cost(qp, z, c.alpha), count)
 
 
-_is_far, _iterations_in, _slots_passed = kernel(hybrid.is_far), kernel(hybrid.iterations_in), kernel(hybrid.slots_passed)
+_is_far, _iterations_in, _slots_passed = (
+    kernel(hybrid.is_far),
+    kernel(hybrid.iterations_in),
+    kernel(hybrid.slots_passed),
+)

@@ -16,6 +16,7 @@ from optimizer_plc.arithmetic import Real
 from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.costs import Matrices, cost_by_columns, gradient, matrices_of
 from optimizer_plc.linear_algebra import cholesky, cholesky_solve
+from optimizer_plc.penalties import DEFAULT_PENALTIES, PenaltySettings
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.solution import Solution, judge, penalty_multipliers
 
@@ -42,11 +43,15 @@ class Flow(NamedTuple):
     tolerance: float
     growth: float
     rejection: float
+    box: float
+    """Penalty weight of the box."""
+    look_ahead_rows: bool
+    hold_at_bounds: bool
     longest: float
     """Step size that is never exceeded, far below the largest number there is: its products stay finite."""
 
 
-def flow_in(settings: OdeSettings, real: Real) -> Flow:
+def flow_in(settings: OdeSettings, penalties: PenaltySettings, real: Real) -> Flow:
     """Return the constants as scalars of a floating-point type."""
     return Flow(
         alpha=real(settings.alpha),
@@ -54,6 +59,9 @@ def flow_in(settings: OdeSettings, real: Real) -> Flow:
         tolerance=real(settings.tolerance),
         growth=real(settings.growth),
         rejection=real(settings.rejection),
+        box=real(penalties.box * settings.alpha),
+        look_ahead_rows=settings.look_ahead_rows,
+        hold_at_bounds=settings.hold_at_bounds,
         longest=real(np.sqrt(np.finfo(real).max)),
     )
 
@@ -61,10 +69,10 @@ def flow_in(settings: OdeSettings, real: Real) -> Flow:
 class OdeSolver:
     """TR-BDF2 on the gradient flow, one step an iteration, in the floating-point type of the problem."""
 
-    def __init__(self, settings: OdeSettings) -> None:
+    def __init__(self, settings: OdeSettings, penalties: PenaltySettings = DEFAULT_PENALTIES) -> None:
         self.alpha = settings.alpha
         self.tau_1_s = settings.tau_1_s
-        self._settings = settings
+        self._settings, self._penalties = settings, penalties
         self._source: tuple[Array, Array] | None = None
 
     def reset(self) -> None:
@@ -76,7 +84,7 @@ class OdeSolver:
         if self._source is None or problem.Phi is not self._source[0] or problem.Gamma is not self._source[1]:
             self._source, self._matrices = (problem.Phi, problem.Gamma), matrices_of(problem)
             self._real = problem.phi.dtype.type
-            self._flow = flow_in(self._settings, self._real)
+            self._flow = flow_in(self._settings, self._penalties, self._real)
         self._look_ahead_rows = np.zeros_like(problem.gamma)
         self._z, self._cost, self._dt = warm_start(self._matrices, problem, guess, self._flow)
         self._stalled = 0
@@ -112,8 +120,18 @@ def velocity(
 ) -> None:  # fmt: skip
     """Write dz/dt = -cost_scale dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0."""
     gradient(constant, qp, z, flow.alpha, result, active)
+    if flow.box > z.dtype.type(0.0):
+        add_box_gradient(qp, z, flow.box, result)
     for i in range(z.shape[0]):
         result[i] *= -flow.cost_scale
+
+
+@kernel
+def add_box_gradient(qp: QuadraticProblem, z: Array, weight: float, result: Array) -> None:
+    """Add the gradient of weight sum max(z - high, low - z, 0)^2 to `result` (n,)."""
+    zero, two = z.dtype.type(0.0), z.dtype.type(2.0)
+    for i in range(z.shape[0]):
+        result[i] += two * weight * (max(z[i] - qp.high[i], zero) - max(qp.low[i] - z[i], zero))
 
 
 @kernel
@@ -217,9 +235,10 @@ def step(
     v0, vg, v1 = np.empty_like(z), np.empty_like(z), np.empty_like(z)
     active = np.empty_like(qp.gamma)
     velocity(constant, qp, z, flow, v0, active)
-    for r in range(active.shape[0]):
-        active[r] = max(look_ahead_rows[r], active[r])
-    held = hold_at_bounds(qp, z, v0)
+    if flow.look_ahead_rows:
+        for r in range(active.shape[0]):
+            active[r] = max(look_ahead_rows[r], active[r])
+    held = hold_at_bounds(qp, z, v0) if flow.hold_at_bounds else np.zeros_like(z)
     M = stage_matrix(constant, qp, active, dt, flow)
     decouple(M, held)
     skyline = cholesky(M)
