@@ -78,7 +78,9 @@ def _rule(program: OptimizerProgram) -> Rule:
     budget, rule, fixed = program.budget, program.rule, program.fixed_ticks
     most = budget.iterations(MAX_PERIOD_TICKS)
     periods = np.array([fixed or budget.period(iterations) for iterations in range(most + 1)])
-    bounds = (rule.q_min, rule.q_max, rule.delta) if isinstance(rule, Algorithm1) else (0, 0, 0)
+    bounds = (rule.first, rule.first, 0)
+    if isinstance(rule, Algorithm1):
+        bounds = (rule.q_min, rule.q_max, rule.delta)
     contraction = rule.parameters if isinstance(rule, ContractionRule) else NO_CONTRACTION
     return Rule(_kind(rule), fixed, *bounds, contraction, most, periods)
 

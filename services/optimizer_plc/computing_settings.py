@@ -24,6 +24,13 @@ class EstimatorKind(StrEnum):
     STATE_FEEDBACK = "state-feedback"
 
 
+class NoiseReference(StrEnum):
+    """What the standard deviations of the sensors are of."""
+
+    MEASUREMENT = "measurement"
+    TIME = "time"
+
+
 class EstimatorSettings(BaseModel):
     """Settings of the estimator; standard deviations are per square root of a sampling period of 5 s."""
 
@@ -46,6 +53,9 @@ class EstimatorSettings(BaseModel):
     speed_sensor: PositiveFloat = 1.0
     temperature_sensor: PositiveFloat = 0.02
     pressure_sensor: PositiveFloat = 1e-3
+    noise_reference: NoiseReference = NoiseReference.MEASUREMENT
+    """Of one measurement, whatever the updating period; or of a mean over a sampling period, so that measurements which
+    follow each other sooner count for less: a model error is then not taken for more load the shorter the period is."""
     longest_riccati: Annotated[int, Field(ge=1)] = 2000
     """Longest run of the Riccati recursion for a stationary gain, in periods."""
 

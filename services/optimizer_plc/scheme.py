@@ -56,6 +56,7 @@ class Rule(NamedTuple):
     """FIXED, ALGORITHM_1 or CONTRACTION."""
     fixed_ticks: int
     q_min: int
+    """That of a fixed period is q_max, too."""
     q_max: int
     delta: int
     contraction: ContractionParameters
@@ -218,9 +219,9 @@ def plan(c: Constants, m: Memory, tick: int, u_before: Array, load: float, y: Ar
     effective = with_floor(augmented_cost(qp, m.z, c.solver.alpha), qp.constant, c.floor)
     o = Observation(s.iterations, s.ticks * TICK_S, s.effective, s.hot_start, s.last_but_one, s.delivered, effective)
     assessment = _assess(o)
-    wanted = s.iterations
+    wanted = rule.q_min
     if rule.kind == ALGORITHM_1:
-        wanted = _one_step(rule.q_min, rule.q_max, rule.delta, wanted, assessment.gamma)
+        wanted = _one_step(rule.q_min, rule.q_max, rule.delta, s.iterations, assessment.gamma)
     elif rule.kind == CONTRACTION:
         s.contraction = _recent_contraction(rule.contraction, s.contraction, s.contraction_delivered, o)
         s.contraction_delivered = s.delivered

@@ -158,6 +158,12 @@ class ProgramSettings(BaseModel):
         return self
 
     @model_validator(mode="after")
+    def _one_cost(self) -> Self:
+        if self.solver is SolverName.HYBRID and self.ode.alpha != self.interior_point.alpha:
+            raise ValueError("hybrid needs one cost for both of its solvers: set ode.alpha = interior_point.alpha")
+        return self
+
+    @model_validator(mode="after")
     def _own_arithmetic(self) -> Self:
         if self.arithmetic is Arithmetic.FLOAT32 and self.solver not in SINGLE_PRECISION_SOLVERS:
             raise ValueError(

@@ -1,8 +1,8 @@
 """Interior point while problems are far from their optimum, the ODE-based solver in quiet; chosen for each problem.
 
 An interior point needs some iterations before it is good, and is at the optimum then; the ODE-based solver makes the
-most of few. With J+_k the cost of the guess of a problem and Jhat_k that of its answer, both with constant and floor, the
-interior-point solver gets problem k if
+most of few. With J+_k the cost of the guess of a problem and Jhat_k that of its answer, both with constant and floor,
+the interior-point solver gets problem k if
 
     max(J+_k, J+_{k-1}) > switch Jhat_{k-1}
 
@@ -115,7 +115,7 @@ def iterations_in(slots: int, slot_s: float, tau_1_s: float) -> int:
 
 
 def slots_passed(done: int, allowed: int, before: int, count: int, slot_s: float, tau_1_s: float) -> int:
-    """Return how many of `count` slots passed after the first `before`: fewer when fewer iterations than allowed were done."""
+    """Return how many of `count` slots passed after the first `before`: fewer when the solver ended by itself."""
     if done == allowed:
         return count
     return max(0, math.ceil(done * tau_1_s / slot_s - 1e-9) - before)

@@ -176,7 +176,7 @@ def add_columns(constant: Structure, weights: Array, result: Array) -> None:
 def begin(
     constant: Structure, qp: QuadraticProblem, guess: Array, path: Path, best: Array, rows: Array
 ) -> tuple[float, Point]:
-    """Write the guess inside the box into `best` (n,) and zeros into `rows` (m,); return its cost, and a point near it."""
+    """Write the guess inside the box into `best` (n,) and zeros into `rows` (m,); return its cost and a point near."""
     for i in range(best.shape[0]):
         best[i] = min(max(guess[i], qp.low[i]), qp.high[i])
     for r in range(rows.shape[0]):
@@ -191,8 +191,15 @@ def begin(
 
 @kernel
 def descend(
-    constant: Structure, qp: QuadraticProblem, path: Path, point: Point, best: Array, rows: Array, cost: float, count: int
-) -> tuple[int, float, Point]:  # fmt: skip
+    constant: Structure,
+    qp: QuadraticProblem,
+    path: Path,
+    point: Point,
+    best: Array,
+    rows: Array,
+    cost: float,
+    count: int,
+) -> tuple[int, float, Point]:
     """Take `count` steps from a point, or fewer once the products are as small as rounding.
 
     `best` (n,), its cost and its multipliers `rows` (m,) are those of the cheapest point so far. Returns how many
