@@ -154,7 +154,7 @@ async def test_nobody_listens(free_port: int) -> None:
         await Transport("plant", "127.0.0.1", free_port, 5.0, None).open()
 
 
-def test_pymodbus_encodes_the_identity_and_nothing_else() -> None:
+def test_pymodbus_makes_frames_and_the_identity_by_its_public_names() -> None:
     """Its internals move with every minor version: what uses it stays small, and uses no private names."""
     users = {}
     for file in SOURCES:
@@ -163,6 +163,21 @@ def test_pymodbus_encodes_the_identity_and_nothing_else() -> None:
         names |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
         if of_pymodbus := {name for name in names if name.split(".")[0] == "pymodbus"}:
             users[str(file.relative_to(ROOT))] = of_pymodbus
-            private = [node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute) and node.attr[0] == "_"]
-            assert not [name for name in private if not name.startswith("__")]
-    assert users == {"shared/coldloop/modbus/identification.py": {"pymodbus.constants", "pymodbus.pdu.mei_message"}}
+            assert not [name for name in of_pymodbus for part in name.split(".") if part.startswith("_")]
+    assert users == {
+        "shared/coldloop/modbus/identification.py": {"pymodbus.constants", "pymodbus.pdu.mei_message"},
+        "shared/coldloop/modbus/transport.py": {"pymodbus.framer", "pymodbus.pdu"},
+    }
+
+
+@pytest.mark.parametrize("garbage", [
+    b"HTTP/1.1 400 Bad Request\r\n", b"\0\1\0\0\0\0\1\1", b"\0\1\0\0\0\1\1\1", b"\0\1\0\0" + b"\xff" * 300, b"\0\1\0\7\0\3",
+])  # fmt: skip
+async def test_every_kind_of_nonsense_ends_the_wait_at_once(garbage: bytes) -> None:
+    async def babble(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await requests_from(reader, 1)
+        writer.write(garbage)
+        await reader.read()
+
+    async with connected_to(babble) as transport:
+        assert await transport.transact([b"a"], 60.0) == [NONSENSE]

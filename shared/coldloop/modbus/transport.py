@@ -2,23 +2,28 @@
 
 A server tells by the transaction id which request an answer is for, so a client need not wait for one answer before it
 sends the next request (Modbus Messaging on TCP/IP V1.0b, section 4.4.1.3; 1 to 16 transactions at a time are usual).
+Frames are made and taken apart by pymodbus; its own client has one request under way at a time.
 """
 
 import asyncio
 import ssl
-import struct
 from collections.abc import Sequence
 from typing import Final, cast
 
+from pymodbus.framer import FramerSocket
+from pymodbus.pdu import DecodePDU
+
 from coldloop.errors import PeerUnreachableError, UntrustedPeerError
-from coldloop.modbus.framing import MalformedFrameError, next_frame
 
 UNIT: Final = 1
 REQUESTS_AT_ONCE: Final = 16
 """Requests that may be under way."""
 NONSENSE: Final = b"\0"
 """What stands for an answer that is not Modbus: it answers no function."""
-_HEADER: Final = struct.Struct(">HHHB")
+_FRAMER: Final = FramerSocket(DecodePDU(is_server=False))
+_PROTOCOL: Final = slice(2, 4)
+"""Where a frame says which protocol it is of: 0 is Modbus."""
+_LARGEST_FRAME: Final = 260
 
 
 class NoAnswerError(Exception):
@@ -133,7 +138,7 @@ class _Wire(asyncio.Protocol):
         for place, pdu in enumerate(requests):
             self._last_id = transaction = self._last_id + 1 & 0xFFFF
             self._awaited[transaction] = place
-            frames.append(_HEADER.pack(transaction, 0, len(pdu) + 1, UNIT) + pdu)
+            frames.append(_FRAMER.encode(pdu, UNIT, transaction))
         self._done = done = asyncio.get_running_loop().create_future()
         if self.transport.is_closing():  # uvloop raises RuntimeError when it is written to
             self._fail(closed=True)
@@ -156,18 +161,17 @@ class _Wire(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Take the answers that are whole by now (event loop callback)."""
         self._buffer += data
-        position = 0
-        try:
-            while (frame := next_frame(self._buffer, position)) is not None:
-                position = frame.end
-                place = self._awaited.pop(frame.transaction, None) if frame.unit == UNIT else None
-                if place is not None:  # else it is an answer that nobody waits for any more, or a second one
-                    self._answers[place] = frame.pdu
-        except MalformedFrameError:
+        size, unit, transaction, pdu = _FRAMER.decode(bytes(self._buffer))
+        while size and pdu:
+            del self._buffer[:size]
+            place = self._awaited.pop(transaction, None) if unit == UNIT else None
+            if place is not None:  # else it is an answer that nobody waits for any more, or a second one
+                self._answers[place] = pdu
+            size, unit, transaction, pdu = _FRAMER.decode(bytes(self._buffer))
+        if size or any(self._buffer[_PROTOCOL]) or len(self._buffer) > _LARGEST_FRAME:  # no beginning of a frame
             self.transport.abort()
             self._answers = [NONSENSE] * len(self._answers)
             self._awaited.clear()
-        del self._buffer[:position]
         if not self._awaited and self._done is not None and not self._done.done():
             self._done.set_result(self._answers)
 
