@@ -171,7 +171,8 @@ def test_pymodbus_makes_frames_and_the_identity_by_its_public_names() -> None:
 
 
 @pytest.mark.parametrize("garbage", [
-    b"HTTP/1.1 400 Bad Request\r\n", b"\0\1\0\0\0\0\1\1", b"\0\1\0\0\0\1\1\1", b"\0\1\0\0" + b"\xff" * 300, b"\0\1\0\7\0\3",
+    b"HTTP/1.1 400 Bad Request\r\n", b"\0\1\0\0\0\0\1\1", b"\0\1\0\0\0\1\1\1", b"\0\1\0\0" + b"\xff" * 300,
+    b"\0\1\0\7\0\3",
 ])  # fmt: skip
 async def test_every_kind_of_nonsense_ends_the_wait_at_once(garbage: bytes) -> None:
     async def babble(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
