@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ def printed_by(*command: str) -> str:
 
 
 def numbers(pattern: str, text: str) -> list[float]:
-    return [float(found.replace(",", "")) for found in re.findall(pattern, text)]
+    return [float(found.replace(",", "")) for found in re.findall(pattern, text, re.MULTILINE)]
 
 
 @pytest.mark.slow
@@ -44,9 +45,13 @@ def test_a_run_takes_a_multiple_of_the_sum_of_its_kernels() -> None:
 
 @pytest.mark.slow
 def test_all_solvers_take_part_in_the_comparison() -> None:
-    text = printed_by("qp_solvers.py", "--hours", "e", "--minutes", "3", "--iterations", "5")
-    for name in ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "daqp"):
-        assert len(re.findall(rf"^{name} ", text, re.MULTILINE)) == 2, text
+    text = printed_by("qp_solvers.py", "--hours", "e", "--minutes", "5", "--iterations", "5")
+    for name in ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "hybrid", "daqp"):
+        assert len(re.findall(rf"^{name} ", text, re.MULTILINE)) == 2 + (name in {"ode", "interior-point"}), text
+    for name, module in {"piqp": "piqp", "proxqp": "proxsuite", "clarabel": "clarabel"}.items():
+        found = numbers(rf"^{name} .*?([0-9.]+) /\s+[0-9.e+]+\s+[0-9.]+$", text)
+        assert found == ([] if find_spec(module) is None else [pytest.approx(1.0, abs=0.02)]), "converged at the end"
+        assert (f"without {name}" in text or f", {name}" in text) == (find_spec(module) is None)
 
 
 @pytest.mark.slow
