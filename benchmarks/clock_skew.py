@@ -13,7 +13,7 @@ from coldloop.process import TICK_S
 from coldloop.registers.control_plc import CONTROL_MAP, PlantLinkState, PlantLinkStatus, Status
 from coldloop.service import run_event_loop
 from plant.load import find_load
-from plant.runtime import own_header
+from plant.own_model import own_header
 from rig.local_services import LocalServices
 from rig.scenario import Scenario
 from rig.session_client import SessionClient

@@ -1,6 +1,7 @@
 """Ticks a second of the networked loop in lock-step, against the bare exchange with the plant's rack."""
 
 import argparse
+import os
 import tempfile
 import time
 from pathlib import Path
@@ -30,6 +31,12 @@ async def bare_exchanges(port: int, count: int) -> float:
     return count / elapsed
 
 
+def on_processor(pid: int) -> float:
+    """Return the time (us) that a process has had on the processor so far (Linux)."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) * 1e6 / os.sysconf("SC_CLK_TCK")
+
+
 async def measure(ticks: int, period_s: float) -> int:
     """Measure both on one rig, and print."""
     settings = Settings()
@@ -39,15 +46,19 @@ async def measure(ticks: int, period_s: float) -> int:
         async with LocalServices(settings, Path(folder)) as services:
             rig = SessionClient(services.endpoints, settings)
 
-            async def work() -> tuple[float, float]:
+            async def work() -> tuple[float, float, dict[str, float]]:
                 await rig.connect(90.0)
+                pids = {name: process.pid for name, process in services.processes.items()} | {"recorder": os.getpid()}
                 bare = await bare_exchanges(services.endpoints.plant.port, ticks)
                 recorder = Recorder(ticks)
+                before = {name: on_processor(pid) for name, pid in pids.items()}
                 await rig.run(scenario, recorder)
-                return bare, ticks / recorder.wall_seconds
+                busy = {name: (on_processor(pid) - before[name]) / ticks for name, pid in pids.items()}
+                return bare, ticks / recorder.wall_seconds, busy
 
-            bare, loop = await services.during(work())
+            bare, loop, busy = await services.during(work())
     print(f"bare exchange {bare:.0f}/s, lock-step {loop:.0f} ticks/s: ratio {loop / bare:.2f}")
+    print("on the processor a tick:", ", ".join(f"{name} {time_us:.0f} us" for name, time_us in busy.items()))
     return 0
 
 

@@ -16,9 +16,11 @@ from coldloop.config import load_configuration
 from coldloop.lti_model import load as load_model
 from coldloop.process import TICK_S
 from plant.load import HOUR_TICKS, HOURS, concatenated, telegraph
+from rig.figure_process import FigureProcess
+from rig.job import Job, Way
 from rig.recording import SampleBlock, Sink
 from rig.results import claim_folder
-from rig.running import Job, Way, make_scenario, run_into
+from rig.running import make_scenario, run_into
 from rig.settings import Settings
 
 NAMES: Final = "abcdef"
@@ -75,7 +77,8 @@ def main() -> None:
     effective = load_configuration(Settings, environment={}, options={"plant.load": (str(load_file), "--load")})
     job = Job(effective, make_scenario(effective.settings, options.hours * HOUR_TICKS), Way.IN_PROCESS)
     memory = MemoryLog(options.out / "memory.csv")
-    summary = run_into(options.out, job, {}, ["png"], [memory])
+    with FigureProcess(["png"]) as figure:
+        summary = run_into(options.out, job, {}, figure, [memory])
     hours, resident, objects = np.array(memory.rows).T
     print(f"{summary['ticks']} ticks, {summary['realtime_factor']:,.0f} x real time, trace {summary['trace_sha256']}")
     for share in np.linspace(0, len(hours) - 1, min(len(hours), 11)).astype(int):

@@ -1,12 +1,17 @@
-"""Coldloop beside general co-simulation frameworks: exchanges a second of the same data between two processes.
+"""Coldloop beside general tools: exchanges a second of the same data between two processes, and one predictive problem.
 
 Each exchange carries what plant and control PLC tell each other in a tick: 51 numbers one way and 4 the other. Neither
 side computes anything, so a framework's figure is its upper limit; Coldloop's lock-step (`lockstep.py`, of the same
-run) has plant, control PLC and solver in it. Needs the packages of `peers.txt`, in an environment of their own:
-`python -m venv peers && peers/bin/pip install -r peers.txt && peers/bin/python peers.py`.
+run) has plant, control PLC and solver in it. The problem (`peer_problem.py`) is stated in do-mpc, with every sample of
+the horizon a decision, and solved by IPOPT; Coldloop solves the same one, and that of the paper's seven instants.
+
+Needs the packages of `peers.txt`, in an environment of their own: `python -m venv peers && peers/bin/pip install -r
+peers.txt && peers/bin/python peers.py`.
 """
 
 import argparse
+import json
+import statistics
 import subprocess
 import sys
 import time
@@ -111,6 +116,75 @@ def mosaik_exchanges(exchanges: int) -> float:
         return exchanges / (time.perf_counter() - start)
 
 
+# -- do-mpc ------------------------------------------------------------------------------------------------------------
+
+
+def do_mpc_controller(problem: dict[str, Any]) -> Any:  # noqa: ANN401 a class of a package that may not be there
+    """Return do-mpc's controller for a problem of `peer_problem.py`; slacks of the bands are inputs of its model."""
+    import casadi  # noqa: PLC0415
+    import do_mpc  # noqa: PLC0415
+
+    m = {name: casadi.DM(value) for name, value in problem.items() if name != "horizon"}
+    model = do_mpc.model.Model("discrete")
+    x, before = (
+        model.set_variable("_x", name, shape=(size, 1)) for name, size in (("x", m["A"].shape[0]), ("before", 3))
+    )
+    u, slack = (model.set_variable("_u", name, shape=(size, 1)) for name, size in (("u", 3), ("slack", 4)))
+    later = m["A"] @ x + m["B"] @ u + m["F"] * m["w"]
+    weights = casadi.vertcat(*(m["violation"][row] for row in (0, 0, 1, 1)))
+    cost = casadi.dot(m["Q"], later**2) + casadi.dot(m["R"], u**2) + casadi.dot(weights, slack**2)
+    for name, value in (("cost", cost), ("y", m["C"] @ later + m["D"] @ u + m["G"] * m["w"]), ("move", u - before)):
+        model.set_expression(name, value)
+    model.set_rhs("x", later)
+    model.set_rhs("before", u)
+    model.setup()
+    controller = do_mpc.controller.MPC(model)
+    controller.settings.n_horizon, controller.settings.t_step = problem["horizon"], 5.0
+    controller.settings.supress_ipopt_output()
+    controller.set_objective(mterm=casadi.DM(0), lterm=model.aux["cost"])
+    for side, sign in (("low", "lower"), ("high", "upper")):
+        controller.bounds[sign, "_u", "u"] = problem[f"u_{side}"]
+    controller.bounds["lower", "_u", "slack"] = 0.0
+    for row in range(2):
+        y = model.aux["y"][row]
+        controller.set_nl_cons(f"low {row}", -y - model.u["slack"][2 * row], ub=-problem["y_low"][row])
+        controller.set_nl_cons(f"high {row}", y - model.u["slack"][2 * row + 1], ub=problem["y_high"][row])
+    for row, rate in enumerate(problem["rate"]):
+        for sign in (1, -1):
+            controller.set_nl_cons(f"rate {row} {sign}", sign * model.aux["move"][row], ub=rate)
+    controller.setup()
+    return controller
+
+
+def do_mpc_solved(problem: dict[str, Any], repeat: int) -> tuple[float, float]:
+    """Return the time (s) that do-mpc takes for a problem, beginning at its last solution, and the cost."""
+    import numpy as np  # noqa: PLC0415
+
+    controller = do_mpc_controller(problem)
+    at_rest = np.zeros((len(problem["A"]) + 3, 1))
+    controller.x0 = at_rest
+    controller.set_initial_guess()
+    times = []
+    for _ in range(repeat + 1):
+        start = time.perf_counter()
+        controller.make_step(at_rest)
+        times.append(time.perf_counter() - start)
+        if not controller.solver_stats["success"]:
+            raise RuntimeError("IPOPT has not solved it")
+    cost = sum(float(value) for value in controller.opt_aux_num["_aux", :, 0, "cost"])
+    return statistics.median(times[1:]), cost
+
+
+def compare_problem(coldloop: Path, repeat: int) -> None:
+    """Print the times and costs of one problem."""
+    own = subprocess.run([coldloop, Path(__file__).with_name("peer_problem.py")], check=True, capture_output=True)
+    told = json.loads(own.stdout)
+    for name, (seconds, cost) in told["own"].items():
+        print(f"Coldloop, {name}: {seconds * 1000:.2f} ms a problem, J {cost:.3f}", flush=True)
+    seconds, cost = do_mpc_solved(told["problem"], repeat)
+    print(f"do-mpc, every sample: {seconds * 1000:.2f} ms a problem, J {cost:.3f}", flush=True)
+
+
 def main() -> None:
     """Measure and print, or be one side of a measurement."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -134,6 +208,7 @@ def main() -> None:
         print(
             "Coldloop:", subprocess.run(lockstep, check=True, capture_output=True, text=True).stdout.strip(), flush=True
         )
+        compare_problem(options.coldloop, repeat=5)
     peers: dict[str, Callable[[], float]] = {"mosaik": lambda: mosaik_exchanges(options.exchanges)}
     peers |= {f"HELICS {core}": lambda core=core: helics_exchanges(core, options.exchanges) for core in CORES}
     for name, measure in peers.items():

@@ -13,9 +13,11 @@ from typing import NamedTuple
 import daqp
 import numpy as np
 from numpy.typing import NDArray
+from qp_peers import TO_THE_END, installed_peers, peer_answer
 
 from coldloop.errors import ConfigurationError
 from coldloop.lti_model import load
+from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
 from optimizer_plc.solution import Solution
@@ -29,6 +31,7 @@ from rig.settings import Settings
 Array = NDArray[np.float64]
 
 COUNTS = (2, 5, 10, 20)
+FEW = (2, 4, 6, 8)
 HARSH = 10.0
 UNBOUNDED = 1e30
 EQUAL = 1e-9
@@ -203,6 +206,40 @@ def main() -> None:
     print(f"\n{'':14} start us  ten us  harsh us/it. rises %  end above %  l any k  l from 0  of harsh")
     for name in names:
         report_paths(name, problems, harsh, options.iterations)
+    if harsh.any():
+        print("\nharsh problems, J / J* (median / largest), begun at the guess or at a point of their own, cut off at")
+        chosen = [one for one, hard in zip(problems, harsh, strict=True) if hard]
+        report_interior_points(chosen, best[harsh], alpha)
+
+
+def report_interior_points(problems: list[Recorded], best: Array, alpha: float) -> None:
+    """Print the accuracy of our interior point and of libraries after few iterations, each problem begun cold."""
+    peers = installed_peers()
+    print(f"\n{'':14}", *(f"{count:21}" for count in (*FEW, TO_THE_END)), " ms a solve")
+    names = ["ode", "interior-point", *peers]
+    for name in names:
+        cells, spent = [], 0.0
+        for count in (*FEW, TO_THE_END):
+            before = time.perf_counter()
+            if name in peers:
+                costs = [
+                    augmented_cost(qp, peer_answer(peers[name], qp, alpha, guess, count), alpha) + qp.constant
+                    for qp, guess in problems
+                ]
+            else:
+                costs = [cost_after(SolverName(name), qp, guess, count) for qp, guess in problems]
+            spent = (time.perf_counter() - before) / len(problems)
+            ratios = np.array(costs) / best
+            cells.append(f"{np.median(ratios):9.4g} / {ratios.max():9.3g}")
+        print(f"{name:14}", *cells, f"{1e3 * spent:10.2f}")
+
+
+def cost_after(name: SolverName, qp: QuadraticProblem, guess: Array, count: int) -> float:
+    """Return J after `count` iterations of one of our solvers."""
+    solver = make_solver(ProgramSettings(solver=name))
+    solver.start(qp, guess)
+    solver.iterate(count)
+    return solver.cost + qp.constant
 
 
 def is_there(name: SolverName) -> bool:

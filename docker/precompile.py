@@ -28,16 +28,16 @@ def control_plc() -> None:
 
 def optimizer_plc() -> None:
     """Let each solver that has kernels of its own answer two updates of a plant that stands still."""
-    from optimizer_plc.settings import ProgramSettings, SolverName  # noqa: PLC0415
+    from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings  # noqa: PLC0415
 
-    for solver in (SolverName.ODE, SolverName.FAST_GRADIENT, SolverName.INTERIOR_POINT):
+    for solver in SINGLE_PRECISION_SOLVERS:
         _answer_two_updates(ProgramSettings(solver=solver))
 
 
 def _answer_two_updates(settings: "ProgramSettings") -> None:
     from coldloop.limits import InputLimits  # noqa: PLC0415
     from coldloop.lti_model import load  # noqa: PLC0415
-    from control_plc.runtime import make_program  # noqa: PLC0415
+    from control_plc.program import make_program  # noqa: PLC0415
     from control_plc.settings import ControlSection  # noqa: PLC0415
     from optimizer_plc.computing_settings import Arithmetic  # noqa: PLC0415
     from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415

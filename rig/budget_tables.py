@@ -84,6 +84,7 @@ def _operation_lines(problem: PredictiveProblem, prediction: PredictionModel, cu
     counts: dict[str, Operations] = {
         "ODE, no row active": operations.ode(n, m, 0),
         f"ODE, {mean:g} rows active (mean)": operations.ode(n, m, mean),
+        f"ODE, {mean:g} rows active (mean), velocity kept": operations.ode_kept(n, m, mean),
         f"ODE, {ACTIVE_ROWS.worst:g} rows active (worst seen)": operations.ode(n, m, ACTIVE_ROWS.worst),
         f"ODE, all {m} rows active": operations.ode(n, m, m),
         f"qpOASES, {WORKING_SET:g} constraints held": operations.qpoases(n, m, WORKING_SET),

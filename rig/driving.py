@@ -13,6 +13,7 @@ from coldloop.process import L1, OUTPUT_NAMES, T5
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import SensorFaultKind
+from rig.arrow_arrays import number_array, text_array
 
 CONTROL: Final = "control_plc"
 PLANT: Final = "plant"
@@ -84,7 +85,7 @@ class DrivingHistory:
         starts = [state.tick for state in self._states[1:]]
         places = np.searchsorted(starts, ticks, side="right")
         texts = [_texts(state) for state in self._states]
-        return [pa.array(texts).field(name).take(pa.array(places)) for name in _TEXTS]
+        return [text_array([text[name] for text in texts], places) for name in _TEXTS]
 
     def measured(self, ticks: NDArray[np.int64], y: NDArray[np.float32]) -> list[pa.Array]:
         """Return what the sensors of `SHOWN` showed; null where it was not a number.
@@ -94,7 +95,7 @@ class DrivingHistory:
             y: Outputs without faults, shape (N, 22).
         """
         shown = [self._shown(output, ticks, y[:, output].copy()) for output in SHOWN]
-        return [pa.array(column, mask=np.isnan(column)) for column in shown]
+        return [number_array(column, pa.float32(), np.isnan(column)) for column in shown]
 
     def _shown(self, output: int, ticks: NDArray[np.int64], values: NDArray[np.float32]) -> NDArray[np.float32]:
         first, end = int(ticks[0]), int(ticks[-1]) + 1

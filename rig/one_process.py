@@ -8,11 +8,11 @@ from coldloop.registers.control_plc import Update, Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStep, Measurement, PlantSample, StationSample
 from control_plc.program import ControlProgram
-from control_plc.runtime import make_program as make_control_program
+from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
 from plant.kinds import plant_maker
+from plant.own_model import own_header
 from plant.program import LoadProfile, PlantProgram
-from plant.runtime import own_header
 from rig.compiled.stretches import CompiledStretches
 from rig.recording import Recorder
 from rig.scenario import Scenario

@@ -12,15 +12,17 @@ from coldloop import __version__
 from coldloop.config import Configuration, load_configuration
 from coldloop.errors import UsageError
 from coldloop.lti_model import load as load_model
+from rig.figure_process import FigureProcess
 from rig.indicators import RunEvaluation
 from rig.inputs import changed_inputs, profile_digest
+from rig.job import Job, Way
 from rig.manifest import DEPENDENCIES
 from rig.one_process import OneProcessRig
 from rig.progress import RunProgress
 from rig.recording import Recorder
 from rig.results import claim_folder, installed_version
 from rig.run_folder import RunFolder
-from rig.running import Job, Way, make_scenario, run_into
+from rig.running import make_scenario, run_into
 from rig.scenario import Scenario
 from rig.settings import Settings
 
@@ -66,10 +68,10 @@ def _configuration(run: RunFolder) -> Configuration[Settings]:
 
 
 def _trace(effective: Configuration[Settings], scenario: Scenario, out: Path | None, *, force: bool) -> str:
-    with RunProgress(scenario.ticks) as progress:
+    with RunProgress(scenario.ticks) as progress, FigureProcess(["png"]) as figure:
         if out is not None:
             claim_folder(out, force=force)
-            summary = run_into(out, Job(effective, scenario, Way.IN_PROCESS), {}, ["png"], [progress])
+            summary = run_into(out, Job(effective, scenario, Way.IN_PROCESS), {}, figure, [progress])
             return str(summary["trace_sha256"])
         settings = effective.settings
         evaluation = RunEvaluation(load_model(settings.model.file), settings.optimizer_plc.program.design)

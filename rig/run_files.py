@@ -14,6 +14,7 @@ from coldloop.process import TICK_S
 from plant.settings import PlantKind
 from rig.columns import ALL_FILES, schema_document
 from rig.disk_reserve import DiskReserve
+from rig.figure_process import FigureProcess
 from rig.file_sinks import EventsSink, StationSink, TraceSink, UpdatesSink
 from rig.indicators import RunEvaluation, StageCost
 from rig.inputs import FOLDER as INPUTS
@@ -21,7 +22,6 @@ from rig.inputs import copy_inputs
 from rig.manifest import final_manifest, first_manifest
 from rig.recording import Recorder, Sink
 from rig.results import write_json
-from rig.run_plot import plot_run
 from rig.scenario import Scenario
 from rig.settings import Settings
 
@@ -72,12 +72,12 @@ class RunFiles:
         )
         self.recorder = Recorder(scenario.ticks, [self._evaluation, *files, *sinks])
 
-    def finish(self, error: BaseException | None, formats: Sequence[str]) -> dict[str, Any]:
+    def finish(self, error: BaseException | None, figure: FigureProcess) -> dict[str, Any]:
         """Close the files, and write summary, manifest and figures of what was recorded; return the summary.
 
         Args:
             error: What ended the run early, if anything did.
-            formats: Of the figure.
+            figure: Draws the figure.
 
         Raises:
             ColdloopError: The run is not complete.
@@ -100,7 +100,7 @@ class RunFiles:
         try:
             write_json(self.folder / "manifest.json", manifest)
             write_json(self.folder / "summary.json", summary)
-            plot_run(self.folder, formats)
+            figure.draw(self.folder)
         except OSError as of_files:
             error = error or of_files
         if error is not None:

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
+from rig.arrow_arrays import numbers_of
 from rig.columns import FORMAT
 
 Curves = dict[str, NDArray[np.float64]]
@@ -83,9 +84,9 @@ class RunFolder:
         return rows
 
 
-def batch_series(batch: pa.RecordBatch | pa.Table) -> Curves:
+def batch_series(batch: pa.RecordBatch) -> Curves:
     """Return the columns of a batch as numbers."""
-    return {name: np.asarray(batch[name].to_numpy(zero_copy_only=False), dtype=float) for name in batch.schema.names}
+    return {name: numbers_of(batch[name]) for name in batch.schema.names}
 
 
 def _reduced(series: Curves, every: int) -> Curves:

@@ -1,11 +1,14 @@
 """The figure of a run from its folder, as PNG, PDF or SVG."""
 
 from collections.abc import Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 from matplotlib.figure import Figure
 
+from coldloop.process import INPUT_NAMES
 from rig.plot import DRAWN, Bounds, RunCurves, draw_run
 from rig.results import whole_file
 from rig.run_folder import RunFolder
@@ -25,6 +28,13 @@ def plot_run(folder: Path, formats: Sequence[str]) -> list[Path]:
     for path in paths:
         save_figure(figure, path)
     return paths
+
+
+def draw_nothing() -> None:
+    """Draw one tick into memory: fonts, and what else the first figure of a process needs, are loaded then."""
+    series = {name: np.zeros(1) for name in ("time_s", *DRAWN)}
+    bounds = Bounds(dict.fromkeys(("L1", "T5"), (0.0, 1.0)), dict.fromkeys(INPUT_NAMES, (0.0, 1.0)))
+    draw_run(RunCurves(series, [], bounds, "", "")).savefig(BytesIO(), dpi=DPI)
 
 
 def save_figure(figure: Figure, path: Path) -> None:

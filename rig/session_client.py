@@ -16,14 +16,14 @@ from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, LadderStatus, Mode, Status
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, STATION_ROWS, PlantSession, SensorFault, Surroundings
-from plant.runtime import own_header
+from plant.own_model import own_header
 from rig.driving import CONTROL, PLANT
 from rig.load_stream import LoadStream, write_table
 from rig.recording import LinkStatistics, Recorder
 from rig.rig_endpoints import RigEndpoints
 from rig.scenario import Scenario
 from rig.session_events import SessionEvents
-from rig.session_reader import SampleReader, UpdateReader
+from rig.session_reader import BATCH, SampleReader, UpdateReader
 from rig.settings import Settings
 
 T = TypeVar("T")
@@ -32,6 +32,10 @@ AHEAD: Final = HISTORY_ROWS - 32
 """Ticks that the control PLC may be ahead of the recording, so that the history still has them."""
 STATION_AHEAD: Final = STATION_ROWS - 32
 """The same where the history of the station counts too."""
+SHORTEST_PAUSE_S: Final = 0.001
+LONGEST_PAUSE_S: Final = 0.2
+LONGEST_LOCKSTEP_PAUSE_S: Final = 0.01
+"""A rig that does not move is looked at so often."""
 QUIET_S: Final = 20.0
 """A rig on which nothing happens for this long is given up."""
 LAST_LOOK_S: Final = 2.0
@@ -180,7 +184,7 @@ class SessionClient:
     async def _follow(self) -> None:
         scenario, recorder = self._scenario, self._recorder
         quiet_since = time.monotonic()
-        pause_s = 20 * TICK_S / scenario.factor if scenario.realtime else 0.001
+        pause_s = min(20 * TICK_S / scenario.factor, LONGEST_PAUSE_S) if scenario.realtime else SHORTEST_PAUSE_S
         while (done := recorder.next_tick) < scenario.ticks:
             await self.grant(scenario.ticks)
             await self.look()
@@ -192,7 +196,9 @@ class SessionClient:
                     f"{self.plant.peer} has been at tick {done} for {now - quiet_since:.0f} s: "
                     "see the logs of the control PLC and of the optimiser"
                 )
-            await asyncio.sleep(min(max(pause_s, 0.001), 0.2))
+            if not scenario.realtime:
+                pause_s = _pause_for_a_batch(pause_s, recorder.next_tick - done)
+            await asyncio.sleep(max(pause_s, SHORTEST_PAUSE_S))
 
     async def grant(self, until: int) -> None:
         """Let the rig go on to a tick, but not further than the load is known and the plant's history reaches back."""
@@ -268,3 +274,13 @@ class SessionClient:
         except (PeerUnreachableError, TimeoutError):
             self.lost_contacts += 1
             return None
+
+
+def _pause_for_a_batch(pause_s: float, ticks: int) -> float:
+    """Return the next pause between two looks at a rig in lock-step, after one in which so many ticks were recorded.
+
+    Each look asks all three services, so it is worth some ticks; but the rig must not come to the end of its grant.
+    """
+    if ticks > 2 * BATCH:
+        return max(pause_s / 2, SHORTEST_PAUSE_S)
+    return min(pause_s * 1.5, LONGEST_LOCKSTEP_PAUSE_S) if ticks < BATCH else pause_s

@@ -6,6 +6,7 @@ from typing import Final
 
 from coldloop.errors import LinkError
 from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.transport import REQUESTS_AT_ONCE
 from coldloop.registers.common import Identity
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import Optimization
@@ -70,25 +71,32 @@ class SampleReader:
         return max(1, min(BATCH, self._scenario.ticks - self.read_until))
 
     async def _read_rows(self, last: int) -> None:
-        for tick in range(self.read_until, last):
-            (sample,) = await self._client.read_rows(PlantSample, tick % HISTORY_ROWS, 1)
-            await self._read_station(tick)
-            if sample.tick == tick:
-                self._recorder.sample(sample)
-            elif not self._tolerant:
-                raise LinkError(
-                    f"{self._client.peer} has overwritten tick {tick} before it was recorded: choose a lower --factor"
-                )
-            self.read_until = tick + 1
+        """Read the ticks before `last`, as many together as requests may be under way, not across ends of histories."""
+        while self.read_until < last:
+            first = self.read_until
+            count = min(last - first, REQUESTS_AT_ONCE, STATION_ROWS - first % STATION_ROWS)
+            samples = await self._client.read_rows(PlantSample, first % HISTORY_ROWS, count)
+            await self._read_stations(first, count)
+            for tick, sample in enumerate(samples, first):
+                if sample.tick == tick:
+                    self._recorder.sample(sample)
+                elif not self._tolerant:
+                    raise LinkError(
+                        f"{self._client.peer} has overwritten tick {tick} before it was recorded: "
+                        "choose a lower --factor"
+                    )
+                self.read_until = tick + 1
 
-    async def _read_station(self, tick: int) -> None:
-        """Read what goes with a tick, if the plant is a whole refrigerator: the first row that is read tells."""
-        if self.has_station is False:
+    async def _read_stations(self, first: int, count: int) -> None:
+        """Read what goes with ticks, if the plant is a whole refrigerator: the first row that is read tells."""
+        if self.has_station is None:
+            (station,) = await self._client.read_rows(StationSample, first % STATION_ROWS, 1)
+            self.has_station = any(station.signals)
+        if not self.has_station:
             return
-        (station,) = await self._client.read_rows(StationSample, tick % STATION_ROWS, 1)
-        self.has_station = self.has_station or any(station.signals)
-        if any(station.signals) and station.tick == tick:
-            self._recorder.station(station)
+        for tick, station in enumerate(await self._client.read_rows(StationSample, first % STATION_ROWS, count), first):
+            if any(station.signals) and station.tick == tick:
+                self._recorder.station(station)
 
 
 class UpdateReader:
@@ -125,11 +133,13 @@ class UpdateReader:
                 raise LinkError(f"{self._client.peer} has overwritten update {self._next} before it was recorded")
             self._next = max(0, newest - UPDATE_ROWS)
         while self._next < newest:
-            (update,) = await self._client.read_rows(Optimization, self._next % UPDATE_ROWS, 1)
-            if not self._tolerant or self._follows(update):
-                self._recorder.update(update)
-                self._last = update
-            self._next += 1
+            place = self._next % UPDATE_ROWS
+            count = min(newest - self._next, UPDATE_ROWS - place)
+            for update in await self._client.read_rows(Optimization, place, count):
+                if not self._tolerant or self._follows(update):
+                    self._recorder.update(update)
+                    self._last = update
+                self._next += 1
 
     def _follows(self, update: Optimization) -> bool:
         """Tell whether a row is the update that is looked for, and not one that was recorded before."""

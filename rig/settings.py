@@ -5,7 +5,7 @@ from pydantic import BaseModel, ConfigDict
 from coldloop.limits import InputLimits
 from coldloop.model_settings import ModelSettings
 from coldloop.session import SessionSettings
-from coldloop.telemetry import TelemetrySettings
+from coldloop.telemetry_settings import TelemetrySettings
 from control_plc.settings import ControlSection
 from hmi.settings import HmiSection
 from optimizer_plc.settings import OptimizerSection

@@ -93,8 +93,9 @@ class Simulation:
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Return the figure of the run; with a path it is written there too, as .png, .pdf or .svg."""
+        (batch,) = self.trace.arrow.select(["time_s", *DRAWN]).to_batches()
         curves = RunCurves(
-            batch_series(self.trace.arrow.select(["time_s", *DRAWN])),
+            batch_series(batch),
             self.events.arrow.to_pylist(),
             Bounds.of(self.configuration),
             title_of(self.configuration),
@@ -120,7 +121,7 @@ def simulate(
 
     Args:
         load: Named load such as `a`, or a CSV file with the columns time_s and load_w.
-        solver: `ode`, `qpoases`, `osqp`, `fast-gradient` or `daqp`.
+        solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`.
         updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`.
         duration_s: Plant time in multiples of 0.25 s; that of the load if not given.
         seed: Seed of the sensors' noise.

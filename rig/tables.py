@@ -10,6 +10,7 @@ from coldloop.event_text import describe, utc_text
 from coldloop.process import TICK_S
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
+from rig.arrow_arrays import number_array, text_array
 from rig.columns import EVENTS, STATION, TRACE, UPDATES, arrow_schema
 from rig.driving import DrivingHistory
 from rig.indicators import StageCost
@@ -33,17 +34,21 @@ def trace_table(
         cost.of(block), *_held(ticks, updates),
     ]  # fmt: skip
     schema = arrow_schema(TRACE)
-    return pa.table([pa.array(data, type=field.type) for field, data in zip(schema, columns, strict=True)], schema)
+    arrays = [
+        data if isinstance(data, pa.Array) else number_array(data, field.type)
+        for field, data in zip(schema, columns, strict=True)
+    ]
+    return pa.table(arrays, schema)
 
 
 def station_table(block: SampleBlock) -> pa.Table:
     """Return what is known of the station at the ticks of a block that has one."""
     ticks = block.first + np.arange(len(block.load))
     unknown = np.isnan(block.station[:, 0])
-    columns = [pa.array(ticks), pa.array(ticks * TICK_S)]
-    columns += [pa.array(np.nan_to_num(column), mask=unknown) for column in block.station.T]
     schema = arrow_schema(STATION)
-    return pa.table([column.cast(field.type) for field, column in zip(schema, columns, strict=True)], schema)
+    columns = [(ticks, None), (ticks * TICK_S, None), *((np.nan_to_num(column), unknown) for column in block.station.T)]
+    arrays = [number_array(data, field.type, mask) for field, (data, mask) in zip(schema, columns, strict=True)]
+    return pa.table(arrays, schema)
 
 
 def _held(ticks: Any, updates: Sequence[Optimization]) -> list[pa.Array]:  # noqa: ANN401 an array of integers
@@ -61,7 +66,7 @@ def _held(ticks: Any, updates: Sequence[Optimization]) -> list[pa.Array]:  # noq
     ]
     held = [np.asarray(column or [0])[np.maximum(latest, 0)] for column in values]
     types = [column.kind for column in TRACE[-len(values) :]]
-    return [pa.array(column, type=kind, mask=none) for column, kind in zip(held, types, strict=True)]
+    return [number_array(column, kind, none) for column, kind in zip(held, types, strict=True)]
 
 
 def updates_table(updates: Sequence[Optimization]) -> pa.Table:
@@ -88,5 +93,12 @@ def _event_row(service: str, event: Event) -> dict[str, Any]:
 
 def _table(rows: Sequence[dict[str, Any]], columns: Any) -> pa.Table:  # noqa: ANN401 a tuple of columns
     return pa.table(
-        [pa.array([row[column.name] for row in rows], type=column.kind) for column in columns], arrow_schema(columns)
+        [_array([row[column.name] for row in rows], column.kind) for column in columns], arrow_schema(columns)
     )
+
+
+def _array(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
+    if pa.types.is_string(kind):
+        return text_array(values)
+    unknown = np.array([value is None for value in values], bool)
+    return number_array([0 if value is None else value for value in values], kind, unknown)

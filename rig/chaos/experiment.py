@@ -12,9 +12,11 @@ from rig.chaos.plan import Plan
 from rig.chaos.runner import conduct
 from rig.chaos.sequencer import Progress
 from rig.chaos.trace import ChaosTrace
+from rig.figure_process import FigureProcess
+from rig.job import Job, Way
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder, Recording
-from rig.running import Job, Way, run_into
+from rig.running import run_into
 from rig.scenario import Scenario
 from rig.settings import Settings
 
@@ -62,7 +64,8 @@ def perform(
 
     try:
         job = Job(plan.configured(effective), scenario, Way.CHAOS, conduct=conducted)
-        run_into(folder, job, arguments, formats, [trace])
+        with FigureProcess(formats) as figure:
+            run_into(folder, job, arguments, figure, [trace])
     except LinkError as error:
         if trace.missing == trace.ticks:
             raise

@@ -7,7 +7,7 @@ from importlib.resources import files
 from typing import Final
 
 MODES: Final = ("lockstep", "realtime")
-SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "daqp")
+SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "hybrid", "daqp")
 PRESETS: Final = ("tuned", "as-printed")
 LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h", "pulses")
 SERVICES: Final = ("control_plc", "optimizer_plc", "plant")
@@ -17,7 +17,7 @@ FIGURE_FORMATS: Final = ("png", "pdf", "svg")
 STUDIES: Final = (
     "cholesky", "unlimited", "limited", "solver-comparison", "trajectories", "updating-period", "plc-2h", "adaptive-2h",
     "trade-off", "classical", "single-precision", "coupling", "disturbances",
-    "oracles", "robustness", "penalties",
+    "oracles", "robustness", "contest", "penalties",
 )  # fmt: skip
 
 

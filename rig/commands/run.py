@@ -2,9 +2,10 @@
 
 import argparse
 import sys
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from coldloop.command_line import add_configuration_options
 from coldloop.errors import UsageError
@@ -21,7 +22,14 @@ from rig.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from rig.running import Job
+    from collections.abc import Iterator
+
+    from rig.figure_process import FigureProcess
+    from rig.job import Job
+    from rig.recording import Sink
+
+SHORT_RUN_TICKS: Final = 2400
+"""Ten minutes of plant time: in one process half a second at the most."""
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -46,16 +54,27 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, help="seed of the sensors' noise (default: 1)")
     parser.add_argument("--out", type=Path, help="folder for the results (default: runs/<load>-<time>)")
     parser.add_argument("--force", action="store_true", help="replace the run in a folder that is not empty")
-    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png", "pdf"], metavar="FORMAT",
-                        help="png, pdf, svg (default: png pdf)")  # fmt: skip
+    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
+                        help="png, pdf, svg (default: png)")  # fmt: skip
     parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run, and write the results."""
     check_load(options.load)
+    from rig.figure_process import FigureProcess
+
+    with FigureProcess(options.figures) as figure:
+        if options.in_process:
+            from coldloop.lean_numba import load_numba_alone
+
+            figure.start()  # a short run would wait for matplotlib
+            load_numba_alone()
+        return _run(options, figure)
+
+
+def _run(options: argparse.Namespace, figure: "FigureProcess") -> int:
     from rig.manifest import plain_arguments
-    from rig.progress import RunProgress
     from rig.results import claim_folder
     from rig.running import run_into
 
@@ -63,16 +82,31 @@ def execute(options: argparse.Namespace) -> int:
     load = Path(job.effective.settings.plant.load).stem
     out = options.out or Path("runs") / f"{load}-{datetime.now():%Y%m%d-%H%M%S}"  # noqa: DTZ005
     claim_folder(out, force=options.force)
-    with RunProgress(job.scenario.ticks) as progress:
-        summary = run_into(out, job, plain_arguments(options), options.figures, [progress])
+    with _progress(job) as sinks:
+        summary = run_into(out, job, plain_arguments(options), figure, sinks)
     _tell(out, summary)
     return 0
+
+
+@contextmanager
+def _progress(job: "Job") -> "Iterator[list[Sink]]":
+    """Show a bar while the run goes on; one that is over before it could be read has none."""
+    from rig.job import Way
+
+    if job.way is Way.IN_PROCESS and job.scenario.ticks <= SHORT_RUN_TICKS:
+        yield []
+        return
+    from rig.progress import RunProgress
+
+    with RunProgress(job.scenario.ticks) as progress:
+        yield [progress]
 
 
 def _job(options: argparse.Namespace) -> "Job":
     """Return the run that the options and the configuration ask for."""
     from coldloop.endpoints import Endpoint
-    from rig.running import Job, Way, as_attached, check_certificates, make_scenario
+    from rig.job import Job, Way
+    from rig.running import check_certificates, make_scenario
 
     effective = configuration(options)
     settings = effective.settings
@@ -85,6 +119,8 @@ def _job(options: argparse.Namespace) -> "Job":
     scenario = make_scenario(settings, options.duration)
     if options.attach:
         ends = [Endpoint(host=end.host, port=end.port, tls=settings.rig.tls) for end in options.attach]
+        from rig.networked_run import as_attached
+
         return Job(as_attached(effective, ends), scenario, Way.ATTACHED, tuple(ends))
     refuse_ineffective(effective, {**dict.fromkeys(PLACES, OWN_PORTS), "session.autostart": "it begins a session"})
     if options.in_process:

@@ -5,7 +5,7 @@ finds out whether it is one; when not, the loop ends with nothing of that tick d
 would cross the link are rounded as the link rounds them, through the rows of the trace.
 """
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -111,47 +111,95 @@ def go_on(
     reports: Reports,
     until: int,
 ) -> int:
-    """Do ticks and updates; return DONE at the tick `until`, or UNUSUAL."""
+    """Do ticks and updates; return DONE at the tick `until`, or UNUSUAL.
+
+    An answer is computed when the programs would deliver it: at its instant, or at once where a load step may cut it
+    off. One that has not begun when something unusual happens is forgotten, as if it had never been computed.
+    """
     s, guard, twin = scans[0], guards[0], guards[1]
-    u_before = np.empty(3)
+    u_before, kept, length = np.empty(3), before_solving(m), 0
+    outcome = DONE
     while s.tick < until:
         tick, instant = s.tick, s.tick == s.next_update
+        outcome = UNUSUAL
         if not look(w, alarms, s, plant, trace):
-            return UNUSUAL
-        if instant and not answer(w, c, s, guard, twin, m, reports):
-            return UNUSUAL
+            break
+        if length == 0 and (instant or s.load_step > 0.0):
+            if s.next_update <= until:
+                length = answer(w, c, s, guard, twin, m, kept, reports)
+            if length == 0:
+                break
+        if instant:
+            begin_sequence(s, m, length)
+            length = 0
         if tick - s.first_tick >= s.length:
-            return UNUSUAL
+            break
         u_before[:] = guard.applied
         scan(w, alarms, s, guard, m.rows, plant, trace)
         if instant:
             latch(w, c, s, m, trace, reports, tick, u_before)
-    return DONE
+        outcome = DONE
+    if length > 0:
+        forget_answer(m, kept)
+        s.solved -= 1
+    return outcome
+
+
+class BeforeSolving(NamedTuple):
+    """What a solve changes in an optimiser's memory, as it was before."""
+
+    numbers: Any
+    u_before: Array
+    predicted: Array
+    x_solved: Array
 
 
 @kernel
-def answer(w: World, c: Constants, s: Any, guard: Any, twin: Any, m: Memory, reports: Reports) -> bool:  # noqa: ANN401
-    """Solve the problem of the update under way, and begin its sequence; tell whether it was accepted.
+def before_solving(m: Memory) -> BeforeSolving:
+    """Return a copy of what a solve changes."""
+    return BeforeSolving(m.numbers.copy(), m.u_before.copy(), m.predicted.copy(), m.x_solved.copy())
 
-    What is refused is forgotten, as if it had never been solved.
+
+@kernel
+def forget_answer(m: Memory, kept: BeforeSolving) -> None:
+    """Undo a solve."""
+    m.numbers[0] = kept.numbers[0]
+    m.u_before[:], m.predicted[:], m.x_solved[:] = kept.u_before, kept.predicted, kept.x_solved
+
+
+@kernel
+def answer(
+    w: World, c: Constants, s: Any, guard: Any, twin: Any, m: Memory, kept: BeforeSolving, reports: Reports  # noqa: ANN401
+) -> int:  # fmt: skip
+    """Solve the problem of the update under way, and judge the sequence as the control PLC would; return its length.
+
+    What is refused has the length 0, and is forgotten, as if it had never been solved.
     """
-    numbers, u_before, predicted, x = m.numbers.copy(), m.u_before.copy(), m.predicted.copy(), m.x_solved.copy()
+    kept.numbers[0] = m.numbers[0]
+    kept.u_before[:], kept.predicted[:], kept.x_solved[:] = m.u_before, m.predicted, m.x_solved
     length = scheme.solve(c, m)
-    accepted = True
+    accepted = s.next_update - s.first_tick <= s.length
     for tick in range(length):
         accepted = accepted and in_range(w.limits, m.answer_rows[tick])
     copy_state(guard, twin, w.limits)
-    if not (accepted and admits(twin, w.limits, s.tick, m.answer_rows, length)):
-        m.numbers[0] = numbers[0]
-        m.u_before[:], m.predicted[:], m.x_solved[:] = u_before, predicted, x
-        return False
+    if accepted:
+        for tick in range(s.tick, s.next_update):
+            admit(twin, w.limits, tick, m.rows[tick - s.first_tick], tick == s.first_tick)
+    if not (accepted and admits(twin, w.limits, s.next_update, m.answer_rows, length)):
+        forget_answer(m, kept)
+        return 0
     report(s, m, reports)
+    trigger(w, s, s.tick)
+    return length
+
+
+@kernel
+def begin_sequence(s: Any, m: Memory, length: int) -> None:  # noqa: ANN401
+    """Let the answer be what is played."""
     scheme.take_answer(m)
     s.number, s.first_tick = m.numbers[0].sequences, s.tick
     s.length, s.tau_u = length, m.numbers[0].ticks
     s.accepted += 1
-    trigger(w, s, s.tick)
-    return True
 
 
 @kernel
@@ -167,7 +215,7 @@ def latch(
     a = scheme.plan(c, m, tick, u_before, np.float64(trace.load[row]), y, x)
     of_update = reports.assessment
     of_update[0], of_update[1], of_update[2], of_update[3] = a.efficiency, a.mismatch, a.contraction, a.gamma
-    s.next_update = tick + m.numbers[0].ticks
+    s.next_update, s.load_step = tick + m.numbers[0].ticks, c.load_step
     trigger(w, s, tick + 1)
 
 

@@ -7,14 +7,15 @@ from coldloop.registers.control_plc import Update, Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.sequence import InputSequence
 from optimizer_plc.budget import MAX_PERIOD_TICKS
-from optimizer_plc.costs import matrices_of, output_maps
+from optimizer_plc.costs import output_maps
 from optimizer_plc.estimator import Estimate, KalmanFilter, StateFeedback
 from optimizer_plc.prediction import Transition
 from optimizer_plc.problem import Situation
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.scheme import ALGORITHM_1, CONTRACTION, FIXED, OPTIMIZER_STATE, Constants, Memory, Rule
 from optimizer_plc.session_state import Delivery, Period
-from optimizer_plc.solvers.ode import OdeSolver, flow_in
+from optimizer_plc.solvers.compiled import KINDS, solver_constants
+from optimizer_plc.solvers.hybrid import HybridSolver
 from optimizer_plc.updating_period import (
     Algorithm1,
     Assessment,
@@ -29,13 +30,11 @@ NO_CONTRACTION = ContractionParameters(0, 0, 0, 1.0, 0.0, 1.0)
 
 
 def is_compiled(program: OptimizerProgram) -> bool:
-    """Tell whether the program's updates have a compiled form: double precision, ODE-based solver, a rule of ours."""
+    """Tell whether the program's updates have a compiled form: double precision, a solver and a rule of our own."""
     if type(program) is not OptimizerProgram:  # who has made another kind of it wants to be asked
         return False
-    if program.problem.Phi.dtype != np.float64 or program.settings.interrupting_load_step_w:
-        return False
     known_rule = isinstance(program.rule, FixedPeriod | Algorithm1 | ContractionRule)
-    return isinstance(program.solver, OdeSolver) and known_rule
+    return program.problem.Phi.dtype == np.float64 and type(program.solver) in KINDS and known_rule
 
 
 def is_ordinary(program: OptimizerProgram) -> bool:
@@ -61,15 +60,16 @@ def constants_of(program: OptimizerProgram, limits: InputLimits) -> Constants:
         kalman=isinstance(estimator, KalmanFilter),
         load_known=not isinstance(estimator, KalmanFilter) or estimator.load_known,
         gains=np.array([gains[ticks] for ticks in sorted(gains)]),
-        Phi=problem.Phi, Gamma=problem.Gamma, matrices=matrices_of(qp), maps=problem.maps, shifts=problem.shifts,
+        Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps, shifts=problem.shifts,
         predicted=output_maps(problem),
         weights=problem.knots_to_samples, input_scale=problem.input_scale, rate=problem.rate,
         scaled_rate=problem.scaled_rate,
         rate_shares=np.array([limits.rate_share(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)]),
         n_inputs=problem.n_inputs,
-        flow=flow_in(program.settings.ode, program.settings.penalties, np.float64),
+        solver=solver_constants(program.solver, program.settings, qp),
         floor=program.settings.adaptive.cost_floor,
         sequence_ticks=program.settings.sequence_ticks,
+        load_step=program.settings.interrupting_load_step_w,
         rule=_rule(program),
     )  # fmt: skip
 
@@ -78,7 +78,9 @@ def _rule(program: OptimizerProgram) -> Rule:
     budget, rule, fixed = program.budget, program.rule, program.fixed_ticks
     most = budget.iterations(MAX_PERIOD_TICKS)
     periods = np.array([fixed or budget.period(iterations) for iterations in range(most + 1)])
-    bounds = (rule.q_min, rule.q_max, rule.delta) if isinstance(rule, Algorithm1) else (0, 0, 0)
+    bounds = (rule.first, rule.first, 0)
+    if isinstance(rule, Algorithm1):
+        bounds = (rule.q_min, rule.q_max, rule.delta)
     contraction = rule.parameters if isinstance(rule, ContractionRule) else NO_CONTRACTION
     return Rule(_kind(rule), fixed, *bounds, contraction, most, periods)
 
@@ -144,6 +146,8 @@ def give_back(program: OptimizerProgram, m: Memory, update: Update, sequence: In
         program.estimator.since = int(n["since"])
     if isinstance(program.estimator, KalmanFilter | StateFeedback):
         program.estimator.estimate = estimate
+    if isinstance(program.solver, HybridSolver):
+        program.solver.go_on_after(float(n["hot_start"]), float(n["delivered"]))
     if isinstance(program.rule, ContractionRule):
         program.rule.contraction = float(n["contraction"])
         program.rule.delivered = float(n["contraction_delivered"])

@@ -59,6 +59,8 @@ class CompiledStretches:
             return None
         answered = self._control.player.has_answer
         whole = self._constants is not None and not answered and optimizer.is_ordinary(self._optimizer)
+        if not whole and not answered and self._control.player.load_step:
+            return None  # the programs deliver at once what a load step may cut off
         until = min(until, (self._control.tick // BLOCK_TICKS + 1) * BLOCK_TICKS)
         ticks = until - self._control.tick
         with self._plant.noise(ticks) as noise:

@@ -4,6 +4,7 @@ from typing import Final
 
 from rig.studies.cholesky import CholeskyStudy
 from rig.studies.classical import ClassicalStudy
+from rig.studies.contest import ContestStudy
 from rig.studies.coupling import CouplingStudy
 from rig.studies.disturbances import DisturbancesStudy
 from rig.studies.experiments import ADAPTIVE_2H, PLC_2H
@@ -36,6 +37,6 @@ _ALL: Final[tuple[Study, ...]] = (
 STUDIES: Final = {study.name: study for study in _ALL}
 """Those of the report, in the order of the paper."""
 
-_APART: Final[tuple[Study, ...]] = (OraclesStudy(), RobustnessStudy(), PenaltiesStudy())
+_APART: Final[tuple[Study, ...]] = (OraclesStudy(), RobustnessStudy(), ContestStudy(), PenaltiesStudy())
 APART: Final = {study.name: study for study in _APART}
 """Those that are too long for the report."""

@@ -17,12 +17,13 @@ from coldloop.lti_model import load
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample
-from control_plc.runtime import make_program as make_control_program
+from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.updating_period import FixedPeriod
 from plant.kinds import plant_maker
+from plant.own_model import own_header
 from plant.program import LoadProfile
-from plant.runtime import own_header
+from rig.compiled.stretches import CompiledStretches
 from rig.indicators import StageCost
 from rig.one_process import Programs, load_table
 from rig.recording import Recorder, SampleBlock
@@ -99,7 +100,13 @@ class LoopBranch:
     """The three programs in one process, with what they have cost so far."""
 
     def __init__(
-        self, settings: Settings, scenario: Scenario, objective: Objective, recorder: Recorder | None = None
+        self,
+        settings: Settings,
+        scenario: Scenario,
+        objective: Objective,
+        recorder: Recorder | None = None,
+        *,
+        compiled: bool = True,
     ) -> None:
         header, model = own_header(settings.model.file), load(settings.model.file)
         program = settings.optimizer_plc.program
@@ -114,6 +121,8 @@ class LoopBranch:
         self._programs.control.restart(session=1)
         self._sums = CostSums(StageCost(model, program.design), recorder)
         self._objective = objective
+        self._load, self._limits = load_table(scenario.load), settings.limits
+        self._compiled = compiled
         if recorder is not None:
             recorder.begin()
 
@@ -128,9 +137,15 @@ class LoopBranch:
 
     def advance(self, choice: int, until: int) -> None:
         """Go on to `until`; periods that begin from now on are of the choice."""
-        self._programs.optimizer.rule = self._rules[choice]
-        while self._programs.plant.tick < until:
-            self._programs.tick(self._sums)
+        plant, control, optimizer = programs = self._programs
+        optimizer.rule = self._rules[choice]
+        stretches = CompiledStretches(plant, control, optimizer, self._load, self._limits) if self._compiled else None
+        while control.tick < until:
+            stretch = stretches.ahead(until) if stretches else None
+            if stretch is not None:
+                self._sums.stretch(*stretch)
+            else:
+                programs.tick(self._sums)
         self._sums.settle()
 
 
@@ -172,6 +187,15 @@ class CostSums:
         if self._recorder is not None:
             self._recorder.station(sample)
 
+    def stretch(self, block: SampleBlock, updates: Sequence[Optimization]) -> None:
+        """Take ticks in a row, and the updates among them."""
+        self.settle()
+        self._stage_costs += float(self._stage_cost.of(block).sum())
+        for update in updates:
+            self._count(update)
+        if self._recorder is not None:
+            self._recorder.stretch(block, updates)
+
     def settle(self) -> None:
         """Add up the ticks taken."""
         if self._samples:
@@ -179,14 +203,18 @@ class CostSums:
             self._samples = []
 
     def update(self, update: Optimization) -> None:
-        """Take an update; it counts when the next one shows that it was not cut off."""
+        """Take an update."""
+        self._count(update)
+        if self._recorder is not None:
+            self._recorder.update(update)
+
+    def _count(self, update: Optimization) -> None:
+        """Let an update count when the next one shows that it was not cut off."""
         last, self._pending = self._pending, update
         if last is not None and update.tick >= last.tick + last.tau_u:
             end = last.tick + last.tau_u
             self._weighted += (last.j_dev + last.j_cst) * (end - self._delivered)
             self._delivered = end
-        if self._recorder is not None:
-            self._recorder.update(update)
 
 
 def run_best_in_hindsight(settings: Settings, scenario: Scenario, recorder: Recorder, objective: Objective) -> None:

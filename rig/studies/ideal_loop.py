@@ -20,7 +20,7 @@ from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.solvers.daqp import DaqpSolver
 from plant.kinds import plant_maker
-from plant.runtime import own_header
+from plant.own_model import own_header
 from rig.recording import Recorder
 from rig.scenario import Scenario
 from rig.settings import Settings

@@ -270,7 +270,7 @@ def up(
         load: Named load such as `a`, or a CSV file with the columns time_s and load_w; its last value is held.
         mode: `lockstep`: plant time passes only in `advance` and `wait_until`; `realtime`: by the clock.
         factor: In real time: seconds of plant time in a second.
-        solver: `ode`, `qpoases`, `osqp`, `fast-gradient` or `daqp`.
+        solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`.
         updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`.
         seed: Seed of the sensors' noise, and of which frames a fault hits.
         config: TOML file with further settings.

@@ -25,7 +25,6 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.declaration import Block, Role
 from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
-from coldloop.seal import sealed
 from coldloop.sequence import InputSequence
 from coldloop.writer_lease import LeaseEvent, WriterLease
 from control_plc.program import ControlProgram
@@ -81,7 +80,7 @@ class Clients:
         publication.lease = self.lease
         bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader, SequenceRow)
         bank.judged_by(self._judge_operator, Operator)
-        bank.put(sealed(Plan(0, 0)))
+        bank.put_sealed(Plan(0, 0))
         bank.judged_by(self._judge_pace, SessionPace)
 
     # -- judged before anything is stored ------------------------------------------------------------------------------
@@ -120,9 +119,9 @@ class Clients:
     def begin(self) -> None:
         """Show nothing of the session before: a session begins."""
         self._begun += 1
-        self._bank.put(sealed(self._bank.get(Update)._replace(session=0)))
-        self._bank.put(sealed(LatchedUpdate()))
-        self._bank.put(sealed(self._program.player.acknowledgement))
+        self._bank.put_sealed(self._bank.get(Update)._replace(session=0))
+        self._bank.put_sealed(LatchedUpdate())
+        self._bank.put_sealed(self._program.player.acknowledgement)
         self._bank.put(self._program.operator)
 
     @property
@@ -132,8 +131,8 @@ class Clients:
 
     def tell(self, update: Update) -> None:
         """Show a new update, and answer who waits for it."""
-        self._bank.put(sealed(update))
-        self._bank.put(sealed(LatchedUpdate(update.session, update.update, update.tick)))
+        self._bank.put_sealed(update)
+        self._bank.put_sealed(LatchedUpdate(update.session, update.update, update.tick))
         self._news.set()
         self._news = asyncio.Event()
 
@@ -214,7 +213,7 @@ class Clients:
     def _offer(self, header: SequenceHeader) -> None:
         rows = [self._bank.get(SequenceRow, row) for row in range(header.length)]
         answer = self._program.offer(InputSequence(header, rows))
-        self._bank.put(sealed(answer))
+        self._bank.put_sealed(answer)
         if answer.verdict != Verdict.ACCEPTED:
             self._publication.safety()
         self._publication.status()
@@ -228,7 +227,7 @@ class Clients:
             latched = program.player.update
             if latched is not None and not (program.awaiting_plan and latched.tick == program.tick - 1):
                 program.abandon()
-                self._bank.put(sealed(latched._replace(session=0)))  # what waits in vain is not given this one
+                self._bank.put_sealed(latched._replace(session=0))  # what waits in vain is not given this one
                 wanted = latched.update + 1
             else:
                 wanted = latched.update if latched else 0

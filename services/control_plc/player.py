@@ -162,7 +162,7 @@ class SequencePlayer:
         if self._playing is None or self.late or not self.invited or self.next_update_tick < tick:
             return False
         if self._spare is None:
-            return self.phase is UpdatePhase.PLANNED and not self._load_step
+            return self.phase is UpdatePhase.PLANNED
         return self.phase is UpdatePhase.ANSWERED
 
     @property

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from coldloop.errors import ConfigurationError
 from coldloop.journal import Journal
 from coldloop.limits import InputLimits
+from coldloop.model_file import ModelHeader
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
@@ -366,3 +367,9 @@ class ControlProgram:
         """Let an operator decide who drives, from the next scan on."""
         self.operator = operator
         self._let_play(usable=self._usable)
+
+
+def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:
+    """Return the program that the configuration asks for, at the operating point of its model file."""
+    point = OperatingPoint(header.u0, header.y0, header.short_digest)
+    return ControlProgram(limits=limits, point=point, section=section)

@@ -15,12 +15,11 @@ from typing import Final
 from coldloop import __version__
 from coldloop.config import selected
 from coldloop.errors import LinkError, PeerUnreachableError
-from coldloop.limits import InputLimits
 from coldloop.logs import dropped
 from coldloop.metrics_server import MetricsServer
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
-from coldloop.model_file import ModelHeader, read_header
+from coldloop.model_file import read_header
 from coldloop.pace import Pace
 from coldloop.process import TICK_S
 from coldloop.registers.audit import EventKind
@@ -34,14 +33,14 @@ from coldloop.telemetry import Telemetry
 from control_plc.certificate_watch import CertificateWatch
 from control_plc.clients import Clients
 from control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
-from control_plc.program import ControlProgram, OperatingPoint
+from control_plc.program import make_program
 from control_plc.publication import Publication
 from control_plc.rack_clock import PHASE, RackClock
 from control_plc.rack_finder import RackFinder
 from control_plc.retained_state import Memory
 from control_plc.scan_cycle import ScanCycle
 from control_plc.sessions import Sessions
-from control_plc.settings import SHOWN, ControlSection, ControlSettings
+from control_plc.settings import SHOWN, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
 
@@ -53,12 +52,6 @@ LONGEST_SLEEP_S: Final = 0.25
 """In real time it is seen so often whether an operator has called meanwhile."""
 KEEP_ALIVE_S: Final = 1.0
 """While paused, the rack is asked something so often."""
-
-
-def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:
-    """Return the program that the configuration asks for, at the operating point of its model file."""
-    point = OperatingPoint(header.u0, header.y0, header.short_digest)
-    return ControlProgram(limits=limits, point=point, section=section)
 
 
 class ControlPlc:

@@ -7,14 +7,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
 from coldloop.limits import InputLimits
-from coldloop.metrics_server import MetricsSettings
+from coldloop.metrics_settings import MetricsSettings
 from coldloop.modbus.settings import ServerSettings
 from coldloop.model_settings import ModelSettings
 from coldloop.process import TICK_S
 from coldloop.registers.codec import WordOrder
 from coldloop.retained import RetainSettings
 from coldloop.session import SessionSettings
-from coldloop.telemetry import TelemetrySettings
+from coldloop.telemetry_settings import TelemetrySettings
 from control_plc.alarm_settings import AlarmSettings
 from control_plc.classical import ClassicalSettings
 from control_plc.sensors import SensorCheckSettings

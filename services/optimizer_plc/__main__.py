@@ -2,9 +2,18 @@
 
 import sys
 
+from coldloop.lean_numba import load_numba_alone
 from coldloop.service import main
-from optimizer_plc.runtime import serve
-from optimizer_plc.settings import OptimizerSettings
+
+
+def start() -> int:
+    """Run the service; return its exit code."""
+    load_numba_alone()
+    from optimizer_plc.runtime import serve  # noqa: PLC0415 has numba imported
+    from optimizer_plc.settings import OptimizerSettings  # noqa: PLC0415
+
+    return main("optimizer_plc", OptimizerSettings, serve, None)
+
 
 if __name__ == "__main__":
-    sys.exit(main("optimizer_plc", OptimizerSettings, serve, None))
+    sys.exit(start())

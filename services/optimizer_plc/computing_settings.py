@@ -24,6 +24,13 @@ class EstimatorKind(StrEnum):
     STATE_FEEDBACK = "state-feedback"
 
 
+class NoiseReference(StrEnum):
+    """What the standard deviations of the sensors are of."""
+
+    MEASUREMENT = "measurement"
+    TIME = "time"
+
+
 class EstimatorSettings(BaseModel):
     """Settings of the estimator; standard deviations are per square root of a sampling period of 5 s."""
 
@@ -46,6 +53,9 @@ class EstimatorSettings(BaseModel):
     speed_sensor: PositiveFloat = 1.0
     temperature_sensor: PositiveFloat = 0.02
     pressure_sensor: PositiveFloat = 1e-3
+    noise_reference: NoiseReference = NoiseReference.MEASUREMENT
+    """Of one measurement, whatever the updating period; or of a mean over a sampling period, so that measurements which
+    follow each other sooner count for less: a model error is then not taken for more load the shorter the period is."""
     longest_riccati: Annotated[int, Field(ge=1)] = 2000
     """Longest run of the Riccati recursion for a stationary gain, in periods."""
 
@@ -146,3 +156,12 @@ class InteriorPointSettings(BaseModel):
     """Share of the box's width by which the guess is at least moved away from its bounds."""
     tau_1_s: PositiveFloat = 0.17
     """87,700 operations at 0.529 Mflop/s are 0.166 s (`docs/budget.md`)."""
+
+
+class HybridSettings(BaseModel):
+    """Settings of the choice between the interior-point method and the ODE-based solver."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    switch: Annotated[float, Field(gt=1.0)] = 2.0
+    """Cost of a guess over that of the last answer from which on the interior-point method gets the problem."""

@@ -72,14 +72,14 @@ def matrices_of(qp: QuadraticProblem) -> Matrices:
 
 
 @kernel
-def cost_by_columns(constant: Matrices, qp: QuadraticProblem, z: Array, alpha: float) -> float:
-    """Return what `augmented_cost` does, to the bit, for a problem with these matrices."""
+def cost_with_excess(constant: Matrices, qp: QuadraticProblem, z: Array, excess: Array, alpha: float) -> float:
+    """Return what `augmented_cost` does, to the bit, for a problem with these matrices, from `excess_by_columns`."""
     slope = qp.phi.copy()
     add_product(constant.Phi, z, slope)
     total = z.dtype.type(0.0)
     for i in range(z.shape[0]):
         total += slope[i] * z[i]
-    return total + alpha * positive_squares(excess_by_columns(constant, qp, z))
+    return total + alpha * positive_squares(excess)
 
 
 @kernel
@@ -95,6 +95,14 @@ def gradient(
     constant: Matrices, qp: QuadraticProblem, z: Array, alpha: float, result: Array, active: Array
 ) -> None:  # fmt: skip
     """Write dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0."""
+    gradient_with_excess(constant, qp, z, excess_by_columns(constant, qp, z), alpha, result, active)
+
+
+@kernel
+def gradient_with_excess(
+    constant: Matrices, qp: QuadraticProblem, z: Array, excess: Array, alpha: float, result: Array, active: Array
+) -> None:  # fmt: skip
+    """Write the same where Gamma z - gamma (m,) is known."""
     n = z.shape[0]
     zero, one, two = z.dtype.type(0.0), z.dtype.type(1.0), z.dtype.type(2.0)
     for i in range(n):
@@ -102,7 +110,7 @@ def gradient(
     add_product(constant.Phi, z, result)
     for i in range(n):
         result[i] = two * result[i] + qp.phi[i]
-    excess, rows = excess_by_columns(constant, qp, z), constant.rows
+    rows = constant.rows
     for r in range(excess.shape[0]):
         active[r] = zero
         if excess[r] > zero:

@@ -10,7 +10,7 @@ from coldloop.errors import ConfigurationError
 from coldloop.process import SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
 from coldloop.registers.control_plc import Update
 from optimizer_plc.arithmetic import DOUBLE, Real
-from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
+from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
 from optimizer_plc.linear_algebra import add_transposed_product, multiply, respond
 from optimizer_plc.prediction import PredictionModel, Transition
 
@@ -134,11 +134,13 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
             A = np.eye(nx + 1)
             A[:nx, :nx], A[:nx, nx] = step.A, step.F[:, 0]
             process = drift**2 * (ticks * TICK_S / SAMPLING_PERIOD_S)
-            gains.append(stationary_gain(A, C, process, sensors**2, P, settings.longest_riccati).T)
+            measured = sensors**2 * (SAMPLING_PERIOD_S / (ticks * TICK_S) if of_time else 1.0)
+            gains.append(stationary_gain(A, C, process, measured, P, settings.longest_riccati).T)
         return np.array(gains)
 
     tick = prediction.transitions[1]
-    decided_by = (tick.A, tick.F, C, drift, sensors, np.array(settings.longest_riccati))
+    of_time = settings.noise_reference is NoiseReference.TIME
+    decided_by = (tick.A, tick.F, C, drift, sensors, np.array(settings.longest_riccati), np.ones(int(of_time)))
     found = kept("kalman", b"".join(part.tobytes() for part in decided_by), computed)
     return {ticks: np.ascontiguousarray(gain) for ticks, gain in zip(prediction.transitions, found, strict=True)}
 

@@ -69,6 +69,12 @@ def ode(n: float, m: float, active: float) -> Operations:
     )  # fmt: skip
 
 
+def ode_kept(n: float, m: float, active: float) -> Operations:
+    """Return those of the same step after another one: its first velocity and the cost's Gamma z are known."""
+    known = gradient(n, m, active).plus(matrix_vector(m, n))
+    return ode(n, m, active).plus(known.times(-1))
+
+
 def qpoases(n: float, m: float, active: float) -> Operations:
     """Return those of one working-set change of a dense null-space active-set method with `active` constraints fixed.
 

@@ -20,7 +20,6 @@ from coldloop.registers.optimizer_plc import (
     Prediction,
     UpdatingRuleStatus,
 )
-from coldloop.seal import sealed
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.control_link import ControlLink
 
@@ -43,7 +42,7 @@ class Publication:
     ) -> None:
         self.bank = RegisterBank(OPTIMIZER_MAP, order)
         self.bank.put(limits)
-        self.bank.put(sealed(Prediction()))
+        self.bank.put_sealed(Prediction())
         self.bank.judged_by(self._judge, OptimizerSession)
         self.bank.judged_by(self._judge_pace, SessionPace)
         self.pace = Pace(realtime=False, factor=1.0)
@@ -108,7 +107,7 @@ class Publication:
         self.pace = pace
         self.bank.put(SessionPace.shown(session, pace))
         self.bank.put(rule)
-        self.bank.put(sealed(Prediction()))
+        self.bank.put_sealed(Prediction())
         self._shown.show()
         self._show_identity(0)
 
@@ -120,7 +119,7 @@ class Publication:
 
     def predicted(self, prediction: Prediction) -> None:
         """Show what a delivered sequence is expected to lead to."""
-        self.bank.put(sealed(prediction))
+        self.bank.put_sealed(prediction)
 
     def _show_link(self) -> None:
         self.bank.put(self.link.registers())

@@ -190,8 +190,13 @@ class OptimizerPlc:
             self._start(update.session)
         self._link.computes()
         plan = program.plan(update)
-        await self._control.plan(plan)
-        sequence = program.solve()
+        sending = asyncio.ensure_future(self._control.plan(plan))
+        try:
+            await asyncio.sleep(0)  # the plan is on its way while the sequence is computed
+            sequence = program.solve()
+            await sending
+        finally:
+            sending.cancel()
         ready = arrived_at + program.answer_after_s() / self.publication.pace.factor
         await self._finish(_Answer(update, sequence, ready, interruptible=plan.load_step > 0))
 

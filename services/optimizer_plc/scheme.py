@@ -1,4 +1,4 @@
-"""The implementation scheme with the ODE-based solver as kernels: what the program does in an ordinary update.
+"""The implementation scheme as kernels: what the program does in an ordinary update.
 
 `solve` is step (3) of the paper's section II, `plan` are steps (4), (5) and (2). They compute with what the program
 computes with, in its order, so that whoever calls them instead has the same bits. Double precision only.
@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from coldloop.compiled import kernel
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
-from optimizer_plc.costs import Matrices, OutputMaps, augmented_cost, predicted_indicators
+from optimizer_plc.costs import OutputMaps, augmented_cost, predicted_indicators
 from optimizer_plc.estimator import corrected
 from optimizer_plc.instance import Maps, instance, keep_first_rate
 from optimizer_plc.linear_algebra import respond
 from optimizer_plc.prediction import Transition
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.profile import inputs_of, shifted
-from optimizer_plc.solvers.ode import Flow, descend, warm_start
+from optimizer_plc.solvers import compiled
+from optimizer_plc.solvers.compiled import Costs, SolverConstants
 from optimizer_plc.updating_period import (
     Assessment,
     ContractionParameters,
@@ -55,6 +56,7 @@ class Rule(NamedTuple):
     """FIXED, ALGORITHM_1 or CONTRACTION."""
     fixed_ticks: int
     q_min: int
+    """That of a fixed period is q_max, too."""
     q_max: int
     delta: int
     contraction: ContractionParameters
@@ -83,7 +85,6 @@ class Constants(NamedTuple):
     """Of the Kalman filter for periods of 1, 2, ... ticks, shape (ticks, 22, n + 1)."""
     Phi: Array
     Gamma: Array
-    matrices: Matrices
     maps: Maps
     shifts: Array
     """Shape (ticks + 1, knots, knots)."""
@@ -97,10 +98,12 @@ class Constants(NamedTuple):
     rate_shares: Array
     """Share of the rate limit after 0, 1, ... ticks, shape (ticks + 1,)."""
     n_inputs: int
-    flow: Flow
+    solver: SolverConstants
     floor: float
     """Constant added to J."""
     sequence_ticks: int
+    load_step: float
+    """Change of the load that interrupts an updating period, W, or 0."""
     rule: Rule
 
 
@@ -157,18 +160,16 @@ def solve(c: Constants, m: Memory) -> int:
     s.played_w, s.played_share, s.played_ticks = s.w, c.rate_shares[ticks], ticks
     m.u_before[:] = u
     qp = problem_at(c, m.predicted, s.w, u, c.rate_shares[ticks])
-    z, cost, dt = warm_start(c.matrices, qp, shifted(c.shifts[ticks], m.z), c.flow)
-    s.hot_start = with_floor(cost, qp.constant, c.floor)
-    active = np.zeros_like(qp.gamma)
-    done, stalled, cost, dt = descend(c.matrices, qp, z, active, cost, dt, 0, s.iterations - 1, c.flow)
-    s.last_but_one = with_floor(cost, qp.constant, c.floor)
-    last, stalled, cost, dt = descend(c.matrices, qp, z, active, cost, dt, stalled, 1, c.flow)
-    s.delivered = with_floor(cost, qp.constant, c.floor)
-    s.done = done + last
-    keep_first_rate(c.maps, c.scaled_rate, u, c.rate_shares[ticks], z)
-    s.j_dev, s.j_cst, s.violation = predicted_indicators(c.predicted, qp, z, m.predicted, s.w, c.n_inputs)
-    m.answer[:] = z
-    return write_rows(c, z, ticks, m.answer_rows)
+    before = Costs(s.hot_start, s.delivered)
+    answer = compiled.solve(c.solver, qp, shifted(c.shifts[ticks], m.z), s.iterations, before)
+    s.hot_start = with_floor(answer.guessed, qp.constant, c.floor)
+    s.last_but_one = with_floor(answer.last_but_one, qp.constant, c.floor)
+    s.delivered = with_floor(answer.delivered, qp.constant, c.floor)
+    s.done = answer.slots
+    keep_first_rate(c.maps, c.scaled_rate, u, c.rate_shares[ticks], answer.z)
+    s.j_dev, s.j_cst, s.violation = predicted_indicators(c.predicted, qp, answer.z, m.predicted, s.w, c.n_inputs)
+    m.answer[:] = answer.z
+    return write_rows(c, answer.z, ticks, m.answer_rows)
 
 
 @kernel
@@ -215,12 +216,12 @@ def plan(c: Constants, m: Memory, tick: int, u_before: Array, load: float, y: Ar
     s, rule = m.numbers[0], c.rule
     estimate(c, m, u_before, load, y, x)
     qp = problem_at(c, m.x, s.w, m.u_before, s.played_share)
-    effective = with_floor(augmented_cost(qp, m.z, c.flow.alpha), qp.constant, c.floor)
+    effective = with_floor(augmented_cost(qp, m.z, c.solver.alpha), qp.constant, c.floor)
     o = Observation(s.iterations, s.ticks * TICK_S, s.effective, s.hot_start, s.last_but_one, s.delivered, effective)
     assessment = _assess(o)
-    wanted = s.iterations
+    wanted = rule.q_min
     if rule.kind == ALGORITHM_1:
-        wanted = _one_step(rule.q_min, rule.q_max, rule.delta, wanted, assessment.gamma)
+        wanted = _one_step(rule.q_min, rule.q_max, rule.delta, s.iterations, assessment.gamma)
     elif rule.kind == CONTRACTION:
         s.contraction = _recent_contraction(rule.contraction, s.contraction, s.contraction_delivered, o)
         s.contraction_delivered = s.delivered

@@ -7,20 +7,21 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from coldloop.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.limits import InputLimits
-from coldloop.metrics_server import MetricsSettings
+from coldloop.metrics_settings import MetricsSettings
 from coldloop.modbus.settings import ServerSettings
 from coldloop.model_settings import ModelSettings
 from coldloop.process import TICK_S
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.session import SessionSettings
-from coldloop.telemetry import TelemetrySettings
+from coldloop.telemetry_settings import TelemetrySettings
 from optimizer_plc.budget import MAX_PERIOD_TICKS, BudgetSettings
 from optimizer_plc.computing_settings import (
     Arithmetic,
     DaqpSettings,
     EstimatorSettings,
     FastGradientSettings,
+    HybridSettings,
     InteriorPointSettings,
     OdeSettings,
     OsqpSettings,
@@ -42,10 +43,11 @@ class SolverName(StrEnum):
     OSQP = "osqp"
     FAST_GRADIENT = "fast-gradient"
     INTERIOR_POINT = "interior-point"
+    HYBRID = "hybrid"
     DAQP = "daqp"
 
 
-SINGLE_PRECISION_SOLVERS = (SolverName.ODE, SolverName.FAST_GRADIENT, SolverName.INTERIOR_POINT)
+SINGLE_PRECISION_SOLVERS = (SolverName.ODE, SolverName.FAST_GRADIENT, SolverName.INTERIOR_POINT, SolverName.HYBRID)
 """Those that are kernels of our own."""
 
 
@@ -128,6 +130,7 @@ class ProgramSettings(BaseModel):
     osqp: OsqpSettings = OsqpSettings()
     fast_gradient: FastGradientSettings = FastGradientSettings()
     interior_point: InteriorPointSettings = InteriorPointSettings()
+    hybrid: HybridSettings = HybridSettings()
     daqp: DaqpSettings = DaqpSettings()
 
     @field_validator("updating_period_s")
@@ -152,6 +155,12 @@ class ProgramSettings(BaseModel):
     def _load_steps_are_seen(self) -> Self:
         if self.interrupting_load_step_w and not self.estimator.load_known:
             raise ValueError("interrupting_load_step_w needs a load that is measured, estimator.load_known = true")
+        return self
+
+    @model_validator(mode="after")
+    def _one_cost(self) -> Self:
+        if self.solver is SolverName.HYBRID and self.ode.alpha != self.interior_point.alpha:
+            raise ValueError("hybrid needs one cost for both of its solvers: set ode.alpha = interior_point.alpha")
         return self
 
     @model_validator(mode="after")

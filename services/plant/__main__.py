@@ -2,9 +2,18 @@
 
 import sys
 
+from coldloop.lean_numba import load_numba_alone
 from coldloop.service import main
-from plant.runtime import serve
-from plant.settings import PlantSettings
+
+
+def start() -> int:
+    """Run the service; return its exit code."""
+    load_numba_alone()
+    from plant.runtime import serve  # noqa: PLC0415 has numba imported
+    from plant.settings import PlantSettings  # noqa: PLC0415
+
+    return main("plant", PlantSettings, serve, None)
+
 
 if __name__ == "__main__":
-    sys.exit(main("plant", PlantSettings, serve, None))
+    sys.exit(start())

@@ -1,7 +1,7 @@
 """Makes the plant that a configuration asks for."""
 
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import ConfigurationError, ModelFileError
 from coldloop.model_file import COLD_BOX, ModelHeader
@@ -10,10 +10,11 @@ from plant.components.valve import Valve
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.rack import MakePlant
 from plant.refrigerator_events import EventSchedule
-from plant.refrigerator_file import SHIPPED, RefrigeratorFile, read_refrigerator_file
-from plant.refrigerator_program import RefrigeratorProgram
 from plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSettings
 from plant.station_settings import StationControlKind
+
+if TYPE_CHECKING:
+    from plant.refrigerator_file import RefrigeratorFile
 
 NO_MISMATCH: Final = MismatchSettings()
 
@@ -31,6 +32,8 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
         return partial(make_program, header, section.sensors, mismatch=section.mismatch)
     if section.mismatch != NO_MISMATCH:
         raise ConfigurationError("plant.mismatch: of a cold box alone; set plant.kind to cold-box, or leave it out")
+    from plant.refrigerator_file import SHIPPED, read_refrigerator_file  # noqa: PLC0415 a cold box starts without it
+
     path = section.refrigerator.file or SHIPPED
     file = read_refrigerator_file(path)
     if section.station.control is StationControlKind.LQ and section.station.weights != file.weights:
@@ -68,8 +71,10 @@ def _box(mismatch: MismatchSettings) -> ColdBox:
 
 
 def _make_refrigerator(
-    header: ModelHeader, section: PlantSection, file: RefrigeratorFile, load: HeatLoad, seed: int
+    header: ModelHeader, section: PlantSection, file: "RefrigeratorFile", load: HeatLoad, seed: int
 ) -> PlantProgram:
+    from plant.refrigerator_program import RefrigeratorProgram  # noqa: PLC0415
+
     happening = section.refrigerator
     return RefrigeratorProgram(
         file=file,

@@ -34,7 +34,6 @@ from coldloop.registers.plant import (
 )
 from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 from coldloop.registers.text import from_words
-from coldloop.seal import sealed
 from coldloop.session import TimeMode
 from coldloop.writer_lease import LeaseEvent, WriterLease
 from plant.faults import HEALTHY
@@ -297,7 +296,7 @@ class RackRegisters:
         if not (age or self._outdated):
             return None
         self._outdated = False
-        return sealed(self.rack.measurement(age, self.lease.refused))
+        return self.rack.measurement(age, self.lease.refused)
 
     def _identity(self) -> Identity:
         rack = self.rack
@@ -325,7 +324,7 @@ class RackRegisters:
     def _show_applied(self) -> None:
         """Put what is applied into the registers of the outputs; the seal keeps others from completing it by a part."""
         rack, outputs = self.rack, self.rack.outputs
-        self.bank.put(sealed(Actuators(rack.tick, *outputs.u, rack.session.number, outputs.holder, outputs.generation)))
+        self.bank.put_sealed(Actuators(rack.tick, *outputs.u, rack.session.number, outputs.holder, outputs.generation))
 
     def _note_lease(self, event: LeaseEvent, who: str) -> None:
         self.rack.journal.note(self.rack.tick, EventKind.LEASE, event, who=who)

@@ -7,52 +7,24 @@ real time the plant moves by the clock, half a tick away from the scans, whateve
 import asyncio
 import logging
 import time
-from functools import cache
-from pathlib import Path
 
 from coldloop import __version__
 from coldloop.clock import Pacer, Schedule
-from coldloop.errors import ColdloopError, ModelFileError
+from coldloop.errors import ColdloopError
 from coldloop.metrics_server import MetricsServer
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
-from coldloop.model_file import ModelHeader, read_header
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S
+from coldloop.process import TICK_S
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import SessionPace
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, PlantSession
 from coldloop.telemetry import Telemetry
-from plant.cold_box import REFERENCE
-from plant.helium.properties import load_helium
 from plant.kinds import plant_maker
-from plant.model import parameters_digest
-from plant.refrigerator import REFERENCE_REFRIGERATOR
-from plant.refrigerator_file import KIND, refrigerator_digest
+from plant.own_model import own_header
 from plant.registers import RackRegisters
 from plant.settings import PlantSettings
 
 log = logging.getLogger("coldloop.plant")
-
-
-def own_header(file: Path) -> ModelHeader:
-    """Return the header of a model file of this very plant: of the cold box alone, or of the refrigerator around it.
-
-    Raises:
-        ModelFileError: The file cannot be read, or the model was made from another plant.
-    """
-    header = read_header(file)
-    names = (header.state_names[: len(STATE_NAMES)], header.input_names, header.output_names)
-    own = _own_parameters_digest(header.plant)
-    if header.parameters_digest != own or names != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
-        raise ModelFileError(f"{file}: a model of another plant; make one with `coldloop model --out FILE`")
-    return header
-
-
-@cache
-def _own_parameters_digest(plant: str) -> str:
-    if plant == KIND:
-        return refrigerator_digest(REFERENCE_REFRIGERATOR, load_helium())
-    return parameters_digest(REFERENCE, load_helium())
 
 
 class PlantRuntime:

@@ -7,14 +7,14 @@ from typing import Annotated, Final
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from coldloop.endpoints import PLANT_PORT
-from coldloop.metrics_server import MetricsSettings
+from coldloop.metrics_settings import MetricsSettings
 from coldloop.modbus.settings import ServerSettings
 from coldloop.model_settings import ModelSettings
 from coldloop.process import TICK_S
 from coldloop.registers.codec import WordOrder
 from coldloop.retained import RetainSettings
 from coldloop.session import SessionSettings
-from coldloop.telemetry import TelemetrySettings
+from coldloop.telemetry_settings import TelemetrySettings
 from plant.refrigerator_events import RANGES, EventTarget, RefrigeratorEvent
 from plant.station_settings import StationSettings
 

@@ -47,6 +47,8 @@ class LatenessRecord:
 
     def percentile_s(self, share: float) -> float:
         """Return the smallest bin edge that at least `share` (0..1) of the latenesses do not exceed."""
+        if not self.count:
+            return 0.0
         wanted = share * self.count
         seen = 0
         for position, number in enumerate(self._bins[:-1]):

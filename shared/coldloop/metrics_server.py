@@ -2,32 +2,17 @@
 
 import asyncio
 import logging
-from typing import Annotated, Final
-
-from pydantic import BaseModel, ConfigDict, Field
+from typing import Final
 
 from coldloop.errors import PortInUseError
 from coldloop.metrics import CONTENT_TYPE, bank_families, exposition
+from coldloop.metrics_settings import MetricsSettings
 from coldloop.registers.bank import RegisterBank
 
 log = logging.getLogger("coldloop.metrics")
 
 LONGEST_REQUEST: Final = 4096
 PATIENCE_S: Final = 2.0
-
-
-class MetricsSettings(BaseModel):
-    """Where a service tells its registers.
-
-    Args:
-        host: Address to listen on.
-        port: TCP port; 0 is off.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    host: str = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=0xFFFF)] = 0
 
 
 class MetricsServer:

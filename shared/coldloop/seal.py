@@ -41,6 +41,12 @@ def sealed(record: S) -> S:
     return cast("S", record._replace(crc=crc))  # type: ignore[attr-defined] # a NamedTuple
 
 
+def sealed_bytes(codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
+    """Return the bytes of `sealed(record)`, which is encoded once only."""
+    raw = bytes(codec.canonical(codec.encode(record)))
+    return bytes(codec.canonical(raw[:-CRC_BYTES] + _checksum(raw).to_bytes(CRC_BYTES, "big")))  # words back in order
+
+
 def _checksum(raw: bytes | bytearray | memoryview) -> int:
     return zlib.crc32(raw[:-CRC_BYTES]) or 1
 

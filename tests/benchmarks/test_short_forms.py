@@ -1,5 +1,6 @@
 """Each benchmark that measures speed runs in a short form, and prints figures of the right order."""
 
+import json
 import re
 import subprocess
 import sys
@@ -59,3 +60,20 @@ def test_lock_step_is_a_share_of_the_bare_exchanges() -> None:
     text = printed_by("lockstep.py", "--ticks", "200")
     (ratio,) = numbers(r"ratio ([0-9.]+)", text)
     assert 0.01 < ratio < 1, text
+
+
+@pytest.mark.slow
+def test_programs_start_in_seconds() -> None:
+    text = printed_by("start.py", "--repeat", "1")
+    seconds = numbers(r"warm: ([0-9.]+) s", text)
+    assert len(seconds) == 4, text
+    assert all(0.05 < each < 60 for each in seconds), text
+
+
+@pytest.mark.slow
+def test_the_problem_for_peers_costs_less_where_every_sample_is_free() -> None:
+    told = json.loads(printed_by("peer_problem.py"))
+    assert len(told["problem"]["A"]) == 28
+    (slow, free), (fast, seven) = told["own"]["every sample"], told["own"]["seven instants"]
+    assert 0 < free < seven < 2 * free
+    assert 0 < fast < slow

@@ -9,7 +9,8 @@ import pytest
 
 from coldloop.errors import PortInUseError
 from coldloop.metrics import Family, Sample, bank_families, exposition
-from coldloop.metrics_server import MetricsServer, MetricsSettings
+from coldloop.metrics_server import MetricsServer
+from coldloop.metrics_settings import MetricsSettings
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
 

@@ -5,8 +5,8 @@ import zlib
 import pytest
 
 from coldloop.registers.codec import WordOrder, codec_of
-from coldloop.registers.plant import PLANT_MAP, Measurement
-from coldloop.seal import CRC_BYTES, Seal, seal_of
+from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
+from coldloop.seal import CRC_BYTES, Seal, seal_of, sealed, sealed_bytes
 
 MEASUREMENT = PLANT_MAP.block_of(Measurement)
 RECORD = Measurement(7, 385.0, (1.0,) * 22, (2.0,) * 28, 1)
@@ -21,3 +21,11 @@ def test_the_seal_of_a_record_with_any_nan_is_intact(bits: int) -> None:
     assert seal_of(codec, raw) is Seal.INTACT
     raw[9] ^= 1
     assert seal_of(codec, raw) is Seal.BROKEN
+
+
+@pytest.mark.parametrize("order", WordOrder)
+def test_a_record_that_is_sealed_while_it_is_encoded_is_that_which_was_sealed_before(order: WordOrder) -> None:
+    codec = codec_of(PLANT_MAP.block_of(Actuators), order)
+    record = Actuators(7, 43.5, 75.25, 36.1, 0x1234_5678, holder=0xDEAD_BEEF, crc=99)
+    assert sealed_bytes(codec, record) == codec.encode(sealed(record))
+    assert seal_of(codec, sealed_bytes(codec, record)) is Seal.INTACT

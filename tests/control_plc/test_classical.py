@@ -17,8 +17,7 @@ from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Mode, SequenceRow
 from coldloop.registers.plant import Measurement
 from control_plc.classical import CV156, NCR22, ClassicalLoops, ClassicalSettings, LevelLoop, PiController, PiSettings
-from control_plc.program import ControlProgram
-from control_plc.runtime import make_program
+from control_plc.program import ControlProgram, make_program
 from control_plc.settings import ControlSection, ControlStrategy
 from plant.kinds import make_program as make_plant
 from plant.load import find_load

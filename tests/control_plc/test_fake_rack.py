@@ -38,9 +38,9 @@ from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import LeaseState
 from coldloop.sequence import InputSequence, with_checksum
 from control_plc.plant_link import PlantLink
+from control_plc.program import make_program
 from control_plc.rack_clock import PHASE, RackClock
 from control_plc.retained_state import Memory, RetainedState
-from control_plc.runtime import make_program
 from control_plc.scan_cycle import ScanCycle
 from control_plc.settings import ControlSection
 from plant.program import LoadProfile

@@ -30,9 +30,8 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.sequence import InputSequence, with_checksum
-from control_plc.program import ControlProgram
+from control_plc.program import ControlProgram, make_program
 from control_plc.retained_state import Memory, RetainedState
-from control_plc.runtime import make_program
 from control_plc.settings import ControlSection
 
 HEADER = read_header(DEFAULT_MODEL_FILE)

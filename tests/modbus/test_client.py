@@ -148,7 +148,7 @@ async def impostor(answer: bytes | None) -> AsyncIterator[int]:
 IMPOSTORS = {
     "silence": (b"", "did not answer in time"),
     "hangs up": (None, "closed the connection"),
-    "HTTP": (b"TP/1.1 400 Bad Request\r\n\r\n", "did not answer in time"),
+    "HTTP": (b"TP/1.1 400 Bad Request\r\n\r\n", "with something else: check host and port"),
     "no identity block": (bytes.fromhex("0000 0003 01 83 02"), "something else .*no identity block"),
     "other registers": (bytes.fromhex("0000 001d 01 03 1a") + bytes(26), r"something else .*not 123.456"),
     "too few registers": (bytes.fromhex("0000 0005 01 03 02 0000"), "with something else"),
@@ -234,8 +234,9 @@ async def test_a_server_that_goes_away_is_noticed_at_once_and_found_again(serve:
 async def test_both_ends_send_small_packets_without_delay(serve: "Serve") -> None:
     async with serve() as running, client_of(running.server.port) as client:
         await client.connect(1.0)
-        transport = client._transport._client.ctx.transport  # noqa: SLF001 - pymodbus' own, through our client
-        assert transport.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        wire = client._transport._wire  # noqa: SLF001
+        assert wire is not None
+        assert wire.transport.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 
 async def test_a_value_that_fits_no_register_is_not_sent(serve: "Serve") -> None:

@@ -18,7 +18,7 @@ from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.plant import Measurement
 from coldloop.sequence import InputSequence
-from control_plc.runtime import make_program
+from control_plc.program import make_program
 from control_plc.settings import ControlSection
 from optimizer_plc.design import ControlDesign
 from optimizer_plc.prediction import PredictionModel

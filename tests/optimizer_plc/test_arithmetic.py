@@ -33,7 +33,8 @@ SINGLE = real_of(Arithmetic.FLOAT32)
 
 ON_LINE = {
     "add_product", "add_transposed_product", "augmented_cost", "cholesky", "cholesky_solve", "corrected",
-    "cost_by_columns", "decouple", "descend", "deviation_cost", "excess_by_columns", "gradient", "hold_at_bounds",
+    "cost_with_excess", "decouple", "descend", "deviation_cost", "excess_by_columns", "gradient",
+    "gradient_with_excess", "hold_at_bounds",
     "inputs_of", "instance", "largest_violation", "positive_squares", "predicted_indicators", "quadratic_cost",
     "respond", "row_excess", "shifted", "stage_matrix", "step", "velocity", "violation_cost", "warm_start",
 }  # fmt: skip

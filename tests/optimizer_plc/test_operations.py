@@ -124,9 +124,12 @@ def test_a_step_of_the_ode_solver_is_counted_right(n: int, m: int, active: int) 
     flow = ode.Flow(*(value if isinstance(value, bool) else Counted(value) for value in constants))  # type: ignore[arg-type]
     z = counted(rng.normal(size=n))
     before = [float(value) for value in z]
-    ode.step(costs.matrices_of(qp), qp, z, np.zeros(m), Counted(1e30), Counted(1e-6), flow)  # type: ignore[arg-type]
+    constant, v, pushing = costs.matrices_of(qp), counted(np.zeros(n)), np.zeros(m)
+    ode.velocity(constant, qp, z, costs.excess_by_columns(constant, qp, z), flow, v, pushing)  # type: ignore[arg-type]
+    Counted.done = 0
+    ode.step(constant, qp, z, v, pushing, np.zeros(m), Counted(1e30), Counted(1e-6), flow)  # type: ignore[arg-type]
     assert [float(value) for value in z] != before, "the step was accepted"
-    assert Counted.done == pytest.approx(operations.ode(n, m, active).flops)
+    assert Counted.done == pytest.approx(operations.ode_kept(n, m, active).flops)
 
 
 @pytest.mark.usefixtures("plain")
@@ -146,9 +149,9 @@ def test_a_step_of_the_interior_point_method_is_counted_right(
         np.diag(rng.uniform(1.0, 2.0, size=n)), rng.normal(size=n), Gamma, np.ones(m), np.full(n, -1.0),
         np.where(np.arange(n) < slacks, np.inf, 1.0), 0.0,
     )  # fmt: skip
-    _, constant = interior_point.structure_of(qp)
-    point = interior_point.begin(constant, qp.gamma, qp.low, qp.high, np.zeros(n), 1e-3, 1.0, 0.1)
-    counting = interior_point.Structure(counted(constant.hessian), counted(constant.Gamma), constant.columns)
+    constant = interior_point.structure_of(qp)
+    point = interior_point.near(constant, qp.gamma, qp.low, qp.high, np.zeros(n), 1e-3, 1.0, 0.1)
+    counting = constant._replace(hessian=counted(constant.hessian), Gamma=counted(constant.Gamma))
     vectors = counted(qp.phi), counted(qp.gamma), counted(qp.low), counted(qp.high)
     begun = interior_point.Point(*map(counted, point))
     Counted.done = 0

@@ -39,7 +39,15 @@ repeatable = settings(max_examples=15, derandomize=True)
 
 EVERY = [name.value for name in SolverName]
 EXACT = ["qpoases", "osqp", "daqp"]
-CONVERGED = {"qpoases": 500, "osqp": 20_000, "daqp": 1, "ode": 400, "fast-gradient": 15_000, "interior-point": 40}
+CONVERGED = {
+    "qpoases": 500,
+    "osqp": 20_000,
+    "daqp": 1,
+    "ode": 400,
+    "fast-gradient": 15_000,
+    "interior-point": 40,
+    "hybrid": 400,
+}
 """Iterations after which nothing is truncated any more."""
 
 
@@ -75,7 +83,9 @@ def test_the_exact_ones_end_at_the_optimum(name: str, optimum: "Optimum", seed: 
     assert z == pytest.approx(optimum(qp), abs=1e-12)
 
 
-@pytest.mark.parametrize(("name", "accuracy"), [("ode", 2e-2), ("fast-gradient", 1e-10), ("interior-point", 1e-11)])
+@pytest.mark.parametrize(
+    ("name", "accuracy"), [("ode", 2e-2), ("fast-gradient", 1e-10), ("interior-point", 1e-11), ("hybrid", 2e-2)]
+)
 @repeatable
 @given(seed=seeds)
 def test_the_penalised_ones_end_at_the_penalised_optimum(

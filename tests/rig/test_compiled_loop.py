@@ -39,13 +39,17 @@ COMPILED = {
     "rates that count elapsed time": ('limits.rate_reference="elapsed"',),
     "long sequences": (f"{PROGRAM}sequence_ticks=240",),
     "a fast PLC": (f"{PROGRAM}budget.power=10",),
-    "as printed": (f'{PROGRAM}preset="as-printed"',),
-    "as printed, elapsed time": (f'{PROGRAM}preset="as-printed"', 'limits.rate_reference="elapsed"'),
-    "soft rows": (f"{PROGRAM}penalties.output_rows=1", f"{PROGRAM}penalties.rate_rows=[1, 2, 3]"),
-    "a box penalty alone": (f"{PROGRAM}penalties.box=2",),
-    "first knot as rows": (f"{PROGRAM}penalties.first_knot_in_box=false",),
-    "no look-ahead rows": (f"{PROGRAM}ode.look_ahead_rows=false",),
-    "not held at bounds": (f"{PROGRAM}ode.hold_at_bounds=false",),
+    "interior point": (f'{PROGRAM}solver="interior-point"', f"{PROGRAM}updating_period_s=5"),
+    "interior point, cut off": (f'{PROGRAM}solver="interior-point"', f'{PROGRAM}adaptive.rule="contraction"'),
+    "hybrid": (f'{PROGRAM}solver="hybrid"', f"{PROGRAM}updating_period_s=1.5"),
+    "hybrid on a fast PLC": (f'{PROGRAM}solver="hybrid"', f"{PROGRAM}budget.power=10"),
+    "fast gradient": (f'{PROGRAM}solver="fast-gradient"',),
+    "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
+    "load steps that interrupt a rule": (
+        f'{PROGRAM}adaptive.rule="contraction"',
+        f"{PROGRAM}interrupting_load_step_w=10",
+        f'{PROGRAM}solver="hybrid"',
+    ),
     "refrigerator": (REFRIGERATOR, TRIP, *NOISE),
     "refrigerator with PI and a model of its own": (
         REFRIGERATOR,
@@ -53,17 +57,22 @@ COMPILED = {
         "model.file=refrigerator",
         f"{PROGRAM}updating_period_s=2.5",
     ),
+    "as printed": (f'{PROGRAM}preset="as-printed"',),
+    "as printed, elapsed time": (f'{PROGRAM}preset="as-printed"', 'limits.rate_reference="elapsed"'),
+    "soft rows": (f"{PROGRAM}penalties.output_rows=1", f"{PROGRAM}penalties.rate_rows=[1, 2, 3]"),
+    "a box penalty alone": (f"{PROGRAM}penalties.box=2",),
+    "first knot as rows": (f"{PROGRAM}penalties.first_knot_in_box=false",),
+    "no look-ahead rows": (f"{PROGRAM}ode.look_ahead_rows=false",),
+    "not held at bounds": (f"{PROGRAM}ode.hold_at_bounds=false",),
 }
 """Whose updates are compiled too."""
 LEFT_TO_PROGRAMS = {
     "single precision": (f'{PROGRAM}arithmetic="float32"',),
-    "fast gradient": (f'{PROGRAM}solver="fast-gradient"',),
-    "interior point": (f'{PROGRAM}solver="interior-point"', f"{PROGRAM}updating_period_s=5"),
     "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
     "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
     "qpoases": (f'{PROGRAM}solver="qpoases"',),
+    "osqp and load steps that interrupt": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}interrupting_load_step_w=10"),
     "qpoases and a refrigerator": (f'{PROGRAM}solver="qpoases"', REFRIGERATOR),
-    "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
 }
 """Whose ticks alone are compiled, where that is worth while."""
 UNUSUAL = {
@@ -71,6 +80,10 @@ UNUSUAL = {
     "sensors out of range": ("control_plc.sensors.level=[59.9,60.1]",),
     "sensors that freeze soon": ("control_plc.sensors.frozen_s=0.5",),
     "sequences that are refused": ("limits.slew_s=4",),
+    "sequences that are refused, and load steps that interrupt": (
+        "limits.slew_s=4",
+        f"{PROGRAM}interrupting_load_step_w=10",
+    ),
     "an impatient watchdog": ("control_plc.ladder.optimizer_timeout_s=2",),
     "the classical loops": ('control_plc.driver="classical"',),
 }
@@ -127,8 +140,11 @@ def done_by_the_loop(monkeypatch: pytest.MonkeyPatch, assignments: tuple[str, ..
     return ticks
 
 
-def test_nearly_all_ticks_of_an_ordinary_run_are_compiled(monkeypatch: pytest.MonkeyPatch, lively: LoadProfile) -> None:
-    assert done_by_the_loop(monkeypatch, (), lively) > 550
+@pytest.mark.parametrize("assignments", [(), COMPILED["hybrid"], COMPILED["load steps that interrupt"]])
+def test_nearly_all_ticks_of_an_ordinary_run_are_compiled(
+    monkeypatch: pytest.MonkeyPatch, assignments: tuple[str, ...], lively: LoadProfile
+) -> None:
+    assert done_by_the_loop(monkeypatch, assignments, lively) > 500
 
 
 def test_nearly_all_ticks_of_a_refrigerator_are_compiled(monkeypatch: pytest.MonkeyPatch, lively: LoadProfile) -> None:

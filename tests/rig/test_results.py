@@ -69,11 +69,10 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def test_a_run_leaves_these_files_and_no_others(folder: Path) -> None:
-    names = {"manifest.json", "summary.json", "schema.json", "run.png", "run.pdf", "inputs", *FILES}
+    names = {"manifest.json", "summary.json", "schema.json", "run.png", "inputs", *FILES}
     assert {path.name for path in folder.iterdir()} == names
     assert [path.name for path in (folder / "inputs").iterdir()] == ["model.json"]
     assert (folder / "run.png").read_bytes().startswith(b"\x89PNG")
-    assert (folder / "run.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_the_summary_has_all_indicators_and_null_for_what_does_not_exist(folder: Path, minute: Recording) -> None:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from coldloop.telemetry import Telemetry, TelemetrySettings
+from coldloop.telemetry import Telemetry
+from coldloop.telemetry_settings import TelemetrySettings
 
 if TYPE_CHECKING:
     from tests.services.conftest import Broker, Serve, ServeFrozen, Start

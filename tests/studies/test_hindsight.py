@@ -130,6 +130,18 @@ def test_a_branch_of_one_period_costs_what_the_run_with_it_costs(hour: Load, obj
         assert branch.cost == pytest.approx(run.J_open_mean, rel=0.02), "but for the last updates, cut off by the end"
 
 
+@pytest.mark.parametrize("objective", list(Objective))
+def test_a_branch_in_compiled_loops_costs_what_it_costs_in_the_programs(hour: Load, objective: Objective) -> None:
+    costs = []
+    for compiled in (True, False):
+        branch = LoopBranch(settings_of((INTERRUPT,)), scenario(hour), objective, compiled=compiled)
+        for number, until in enumerate(segment_ends(hour.profile, hour.ticks)):
+            branch = branch.fork()
+            branch.advance(number % len(PERIODS_S), until)
+        costs.append(branch.cost)
+    assert costs[0] == pytest.approx(costs[1], rel=1e-12)
+
+
 def test_forks_do_not_disturb_each_other(hour: Load) -> None:
     root = LoopBranch(settings_of(()), scenario(hour), Objective.CLOSED_LOOP)
     root.advance(0, 300)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from optimizer_plc.solvers.daqp import DaqpSolver
 from optimizer_plc.solvers.fast_gradient import FastGradientSolver
+from optimizer_plc.solvers.hybrid import HybridSolver
 from optimizer_plc.solvers.interface import Solver
 from optimizer_plc.solvers.interior_point import InteriorPointSolver
 from optimizer_plc.solvers.ode import OdeSolver
@@ -22,6 +23,12 @@ _MAKERS: "dict[str, Callable[[ProgramSettings], Solver]]" = {
     "osqp": lambda settings: OsqpSolver(settings.osqp),
     "fast-gradient": lambda settings: FastGradientSolver(settings.fast_gradient),
     "interior-point": lambda settings: InteriorPointSolver(settings.interior_point),
+    "hybrid": lambda settings: HybridSolver(
+        settings.hybrid,
+        InteriorPointSolver(settings.interior_point),
+        OdeSolver(settings.ode, settings.penalties),
+        settings.adaptive.cost_floor,
+    ),
     "daqp": lambda settings: DaqpSolver(settings.daqp),
 }
 

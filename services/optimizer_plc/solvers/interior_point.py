@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.compiled import kernel
+from optimizer_plc.arithmetic import Real
 from optimizer_plc.computing_settings import InteriorPointSettings
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.linear_algebra import cholesky, cholesky_solve
@@ -40,6 +41,8 @@ FINEST = 100.0
 class Structure(NamedTuple):
     """The constant matrices, variables in the order of elimination."""
 
+    order: Indices
+    """Which variable of the problem comes first, second, ..., shape (n,)."""
     hessian: Array
     """2 Phi, shape (n, n)."""
     Gamma: Array
@@ -61,6 +64,34 @@ class Point(NamedTuple):
     """Multipliers of the upper bounds, shape (n,); 0 where there is none."""
 
 
+class Path(NamedTuple):
+    """Constants of the method, in the floating-point type of the problem."""
+
+    alpha: float
+    softness: float
+    """Of the rows, 1 / (2 alpha)."""
+    first_mu: float
+    least_mu: float
+    margin: float
+    size: float
+    """Number of variables and rows."""
+    finest: float
+    """mu below which there is nothing left to win."""
+
+
+def path_in(settings: InteriorPointSettings, size: int, real: Real) -> Path:
+    """Return the constants as scalars of a floating-point type, for a problem of so many variables and rows."""
+    return Path(
+        alpha=real(settings.alpha),
+        softness=real(0.5 / settings.alpha),
+        first_mu=real(settings.first_mu),
+        least_mu=real(settings.least_mu),
+        margin=real(settings.margin),
+        size=real(size),
+        finest=real(FINEST * np.finfo(real).eps),
+    )
+
+
 class InteriorPointSolver:
     """Predictor and corrector, one factorisation an iteration."""
 
@@ -78,34 +109,19 @@ class InteriorPointSolver:
         self._problem = problem
         if self._matrices is None or problem.Phi is not self._matrices[0] or problem.Gamma is not self._matrices[1]:
             self._matrices = problem.Phi, problem.Gamma
-            self._order, self._structure = structure_of(problem)
-        real, order = problem.phi.dtype.type, self._order
-        self._softness = real(0.5 / self.alpha)
-        self._vectors = problem.phi[order], problem.gamma, problem.low[order], problem.high[order]
-        self._best = np.clip(guess, problem.low, problem.high)
-        self._cost = float(augmented_cost(problem, self._best, real(self.alpha)))
-        self._rows = np.zeros_like(problem.gamma)
-        share = self._settings.first_mu / (len(problem.phi) + len(problem.gamma))
-        mu = max(self._settings.least_mu, share * (self._cost + problem.constant))
-        self._point = begin(
-            self._structure, *self._vectors[1:], self._best[order],
-            self._softness, real(mu), real(self._settings.margin),
-        )  # fmt: skip
+            self._structure = structure_of(problem)
+            self._path = path_in(self._settings, len(problem.phi) + len(problem.gamma), problem.phi.dtype.type)
+        self._best = np.empty_like(problem.phi)
+        self._rows = np.empty_like(problem.gamma)
+        self._cost, self._point = begin(self._structure, problem, guess, self._path, self._best, self._rows)
 
     def iterate(self, count: int) -> int:
         """Take `count` steps, or fewer once the products are as small as rounding."""
         real = self._problem.phi.dtype.type
-        finest = real(FINEST * np.finfo(real).eps)
-        for done in range(count):
-            self._point, moved = step(self._structure, *self._vectors, self._point, self._softness, finest)
-            if not moved:
-                return done
-            z = np.empty_like(self._best)
-            z[self._order] = self._point.z
-            cost = float(augmented_cost(self._problem, z, real(self.alpha)))
-            if cost < self._cost:
-                self._cost, self._best, self._rows = cost, z, self._point.rows.copy()
-        return count
+        done, self._cost, self._point = descend(
+            self._structure, self._problem, self._path, self._point, self._best, self._rows, real(self._cost), count
+        )
+        return done
 
     @property
     def solution(self) -> Array:
@@ -122,8 +138,8 @@ class InteriorPointSolver:
         return judge(self._problem, self.solution, self.alpha, self._rows.copy())
 
 
-def structure_of(problem: QuadraticProblem) -> tuple[Indices, Structure]:
-    """Return the order of elimination (n,), which begins with the variables without upper bound, and the matrices."""
+def structure_of(problem: QuadraticProblem) -> Structure:
+    """Return the matrices in the order of elimination, which begins with the variables without upper bound."""
     order = np.argsort(np.isfinite(problem.high), kind="stable")
     Gamma = np.ascontiguousarray(problem.Gamma[:, order])
     columns = np.full(Gamma.shape, -1)
@@ -131,7 +147,7 @@ def structure_of(problem: QuadraticProblem) -> tuple[Indices, Structure]:
         found = np.flatnonzero(row)
         columns[r, : len(found)] = found
     two = problem.Phi.dtype.type(2.0)
-    return order, Structure(np.ascontiguousarray(two * problem.Phi[np.ix_(order, order)]), Gamma, columns)
+    return Structure(order, np.ascontiguousarray(two * problem.Phi[np.ix_(order, order)]), Gamma, columns)
 
 
 @kernel
@@ -158,6 +174,56 @@ def add_columns(constant: Structure, weights: Array, result: Array) -> None:
 
 @kernel
 def begin(
+    constant: Structure, qp: QuadraticProblem, guess: Array, path: Path, best: Array, rows: Array
+) -> tuple[float, Point]:
+    """Write the guess inside the box into `best` (n,) and zeros into `rows` (m,); return its cost and a point near."""
+    for i in range(best.shape[0]):
+        best[i] = min(max(guess[i], qp.low[i]), qp.high[i])
+    for r in range(rows.shape[0]):
+        rows[r] = qp.gamma.dtype.type(0.0)
+    cost = augmented_cost(qp, best, path.alpha)
+    mu = qp.phi.dtype.type(max(path.least_mu, path.first_mu / path.size * (cost + qp.constant)))
+    order = constant.order
+    return cost, near(
+        constant, qp.gamma, qp.low[order], qp.high[order], best[order], path.softness, mu, path.margin
+    )  # fmt: skip
+
+
+@kernel
+def descend(
+    constant: Structure,
+    qp: QuadraticProblem,
+    path: Path,
+    point: Point,
+    best: Array,
+    rows: Array,
+    cost: float,
+    count: int,
+) -> tuple[int, float, Point]:
+    """Take `count` steps from a point, or fewer once the products are as small as rounding.
+
+    `best` (n,), its cost and its multipliers `rows` (m,) are those of the cheapest point so far. Returns how many
+    steps were taken, the cost of `best`, and the point reached.
+    """
+    order = constant.order
+    phi, low, high = qp.phi[order], qp.low[order], qp.high[order]
+    for done in range(count):
+        point, moved = step(constant, phi, qp.gamma, low, high, point, path.softness, path.finest)
+        if not moved:
+            return done, cost, point
+        z = np.empty_like(best)
+        for i in range(z.shape[0]):
+            z[order[i]] = point.z[i]
+        reached = augmented_cost(qp, z, path.alpha)
+        if reached < cost:
+            cost = reached
+            best[:] = z
+            rows[:] = point.rows
+    return count, cost, point
+
+
+@kernel
+def near(
     constant: Structure, gamma: Array, low: Array, high: Array, guess: Array, softness: float, mu: float, margin: float
 ) -> Point:  # fmt: skip
     """Return a point near the guess: inside the box, and on each row on the central path for mu."""

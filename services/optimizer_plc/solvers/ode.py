@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from coldloop.compiled import kernel
 from optimizer_plc.arithmetic import Real
 from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.costs import Matrices, cost_by_columns, gradient, matrices_of
+from optimizer_plc.costs import Matrices, cost_with_excess, excess_by_columns, gradient_with_excess, matrices_of
 from optimizer_plc.linear_algebra import cholesky, cholesky_solve
 from optimizer_plc.penalties import DEFAULT_PENALTIES, PenaltySettings
 from optimizer_plc.problem import QuadraticProblem
@@ -116,10 +116,13 @@ class OdeSolver:
 
 @kernel
 def velocity(
-    constant: Matrices, qp: QuadraticProblem, z: Array, flow: Flow, result: Array, active: Array
+    constant: Matrices, qp: QuadraticProblem, z: Array, excess: Array, flow: Flow, result: Array, active: Array
 ) -> None:  # fmt: skip
-    """Write dz/dt = -cost_scale dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0."""
-    gradient(constant, qp, z, flow.alpha, result, active)
+    """Write dz/dt = -cost_scale dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0.
+
+    `excess` (m,) is Gamma z - gamma.
+    """
+    gradient_with_excess(constant, qp, z, excess, flow.alpha, result, active)
     if flow.box > z.dtype.type(0.0):
         add_box_gradient(qp, z, flow.box, result)
     for i in range(z.shape[0]):
@@ -164,23 +167,24 @@ def warm_start(constant: Matrices, qp: QuadraticProblem, guess: Array, flow: Flo
     for i in range(z.shape[0]):
         z[i] = min(max(guess[i], qp.low[i]), qp.high[i])
     v = np.empty_like(z)
-    velocity(constant, qp, z, flow, v, np.empty_like(qp.gamma))
+    excess = excess_by_columns(constant, qp, z)
+    velocity(constant, qp, z, excess, flow, v, np.empty_like(qp.gamma))
     total = z.dtype.type(0.0)
     for i in range(v.shape[0]):
         total += v[i] * v[i]
     speed = max(math.sqrt(total), z.dtype.type(1e-12))
-    return z, cost_by_columns(constant, qp, z, flow.alpha), math.sqrt(z.dtype.type(1.0) / speed)
+    return z, cost_with_excess(constant, qp, z, excess, flow.alpha), math.sqrt(z.dtype.type(1.0) / speed)
 
 
 @kernel
 def stage_matrix(constant: Matrices, qp: QuadraticProblem, in_matrix: Array, dt: float, flow: Flow) -> Array:
     """Return I + (gamma / 2) dt Hess(cost_scale J), upper triangle, with the rows that are 1.0 in `in_matrix` (m,)."""
     n = qp.phi.shape[0]
-    M = np.empty((n, n), qp.phi.dtype)
+    M = np.zeros((n, n), qp.phi.dtype)
     zero, one = M.dtype.type(0.0), M.dtype.type(1.0)
     weight = M.dtype.type(D) * dt * flow.cost_scale * M.dtype.type(2.0)
     for i in range(n):
-        for j in range(i, n):
+        for j in range(np.uint64(i), constant.Phi.end[i]):
             M[i, j] = weight * qp.Phi[i, j]
         M[i, i] += one
     for r in range(qp.Gamma.shape[0]):
@@ -213,10 +217,12 @@ def descend(
     size.
     """
     stationarity = z.dtype.type(STATIONARITY)
+    v, active = np.empty_like(z), np.empty_like(qp.gamma)
+    velocity(constant, qp, z, excess_by_columns(constant, qp, z), flow, v, active)
     for done in range(count):
         if stalled == STALLED_STEPS:
             return done, stalled, cost, dt
-        dt, reached = step(constant, qp, z, look_ahead_rows, cost, dt, flow)
+        dt, reached = step(constant, qp, z, v, active, look_ahead_rows, cost, dt, flow)
         stalled = stalled + 1 if cost - reached <= stationarity * abs(cost) else 0
         cost = reached
     return count, stalled, cost, dt
@@ -224,46 +230,60 @@ def descend(
 
 @kernel
 def step(
-    constant: Matrices, qp: QuadraticProblem, z: Array, look_ahead_rows: Array, cost: float, dt: float, flow: Flow
+    constant: Matrices,
+    qp: QuadraticProblem,
+    z: Array,
+    v: Array,
+    active: Array,
+    look_ahead_rows: Array,
+    cost: float,
+    dt: float,
+    flow: Flow,
 ) -> tuple[float, float]:
     """Move z by one TR-BDF2 step of size dt, or not at all; return the next step size and the cost at z.
 
-    The matrix has the rows that are active at z or in `look_ahead_rows` (m,): those that were active at the middle
-    stage of the step before, which is overwritten by those of this one.
+    `v` (n,) and `active` (m,) are `velocity` at z, before and after. The matrix has the rows that are active at z or in
+    `look_ahead_rows` (m,): those that were active at the middle stage of the step before, which is overwritten by those
+    of this one.
     """
     n, real = z.shape[0], z.dtype.type
-    v0, vg, v1 = np.empty_like(z), np.empty_like(z), np.empty_like(z)
-    active = np.empty_like(qp.gamma)
-    velocity(constant, qp, z, flow, v0, active)
+    v0, vg, v1 = v.copy(), np.empty_like(z), np.empty_like(z)
+    in_matrix, active_ahead = active.copy(), np.empty_like(active)
     if flow.look_ahead_rows:
         for r in range(active.shape[0]):
-            active[r] = max(look_ahead_rows[r], active[r])
+            in_matrix[r] = max(look_ahead_rows[r], active[r])
     held = hold_at_bounds(qp, z, v0) if flow.hold_at_bounds else np.zeros_like(z)
-    M = stage_matrix(constant, qp, active, dt, flow)
+    M = stage_matrix(constant, qp, in_matrix, dt, flow)
     decouple(M, held)
     skyline = cholesky(M)
     change = real(G) * dt * v0
     cholesky_solve(M, skyline, change)
     zg = z + change
-    velocity(constant, qp, zg, flow, vg, look_ahead_rows)
+    velocity(constant, qp, zg, excess_by_columns(constant, qp, zg), flow, vg, look_ahead_rows)
     for i in range(n):
         vg[i] *= real(1.0) - held[i]
     change = real(C1) * zg - real(C0) * z - zg + real(D) * dt * vg
     cholesky_solve(M, skyline, change)
     candidate = zg + change
-    velocity(constant, qp, candidate, flow, v1, active)
+    excess = excess_by_columns(constant, qp, candidate)
+    velocity(constant, qp, candidate, excess, flow, v1, active_ahead)
+    error, inside = real(0.0), True
     for i in range(n):
-        v1[i] *= real(1.0) - held[i]
-    error = real(0.0)
-    for i in range(n):
-        curvature = v0[i] / real(G) - vg[i] / real(G * (1.0 - G)) + v1[i] / real(1.0 - G)
+        curvature = v0[i] / real(G) - vg[i] / real(G * (1.0 - G)) + v1[i] * (real(1.0) - held[i]) / real(1.0 - G)
         local = real(2.0 * ERROR_CONSTANT) * dt * curvature
         error = max(error, abs(local))
-        candidate[i] = min(max(candidate[i], qp.low[i]), qp.high[i])
-    reached = cost_by_columns(constant, qp, candidate, flow.alpha)
+        bounded = min(max(candidate[i], qp.low[i]), qp.high[i])
+        inside = inside and bounded == candidate[i]
+        candidate[i] = bounded
+    if not inside:
+        excess = excess_by_columns(constant, qp, candidate)
+        velocity(constant, qp, candidate, excess, flow, v1, active_ahead)
+    reached = cost_with_excess(constant, qp, candidate, excess, flow.alpha)
     if not reached <= cost:
         return dt * flow.rejection, cost
     for i in range(n):
-        z[i] = candidate[i]
+        z[i], v[i] = candidate[i], v1[i]
+    for r in range(active.shape[0]):
+        active[r] = active_ahead[r]
     wanted = (flow.tolerance / max(error, real(1e-12))) ** real(1.0 / 3.0)
     return min(dt * min(flow.growth, max(flow.rejection, wanted)), flow.longest), reached

@@ -9,7 +9,6 @@ from typing import Any, Final, Self, TypeVar, cast
 from coldloop.endpoints import Endpoint
 from coldloop.errors import DamagedAnswerError, PeerUnreachableError, RequestRefusedError, UntrustedPeerError
 from coldloop.modbus.peer_check import check_peer
-from coldloop.modbus.raw_pdu import RawPdu
 from coldloop.modbus.requests import (
     MAX_READ_WORDS,
     MAX_WRITE_WORDS,
@@ -18,19 +17,21 @@ from coldloop.modbus.requests import (
     WRITE_MULTIPLE_REGISTERS,
 )
 from coldloop.modbus.settings import TlsSettings
-from coldloop.modbus.transport import NoAnswerError, Transport
+from coldloop.modbus.transport import REQUESTS_AT_ONCE, NoAnswerError, Transport
 from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
-from coldloop.seal import Seal, seal_of, sealed
+from coldloop.seal import Seal, seal_of, sealed_bytes
 
 R = TypeVar("R", bound=tuple[Any, ...])
 S = TypeVar("S", bound=tuple[Any, ...])
 
 CONNECT_PAUSE_S: Final = 0.1
-_READ: Final = struct.Struct(">HH")
-_WRITE: Final = struct.Struct(">HHB")
-_READ_WRITE: Final = struct.Struct(">HHHHB")
+_READ: Final = struct.Struct(">BHH")
+_WRITE: Final = struct.Struct(">BHHB")
+_READ_WRITE: Final = struct.Struct(">BHHHHB")
+_WRITTEN: Final = slice(1, _READ.size)
+"""What the answer to a write repeats of it behind the function code: address and count."""
 _EXCEPTIONS: Final = {
     1: "no such function, or not for the role of this client",
     2: "no such register, or read-only",
@@ -121,7 +122,7 @@ class RegisterClient:
         while True:
             try:
                 block, codec = self._places[Identity]
-                raw = await self._read_words(block, block.address, codec.size // 2)
+                (raw,) = await self._read_words(block, [(block.address, codec.size // 2)])
             except UntrustedPeerError:
                 raise
             except PeerUnreachableError:
@@ -141,17 +142,27 @@ class RegisterClient:
         return (await self.read_rows(record, 0, 1))[0]
 
     async def read_rows(self, record: type[R], start: int, count: int) -> list[R]:
-        """Return `count` rows from row `start` on; rows that need several requests are read in several."""
+        """Return `count` rows from row `start` on.
+
+        Rows that need several requests are read in several, which are sent together, up to `REQUESTS_AT_ONCE`.
+        """
         block, codec = self._places[record]
         row_words = codec.size // 2
         rows_at_once = MAX_READ_WORDS // row_words
+        end = start + count
+        parts = [(first, min(rows_at_once, end - first)) for first in range(start, end, rows_at_once)]
         rows: list[R] = []
-        for first in range(start, start + count, rows_at_once):
-            here = min(rows_at_once, start + count - first)
-            raw = await self._read_words(block, block.address + first * row_words, here * row_words)
-            for row in range(here if block.sealed else 0):
-                self._check_seal(block, codec, raw, row * codec.size)
-            rows += [cast("R", codec.decode(raw, row * codec.size)) for row in range(here)]
+        for place in range(0, len(parts), REQUESTS_AT_ONCE):
+            words = [
+                (block.address + first * row_words, here * row_words)
+                for first, here in parts[place : place + REQUESTS_AT_ONCE]
+            ]
+            for raw in await self._read_words(block, words):
+                places = range(0, len(raw), codec.size)
+                if block.sealed:
+                    for offset in places:
+                        self._check_seal(block, codec, raw, offset)
+                rows += [cast("R", codec.decode(raw, offset)) for offset in places]
         return rows
 
     async def write(self, record: tuple[Any, ...]) -> None:
@@ -167,9 +178,10 @@ class RegisterClient:
         rows_at_once = MAX_WRITE_WORDS // row_words
         for first in range(0, len(records), rows_at_once):
             data = b"".join([_encoded(block, codec, record) for record in records[first : first + rows_at_once]])
-            head = _WRITE.pack(block.address + (start + first) * row_words, len(data) // 2, len(data))
-            answer = await self._transact(RawPdu(WRITE_MULTIPLE_REGISTERS, head + data), block)
-            if answer != head[: _READ.size]:
+            address = block.address + (start + first) * row_words
+            head = _WRITE.pack(WRITE_MULTIPLE_REGISTERS, address, len(data) // 2, len(data))
+            answer = await self._transact(head + data, block)
+            if answer != head[_WRITTEN]:
                 raise self._nonsense(block)
 
     async def exchange(
@@ -191,12 +203,13 @@ class RegisterClient:
         block, codec = self._places[type(record)]
         answer_block, answer_codec = self._places[answer]
         data = _encoded(block, codec, record) + b"".join([self._places[type(row)][1].encode(row) for row in rows])
-        head = _READ_WRITE.pack(answer_block.address, answer_codec.size // 2, block.address, len(data) // 2, len(data))
-        raw = await self._transact(RawPdu(READ_WRITE_REGISTERS, head + data), block, patience_s)
-        words = self._checked(raw, answer_codec.size, answer_block)
+        head = _READ_WRITE.pack(
+            READ_WRITE_REGISTERS, answer_block.address, answer_codec.size // 2, block.address, len(data) // 2, len(data)
+        )
+        words = self._checked(await self._transact(head + data, block, patience_s), answer_codec.size, answer_block)
         if answer_block.sealed:
-            self._check_seal(answer_block, answer_codec, words, 1)
-        return cast("R", answer_codec.decode(words, 1))
+            self._check_seal(answer_block, answer_codec, words, 0)
+        return cast("R", answer_codec.decode(words))
 
     async def query(self, record: tuple[Any, ...], answer: type[R], rows: type[S], count: int) -> tuple[R, list[S]]:
         """Write `record`, then read `answer` and the first `count` rows of the block that adjoins it, in one request.
@@ -208,42 +221,56 @@ class RegisterClient:
         row_codec = self._places[rows][1]
         size = codec.size + count * row_codec.size
         data = _encoded(written, own_codec, record)
-        head = _READ_WRITE.pack(block.address, size // 2, written.address, len(data) // 2, len(data))
-        raw = self._checked(await self._transact(RawPdu(READ_WRITE_REGISTERS, head + data), written), size, block)
-        places = range(1 + codec.size, 1 + size, row_codec.size)
-        return cast("R", codec.decode(raw, 1)), [cast("S", row_codec.decode(raw, place)) for place in places]
+        head = _READ_WRITE.pack(
+            READ_WRITE_REGISTERS, block.address, size // 2, written.address, len(data) // 2, len(data)
+        )
+        raw = self._checked(await self._transact(head + data, written), size, block)
+        places = range(codec.size, size, row_codec.size)
+        return cast("R", codec.decode(raw)), [cast("S", row_codec.decode(raw, place)) for place in places]
 
     def close(self) -> None:
         """Close the connection."""
         self._transport.close()
 
-    async def _read_words(self, block: Block, address: int, count: int) -> bytes:
-        raw = await self._transact(RawPdu(READ_HOLDING_REGISTERS, _READ.pack(address, count)), block)
-        return self._checked(raw, 2 * count, block)[1:]
+    async def _read_words(self, block: Block, parts: Sequence[tuple[int, int]]) -> list[bytes]:
+        """Return the words of parts of a block, each given by its address and the number of words."""
+        requests = [_READ.pack(READ_HOLDING_REGISTERS, address, count) for address, count in parts]
+        answers = await self._transact_all(requests, block)
+        return [self._checked(raw, 2 * count, block) for raw, (_, count) in zip(answers, parts, strict=True)]
 
     def _checked(self, raw: bytes, size: int, block: Block) -> bytes:
+        """Return the words of an answer to a read."""
         if len(raw) != size + 1 or raw[0] != size:
             raise self._nonsense(block)
-        return raw
+        return raw[1:]
 
     def _check_seal(self, block: Block, codec: RecordCodec, raw: bytes, offset: int) -> None:
         if seal_of(codec, raw, offset) is not Seal.INTACT:
             raise DamagedAnswerError(f"{self.peer}: block '{block.name}' arrived damaged, or is not sealed there")
 
-    async def _transact(self, request: RawPdu, block: Block, patience_s: float | None = None) -> bytes:
-        """Send a request, connecting first where needed; return the bytes behind the answer's function code."""
+    async def _transact(self, request: bytes, block: Block, patience_s: float | None = None) -> bytes:
+        """Send a PDU; return the bytes behind the answer's function code."""
+        return (await self._transact_all([request], block, patience_s))[0]
+
+    async def _transact_all(
+        self, requests: Sequence[bytes], block: Block, patience_s: float | None = None
+    ) -> list[bytes]:
+        """Send PDUs, connecting first where needed; return the bytes behind the function codes of the answers."""
         async with self._turn:
             if not self._transport.connected:
                 await self._transport.open()
             try:
-                response = await self._transport.transact(request, patience_s or self._timeout_s)
+                answers = await self._transport.transact(requests, patience_s or self._timeout_s)
             except NoAnswerError as error:
                 raise self._silent(block, closed=error.closed) from error
-        if not isinstance(response, RawPdu) or response.function_code & 0x7F != request.function_code:
+        return [self._payload(request, answer, block) for request, answer in zip(requests, answers, strict=True)]
+
+    def _payload(self, request: bytes, answer: bytes, block: Block) -> bytes:
+        if answer[0] == request[0]:
+            return answer[1:]
+        if answer[0] & 0x7F != request[0]:
             raise self._nonsense(block)
-        if response.function_code != request.function_code:
-            raise self._refused(request.function_code, block, response.payload)
-        return response.payload
+        raise self._refused(request[0], block, answer[1:])
 
     def _silent(self, block: Block, *, closed: bool) -> PeerUnreachableError:
         what = "closed the connection" if closed else "did not answer in time"
@@ -272,4 +299,4 @@ def _secured(tls: TlsSettings, name: str) -> ssl.SSLContext:
 
 
 def _encoded(block: Block, codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
-    return codec.encode(sealed(record) if block.sealed else record)
+    return sealed_bytes(codec, record) if block.sealed else codec.encode(record)

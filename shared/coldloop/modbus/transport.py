@@ -1,37 +1,29 @@
-"""What Coldloop needs of pymodbus' client: connection, transaction ids, framing and time-outs, for PDUs of bytes.
+"""A client's connection to one server: requests out, answers in, several at a time.
 
-This is the one module that knows pymodbus' client, and the only one that uses its insides: those in `INSIDES`, which
-may move with every minor version.
+A server tells by the transaction id which request an answer is for, so a client need not wait for one answer before it
+sends the next request (Modbus Messaging on TCP/IP V1.0b, section 4.4.1.3; 1 to 16 transactions at a time are usual).
+Frames are made and taken apart by pymodbus; its own client has one request under way at a time.
 """
 
 import asyncio
-import logging
 import ssl
-from functools import cached_property, partial
-from typing import Any, Final, cast
+from collections.abc import Sequence
+from typing import Final, cast
 
-from pymodbus.client import AsyncModbusTcpClient
-from pymodbus.exceptions import ConnectionException, ModbusException
+from pymodbus.framer import FramerSocket
+from pymodbus.pdu import DecodePDU
 
 from coldloop.errors import PeerUnreachableError, UntrustedPeerError
-from coldloop.modbus.raw_pdu import RawDecoder, RawPdu
 
-BUFFER_BYTES: Final = 4096
-"""pymodbus throws away what is received when more than two frames' length of it has come, stale answers included."""
-
-INSIDES: Final = {
-    "comm_params": "time-out of a single request: a server may let one wait for longer than others",
-    "framer": "its decoder, as ours takes any response as bytes",
-    "max_buffer_size": "what may be received before pymodbus throws it away",
-    "response_future": "ended when the peer closes: pymodbus only notices by the time-out",
-    "call_create": "makes a TLS connection: pymodbus' own TLS client takes each TLS record for a whole answer",
-    "handle_new_connection": "the protocol for that connection",
-    "transport": "aborted when a TLS connection is closed",
-}
-"""Attributes of pymodbus' transaction manager (`client.ctx`) that are used, and what for."""
-
-# pymodbus logs each failure besides reporting it; here every one becomes an error of Coldloop's that says more.
-logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+UNIT: Final = 1
+REQUESTS_AT_ONCE: Final = 16
+"""Requests that may be under way."""
+NONSENSE: Final = b"\0"
+"""What stands for an answer that is not Modbus: it answers no function."""
+_FRAMER: Final = FramerSocket(DecodePDU(is_server=False))
+_PROTOCOL: Final = slice(2, 4)
+"""Where a frame says which protocol it is of: 0 is Modbus."""
+_LARGEST_FRAME: Final = 260
 
 
 class NoAnswerError(Exception):
@@ -61,6 +53,7 @@ class Transport:
         self._port = port
         self._timeout_s = timeout_s
         self._tls = tls
+        self._wire: _Wire | None = None
 
     @property
     def peer(self) -> str:
@@ -70,7 +63,7 @@ class Transport:
     @property
     def connected(self) -> bool:
         """Whether there is a connection."""
-        return bool(self._client.connected)
+        return self._wire is not None and not self._wire.transport.is_closing()
 
     async def open(self) -> None:
         """Connect.
@@ -79,75 +72,109 @@ class Transport:
             PeerUnreachableError: Nobody listens, or not with TLS.
             UntrustedPeerError: The certificate of the peer does not hold.
         """
-        self._client.ctx.comm_params.timeout_connect = self._timeout_s
-        connected = await self._client.connect()
-        _raise_lost_cancellation()
-        if not connected:
-            raise PeerUnreachableError(f"nobody listens as {self.peer}: start it, or check host and port")
-
-    async def transact(self, request: RawPdu, timeout_s: float) -> object:
-        """Send a request, and return the answer's PDU; whatever goes wrong closes the connection.
-
-        Raises:
-            NoAnswerError: The peer is silent for `timeout_s`, or has closed the connection.
-        """
-        client = self._client
-        client.ctx.comm_params.timeout_connect = timeout_s
+        loop = asyncio.get_running_loop()
         try:
-            response = await client.execute(False, request)  # noqa: FBT003 - pymodbus takes it by position only
-        except (ModbusException, RuntimeError) as error:  # uvloop's, when the transport has just been closed
-            client.close()  # a late answer must not meet a later request
-            raise NoAnswerError(closed=isinstance(error, ConnectionException | RuntimeError)) from error
-        except asyncio.CancelledError:
-            client.close()
-            raise
-        _raise_lost_cancellation()
-        return response
-
-    def close(self) -> None:
-        """Close the connection."""
-        transport = cast("asyncio.WriteTransport | None", self._client.ctx.transport)
-        self._client.close()
-        if transport is not None and self._tls is not None:
-            transport.abort()  # the farewell of TLS takes a round trip, and may outlast the event loop
-
-    @cached_property
-    def _client(self) -> AsyncModbusTcpClient:
-        client = AsyncModbusTcpClient(
-            self._host,
-            port=self._port,
-            name=self._service,
-            timeout=self._timeout_s,
-            retries=0,
-            reconnect_delay=0,
-            trace_connect=self._connection_changed,
-        )
-        client.ctx.framer.decoder = RawDecoder(is_server=False)
-        client.ctx.max_buffer_size = BUFFER_BYTES
-        if self._tls is not None:
-            client.ctx.call_create = partial(self._create_secured, client, self._tls)
-        return client
-
-    async def _create_secured(self, client: AsyncModbusTcpClient, tls: ssl.SSLContext) -> Any:  # noqa: ANN401 - pymodbus' signature
-        try:
-            return await asyncio.get_running_loop().create_connection(
-                client.ctx.handle_new_connection, self._host, self._port, ssl=tls
-            )
+            async with asyncio.timeout(self._timeout_s):
+                _, self._wire = await loop.create_connection(_Wire, self._host, self._port, ssl=self._tls)
         except ssl.SSLCertVerificationError as error:
             raise UntrustedPeerError(
                 f"{self.peer} cannot be trusted: {error.verify_message}: check the host name, and tls.ca here"
             ) from None
-        except (ssl.SSLError, ConnectionResetError, ConnectionAbortedError):
-            raise PeerUnreachableError(f"{self.peer} does not speak TLS 1.3: check server.tls there") from None
+        except OSError as error:
+            if self._tls is not None and isinstance(
+                error, ssl.SSLError | ConnectionResetError | ConnectionAbortedError
+            ):
+                raise PeerUnreachableError(f"{self.peer} does not speak TLS 1.3: check server.tls there") from None
+            raise PeerUnreachableError(f"nobody listens as {self.peer}: start it, or check host and port") from None
 
-    def _connection_changed(self, connected: bool) -> None:  # noqa: FBT001 - pymodbus' signature
-        answer = self._client.ctx.response_future
-        if not connected and not answer.done():
-            answer.set_exception(ConnectionException("closed by the peer"))
+    async def transact(self, requests: Sequence[bytes], timeout_s: float) -> list[bytes]:
+        """Send up to `REQUESTS_AT_ONCE` PDUs, and return the answers' PDUs; whatever goes wrong closes the connection.
+
+        One call at a time.
+
+        Raises:
+            NoAnswerError: The peer is silent for `timeout_s`, or has closed the connection.
+        """
+        if self._wire is None:
+            raise NoAnswerError(closed=True)
+        answers = self._wire.send(requests)
+        timer = asyncio.get_running_loop().call_later(timeout_s, self._wire.give_up)
+        try:
+            return await answers
+        except (NoAnswerError, asyncio.CancelledError):
+            self.close()  # a late answer must not meet a later request
+            raise
+        finally:
+            timer.cancel()
+
+    def close(self) -> None:
+        """Close the connection."""
+        wire, self._wire = self._wire, None
+        if wire is None:
+            return
+        if self._tls is None:
+            wire.transport.close()
+        else:
+            wire.transport.abort()  # the farewell of TLS takes a round trip, and may outlast the event loop
 
 
-def _raise_lost_cancellation() -> None:
-    """Raise the cancellation that `asyncio.wait_for` loses before Python 3.12 when it meets what is waited for."""
-    task = asyncio.current_task()
-    if task is not None and task.cancelling():
-        raise asyncio.CancelledError
+class _Wire(asyncio.Protocol):
+    """The frames of one connection."""
+
+    def __init__(self) -> None:
+        self.transport: asyncio.Transport
+        self._buffer = bytearray()
+        self._last_id = 0
+        self._awaited: dict[int, int] = {}
+        """By transaction id: which of the requests is not answered yet."""
+        self._answers: list[bytes] = []
+        self._done: asyncio.Future[list[bytes]] | None = None
+
+    def send(self, requests: Sequence[bytes]) -> asyncio.Future[list[bytes]]:
+        """Send PDUs; return their answers when all are there."""
+        frames = []
+        self._awaited.clear()
+        self._answers = [b""] * len(requests)
+        for place, pdu in enumerate(requests):
+            self._last_id = transaction = self._last_id + 1 & 0xFFFF
+            self._awaited[transaction] = place
+            frames.append(_FRAMER.encode(pdu, UNIT, transaction))
+        self._done = done = asyncio.get_running_loop().create_future()
+        if self.transport.is_closing():  # uvloop raises RuntimeError when it is written to
+            self._fail(closed=True)
+        else:
+            self.transport.write(b"".join(frames))
+        return done
+
+    def give_up(self) -> None:
+        """Wait no longer."""
+        self._fail(closed=False)
+
+    def _fail(self, *, closed: bool) -> None:
+        if self._done is not None and not self._done.done():
+            self._done.set_exception(NoAnswerError(closed=closed))
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take the transport (event loop callback)."""
+        self.transport = cast("asyncio.Transport", transport)
+
+    def data_received(self, data: bytes) -> None:
+        """Take the answers that are whole by now (event loop callback)."""
+        self._buffer += data
+        size, unit, transaction, pdu = _FRAMER.decode(bytes(self._buffer))
+        while size and pdu:
+            del self._buffer[:size]
+            place = self._awaited.pop(transaction, None) if unit == UNIT else None
+            if place is not None:  # else it is an answer that nobody waits for any more, or a second one
+                self._answers[place] = pdu
+            size, unit, transaction, pdu = _FRAMER.decode(bytes(self._buffer))
+        if size or any(self._buffer[_PROTOCOL]) or len(self._buffer) > _LARGEST_FRAME:  # no beginning of a frame
+            self.transport.abort()
+            self._answers = [NONSENSE] * len(self._answers)
+            self._awaited.clear()
+        if not self._awaited and self._done is not None and not self._done.done():
+            self._done.set_result(self._answers)
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - why it was lost changes nothing
+        """Tell who waits for an answer (event loop callback)."""
+        self._fail(closed=True)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 from coldloop.registers.codec import RecordCodec, ValueCodec, WordOrder, codec_of
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, Role, fields_of
-from coldloop.seal import Seal, seal_of, sealed
+from coldloop.seal import Seal, seal_of, sealed_bytes
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -97,7 +97,7 @@ class RegisterBank:
         self._checks: list[tuple[int, Kind, Field, str]] = []
         self._spans: dict[tuple[int, int], _Span] = {}
         self._judges: dict[type[tuple[Any, ...]], Judge] = {}
-        self._live: list[tuple[int, int, Callable[[], tuple[Any, ...] | None]]] = []
+        self._live: list[tuple[int, int, Callable[[], tuple[Any, ...] | None], Callable[[tuple[Any, ...]], None]]] = []
         for block in register_map.blocks:
             self._declare(block)
         self._check_addresses = [address for address, *_ in self._checks]
@@ -108,7 +108,7 @@ class RegisterBank:
         if block.writer is not None:
             self._writable[block.address : block.end] = b"\1" * size
         if block.sealed and block.writer is None:  # no seal is damage to those who read, also before there is anything
-            self.put(sealed(codec_of(block, self.order).decode(bytes(2 * size))))
+            self.put_sealed(codec_of(block, self.order).decode(bytes(2 * size)))
         fields = {name: _with_stored_bounds(field) for name, field in fields_of(block.record).items()}
         for row in range(block.rows):
             for register in block.registers(row):
@@ -130,6 +130,12 @@ class RegisterBank:
         start = 2 * block.address + row * codec.size
         self._memory[start : start + codec.size] = codec.encode(record)
 
+    def put_sealed(self, record: tuple[Any, ...]) -> None:
+        """Store the row of a sealed block, with its seal."""
+        block, codec = self._places[type(record)]
+        start = 2 * block.address
+        self._memory[start : start + codec.size] = sealed_bytes(codec, record)
+
     def judged_by(self, judge: Judge, *records: type[tuple[Any, ...]]) -> None:
         """Let `judge` have a say in what clients write to the blocks of these records."""
         for record in records:
@@ -137,9 +143,12 @@ class RegisterBank:
         self._spans.clear()
 
     def keep_fresh(self, record: type[tuple[Any, ...]], present: Callable[[], tuple[Any, ...] | None]) -> None:
-        """Store `present()` whenever a client reads from the block that holds `record`; None leaves it as it is."""
+        """Store `present()`, sealed where the block is, whenever a client reads from the block that holds `record`.
+
+        None leaves it as it is.
+        """
         block, _ = self._places[record]
-        self._live.append((block.address, block.end, present))
+        self._live.append((block.address, block.end, present, self.put_sealed if block.sealed else self.put))
 
     def check_readable(self, address: int, count: int) -> None:
         """Check that `count` words from `address` on may be read: all up to the end of the map, gaps included.
@@ -160,11 +169,11 @@ class RegisterBank:
         """
         self.check_readable(address, count)
         end = address + count
-        for start, behind, present in self._live:
+        for start, behind, present, store in self._live:
             if address < behind and start < end:
                 record = present()
                 if record is not None:
-                    self.put(record)
+                    store(record)
         return bytes(self._memory[2 * address : 2 * end])
 
     def write(self, address: int, data: bytes, caller: Caller = ANYBODY) -> list[Block]:

@@ -1,0 +1,43 @@
+"""Configuration of telemetry, checked when it is made and immutable after."""
+
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+
+
+class TelemetrySettings(BaseModel):
+    """Where to publish to."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    broker: str = ""
+    """Host of the broker; empty is off."""
+    port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    username: str = ""
+    """Name at the broker; empty is a broker that asks for none."""
+    password_file: Path | None = None
+    """File that holds the password for it, on one line. It is read at each connection; without TLS it is sent as it
+    is, so this is for a network of its own."""
+    prefix: Annotated[str, Field(pattern=r"^[^#+]+$")] = "coldloop"
+    period_s: PositiveFloat = 1.0
+    """Real time between snapshots."""
+    queue: Annotated[int, Field(ge=1)] = 100
+    """Snapshots kept while the broker is away; the oldest go first."""
+    timeout_s: PositiveFloat = 5.0
+
+    @model_validator(mode="after")
+    def _password_belongs_to_a_name(self) -> Self:
+        if self.password_file and not self.username:
+            raise ValueError("a password needs a name: set telemetry.username")
+        return self
+
+    def password(self) -> str | None:
+        """Return the password; None is none.
+
+        Raises:
+            OSError: The file cannot be read.
+        """
+        if self.password_file is None:
+            return None
+        return self.password_file.read_text(encoding="utf-8").rstrip("\r\n")
