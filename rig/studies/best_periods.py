@@ -82,7 +82,7 @@ def _row(table: Series, periods: Sequence[float]) -> tuple[Cell, ...]:
 
 
 def period_figure(timed: Mapping[Variant, PeriodCosts], periods: Sequence[float]) -> Figure:
-    """Draw the first draw of each hour in % of its worst period, both presets and the paper's points."""
+    """Draw the first draw of each hour over its best period, both presets and the paper's points."""
     colours = {Preset.TUNED: INK, Preset.AS_PRINTED: ACCENT}
     presets = {setting: costs for setting, costs in timed.items() if not setting.change}
     names = [load.name for load in next(iter(presets.values())) if load.draw == 1]
@@ -91,15 +91,16 @@ def period_figure(timed: Mapping[Variant, PeriodCosts], periods: Sequence[float]
         for name, place in zip(names, axes, strict=False):
             for setting, costs in presets.items():
                 of_hour = next(of_load for load, of_load in costs.items() if load.name == name)["J_open_mean"]
-                place.plot(periods, 100.0 * of_hour / of_hour.max(), color=colours[setting.preset], marker=".",
+                place.plot(periods, of_hour / of_hour.min(), color=colours[setting.preset], marker=".",
                            label=setting.label)  # fmt: skip
             theirs = published.updating_period().get(name)
             if theirs:
-                paper(place, theirs["tau_u_s"], theirs["cost_fixed_pct"], THIRD, "paper")
+                fixed = theirs["cost_fixed_pct"]
+                paper(place, theirs["tau_u_s"], fixed / fixed.min(), THIRD, "paper")
             place.set_title(f"({name})", loc="left")
-            place.set_ylabel("cost (% of the worst)")
+            place.set_ylabel("cost over that of the best (1)")
             place.set_yscale("log")
-            place.set_yticks([2, 5, 10, 20, 50, 100], ["2", "5", "10", "20", "50", "100"])
+            place.set_yticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
             place.minorticks_off()
         legend_outside(figure, axes[0])
         for place in axes[-2:]:

@@ -58,6 +58,7 @@ COMPILED = {
         f"{PROGRAM}updating_period_s=2.5",
     ),
     "as printed": (f'{PROGRAM}preset="as-printed"',),
+    "as printed, interior point": (f'{PROGRAM}preset="as-printed"', f'{PROGRAM}solver="interior-point"'),
     "as printed, elapsed time": (f'{PROGRAM}preset="as-printed"', 'limits.rate_reference="elapsed"'),
     "soft rows": (f"{PROGRAM}penalties.output_rows=1", f"{PROGRAM}penalties.rate_rows=[1, 2, 3]"),
     "a box penalty alone": (f"{PROGRAM}penalties.box=2",),
