@@ -2,8 +2,10 @@
 
 Each exchange carries what plant and control PLC tell each other in a tick: 51 numbers one way and 4 the other. Neither
 side computes anything, so a framework's figure is its upper limit; Coldloop's lock-step (`lockstep.py`, of the same
-run) has plant, control PLC and solver in it. The problem (`peer_problem.py`) is stated in do-mpc, with every sample of
-the horizon a decision, and solved by IPOPT; Coldloop solves the same one, and that of the paper's seven instants.
+run) has plant, control PLC and solver in it. Coldloop and mosaik act in turn, the one on what the other has just told;
+so does HELICS, and again with both sides at once, which hides one of the two ways but is another coupling. The problem
+(`peer_problem.py`) is stated in do-mpc, with every sample of the horizon a decision, and solved by IPOPT; Coldloop
+solves the same one, and that of the paper's seven instants.
 
 Needs the packages of `peers.txt`, in an environment of their own: `python -m venv peers && peers/bin/pip install -r
 peers.txt && peers/bin/python peers.py`.
@@ -28,38 +30,48 @@ CORES: Final = ("tcp", "zmq", "ipc")
 # -- HELICS ------------------------------------------------------------------------------------------------------------
 
 
-def helics_federate(core: str, name: str, other: str, numbers: int, exchanges: int) -> float:
-    """Exchange vectors once a second of simulated time; return exchanges a second of real time."""
+def helics_federate(core: str, name: str, other: str, numbers: int, exchanges: int, *, in_turn: bool) -> float:
+    """Exchange vectors once a second of simulated time; return exchanges a second of real time.
+
+    In turn, the plant has the halves of seconds: each side sees what the other made of its last vector, as a controller
+    and a plant do, and Coldloop's control PLC and rack. Otherwise both tell and hear at the same time.
+    """
     import helics as h  # noqa: PLC0415 in its own environment
 
     info = h.helicsCreateFederateInfo()
     h.helicsFederateInfoSetCoreTypeFromString(info, core)
     h.helicsFederateInfoSetCoreInitString(info, "--federates=1")
-    h.helicsFederateInfoSetTimeProperty(info, h.HELICS_PROPERTY_TIME_DELTA, 1.0)
+    h.helicsFederateInfoSetTimeProperty(info, h.HELICS_PROPERTY_TIME_DELTA, 0.5 if in_turn else 1.0)
     federate = h.helicsCreateValueFederate(name, info)
     output = h.helicsFederateRegisterGlobalPublication(federate, name, h.HELICS_DATA_TYPE_VECTOR, "")
     received = h.helicsFederateRegisterSubscription(federate, other, "")
     h.helicsFederateEnterExecutingMode(federate)
+    is_first = in_turn and name == "plant"
     start = time.perf_counter()
     for tick in range(1, exchanges + 1):
-        h.helicsPublicationPublishVector(output, [float(tick)] * numbers)
-        h.helicsFederateRequestTime(federate, float(tick))
-        if h.helicsInputGetVector(received) != [float(tick)] * (PLANT_NUMBERS + CONTROL_NUMBERS - numbers):
+        if not in_turn:
+            h.helicsPublicationPublishVector(output, [float(tick)] * numbers)
+        h.helicsFederateRequestTime(federate, tick - 0.5 if is_first else float(tick))
+        heard, expected = h.helicsInputGetVector(received), tick - 1 if is_first else tick
+        if expected and heard != [float(expected)] * (PLANT_NUMBERS + CONTROL_NUMBERS - numbers):
             raise RuntimeError("what the other side has sent for this tick did not arrive")
+        if in_turn:
+            h.helicsPublicationPublishVector(output, [float(tick)] * numbers)
     elapsed = time.perf_counter() - start
     h.helicsFederateDisconnect(federate)
     h.helicsFederateFree(federate)
     return exchanges / elapsed
 
 
-def helics_exchanges(core: str, exchanges: int) -> float:
+def helics_exchanges(core: str, exchanges: int, *, in_turn: bool) -> float:
     """Return exchanges a second between two processes and a broker."""
     import helics as h  # noqa: PLC0415
 
     broker = h.helicsCreateBroker(core, "", "-f 2")
     command = [sys.executable, __file__, "--helics-control", core, "--exchanges", str(exchanges)]
+    command += ["--in-turn"] if in_turn else []
     with subprocess.Popen(command) as control:
-        rate = helics_federate(core, "plant", "control", PLANT_NUMBERS, exchanges)
+        rate = helics_federate(core, "plant", "control", PLANT_NUMBERS, exchanges, in_turn=in_turn)
         control.wait(60)
     h.helicsBrokerWaitForDisconnect(broker, 10_000)
     h.helicsCloseLibrary()
@@ -191,11 +203,14 @@ def main() -> None:
     parser.add_argument("--exchanges", type=int, default=3000)
     parser.add_argument("--coldloop", type=Path, default=OWN_PYTHON, help="an interpreter that has Coldloop")
     parser.add_argument("--helics-control", choices=CORES, help=argparse.SUPPRESS)
+    parser.add_argument("--in-turn", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--mosaik-side", type=int, help=argparse.SUPPRESS)
     parser.add_argument("address", nargs="?", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.helics_control:
-        helics_federate(options.helics_control, "control", "plant", CONTROL_NUMBERS, options.exchanges)
+        helics_federate(
+            options.helics_control, "control", "plant", CONTROL_NUMBERS, options.exchanges, in_turn=options.in_turn
+        )
         return
     if options.mosaik_side:
         import mosaik_api_v3  # noqa: PLC0415
@@ -210,7 +225,11 @@ def main() -> None:
         )
         compare_problem(options.coldloop, repeat=5)
     peers: dict[str, Callable[[], float]] = {"mosaik": lambda: mosaik_exchanges(options.exchanges)}
-    peers |= {f"HELICS {core}": lambda core=core: helics_exchanges(core, options.exchanges) for core in CORES}
+    peers |= {
+        f"HELICS {core}, {'in turn' if in_turn else 'both at once'}":
+            lambda core=core, in_turn=in_turn: helics_exchanges(core, options.exchanges, in_turn=in_turn)
+        for core in CORES for in_turn in (True, False)
+    }  # fmt: skip
     for name, measure in peers.items():
         print(f"{name}: {measure():.0f} exchanges/s", flush=True)
 
