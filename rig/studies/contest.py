@@ -14,8 +14,11 @@ from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult
 from rig.studies.updating_period import ADAPTIVE, INTERRUPT, RULE, TUNING_DRAWS, Policy
 
 SOLVERS: Final = {
-    "ODE": (), "interior point": (f"{PROGRAM}solver=interior-point",), "hybrid": (f"{PROGRAM}solver=hybrid",),
-}  # fmt: skip
+    "ODE": (),
+    "ODE as printed": (f"{PROGRAM}preset=as-printed",),
+    "interior point": (f"{PROGRAM}solver=interior-point",),
+    "hybrid": (f"{PROGRAM}solver=hybrid",),
+}
 WAYS: Final = (
     Policy("Algorithm 1", ADAPTIVE),
     Policy("Algorithm 1, interrupt", ADAPTIVE, (INTERRUPT,)),
@@ -104,7 +107,7 @@ def _table(title: str, ratios: Mapping[tuple[str, str], Ratio], hours: int) -> s
 def _figure(ratios: Mapping[tuple[str, str], Ratio], cost: str) -> Figure:
     with panels(1, 1, (8.0, 4.0)) as (figure, (place,)):
         for number, (solver, colour) in enumerate(zip(SOLVERS, COLOURS, strict=False)):
-            rows = np.arange(len(WAYS)) + 0.2 * (number - 1)
+            rows = np.arange(len(WAYS)) + 0.2 * (number - 0.5 * (len(SOLVERS) - 1))
             means = [ratios[solver, way.label][0] for way in WAYS]
             place.plot([one.value for one in means], rows, "o", markersize=4, color=colour, label=solver)
             place.hlines(rows, [one.low for one in means], [one.high for one in means], color=colour, linewidth=1.0)
@@ -113,5 +116,5 @@ def _figure(ratios: Mapping[tuple[str, str], Ratio], cost: str) -> Figure:
         place.invert_yaxis()
         place.set_xscale("log")
         place.set_xlabel(f"{cost} over that of {' under '.join(REFERENCE)} (1)")
-        legend_outside(figure, place, 3)
+        legend_outside(figure, place, len(SOLVERS))
     return figure

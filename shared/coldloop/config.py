@@ -9,6 +9,7 @@ import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -92,9 +93,21 @@ def load_configuration(
     for section in set(others) - set(model.model_fields):
         layers.values.pop(section, None)
     try:
-        return Configuration(model.model_validate(layers.values), layers.sources)
+        settings = model.model_validate(layers.values)
     except ValidationError as error:
         raise ConfigurationError(_explained(error, layers.sources)) from None
+    for key, value in flattened(settings.model_dump()).items():
+        if not _is_finite(value):
+            raise ConfigurationError(f"{_where(key, layers.sources)}: input should be finite (got {value!r})")
+    return Configuration(settings, layers.sources)
+
+
+def _is_finite(value: object) -> bool:
+    if isinstance(value, Mapping):
+        return all(map(_is_finite, value.values()))
+    if isinstance(value, list | tuple):
+        return all(map(_is_finite, value))
+    return not isinstance(value, float) or isfinite(value)
 
 
 Entry = tuple[str, object, str]
@@ -175,10 +188,14 @@ def selected(settings: BaseModel, keys: Iterable[str]) -> dict[str, Any]:
 
 def _explained(error: ValidationError, sources: Mapping[str, str]) -> str:
     first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"])
-    source = next((s for k, s in sources.items() if k == key or k.startswith(f"{key}.") or key.startswith(f"{k}.")), "")
-    where = f"{source}: {key}" if source and not source.endswith(key) else source or key or "configuration"
+    where = _where(".".join(str(part) for part in first["loc"]), sources)
     if first["type"] == "extra_forbidden":
         return f"{where}: no such key; `coldloop config` lists the keys"
     message = first["msg"].removeprefix("Value error, ")
     return f"{where}: {message[0].lower()}{message[1:]} (got {first['input']!r})"
+
+
+def _where(key: str, sources: Mapping[str, str]) -> str:
+    """Name a key and the source of its value, or of a part of it, or of what it is a part of."""
+    source = next((s for k, s in sources.items() if k == key or k.startswith(f"{key}.") or key.startswith(f"{k}.")), "")
+    return f"{source}: {key}" if source and not source.endswith(key) else source or key or "configuration"

@@ -75,6 +75,20 @@ def refused(
     return message
 
 
+# -- numbers that are none ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", ["inf", "-inf", "Infinity", "1e999"])
+def test_an_infinite_number_is_refused_wherever_it_comes_from(value: str, write: Write) -> None:
+    key = "bounds.high" if value != "-inf" else "bounds.low"
+    assert refused(assignments=(f"{key}={value}",)).startswith(f"--set {key}: input should be finite (got ")
+    section, name = key.split(".")
+    variable = f"COLDLOOP__{section.upper()}__{name.upper()}"
+    assert refused(environment={variable: value}).startswith(f"{variable}: {key}: input should be finite (got ")
+    file = write(f"[{section}]\n{name} = {value if value != 'Infinity' else 'inf'}\n")
+    assert refused(file).startswith(f"{file}: {key}: input should be finite (got ")
+
+
 # -- precedence and provenance ----------------------------------------------------------------------------------------
 
 
