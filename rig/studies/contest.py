@@ -18,6 +18,7 @@ SOLVERS: Final = {
     "ODE as printed": (f"{PROGRAM}preset=as-printed",),
     "interior point": (f"{PROGRAM}solver=interior-point",),
     "hybrid": (f"{PROGRAM}solver=hybrid",),
+    "hybrid as printed": (f"{PROGRAM}solver=hybrid", f"{PROGRAM}preset=as-printed"),
 }
 WAYS: Final = (
     Policy("Algorithm 1", ADAPTIVE),
@@ -107,7 +108,7 @@ def _table(title: str, ratios: Mapping[tuple[str, str], Ratio], hours: int) -> s
 def _figure(ratios: Mapping[tuple[str, str], Ratio], cost: str) -> Figure:
     with panels(1, 1, (8.0, 4.0)) as (figure, (place,)):
         for number, (solver, colour) in enumerate(zip(SOLVERS, COLOURS, strict=False)):
-            rows = np.arange(len(WAYS)) + 0.2 * (number - 0.5 * (len(SOLVERS) - 1))
+            rows = np.arange(len(WAYS)) + 0.16 * (number - 0.5 * (len(SOLVERS) - 1))
             means = [ratios[solver, way.label][0] for way in WAYS]
             place.plot([one.value for one in means], rows, "o", markersize=4, color=colour, label=solver)
             place.hlines(rows, [one.low for one in means], [one.high for one in means], color=colour, linewidth=1.0)

@@ -193,7 +193,7 @@ def test_equal_plc_times_hold_these_iterations() -> None:
     # 0.34, 0.68, 1.02 and 1.36 s over 0.25, 0.475, 0.05, 0.03, 0.17 and 4.75 s
     assert counts == {
         "ode": (1, 2, 4, 5), "qpoases": (0, 1, 2, 2), "osqp": (6, 13, 20, 27), "fast-gradient": (11, 22, 34, 45),
-        "interior-point": (2, 4, 6, 8), "daqp": (0, 0, 0, 0),
+        "interior-point": (2, 4, 6, 8), "hybrid": (1, 2, 4, 5), "daqp": (0, 0, 0, 0),
     }  # fmt: skip
     assert QpoasesSettings().tau_1_s == 0.475
 
