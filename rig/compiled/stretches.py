@@ -111,4 +111,4 @@ class CompiledStretches:
         control.give_back_scan(self._control, s, self._trace)
         ticks = int(s["tick"]) - int(s["first"])
         load, u, y, x, station = (part[:ticks].copy() for part in self._trace)
-        return SampleBlock(int(s["first"]), load, u, y, x, station if self._plant.station else NO_STATION)
+        return SampleBlock(int(s["first"]), load, u, y, x, station if station.size else NO_STATION)

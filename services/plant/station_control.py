@@ -50,15 +50,6 @@ class StationControl:
         self.mode = StationMode.AUTOMATIC
         self.alarms = StationAlarm(0)
 
-    def retained(self) -> list[float]:
-        """Return what `resume` needs."""
-        return [float(integral) for integral in self.integrals]
-
-    def resume(self, retained: list[float]) -> None:
-        """Go on from what `retained` returned (ValueError if it is of something else)."""
-        hp, lp, nitrogen = retained
-        self.integrals = np.array([hp, lp, nitrogen], dtype=np.float64)
-
     def step(self, measured: StationMeasurement) -> Commands:
         """Return the openings for the tick that begins."""
         self.alarms = StationAlarm(raised_alarms(self.law.alarms, measured))
