@@ -27,14 +27,12 @@ def numbers(pattern: str, text: str) -> list[float]:
     return [float(found.replace(",", "")) for found in re.findall(pattern, text, re.MULTILINE)]
 
 
-@pytest.mark.slow
 def test_an_ode_iteration_costs_some_cholesky_factorisations() -> None:
     text = printed_by("ode_iteration.py", "--problems", "20", "--minutes", "2", "--repeat", "1")
     (ratio,) = numbers(r"ratio ([0-9.]+)", text)
     assert 0.3 < ratio < 30, text
 
 
-@pytest.mark.slow
 def test_a_run_takes_a_multiple_of_the_sum_of_its_kernels() -> None:
     text = printed_by("limits.py", "--ticks", "2400", "--repeat", "1", "--calls", "300")
     ratios = numbers(r"([0-9.]+) times the sum", text)
@@ -43,7 +41,6 @@ def test_a_run_takes_a_multiple_of_the_sum_of_its_kernels() -> None:
     assert all(speed > 50 for speed in numbers(r": ([0-9,]+) times real time", text)), text
 
 
-@pytest.mark.slow
 def test_all_solvers_take_part_in_the_comparison() -> None:
     text = printed_by("qp_solvers.py", "--hours", "e", "--minutes", "5", "--iterations", "5")
     for name in ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "hybrid", "daqp"):
@@ -54,20 +51,17 @@ def test_all_solvers_take_part_in_the_comparison() -> None:
         assert (f"without {name}" in text or f", {name}" in text) == (find_spec(module) is None)
 
 
-@pytest.mark.slow
 def test_one_process_and_three_leave_one_trace_in_the_speed_benchmark() -> None:
     text = printed_by("run_speed.py", "--load", "a", "--duration", "20s", "--repeat", "1")
     assert text.count("one trace: True") == 2, text
 
 
-@pytest.mark.slow
 def test_lock_step_is_a_share_of_the_bare_exchanges() -> None:
     text = printed_by("lockstep.py", "--ticks", "200")
     (ratio,) = numbers(r"ratio ([0-9.]+)", text)
     assert 0.01 < ratio < 1, text
 
 
-@pytest.mark.slow
 def test_programs_start_in_seconds() -> None:
     text = printed_by("start.py", "--repeat", "1")
     seconds = numbers(r"warm: ([0-9.]+) s", text)
@@ -75,7 +69,6 @@ def test_programs_start_in_seconds() -> None:
     assert all(0.05 < each < 60 for each in seconds), text
 
 
-@pytest.mark.slow
 def test_the_problem_for_peers_costs_less_where_every_sample_is_free() -> None:
     told = json.loads(printed_by("peer_problem.py"))
     assert len(told["problem"]["A"]) == 28

@@ -181,7 +181,6 @@ end_logs("the end")
 """
 
 
-@pytest.mark.slow
 def test_a_program_whose_lines_nobody_reads_goes_on_and_ends() -> None:
     with subprocess.Popen([sys.executable, "-c", PROGRAM], stderr=subprocess.PIPE, text=True) as process:
         assert process.wait(timeout=20) == 0

@@ -248,7 +248,6 @@ def test_whatever_the_sensors_tell_bounds_and_rates_are_kept(
             assert abs(value - window[i]) <= limits.rate[i]
 
 
-@pytest.mark.slow
 def test_the_loops_hold_the_plant_by_themselves_on_load_a() -> None:
     load = find_load("a", HEADER.w0)
     plant = make_plant(HEADER, SensorSettings(), load, seed=1)

@@ -147,7 +147,6 @@ async def test_a_new_session_of_an_operator_is_no_loss_of_the_plant() -> None:
         assert alarm(plc, AlarmKind.PLANT_LOST) is AlarmState.NORMAL
 
 
-@pytest.mark.slow
 async def test_autostart_leaves_a_session_to_the_operator_who_is_about_to_ask_for_it() -> None:
     """He writes to the rack first, and then to the control PLC."""
     rack = SmallRack(1)
@@ -160,7 +159,6 @@ async def test_autostart_leaves_a_session_to_the_operator_who_is_about_to_ask_fo
         assert plc.sessions.running
 
 
-@pytest.mark.slow
 async def test_no_number_of_a_start_or_of_an_event_is_given_out_twice(tmp_path: Path) -> None:
     """Whether scans are made or not: here there is no rack."""
     given: list[tuple[int, int]] = []

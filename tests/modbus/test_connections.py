@@ -112,7 +112,6 @@ async def test_half_a_request_does_not_keep_a_connection(serve: "Serve") -> None
         assert await wire.closed() == b""
 
 
-@pytest.mark.slow
 async def test_a_client_that_does_not_read_costs_bounded_memory_and_is_dropped(serve: "Serve") -> None:
     async with serve(idle_timeout_s=1.0) as running:
         greedy, other = await running.connect(), await running.connect()

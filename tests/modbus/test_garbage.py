@@ -5,14 +5,12 @@ import struct
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Running, Serve
 
-pytestmark = pytest.mark.slow
 
 READ_MAGIC = bytes.fromhex("03 0000 0002")
 FUNCTIONS = [1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 43]

@@ -85,7 +85,6 @@ async def test_of_64_kilobytes_of_requests_a_few_are_answered_in_each_turn_and_a
     assert longest_s < TURN_S + 3 * STEP_S
 
 
-@pytest.mark.slow
 async def test_requests_of_two_hundred_clients_in_one_turn_take_its_time_and_no_more(
     plug: "Plug", clock: Clock
 ) -> None:

@@ -148,7 +148,6 @@ def bank_with(register_map: RegisterMap, block: Block, before: str, row: int) ->
     return bank
 
 
-@pytest.mark.slow
 @each_command
 @settings(max_examples=100, deadline=None)
 @given(data=st.data(), before=st.sampled_from(BEFORE))

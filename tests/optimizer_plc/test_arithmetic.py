@@ -85,7 +85,6 @@ def update_twice(program: OptimizerProgram, model: LtiModel) -> None:
         program.report(Verdict.NONE)
 
 
-@pytest.mark.slow
 def test_no_kernel_computes_with_a_double_in_single_precision(model: LtiModel) -> None:
     for kind in EstimatorKind:
         update_twice(single_program(model, kind), model)

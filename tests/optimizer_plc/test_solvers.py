@@ -271,7 +271,6 @@ def test_a_problem_without_solution_leaves_the_guess_and_the_next_one_is_solved(
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.slow
 def test_no_solver_prints() -> None:
     program = (
         "import numpy as np\n"
@@ -302,7 +301,6 @@ def test_without_casadi_qpoases_says_what_to_do(monkeypatch: pytest.MonkeyPatch)
     assert all(part in message for part in ("optimizer_plc.program.solver", "CasADi", "coldloop[qpoases]"))
 
 
-@pytest.mark.slow
 def test_casadi_is_not_imported_unless_it_is_needed() -> None:
     program = (
         "import sys\n"
@@ -340,7 +338,6 @@ def test_without_momentum_a_step_never_raises_the_cost(harsh_jumps: "list[Jump]"
         assert solver.cost <= before
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "make",
     [

@@ -25,7 +25,6 @@ def send(plant: PlantRuntime) -> None:
     plant.on_write(PLANT_MAP.block_of(Actuators), ANYBODY)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("clock_error_ppm", [-50_000.0, 0.0, 50_000.0])
 async def test_the_clock_is_as_fast_as_is_configured(clock_error_ppm: float) -> None:
     plant = runtime("realtime", clock_error_ppm=clock_error_ppm)

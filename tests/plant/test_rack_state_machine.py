@@ -4,7 +4,6 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -202,7 +201,6 @@ class RackMachine(RuleBasedStateMachine):
             assert any(lease.who)
 
 
-@pytest.mark.slow
 def test_nobody_moves_the_outputs_who_does_not_know_what_is_applied(switch_on: "type[RackOnTheBus]") -> None:
     run_state_machine_as_test(
         lambda: RackMachine(switch_on), settings=settings(max_examples=40, stateful_step_count=40, deadline=None)

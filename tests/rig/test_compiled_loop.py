@@ -118,7 +118,6 @@ def left_by(assignments: tuple[str, ...], load: LoadProfile, ticks: int, *, comp
     return Left(recording.trace_sha256, recording.updates, events)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", [*COMPILED, *LEFT_TO_PROGRAMS, *UNUSUAL])
 def test_the_compiled_loop_leaves_what_the_programs_leave(name: str, lively: LoadProfile) -> None:
     assignments = (COMPILED | LEFT_TO_PROGRAMS | UNUSUAL)[name]

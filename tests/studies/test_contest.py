@@ -50,7 +50,6 @@ def test_the_reference_is_among_the_ways() -> None:
     assert REFERENCE[1] in {way.label for way in WAYS}
 
 
-@pytest.mark.slow
 def test_the_study_is_conducted(running: Workers, tmp_path: Path) -> None:
     options = StudyOptions(ticks=240, loads=("e",), seeds=1)
     result = conduct(STUDY, options, running, tmp_path)

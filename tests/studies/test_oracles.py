@@ -86,7 +86,6 @@ def test_robustness_compares_under_the_same_condition() -> None:
         assert row["Algorithm 1"][:3] == pytest.approx((4.0, 2.0, 8.0))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("study", [OraclesStudy(), RobustnessStudy()])
 def test_the_whole_study_of_half_a_minute_has_a_row_for_each_run(
     study: OraclesStudy | RobustnessStudy, running: Workers, tmp_path: Path

@@ -88,7 +88,6 @@ def test_hours_that_rules_were_tuned_on_are_not_fresh() -> None:
     }
 
 
-@pytest.mark.slow
 def test_the_whole_study_of_half_a_minute_has_a_row_for_each_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
