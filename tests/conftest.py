@@ -38,7 +38,7 @@ USES: Final = {
 }
 """The mark of a test that requests, itself or through other fixtures, one of these."""
 
-SHARED: Final = ("site", "served", "rack", "three_processes", "up", "client")
+SHARED: Final = ("site", "served", "rack", "three_processes", "up", "client", "_engine")
 """Fixtures that start processes for many tests: these tests run in one worker, which starts them once."""
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # whoever started the tests ignores it; what they start must not
