@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from pydantic import BaseModel
 
@@ -23,6 +23,14 @@ def environment(settings: BaseModel | None = None, more: Mapping[str, str] | Non
     """Return the variables for a process: no configuration from outside, that of `settings`, and `more`."""
     outside = {name: value for name, value in os.environ.items() if not name.startswith(PREFIX)}
     return {**outside, **(to_environment(settings) if settings else {}), **(more or {})}
+
+
+class Ended(NamedTuple):
+    """What a program left behind that has ended."""
+
+    code: int
+    out: str
+    err: str
 
 
 class Process:
@@ -61,6 +69,11 @@ class Process:
         for pipe in (self.popen.stdout, self.popen.stderr):
             if pipe is not None:
                 pipe.close()
+
+    def ended(self, within_s: float = END_S) -> Ended:
+        """Wait until it ends; return its exit code and what it has written to its pipes."""
+        out, err = self.popen.communicate(timeout=within_s)
+        return Ended(self.popen.returncode, out or "", err or "")
 
     def interrupt(self, number: signal.Signals = signal.SIGINT, within_s: float = END_S) -> int:
         """Send a signal; return the exit code."""
