@@ -50,7 +50,7 @@ def assert_incomplete_but_readable(folder: Path, reason: str) -> int:
 
 SOON_ON_DISK = """
 import sys, rig.file_sinks
-rig.file_sinks.GROUP_TICKS = 512
+rig.file_sinks.GROUP_TICKS = rig.file_sinks.HELD_BACK_TICKS = 512
 from rig.__main__ import main
 sys.exit(main())
 """
