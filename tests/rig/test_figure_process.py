@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from tests.rig.conftest import Coldloop
 
 
+pytestmark = pytest.mark.usefixtures("processes")
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two seconds without a figure."""

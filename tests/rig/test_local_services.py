@@ -14,6 +14,7 @@ async def unreachable() -> None:
     raise PeerUnreachableError("nobody answers")
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_service_that_ended_is_named_even_when_the_work_fails_with_it(tmp_path: Path) -> None:
     """The end and its consequence may be known in the same turn of the event loop."""
 

@@ -53,6 +53,12 @@ def until(coldloop: Coldloop, base: str, row: str, part: str) -> str:
     return text
 
 
+def until_plant_time_passes(coldloop: Coldloop, base: str) -> None:
+    before, deadline = shown(coldloop, base)["session"], time.monotonic() + PATIENCE_S
+    while shown(coldloop, base)["session"] == before:
+        assert time.monotonic() < deadline, "plant time stands still"
+
+
 def test_status_shows_session_mode_load_outputs_and_alarms(coldloop: Coldloop, up: str) -> None:
     rows = shown(coldloop, up)
     assert set(rows) == {"session", "mode", "operator", "load", "L1", "T5", "tau_u", "alarms"}
@@ -105,7 +111,7 @@ def test_what_cannot_be_done_is_one_line(coldloop: Coldloop, up: str, words: tup
 @pytest.mark.parametrize("mode", list(OperatorMode))
 def test_a_setpoint_beyond_the_bounds_is_refused_by_the_control_plc_itself(up: str, mode: OperatorMode) -> None:
     async def write() -> None:
-        control = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=int(up) + 1, timeout_s=10.0)
+        control = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=int(up) + 1, timeout_s=PATIENCE_S)
         before = await control.read(Operator)
         with pytest.raises(RequestRefusedError) as refusal:
             await control.write(Operator(mode, 80.0, before.ncr22, before.cv156))
@@ -149,9 +155,7 @@ def test_a_rig_that_was_attached_to_runs_on_in_real_time(coldloop: Coldloop, up:
     outcome = coldloop(*run, tmp_path / "run")
     assert outcome.code == 0, outcome.complaints
     until(coldloop, up, "session", f"{FACTOR} x real time")
-    before, deadline = shown(coldloop, up)["session"], time.monotonic() + PATIENCE_S
-    while shown(coldloop, up)["session"] == before:
-        assert time.monotonic() < deadline, "plant time goes on"
+    until_plant_time_passes(coldloop, up)
 
 
 def attach(up: str) -> tuple[str, ...]:
@@ -199,5 +203,6 @@ def test_ctrl_c_gives_an_attached_rig_back_too(
 ) -> None:
     run = processes.coldloop(*attach(up), "--load", "e", "--duration", "100h", "--out", tmp_path / "run")
     until(coldloop, up, "session", "lock-step")
+    until_plant_time_passes(coldloop, up)
     assert run.interrupt() == 130
     until(coldloop, up, "session", f"{FACTOR} x real time")
