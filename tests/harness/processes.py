@@ -109,6 +109,13 @@ class Processes:
         """Start an interpreter with arguments."""
         return self._start([sys.executable, *arguments], "python", stdout=stdout, stderr=stderr)
 
+    def run_python(self, program: str) -> tuple[str, str]:
+        """Run lines of Python to their successful end; return what they wrote on standard output and standard error."""
+        process = self.python("-c", program, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        out, err = process.popen.communicate(timeout=END_S)
+        assert process.popen.returncode == 0, err
+        return out, err
+
     def _start(
         self, words: Sequence[str], name: str, *, port: int = 0, env: Mapping[str, str] | None = None,
         cwd: Path | None = None, stdout: int | None = None, stderr: int | None = None,
