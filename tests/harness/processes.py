@@ -57,7 +57,10 @@ class Process:
 
     def kill(self) -> None:
         self.popen.kill()
-        self.popen.communicate()
+        self.popen.wait()
+        for pipe in (self.popen.stdout, self.popen.stderr):
+            if pipe is not None:
+                pipe.close()
 
     def interrupt(self, number: signal.Signals = signal.SIGINT, within_s: float = END_S) -> int:
         """Send a signal; return the exit code."""
@@ -108,6 +111,13 @@ class Processes:
     def python(self, *arguments: str, stdout: int | None = None, stderr: int | None = None) -> Process:
         """Start an interpreter with arguments."""
         return self._start([sys.executable, *arguments], "python", stdout=stdout, stderr=stderr)
+
+    def run_python(self, program: str, within_s: float = END_S) -> tuple[str, str]:
+        """Run lines of Python to their successful end; return what they wrote on standard output and standard error."""
+        process = self.python("-c", program, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        out, err = process.popen.communicate(timeout=within_s)
+        assert process.popen.returncode == 0, err
+        return out, err
 
     def _start(
         self, words: Sequence[str], name: str, *, port: int = 0, env: Mapping[str, str] | None = None,
