@@ -62,8 +62,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         fixtures = set(getattr(item, "fixturenames", ()))
         for mark in (mark for mark, names in USES.items() if names & fixtures):
             item.add_marker(mark)
-        for name in (name for name in SHARED if name in fixtures):
-            item.add_marker(pytest.mark.xdist_group(name))
+        group = next((name for name in SHARED if name in fixtures), None)
+        if group:
+            item.add_marker(pytest.mark.xdist_group(group))
         if item.get_closest_marker("exhaustive") or item.get_closest_marker("container"):
             left_out.add(item)
     if left_out and not config.getoption("--all"):

@@ -105,9 +105,13 @@ class Processes:
         words = [sys.executable, "-m", "rig", *map(str, arguments)]
         return self._start(words, "coldloop", env=environment(more=more), cwd=cwd, stdout=stdout, stderr=stderr)
 
-    def python(self, *arguments: str, stdout: int | None = None, stderr: int | None = None) -> Process:
+    def python(
+        self, *arguments: str, stdout: int | None = None, stderr: int | None = None,
+        more: Mapping[str, str] | None = None,
+    ) -> Process:  # fmt: skip
         """Start an interpreter with arguments."""
-        return self._start([sys.executable, *arguments], "python", stdout=stdout, stderr=stderr)
+        words = [sys.executable, *arguments]
+        return self._start(words, "python", env=environment(more=more), stdout=stdout, stderr=stderr)
 
     def _start(
         self, words: Sequence[str], name: str, *, port: int = 0, env: Mapping[str, str] | None = None,
