@@ -1,10 +1,10 @@
 """`coldloop config`: the effective configuration, and where each value comes from."""
 
 import argparse
-import json
 import sys
 
 from coldloop.command_line import add_configuration_options
+from coldloop.config import as_toml
 from rig.commands.options import configuration
 
 
@@ -26,4 +26,4 @@ def execute(options: argparse.Namespace) -> int:
 
 def _shown(key: str, value: object) -> str:
     """Return a line of TOML, which has no word for what is not set."""
-    return f"# {key} = not set" if value is None else f"{key} = {json.dumps(value, ensure_ascii=False)}"
+    return f"# {key} = not set" if value is None else f"{key} = {as_toml(value)}"

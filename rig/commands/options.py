@@ -2,10 +2,9 @@
 
 import argparse
 import re
-import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
 from coldloop.process import TICK_S
@@ -17,6 +16,8 @@ if TYPE_CHECKING:
     from rig.rig_endpoints import RigEndpoints
     from rig.settings import Settings
 
+LONGEST_TICKS: Final = 2**32 - 1
+"""Ticks are 32-bit numbers on the bus."""
 _UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 
 KEYS = {
@@ -47,9 +48,11 @@ def duration(text: str) -> int:
     ticks = float(match[1]) * _UNITS[match[2]] / TICK_S
     if ticks <= 0:
         raise argparse.ArgumentTypeError(f"'{text}' is not positive; write 90s, 15min or 2h")
-    if ticks != round(ticks):
+    if not ticks < LONGEST_TICKS:
+        raise argparse.ArgumentTypeError(f"'{text}' is longer than a session can be, {LONGEST_TICKS * TICK_S:g} s")
+    if not ticks.is_integer():
         raise argparse.ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s")
-    return round(ticks)
+    return int(ticks)
 
 
 def updating_period(text: str) -> float:
@@ -141,21 +144,15 @@ def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Set
 
 def _tls_site(folder: Path) -> dict[str, tuple[object, str]]:
     """Return the settings of a folder of `coldloop certificates`, and where they come from."""
+    from coldloop.config import flattened, parsed_toml
+
     file = folder / "tls.toml"
     try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
+        content = parsed_toml(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise UsageError(f"{file}: {reason}; make it with `coldloop certificates --out {folder}`") from None
-    return {key: (value, "--tls") for key, value in _flat(content)}
-
-
-def _flat(section: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
-    for name, value in section.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
+    return {key: (value, "--tls") for key, value in flattened(content).items()}
 
 
 def configuration(options: argparse.Namespace) -> "Configuration[Settings]":
