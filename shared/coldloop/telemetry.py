@@ -12,17 +12,17 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import Final
 
+from coldloop.mqtt_publisher import BrokerError, Login, MqttPublisher
 from coldloop.telemetry_settings import TelemetrySettings
-
-if TYPE_CHECKING:
-    import aiomqtt
 
 log = logging.getLogger("coldloop.telemetry")
 
-FAREWELL_S = 1.0
+FAREWELL_S: Final = 1.0
 """How long a service that ends waits for its broker."""
+KEEPALIVE_S: Final = 60
+"""Without a word for this time, and two periods, the broker publishes that the service is offline."""
 
 Snapshot = Callable[[], Mapping[str, object]]
 
@@ -56,33 +56,32 @@ class Telemetry:
             try:
                 await self._publish()
             except Exception as error:  # noqa: BLE001 - a service never ends because of its telemetry
-                log.warning("broker lost", extra={"broker": self._settings.broker, "reason": str(error)})
+                log.warning(
+                    "broker lost", extra={"broker": self._settings.broker, "reason": str(error) or "no answer in time"}
+                )
             await asyncio.sleep(self._settings.timeout_s)
 
     async def _publish(self) -> None:
-        import aiomqtt  # noqa: PLC0415 a tenth of what a service loads at its start, and most have no broker
-
-        s = self._settings
-        offline = aiomqtt.Will(f"{self._topic}/state", json.dumps({"state": "offline"}), qos=1, retain=True)
-        name = s.username or None
-        async with aiomqtt.Client(
-            s.broker, s.port, username=name, password=s.password(), will=offline, timeout=s.timeout_s
-        ) as client:
-            await client.publish(f"{self._topic}/state", json.dumps({"state": "online"}), qos=1, retain=True)
+        s, state = self._settings, f"{self._topic}/state"
+        online, offline = (json.dumps({"state": word}) for word in ("online", "offline"))
+        login = Login(s.username, s.password(), state, offline, min(0xFFFF, KEEPALIVE_S + math.ceil(2 * s.period_s)))
+        async with MqttPublisher.connected(s.broker, s.port, login, s.timeout_s) as broker:
+            await broker.publish(state, online)
             try:
-                await self._forward(client)
+                await self._forward(broker)
             except asyncio.CancelledError:  # a clean end calls for no last will
-                with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
+                with contextlib.suppress(BrokerError, OSError, TimeoutError, EOFError):
                     async with asyncio.timeout(FAREWELL_S):
-                        await client.publish(f"{self._topic}/state", offline.payload, qos=1, retain=True)
+                        await broker.publish(state, offline)
+                        await broker.disconnect()
                 raise
 
-    async def _forward(self, client: "aiomqtt.Client") -> None:
+    async def _forward(self, broker: MqttPublisher) -> None:
         while True:
             await self._arrived.wait()
             self._arrived.clear()
             while self._waiting:
-                await client.publish(f"{self._topic}/telemetry", self._waiting[0], qos=1, retain=True)
+                await broker.publish(f"{self._topic}/telemetry", self._waiting[0])
                 self._waiting.popleft()
 
 

@@ -34,6 +34,7 @@ def load(site: Site) -> float:
 
 def view(page: "Page", name: str) -> None:
     page.click(f"nav a[href='#{name}']")
+    page.wait_for_selector(f"#{name}:visible")
 
 
 def confirm(page: "Page") -> str:
