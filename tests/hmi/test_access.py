@@ -150,7 +150,7 @@ def test_a_confirmation_counts_once_and_only_from_who_asked(site: Site) -> None:
 def test_requests_that_no_browser_sends_are_refused_like_others(
     site: Site, headers: dict[str, str], body: str, status: int
 ) -> None:
-    connection = HTTPConnection("127.0.0.1", site.ports["hmi"], timeout=20)
+    connection = HTTPConnection("127.0.0.1", site.ports["hmi"], timeout=60)
     connection.request("POST", "/api/login", body, {"Origin": site.address, **headers})
     answer = connection.getresponse()
     assert answer.status == status
@@ -295,6 +295,7 @@ def test_passwords_are_kept_as_hashes_in_a_file_of_their_owner(tmp_path: Path) -
         f"anna:view:{WHOLE_HASH[:-5]}", f"anna:view:{WHOLE_HASH.replace('$16384$', '$16383$')}",
         f"anna:view:{WHOLE_HASH.replace('$16384$', '$much$')}", f"anna:view:{WHOLE_HASH.replace('$8$', '$80000$')}",
     ],
+    ids=["name", "no hash", "no such role", "no hash but a word", "cut", "cost", "cost is a word", "block size"],
 )  # fmt: skip
 def test_a_line_that_is_no_user_is_named(tmp_path: Path, line: str) -> None:
     file = tmp_path / "users"
