@@ -65,6 +65,7 @@ def check(limits: InputLimits, initial: SequenceRow, history: list[tuple[Sequenc
 
 
 @each_reference
+@settings(max_examples=4 * settings.default.max_examples)
 @given(history=scans)
 def test_whatever_is_asked_every_output_is_inside_its_bounds_and_its_rate_window(
     reference: RateReference, history: list[tuple[SequenceRow, bool, int]]
@@ -72,6 +73,7 @@ def test_whatever_is_asked_every_output_is_inside_its_bounds_and_its_rate_window
     check(InputLimits(rate_reference=reference), INITIAL, history)
 
 
+@settings(max_examples=4 * settings.default.max_examples)
 @given(limits=odd_limits(), history=scans, share=st.floats(0.0, 1.0))
 def test_rates_that_single_precision_cannot_represent_are_kept_too(
     limits: InputLimits, history: list[tuple[SequenceRow, bool, int]], share: float
