@@ -133,11 +133,16 @@ def realtime() -> None:
     """Requested where plant time follows the clock: it marks the test."""
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs in this process leave no figure: to draw one takes longer than a short run."""
+def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let runs in this process leave no figure: to draw one takes longer than a short run."""
     monkeypatch.setattr(FigureProcess, "start", lambda _: None)
     monkeypatch.setattr(FigureProcess, "draw", lambda *_: None)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs in this process leave no figure."""
+    draw_nothing(monkeypatch)
 
 
 @pytest.fixture

@@ -129,6 +129,10 @@ class Processes:
         words = [sys.executable, *arguments]
         return self._start(words, "python", env=environment(more=more), stdout=stdout, stderr=stderr)
 
+    def script(self, file: Path, *arguments: str, stdout: int | None = None, stderr: int | None = None) -> Process:
+        """Start a program that is a file, with arguments."""
+        return self._start([str(file), *arguments], file.name, stdout=stdout, stderr=stderr)
+
     def run_python(self, program: str, within_s: float = END_S) -> tuple[str, str]:
         """Run lines of Python to their successful end; return what they wrote on standard output and standard error."""
         code, out, err = self.python("-c", program, stdout=subprocess.PIPE, stderr=subprocess.PIPE).ended(within_s)

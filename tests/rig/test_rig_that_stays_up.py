@@ -3,10 +3,7 @@
 import asyncio
 import json
 import os
-import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,19 +16,22 @@ from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
 from rig import cli
 from rig.started_rigs import running_rig
 from tests.conftest import Coldloop, first_of_three_ports
+from tests.harness.processes import Processes
+
+pytestmark = pytest.mark.usefixtures("realtime", "undrawn")
 
 FACTOR = "5"
+PATIENCE_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def up(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) -> Iterator[str]:
     """The first port of a rig that is up."""
     os.environ["XDG_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
     base = str(first_of_three_ports())
-    command = [sys.executable, "-m", "rig", "up", "--port-base", base, "--load", "e", "--factor", FACTOR]
-    command += ["--set", "plant.sensors.level=0.01"]
+    words = ("up", "--port-base", base, "--load", "e", "--factor", FACTOR, "--set", "plant.sensors.level=0.01")
     try:
-        subprocess.run([*command, "--detach"], check=True, timeout=120, stdout=subprocess.DEVNULL)
+        assert shared_processes.coldloop(*words, "--detach").popen.wait(PATIENCE_S) == 0
         yield base
         assert cli.main(["down", "--port-base", base]) == 0
         assert running_rig(int(base)) is None
@@ -47,7 +47,7 @@ def shown(coldloop: Coldloop, base: str) -> dict[str, str]:
 
 
 def until(coldloop: Coldloop, base: str, row: str, part: str) -> str:
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE_S
     while part not in (text := shown(coldloop, base)[row]):
         assert time.monotonic() < deadline, f"{row} is {text}, not {part}"
     return text
@@ -149,7 +149,7 @@ def test_a_rig_that_was_attached_to_runs_on_in_real_time(coldloop: Coldloop, up:
     outcome = coldloop(*run, tmp_path / "run")
     assert outcome.code == 0, outcome.complaints
     until(coldloop, up, "session", f"{FACTOR} x real time")
-    before, deadline = shown(coldloop, up)["session"], time.monotonic() + 30
+    before, deadline = shown(coldloop, up)["session"], time.monotonic() + PATIENCE_S
     while shown(coldloop, up)["session"] == before:
         assert time.monotonic() < deadline, "plant time goes on"
 
@@ -194,13 +194,10 @@ def test_what_a_rig_runs_may_be_named_again(coldloop: Coldloop, up: str, results
     assert coldloop(*run).code == 0
 
 
-def test_ctrl_c_gives_an_attached_rig_back_too(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
-    ends = [f"127.0.0.1:{int(up) + place}" for place in range(3)]
-    command = [sys.executable, "-m", "rig", "run", "--attach", *ends, "--load", "e", "--duration", "100h"]
-    with subprocess.Popen(
-        [*command, "--figures", "png", "--out", str(tmp_path / "run")], stderr=subprocess.DEVNULL
-    ) as run:
-        until(coldloop, up, "session", "lock-step")
-        run.send_signal(signal.SIGINT)
-        assert run.wait(60) == 130
+def test_ctrl_c_gives_an_attached_rig_back_too(
+    coldloop: Coldloop, up: str, tmp_path: Path, processes: Processes
+) -> None:
+    run = processes.coldloop(*attach(up), "--load", "e", "--duration", "100h", "--out", tmp_path / "run")
+    until(coldloop, up, "session", "lock-step")
+    assert run.interrupt() == 130
     until(coldloop, up, "session", f"{FACTOR} x real time")
