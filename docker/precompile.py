@@ -1,6 +1,6 @@
 """Compile numerical kernels before they are needed: `python precompile.py PART...`.
 
-An image takes the part of its service. Several parts are done in parallel, with what is left on standard error and their
+An image takes the part of its service. Several parts are done in parallel, with what is left on standard error, their
 own output on standard output.
 """  # noqa: INP001 a program
 
