@@ -6,6 +6,7 @@ own output on standard output.
 
 import compileall
 import os
+import signal
 import subprocess
 import sys
 import sysconfig
@@ -158,6 +159,11 @@ def _show(line: str) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 2:
+    if len(sys.argv) == 2:
+        PARTS[sys.argv[1]][0]()
+        sys.exit()
+    try:
         sys.exit(not compile_parts(sys.argv[1:]))
-    PARTS[sys.argv[1]][0]()
+    except KeyboardInterrupt:  # who called us ends too when we end by the signal
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGINT)

@@ -57,7 +57,8 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _cached(function: Callable[P, R], dispatcher: Any) -> Callable[P, R]:  # noqa: ANN401 numba has no types
-    cache, compile_kernel = SharedCache(function), dispatcher.compile
+    cache = SharedCache(function)  # type: ignore[no-untyped-call]
+    compile_kernel = dispatcher.compile
 
     def compile_in_turn(signature: Any) -> Any:  # noqa: ANN401
         try:
@@ -70,7 +71,7 @@ def _cached(function: Callable[P, R], dispatcher: Any) -> Callable[P, R]:  # noq
     return cast("Callable[P, R]", dispatcher)
 
 
-class SharedCache(FunctionCache):  # type: ignore[misc] # numba has no types
+class SharedCache(FunctionCache):
     """numba's cache of one function, locked by the process that compiles a kernel until it is saved.
 
     Without the lock two processes compile the same kernel, and may save different ones under the same name. It is one
@@ -80,10 +81,11 @@ class SharedCache(FunctionCache):  # type: ignore[misc] # numba has no types
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401
         """Return the kernel for a signature; None, with the lock, when this process is to compile it."""
-        found = super().load_overload(sig, target_context)
+        found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         if found is None:
             self._lock()
-            found = super().load_overload(sig, target_context)  # another process may have compiled it meanwhile
+            # another process may have compiled it meanwhile
+            found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
             if found is None:
                 needs_compiling()
         return found
