@@ -98,9 +98,11 @@ def _simulate(plant: str) -> None:
 
 
 def run_modules() -> None:
-    """Import what a networked run needs besides kernels, so that its bytecode is written."""
-    modules = "control_plc.runtime", "rig.cli", "rig.commands.run", "rig.networked_run", "rig.progress", "rig.run_plot"
-    for module in (*modules, "rig.running"):
+    """Import what a run needs besides kernels, so that its bytecode is written."""
+    for module in (
+        "control_plc.runtime", "rig.cli", "rig.commands.run", "rig.running", "rig.networked_run", "rig.one_process",
+        "rig.progress", "rig.figure_process", "rig.run_plot",
+    ):  # fmt: skip
         import_module(module)
 
 
