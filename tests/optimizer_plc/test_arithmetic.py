@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 from itertools import product
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 SINGLE = real_of(Arithmetic.FLOAT32)
-
-COMPILING_S: Final = 900.0
-"""Kernels that are in no cache may have to be compiled, on a busy machine."""
 
 ON_LINE = {
     "costs.augmented_cost", "costs.predicted_indicators", "estimator.corrected", "instance.instance",
@@ -58,7 +55,7 @@ def check(cases: list[tuple[SolverName, EstimatorKind]], processes: Processes) -
     """Let these pairs compute in an interpreter of their own, which has compiled nothing for other tests."""
     names = [(solver.value, estimator.value) for solver, estimator in cases]
     program = f"from tests.optimizer_plc.single_precision import main; main({names})"
-    called, faults = json.loads(processes.run_python(program, within_s=COMPILING_S)[0])
+    called, faults = json.loads(processes.run_python(program)[0])
     assert not faults
     own = {f"solvers.{name}" for solver, _ in cases for name in OF_SOLVERS[solver]}
     assert set(called) >= {f"optimizer_plc.{name}" for name in ON_LINE | own}
