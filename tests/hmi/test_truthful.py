@@ -72,7 +72,7 @@ def test_a_second_command_waits_with_a_word_until_the_first_is_over(operated: "P
     operated.click("#load-set")
     eventually(lambda: "load: waits until the command before it is over" in outcome(operated), "it says so")
     for text in ("stand still", "444"):
-        eventually(lambda: held, "it is prepared")
+        eventually(lambda: operated.evaluate("1") and held, "it is prepared")
         held.pop().continue_()
         operated.wait_for_selector("#confirm[open]")
         assert text in operated.inner_text("#confirm-text")
