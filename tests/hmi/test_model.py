@@ -14,7 +14,7 @@ from coldloop.metrics import exposition
 from coldloop.process import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalPage
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import LadderStatus, Process
+from coldloop.registers.control_plc import LadderStatus, Mode, Process
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
 from hmi.access import Party
@@ -184,6 +184,33 @@ def test_modes_are_told_stretch_by_stretch() -> None:
         (0.75, 1.25, 3),
         (1.25, 1.25, 1),
     ]
+
+
+def test_where_nothing_was_read_there_is_no_line_however_much_is_thinned(model: Model, clock: Clock) -> None:
+    for tick in range(2, 400):
+        model.put("control_plc", process(tick))
+        model.heard("control_plc")
+    clock.time += 35.0
+    model.put("control_plc", LadderStatus(1, 0, 0, 1, 1 << OUTPUT_NAMES.index("L1"), 0))
+    for tick in range(540, 900):
+        model.put("control_plc", process(tick, 61.0))
+        model.heard("control_plc")
+    for points in (20, 4000):
+        trend = trend_document(model, ["L1"], 0, 900, points)
+        assert trend["gaps"] == [[399 * 0.25, 540 * 0.25]]
+        level = dict(zip(trend["time"], trend["series"]["L1"], strict=True))
+        assert [time for time, value in level.items() if value is None] == [400 * 0.25]
+        assert {value for time, value in level.items() if time < 100} == {60.0}
+        assert {value for time, value in level.items() if time > 100} == {61.0}
+    assert [(one["from"], one["to"]) for one in trend["modes"]] == [(0.25, 399 * 0.25), (540 * 0.25, 899 * 0.25)]
+    assert trend["substituted"]["L1"] == [(540 * 0.25, 900 * 0.25)]
+
+
+def test_the_updating_period_is_not_current_while_mpc_does_not_drive(model: Model) -> None:
+    for mode in Mode:
+        model.put("control_plc", LadderStatus(mode, 0, 0, 1, 0, 0))
+        assert ("update" in model.stale_prefixes()) is (mode != Mode.MPC)
+        assert model.is_planned is (mode == Mode.MPC)
 
 
 def test_a_value_that_is_substituted_is_told_stretch_by_stretch_and_no_other(model: Model) -> None:
