@@ -87,7 +87,7 @@ def test_commands_to_a_rig_import_nothing_that_takes_time(words: list[str], free
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))\n"
     )
     done = python("-c", program, *words, "--port-base", str(free_port))
-    assert "nobody listens" in done.stderr or "no rig was started" in done.stderr
+    assert "no rig" in done.stderr
     loaded = set(done.stdout.split())
     assert "coldloop" in loaded
     assert not loaded & (HEAVY - {"pydantic"} | {"plant", "control_plc", "optimizer_plc"})

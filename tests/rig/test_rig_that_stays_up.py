@@ -60,6 +60,13 @@ def test_status_shows_session_mode_load_outputs_and_alarms(coldloop: Coldloop, u
     assert rows["L1"].endswith("%")
 
 
+def test_commands_find_the_one_rig_that_is_up(coldloop: Coldloop, up: str) -> None:
+    for words in (("status",), ("events",), ("events", "--service", "plant"), ("set", "resume")):
+        outcome = coldloop(*words)
+        assert outcome.code == 0, outcome.complaints
+        assert outcome.out.split()[0] == coldloop(*words, "--port-base", up).out.split()[0]
+
+
 def test_a_rig_that_was_started_has_not_lost_anything_yet(coldloop: Coldloop, up: str) -> None:
     outcome = coldloop("events", f"127.0.0.1:{int(up) + 1}", "--kind", "alarm raised")
     assert outcome.code == 0, outcome.complaints
