@@ -133,6 +133,26 @@ def test_a_load_file_begins_now(coldloop: Coldloop, up: str, tmp_path: Path) -> 
     assert coldloop("set", "--port-base", up, "load", "385").code == 0
 
 
+def test_a_load_that_begins_later_is_told_as_it_was_written(coldloop: Coldloop, up: str) -> None:
+    assert coldloop("set", "--port-base", up, "load", "385").code == 0  # nothing else is to come
+    assert coldloop("set", "--port-base", up, "load", "444", "--at", "80000").out.startswith(
+        "load 444 W from 80000 s on ("
+    )
+    outcome = coldloop("set", "--port-base", up, "load", "400", "--at", "90000.25")
+    assert outcome.out.startswith("load 400 W from 90000.2 s on, before it 444 W from 80000 s on (was ")
+    assert coldloop("set", "--port-base", up, "load", "385").code == 0
+    outcome = coldloop("set", "--port-base", up, "load", "400", "--at", "0.25")
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+    assert "plant time is" in outcome.complaints[0]
+
+
+@pytest.mark.parametrize("time", ["-1", "0.1", "nan", "inf", "1e300", "9" * 5000, "soon", str(2**32)])
+def test_a_time_that_no_session_has_is_one_line(coldloop: Coldloop, time: str) -> None:
+    outcome = coldloop("set", "load", "400", "--at", time)
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+    assert "not a number of seconds" in outcome.complaints[0]
+
+
 def test_a_second_rig_on_the_same_ports_is_refused_and_the_holder_named(coldloop: Coldloop, up: str) -> None:
     outcome = coldloop("up", "--port-base", up)
     assert outcome.code == 2
