@@ -2,7 +2,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.limits import InputLimits
@@ -28,7 +28,6 @@ def test_a_session_begins_with_the_initial_inputs_and_an_update_at_tick_0(
     assert bench.program.awaiting_plan
 
 
-@settings(max_examples=30)
 @given(ticks=st.integers(1, 30), length=st.integers(1, 40))
 def test_a_sequence_takes_effect_exactly_at_its_first_tick_and_plays_a_row_a_tick(
     new_bench: "Callable[[InputLimits], Bench]", at: At, ticks: int, length: int

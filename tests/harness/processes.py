@@ -18,6 +18,9 @@ from rig.ports import ReservedPorts
 END_S: Final = 60.0
 """A process that is told to end has failed when it takes longer; the machine may be busy with something else."""
 
+PROGRAM_S: Final = 900.0
+"""The same for lines of Python: kernels that are in no cache may have to be compiled."""
+
 
 def environment(settings: BaseModel | None = None, more: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return the variables for a process: no configuration from outside, that of `settings`, and `more`."""
@@ -133,11 +136,10 @@ class Processes:
         """Start a program that is a file, with arguments."""
         return self._start([str(file), *arguments], file.name, stdout=stdout, stderr=stderr)
 
-    def run_python(self, program: str, within_s: float = END_S) -> tuple[str, str]:
+    def run_python(self, program: str) -> tuple[str, str]:
         """Run lines of Python to their successful end; return what they wrote on standard output and standard error."""
-        process = self.python("-c", program, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        out, err = process.popen.communicate(timeout=within_s)
-        assert process.popen.returncode == 0, err
+        code, out, err = self.python("-c", program, stdout=subprocess.PIPE, stderr=subprocess.PIPE).ended(PROGRAM_S)
+        assert code == 0, err
         return out, err
 
     def _start(

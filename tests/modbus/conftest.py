@@ -28,7 +28,7 @@ from coldloop.registers.declaration import Block, RegisterMap, Role
 from coldloop.registers.plant import PLANT_MAP
 from rig.certificates import Authority, Pair
 
-PATIENCE_S = 20.0
+PATIENCE_S = 100.0
 
 
 def frame(pdu: bytes, transaction: int = 1, unit: int = 1) -> bytes:

@@ -203,5 +203,6 @@ class RackMachine(RuleBasedStateMachine):
 
 def test_nobody_moves_the_outputs_who_does_not_know_what_is_applied(switch_on: "type[RackOnTheBus]") -> None:
     run_state_machine_as_test(
-        lambda: RackMachine(switch_on), settings=settings(max_examples=40, stateful_step_count=40, deadline=None)
+        lambda: RackMachine(switch_on),
+        settings=settings(max_examples=2 * settings.default.max_examples, stateful_step_count=40),
     )

@@ -97,7 +97,7 @@ def test_commands_to_a_rig_import_nothing_that_takes_time(words: list[str], free
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))\n"
     )
     done = python("-c", program, *words, "--port-base", str(free_port))
-    assert "nobody listens" in done.err or "no rig was started" in done.err
+    assert "no rig" in done.err
     loaded = set(done.out.split())
     assert "coldloop" in loaded
     assert not loaded & (HEAVY - {"pydantic"} | {"plant", "control_plc", "optimizer_plc"})

@@ -244,7 +244,7 @@ def test_nobody_there_is_told_in_one_line_and_no_file_is_made(coldloop: "Coldloo
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "HOST:PORT"),
+        (["127.0.0.1:1", "--port-base", "5020"], "give one of them"),
         (["localhost"], "'localhost' is not HOST:PORT"),
         (["127.0.0.1:1", "--kind", "alarms"], "no kind is called 'alarms'; there are mode, alarm-raised, "),
         (["127.0.0.1:1", "--since", "yesterday"], "'yesterday' is neither the number of an event nor a time"),

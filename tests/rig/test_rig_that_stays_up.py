@@ -66,6 +66,13 @@ def test_status_shows_session_mode_load_outputs_and_alarms(coldloop: Coldloop, u
     assert rows["L1"].endswith("%")
 
 
+def test_commands_find_the_one_rig_that_is_up(coldloop: Coldloop, up: str) -> None:
+    for words in (("status",), ("events",), ("events", "--service", "plant"), ("set", "resume")):
+        outcome = coldloop(*words)
+        assert outcome.code == 0, outcome.complaints
+        assert outcome.out.split()[0] == coldloop(*words, "--port-base", up).out.split()[0]
+
+
 def test_a_rig_that_was_started_has_not_lost_anything_yet(coldloop: Coldloop, up: str) -> None:
     outcome = coldloop("events", f"127.0.0.1:{int(up) + 1}", "--kind", "alarm raised")
     assert outcome.code == 0, outcome.complaints
@@ -130,6 +137,26 @@ def test_a_load_file_begins_now(coldloop: Coldloop, up: str, tmp_path: Path) -> 
     assert "load of 3000 steps from 90000 s to 92999 s" in outcome.out
     assert "400 W from 90000 s" in shown(coldloop, up)["load"]
     assert coldloop("set", "--port-base", up, "load", "385").code == 0
+
+
+def test_a_load_that_begins_later_is_told_as_it_was_written(coldloop: Coldloop, up: str) -> None:
+    assert coldloop("set", "--port-base", up, "load", "385").code == 0  # nothing else is to come
+    assert coldloop("set", "--port-base", up, "load", "444", "--at", "80000").out.startswith(
+        "load 444 W from 80000 s on ("
+    )
+    outcome = coldloop("set", "--port-base", up, "load", "400", "--at", "90000.25")
+    assert outcome.out.startswith("load 400 W from 90000.2 s on, before it 444 W from 80000 s on (was ")
+    assert coldloop("set", "--port-base", up, "load", "385").code == 0
+    outcome = coldloop("set", "--port-base", up, "load", "400", "--at", "0.25")
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+    assert "plant time is" in outcome.complaints[0]
+
+
+@pytest.mark.parametrize("time", ["-1", "0.1", "nan", "inf", "1e300", "9" * 5000, "soon", str(2**32)])
+def test_a_time_that_no_session_has_is_one_line(coldloop: Coldloop, time: str) -> None:
+    outcome = coldloop("set", "load", "400", "--at", time)
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+    assert "not a number of seconds" in outcome.complaints[0]
 
 
 def test_a_second_rig_on_the_same_ports_is_refused_and_the_holder_named(coldloop: Coldloop, up: str) -> None:
