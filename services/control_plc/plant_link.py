@@ -103,7 +103,7 @@ class PlantLink:
             self._enter(PlantLinkState.FOREIGN, cause)
         elif cause is LinkCause.REFUSED:
             self._enter(PlantLinkState.NOT_TAKEN, cause)
-        elif cause is LinkCause.DAMAGED:
+        elif cause in (LinkCause.DAMAGED, LinkCause.IMPLAUSIBLE):
             self._enter(PlantLinkState.JOINING, cause)
         else:
             self._enter(PlantLinkState.SEARCHING, cause)
@@ -133,7 +133,7 @@ class PlantLink:
         if reading.session != session or not session:
             self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
         elif not all(map(math.isfinite, reading.u)):
-            self._enter(PlantLinkState.JOINING, LinkCause.NOT_FINITE)
+            self._enter(PlantLinkState.JOINING, LinkCause.IMPLAUSIBLE)
         elif stopped:
             self._enter(PlantLinkState.FROZEN, LinkCause.STOPPED)
         else:

@@ -29,7 +29,7 @@ from coldloop.registers.control_plc import (
     Update,
     Verdict,
 )
-from coldloop.registers.plant import MAX_LOAD_W, Actuators, Measurement
+from coldloop.registers.plant import MAX_LOAD_W, MAX_STATE, Actuators, Measurement
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.sequence import InputSequence
 from coldloop.watchdog import Watchdog
@@ -262,7 +262,7 @@ class ControlProgram:
         applied = tuple(self.guard.applied)
         y = tuple(self.sensors.check(self.tick, measurement.y))
         self.process = Process(self.tick, measurement.load, applied, y)
-        self._unknown = not (0.0 <= measurement.load <= MAX_LOAD_W and all(map(math.isfinite, measurement.x)))
+        self._unknown = not (0.0 <= measurement.load <= MAX_LOAD_W and _are_states(measurement.x))
         self._let_play(usable=self._usable)
         latched = None
         if self.player.latches(self.tick, measurement.load):
@@ -367,6 +367,11 @@ class ControlProgram:
         """Let an operator decide who drives, from the next scan on."""
         self.operator = operator
         self._let_play(usable=self._usable)
+
+
+def _are_states(x: Sequence[float]) -> bool:
+    """Tell whether these can be states: an update that has others is none."""
+    return math.isfinite(sum(x)) and min(x) >= -MAX_STATE and max(x) <= MAX_STATE
 
 
 def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:

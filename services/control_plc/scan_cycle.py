@@ -6,7 +6,7 @@ that has a rack of its own. Time is the rack's: after a break the program goes o
 
 from collections.abc import Callable
 
-from coldloop.errors import BUSY, DamagedAnswerError, LinkError, RequestRefusedError
+from coldloop.errors import BUSY, DamagedAnswerError, ImplausibleAnswerError, LinkError, RequestRefusedError
 from coldloop.registers.control_plc import LinkCause, Update
 from coldloop.registers.plant import Actuators, Measurement
 from control_plc.plant_link import PlantLink
@@ -19,6 +19,8 @@ Adopt = Callable[[Measurement], bool]
 
 def cause_of(error: LinkError) -> LinkCause:
     """Return why a request came to nothing."""
+    if isinstance(error, ImplausibleAnswerError):
+        return LinkCause.IMPLAUSIBLE
     if isinstance(error, DamagedAnswerError):
         return LinkCause.DAMAGED
     if isinstance(error, RequestRefusedError):
