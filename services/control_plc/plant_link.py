@@ -46,6 +46,7 @@ REFUSED_OUTPUTS: Final[Mapping[int, tuple[PlantLinkState, LinkCause]]] = {
     OutputVerdict.WRONG_SESSION: (PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION),
     OutputVerdict.UNTIMELY: (PlantLinkState.NOT_TAKEN, LinkCause.UNTIMELY),
     OutputVerdict.CHANGED: (PlantLinkState.JOINING, LinkCause.CHANGED),
+    OutputVerdict.LIMITED: (PlantLinkState.JOINING, LinkCause.LIMITED),
 }
 
 

@@ -39,6 +39,8 @@ from plant.settings import SafeAction, WatchdogSettings
 MakePlant = Callable[[HeatLoad, int], PlantProgram]
 """Returns the plant at tick 0, for a load and a seed of the sensors' noise."""
 
+APPLIED: Final = (OutputVerdict.TAKEN, OutputVerdict.LIMITED)
+"""Verdicts on outputs that move the plant."""
 UNWATCHED_SILENCE_S: Final = 10.0
 """Real time after which a silent client loses its lease when the watchdog is off."""
 
@@ -62,6 +64,7 @@ class Rack:
         make_plant: Makes the simulation of a session.
         session: The one to begin with.
         journal: Takes the events.
+        rate: Largest change of the outputs in one tick; None does not limit.
         generation: Number of the first generation of outputs.
     """
 
@@ -73,14 +76,16 @@ class Rack:
         session: Session,
         *,
         journal: Journal,
+        rate: Inputs | None = None,
         generation: int = 1,
     ) -> None:
+        self._rate = rate
         self._safety = watchdog
         self._u0 = u0
         self._make_plant = make_plant
         self.journal = journal
         self.watchdog = Watchdog(watchdog.ticks)
-        self.outputs = AppliedOutputs(u0, generation=generation)
+        self.outputs = AppliedOutputs(u0, rate=rate, generation=generation)
         self._set_up(session)
 
     def _set_up(self, session: Session) -> None:
@@ -137,7 +142,7 @@ class Rack:
         self._program, self.load = program, schedule
         self.watchdog.set(state.watchdog, program.tick)
         self.outputs = AppliedOutputs(
-            (cv155, ncr22, cv156), holder=state.holder, generation=next_generation(state.generation)
+            (cv155, ncr22, cv156), rate=self._rate, holder=state.holder, generation=next_generation(state.generation)
         )
         self.moving = state.pace.realtime and program.tick > 0
 
@@ -158,7 +163,7 @@ class Rack:
         verdict = self.outputs.offer(
             asked, caller, session=self.session.number, tick=self.tick, realtime=self.session.pace.realtime
         )
-        if verdict is OutputVerdict.TAKEN:
+        if verdict in APPLIED:
             self._program.apply(self.outputs.u)
             self.watchdog.trigger(self.tick)
             self.moving = True
@@ -171,6 +176,7 @@ class Rack:
         self.moving = self.session.pace.realtime
         before = program.station
         program.advance()
+        self.outputs.begin_tick()
         if before is not None and program.station is not None:
             self._note_station(before, program.station)
         if self.watchdog.check(program.tick):

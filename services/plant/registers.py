@@ -40,7 +40,7 @@ from plant.faults import HEALTHY
 from plant.load import find_load
 from plant.outputs import next_generation
 from plant.program import LoadProfile
-from plant.rack import MakePlant, Rack, Session
+from plant.rack import APPLIED, MakePlant, Rack, Session
 from plant.retained_state import Memory, refused
 from plant.settings import SHOWN, PlantSettings
 
@@ -114,8 +114,9 @@ class RackRegisters:
         generation = first_generation if state is None else next_generation(state.generation)
         cv155, ncr22, cv156 = header.u0
         rack = Rack(
-            section.watchdog, (cv155, ncr22, cv156), make_plant, session, journal=journal, generation=generation
-        )
+            section.watchdog, (cv155, ncr22, cv156), make_plant, session, journal=journal,
+            rate=settings.limits.rate if section.rate_limited else None, generation=generation,
+        )  # fmt: skip
         if state is None or not state.session:
             return rack, False
         try:
@@ -211,7 +212,7 @@ class RackRegisters:
     def _take_outputs(self, asked: Actuators, caller: Caller) -> None:
         self.move_on()  # the next request may come before the plant has moved on
         verdict = self.rack.offer(asked, caller)
-        if verdict in {OutputVerdict.TAKEN, OutputVerdict.CHANGED}:
+        if verdict in {*APPLIED, OutputVerdict.CHANGED}:
             self.lease.take(caller, asked.holder)
         if verdict is not OutputVerdict.TAKEN or not asked.crc:
             self._show_applied()

@@ -124,9 +124,13 @@ def services(tmp_path: Path) -> Iterator[Services]:
 
 @pytest.fixture(scope="session")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """One rack for all tests, each of which has a session of its own; its watchdog leads to `SAFE_STATE`."""
+    """One rack for all tests, each of which has a session of its own; its watchdog leads to `SAFE_STATE`.
+
+    It does not limit what it applies: so it shows what control PLCs do.
+    """
     started = Services(tmp_path_factory.mktemp("plant"))
-    yield started.start("plant", "plant.watchdog.action=safe", f"plant.watchdog.safe_state={list(SAFE_STATE)}")
+    safe = ("plant.watchdog.action=safe", f"plant.watchdog.safe_state={list(SAFE_STATE)}")
+    yield started.start("plant", *safe, "plant.rate_limited=false")
     started.end()
 
 

@@ -103,6 +103,35 @@ def test_in_real_time_what_a_network_held_up_is_not_applied(switch_on: "SwitchOn
         assert plc.send(*U, tick=tick).verdict == OutputVerdict[verdict], tick
 
 
+def test_nobody_moves_an_output_by_more_than_its_rate_in_a_tick_however_often_it_is_written(
+    switch_on: "SwitchOn",
+) -> None:
+    rack = switch_on(session=REALTIME, rate_limited=True)
+    plc = rack.client("control PLC", 77)
+    start = rack.shown().u
+    plc.send(*start)
+    rack.passes(1)
+    first = plc.send(*map(float.__add__, start, (0.5, -10.0, 0.1)))
+    assert first.verdict == OutputVerdict.TAKEN
+    for _ in range(3):  # within the same tick
+        again = plc.send(*map(float.__add__, first.u, (0.5, -10.0, 0.1)), generation=0)
+        assert (again.verdict, again.u) == (OutputVerdict.LIMITED, pytest.approx(first.u, rel=1e-6))
+    rack.passes(1)
+    far = plc.send(0.0, 1000.0, 100.0)
+    assert far.verdict == OutputVerdict.LIMITED
+    assert far.u == pytest.approx([again.u[0] - 0.5, again.u[1] + 10.0, again.u[2] + 0.1], rel=1e-6)
+    assert (far.holder, far.generation) == (77, first.generation + 4), "it is to be read back"
+    assert plc.send(*far.u, generation=first.generation).verdict == OutputVerdict.CHANGED
+    assert rack.operator.read(WatchdogStatus).lowest >= 38, "outputs that are limited are a sign of life"
+
+
+def test_the_safe_state_is_applied_in_one_step_also_by_a_rack_that_limits(switch_on: "SwitchOn") -> None:
+    rack = switch_on(session=REALTIME, watchdog=SAFE_AFTER_5_S, rate_limited=True)
+    rack.client("control PLC", 77).send(*U)
+    rack.passes(20)
+    assert rack.shown().u == SAFE
+
+
 # -- breaks ------------------------------------------------------------------------------------------------------------
 
 

@@ -126,6 +126,8 @@ class LinkCause(IntEnum):
     STARTED = 12
     PACE = 13
     """The time base of the session was changed."""
+    LIMITED = 14
+    """The rack moved its outputs by no more than it lets anybody move them in one of its ticks."""
 
 
 class Process(NamedTuple):
@@ -302,7 +304,7 @@ class PlantLinkStatus(NamedTuple):
         int,
         u16(
             "0 none, 1 no answer, 2 damaged, 3 implausible, 4 wrong session, 5 untimely, 6 changed, 7 second master, "
-            "8 refused, 9 overslept, 10 leapt, 11 stopped, 12 started, 13 pace",
+            "8 refused, 9 overslept, 10 leapt, 11 stopped, 12 started, 13 pace, 14 limited",
             values=LinkCause,
         ),
     ] = LinkCause.NONE

@@ -50,6 +50,8 @@ class OutputVerdict(IntEnum):
     """For another tick than the present one; in real time, too old."""
     CHANGED = 4
     """What is applied has changed since it was read back: read it back, and begin from there."""
+    LIMITED = 5
+    """Applied as far as the rack lets outputs move in one of its ticks: read back how far, and begin from there."""
 
 
 class Actuators(NamedTuple):
@@ -94,7 +96,8 @@ class Measurement(NamedTuple):
     verdict: Annotated[
         int,
         u16(
-            "Outputs sent last: 0 none, 1 taken, 2 wrong session, 3 untimely, 4 changed since they were read back",
+            "Outputs sent last: 0 none, 1 taken, 2 wrong session, 3 untimely, 4 changed since they were read back, "
+            "5 limited to the rate in a tick",
             values=OutputVerdict,
         ),
     ] = OutputVerdict.NONE
