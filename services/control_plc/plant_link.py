@@ -83,6 +83,11 @@ class PlantLink:
         """Whether outputs may be written."""
         return self.state is PlantLinkState.IN_STEP
 
+    @property
+    def is_alarmed(self) -> bool:
+        """An alarm of the link is active: it says why no outputs are written."""
+        return any(self._alarms.rows[alarm].active for alarm in ALARMS.values())
+
     # -- events --------------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:

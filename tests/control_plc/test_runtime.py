@@ -126,6 +126,20 @@ async def test_an_alarm_with_a_delay_is_raised_also_while_no_scans_are_made() ->
         await until(lambda: alarm(plc, AlarmKind.PLANT_LOST) is AlarmState.UNACKNOWLEDGED)
 
 
+async def test_scans_that_are_not_made_are_alarmed_from_outside_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = asyncio.Event()
+    async with running(SmallRack(1)) as plc:
+        monkeypatch.setattr(plc, "_scan", ended.wait)
+        watch = asyncio.create_task(plc.watch_scans())
+        ask(plc, ControlSession(1, 1, 10.0))
+        await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IN_STEP)
+        await until(lambda: alarm(plc, AlarmKind.SCANS_STOPPED) is AlarmState.UNACKNOWLEDGED)
+        ask(plc, ControlSession(2, 0, 1.0))  # in lock-step nobody expects scans
+        ended.set()
+        await until(lambda: alarm(plc, AlarmKind.SCANS_STOPPED) is AlarmState.RETURNED)
+        watch.cancel()
+
+
 async def test_a_new_session_does_not_wait_for_a_tick_that_lasts_long() -> None:
     rack = SmallRack(1)
     async with running(rack, session={"autostart": True, "mode": "realtime", "factor": 0.01}) as plc:
