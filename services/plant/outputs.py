@@ -57,11 +57,16 @@ class AppliedOutputs:
         self._at_beginning = u
         self._begin_generation()
 
-    def offer(self, asked: Actuators, caller: Caller, *, session: int, tick: int, realtime: bool) -> OutputVerdict:
-        """Judge outputs, and take them if they are for the present session (0 is none), tick and generation."""
+    def offer(
+        self, asked: Actuators, caller: Caller, *, session: int, tick: int, realtime: bool, ended: bool = False
+    ) -> OutputVerdict:
+        """Judge outputs, and take them if they are for the present session (0 is none), tick and generation.
+
+        The tick in which a session has `ended` takes none.
+        """
         if not session or asked.session != session:
             self.verdict = OutputVerdict.WRONG_SESSION
-        elif abs(asked.tick - tick) > (STALE_TICKS if realtime else 0):
+        elif ended or abs(asked.tick - tick) > (STALE_TICKS if realtime else 0):
             self.verdict = OutputVerdict.UNTIMELY
         else:
             self.verdict = self._judge_writer(asked, caller)

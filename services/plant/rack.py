@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from coldloop.journal import Journal
 from coldloop.pace import Pace
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
+from coldloop.process import INPUT_NAMES, LAST_TICK, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import pace_subject
@@ -105,6 +105,11 @@ class Rack:
         return self._program.tick
 
     @property
+    def has_ended(self) -> bool:
+        """The session has reached its last tick: the plant moves again in another one."""
+        return self.tick >= LAST_TICK
+
+    @property
     def station(self) -> StationSample | None:
         """Compression station and nitrogen at the present tick; a cold box alone has none."""
         return self._program.station
@@ -144,7 +149,7 @@ class Rack:
         self.outputs = AppliedOutputs(
             (cv155, ncr22, cv156), rate=self._rate, holder=state.holder, generation=next_generation(state.generation)
         )
-        self.moving = state.pace.realtime and program.tick > 0
+        self.moving = state.pace.realtime and program.tick > 0 and not self.has_ended
 
     def retained(self) -> RetainedState:
         """Return what `resume` needs."""
@@ -159,10 +164,11 @@ class Rack:
     # -- outputs -------------------------------------------------------------------------------------------------------
 
     def offer(self, asked: Actuators, caller: Caller) -> OutputVerdict:
-        """Judge outputs, and apply them from the present tick on if they are taken."""
+        """Judge outputs, and apply them from the present tick on if they are taken: at the last one none are."""
         verdict = self.outputs.offer(
-            asked, caller, session=self.session.number, tick=self.tick, realtime=self.session.pace.realtime
-        )
+            asked, caller, session=self.session.number, tick=self.tick, realtime=self.session.pace.realtime,
+            ended=self.has_ended,
+        )  # fmt: skip
         if verdict in APPLIED:
             self._program.apply(self.outputs.u)
             self.watchdog.trigger(self.tick)

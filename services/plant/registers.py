@@ -110,7 +110,11 @@ class RackRegisters:
         load = find_load(section.load, header.w0)
         session = Session(1 if configured.autostart else 0, pace, load, section.seed)
         state = self._memory.recall()
-        journal = Journal(now=utc) if state is None else Journal(boot=state.boot + 1, count=state.events, now=utc)
+        journal = (
+            Journal(now=utc)
+            if state is None
+            else Journal(boot=state.boot % 0xFFFF_FFFF + 1, count=state.events, now=utc)
+        )
         generation = first_generation if state is None else next_generation(state.generation)
         cv155, ncr22, cv156 = header.u0
         rack = Rack(

@@ -6,11 +6,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process import L1, T5
+from coldloop.process import L1, LAST_TICK, T5
 from coldloop.registers.audit import EventKind
 from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import (
     Actuators,
+    LiveLoad,
+    LoadAhead,
+    LoadStatus,
+    LoadStep,
     Measurement,
     OutputVerdict,
     PlantSample,
@@ -101,6 +105,34 @@ def test_in_real_time_what_a_network_held_up_is_not_applied(switch_on: "SwitchOn
     rack.passes(40)
     for tick, verdict in ((31, "UNTIMELY"), (49, "UNTIMELY"), (32, "TAKEN"), (48, "TAKEN")):
         assert plc.send(*U, tick=tick).verdict == OutputVerdict[verdict], tick
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_a_session_ends_at_its_last_tick_and_another_one_begins(switch_on: "SwitchOn", mode: str) -> None:
+    rack = switch_on(session={"mode": mode})
+    plc = rack.client("control PLC", 77)
+    rack.registers.rack._program.tick = LAST_TICK - 1  # noqa: SLF001 - 34 years are too long
+    assert plc.send(*U).verdict == OutputVerdict.TAKEN
+    if mode == "realtime":
+        rack.registers.advance()
+    assert (rack.tick, rack.registers.rack.has_ended) == (LAST_TICK, True)
+    assert plc.send(*U).verdict == OutputVerdict.UNTIMELY
+    assert rack.tick == LAST_TICK
+    assert plc.exchange(plc.outputs(*U, tick=LAST_TICK + 1)) == (3,)
+    assert rack.operator.read(LoadStatus).watts > 0
+    assert rack.operator.write(PlantSession(0xFFFF_FFFF, 0, 1.0, 1, 1)) is None
+    assert plc.send(*U).verdict == OutputVerdict.TAKEN
+    assert rack.operator.write(PlantSession(1, 0, 1.0, 1, 1)) is None
+
+
+def test_no_load_is_taken_for_a_tick_that_never_comes(switch_on: "SwitchOn") -> None:
+    rack = switch_on()
+    assert rack.operator.write(LoadStep(LAST_TICK + 1, 300.0), 1) == (3,)
+    assert rack.operator.write(LiveLoad(0xFFFF_FFFF, 300.0)) == (3,)
+    ahead = LoadAhead.first_of(1, [LAST_TICK - 1, LAST_TICK + 60_000], [300.0, 310.0])
+    assert rack.operator.write(ahead) == (3,)
+    assert rack.operator.write(LoadAhead.first_of(1, [LAST_TICK - 1, LAST_TICK], [300.0, 310.0])) is None
+    assert rack.operator.read(LoadStatus).last_tick == LAST_TICK
 
 
 def test_nobody_moves_an_output_by_more_than_its_rate_in_a_tick_however_often_it_is_written(
