@@ -55,6 +55,10 @@ KEEP_ALIVE_S: Final = 1.0
 """While paused, the rack is asked something so often."""
 
 
+STATE_REFUSED: Final = 1
+"""Cause of the alarm STATE_NOT_RETAINED: at the start there was one that is not used."""
+
+
 class ControlPlc:
     """Connects the program to the registers and to the rack."""
 
@@ -87,7 +91,9 @@ class ControlPlc:
         self._awaiting_since: float | None = None
         self.bank.put(program.operator)
         self.bank.put(WatchdogTime(program.watchdog.time))
-        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None))
+        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._memory.refused))
+        if self._memory.refused:
+            program.alarms.raised(AlarmKind.STATE_NOT_RETAINED, STATE_REFUSED)
         self._publish()
 
     def close(self) -> None:

@@ -4,6 +4,7 @@ In lock-step, outputs that are taken make the plant due for one tick. In real ti
 whatever the control PLC does.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -136,10 +137,12 @@ class Rack:
         """Go on where a session was when the rack was ended; a new generation of outputs begins.
 
         Raises:
-            KeyError, TypeError, ValueError: It is not the state of such a plant; nothing has changed.
+            ArithmeticError, AttributeError, LookupError, TypeError, ValueError: It is not the state of such a plant, or
+                one from which no plant goes on; nothing has changed.
         """
         load = LoadProfile(state.times, state.watts)
         schedule = LoadSchedule(load)
+        _try_a_tick(self._make_plant(schedule, state.seed), state)
         program = self._make_plant(schedule, state.seed)
         program.resume(**state.program)
         cv155, ncr22, cv156 = state.program["u"]
@@ -296,6 +299,14 @@ class Rack:
             "outputs": dict(zip(OUTPUT_NAMES, program.measure(), strict=True)),
             **({} if station is None else {"station": station_snapshot(station)}),
         }
+
+
+def _try_a_tick(program: PlantProgram, state: RetainedState) -> None:
+    """Move a plant, which is not used any further, on from a state that may be nonsense."""
+    program.resume(**state.program)
+    program.advance()
+    if not all(map(math.isfinite, (*program.measure(), *program.state))):
+        raise ValueError("from there the plant goes nowhere")
 
 
 def station_snapshot(station: StationSample) -> Mapping[str, object]:

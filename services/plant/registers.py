@@ -41,7 +41,7 @@ from plant.load import find_load
 from plant.outputs import next_generation
 from plant.program import LoadProfile
 from plant.rack import APPLIED, MakePlant, Rack, Session
-from plant.retained_state import Memory, refused
+from plant.retained_state import Memory
 from plant.settings import SHOWN, PlantSettings
 
 log = logging.getLogger("coldloop.plant")
@@ -81,7 +81,7 @@ class RackRegisters:
             settings, header, make_plant, utc, first_generation or secrets.randbelow(2**31) + 1
         )
         self._journal = JournalPublication(self.rack.journal, self.bank)
-        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed))
+        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed), int(self._memory.refused))
         self.lease = WriterLease("the outputs", lambda: self.rack.silence_s, self._note_lease, now)
         self._written_row = 0
         self._outdated = True
@@ -125,8 +125,8 @@ class RackRegisters:
             return rack, False
         try:
             rack.resume(state)
-        except (KeyError, TypeError, ValueError) as error:
-            refused(repr(error))
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            self._memory.refuse(repr(error))
             return rack, False
         return rack, True
 

@@ -248,7 +248,22 @@ async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
 
 
 @pytest.mark.parametrize(
-    "odd", [{"pace": (1, 0.0)}, {"pace": (1, math.nan)}, {"operator": (77, 1, 1, 1)}, {"operator": (2, math.nan, 1, 1)}]
+    "odd",
+    [
+        {"pace": (1, 0.0)},
+        {"pace": (1, math.nan)},
+        {"pace": (1, 1e300)},
+        {"operator": (77, 1, 1, 1)},
+        {"operator": (2, math.nan, 1, 1)},
+        {"operator": (2, 1e300, 1, 1)},
+        {"tick": -5},
+        {"tick": 2**32 - 1},
+        {"updates": 2**32 - 1},
+        {"alarms": [(9, 0, 0, 0, 0, 0, 1, 0)] * len(AlarmKind)},
+        {"alarms": [(0, 0, 0, -1, 0, 0, 1, 2**40)] * len(AlarmKind)},
+        {"playing": ((2**32 - 1, 0, 0, 0, 0, 0, 0), "")},
+    ],
+    ids=str,
 )
 async def test_a_retained_state_that_cannot_be_keeps_nobody_from_starting(tmp_path: Path, odd: dict[str, Any]) -> None:
     file = tmp_path / "state"
@@ -261,3 +276,5 @@ async def test_a_retained_state_that_cannot_be_keeps_nobody_from_starting(tmp_pa
     kept.save({**state, **odd})
     async with running(SmallRack(4), control_plc={"retain": {"file": file}}) as plc:
         await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IDLE)
+        assert alarm(plc, AlarmKind.STATE_NOT_RETAINED) is AlarmState.UNACKNOWLEDGED
+        assert file.with_name("state.refused").exists(), "it is set aside"

@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -23,7 +23,10 @@ from coldloop.registers.plant import (
     SensorFaultKind,
 )
 from coldloop.registers.safety import WatchdogState, WatchdogStatus, WatchdogTime
+from coldloop.retained import RetainedFile
 from coldloop.seal import sealed
+from plant.retained_state import OWNER
+from tests.plant.conftest import HEADER
 
 if TYPE_CHECKING:
     from tests.plant.conftest import RackOnTheBus
@@ -357,6 +360,42 @@ def test_no_generation_comes_twice_when_the_rack_is_killed_behind_an_answer(
     generation = rack.client("another control PLC", 78).send(44.0, 80.0, 36.0, generation=1).generation
     assert generation == 2
     assert switch_on(**retained).shown().generation > generation
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"pace": (1, 1e300)},
+        {"times": (0, 2**33), "watts": (385.0, 300.0)},
+        {"watts": (1e300,)},
+        {"program": {}},
+        {"program": {"tick": -5}},
+        {"program": {"x": [1e300] * 28}},
+        {"program": {"x": [0.0] * 28}},
+        {"program": {"x": [10**400] * 28}},
+        {"program": {"u": [43.0]}},
+        {"program": {"noise_state": {}}},
+        {"program": {"noise_state": {"bit_generator": "PCG64", "state": {"state": -1, "inc": 2**200}}}},
+        {"program": {"noise_state": 7}},
+    ],
+    ids=str,
+)
+def test_a_sealed_state_that_cannot_be_is_set_aside_and_the_rack_starts_without(
+    switch_on: "SwitchOn", tmp_path: Path, odd: dict[str, Any]
+) -> None:
+    file = tmp_path / "plant"
+    switch_on(retain={"file": str(file)}).client("control PLC", 77).send(*U)
+    kept = RetainedFile(file, OWNER, HEADER.short_digest)
+    state = kept.load()
+    assert state is not None
+    if odd.get("program"):
+        odd = {"program": state["program"] | odd["program"]}
+    kept.save(state | odd)
+    rack = switch_on(retain={"file": str(file)})
+    assert (rack.tick, file.with_name("plant.refused").exists()) == (0, True)
+    (boot,) = rack.events(EventKind.BOOT)
+    assert (boot.subject, boot.cause) == (0, 1)
+    assert rack.client("control PLC", 77).send(*U).verdict == OutputVerdict.TAKEN
 
 
 @pytest.mark.parametrize("content", [b"", b"coldloop-retained plant/2", b"\x00" * 100])
