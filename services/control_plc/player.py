@@ -82,6 +82,11 @@ class SequencePlayer:
         """The optimiser has planned the update under way, so its sequence is to be expected."""
         return self.phase in (UpdatePhase.PLANNED, UpdatePhase.ANSWERED)
 
+    @property
+    def given_up(self) -> bool:
+        """No sequence is to be expected for the last update: it was abandoned, or what was sent for it refused."""
+        return self.phase in (UpdatePhase.NONE, UpdatePhase.REFUSED, UpdatePhase.ABANDONED)
+
     # -- scan ----------------------------------------------------------------------------------------------------------
 
     def begin(self, tick: int) -> bool:

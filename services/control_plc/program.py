@@ -42,6 +42,8 @@ from control_plc.process_alarms import ProcessAlarms
 from control_plc.sensors import SensorMonitor
 from control_plc.settings import ControlSection, ControlStrategy
 
+HANDSHAKE_TICKS = TICKS_PER_SAMPLE
+"""For no longer are the classical loops held for a sequence that is to come."""
 HANDSHAKE_PAUSE_S = 30.0
 """After a handshake that came to nothing the classical loops are not held again for so long."""
 SET_BACK_TICKS = TICKS_PER_SAMPLE
@@ -152,6 +154,10 @@ class ControlProgram:
         self._unknown = False
         """The load or the state that was measured last makes no sense."""
         self._failed_handshake = -math.inf
+        self._held_from: int | None = None
+        """Since when the loops have been held for the sequence to come."""
+        self._answer_failed = False
+        """The last handshake came to nothing with a sequence that had been accepted."""
         self._in_scan = False
         self.watchdog.set(self.watchdog.time, tick)
         self._loops.restart()
@@ -235,7 +241,8 @@ class ControlProgram:
             if before is not Mode.CLASSICAL:
                 self._loops.restart()
         elif before is Mode.CLASSICAL:
-            self._failed_handshake = -math.inf
+            self._failed_handshake, self._answer_failed = -math.inf, False
+        self._held_from = None
         self._note_mode(tick)
 
     def _note_mode(self, tick: int) -> None:
@@ -251,11 +258,22 @@ class ControlProgram:
         return self.guard.applied if row is None else row
 
     def _handing_over(self, tick: int) -> bool:
-        """Tell whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows."""
-        if self.player.has_answer:  # it was judged from where the inputs are
-            return True
+        """Tell whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows.
+
+        A handshake fails when its update is abandoned or its sequence refused, and in any case after `HANDSHAKE_TICKS`.
+        """
+        player, held_from = self.player, self._held_from
+        if held_from is not None and (player.given_up or not 0 <= tick - held_from < HANDSHAKE_TICKS):
+            self._failed_handshake, self._held_from = tick, None
+            self._answer_failed = player.has_answer
         rested = tick - self._failed_handshake > HANDSHAKE_PAUSE_S / TICK_S
-        return rested and self.operator.mode == OperatorMode.AUTO and self.player.answering
+        if player.has_answer:  # it was judged from where the inputs are
+            held = rested or not self._answer_failed
+        else:
+            held = rested and self.operator.mode == OperatorMode.AUTO and player.answering
+        if held and self._held_from is None:
+            self._held_from = tick
+        return held
 
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
@@ -314,6 +332,7 @@ class ControlProgram:
         self.ladder.set_back(tick)
         self.watchdog.set_back(tick)
         self._failed_handshake = min(self._failed_handshake, tick)
+        self._held_from = None
         self.alarms.begin_at(tick)
 
     # -- the optimiser's side ------------------------------------------------------------------------------------------
