@@ -42,6 +42,8 @@ from control_plc.process_alarms import ProcessAlarms
 from control_plc.sensors import SensorMonitor
 from control_plc.settings import ControlSection, ControlStrategy
 
+SEEN = 0.1
+"""Share of its rate by which an input must have moved for the process to show it."""
 HANDSHAKE_TICKS = TICKS_PER_SAMPLE
 """For no longer are the classical loops held for a sequence that is to come."""
 HANDSHAKE_PAUSE_S = 30.0
@@ -150,7 +152,9 @@ class ControlProgram:
             self.guard.begin_at(tick, applied)
         self._before = self.guard.applied
         self.player = SequencePlayer(self.guard, self._point.model_digest, updates=updates)
-        self.sensors = SensorMonitor(self._section.sensors, self._point.outputs)
+        self.sensors = SensorMonitor(
+            self._section.sensors, self._point.outputs, [SEEN * rate for rate in self._limits.rate]
+        )
         self._unknown = False
         """The load or the state that was measured last makes no sense."""
         self._failed_handshake = -math.inf
@@ -278,7 +282,7 @@ class ControlProgram:
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
         applied = tuple(self.guard.applied)
-        y = tuple(self.sensors.check(self.tick, measurement.y))
+        y = tuple(self.sensors.check(self.tick, measurement.y, applied, measurement.x, (measurement.load,)))
         self.process = Process(self.tick, measurement.load, applied, y)
         self._unknown = not (0.0 <= measurement.load <= MAX_LOAD_W and _are_states(measurement.x))
         self._let_play(usable=self._usable)
@@ -309,7 +313,7 @@ class ControlProgram:
         """Give up the scan under way: what the rack has done with its outputs is not known."""
         self._in_scan = False
 
-    def rejoin(self, tick: int, applied: Sequence[float]) -> None:
+    def rejoin(self, tick: int, applied: Sequence[float], passed: int | None = None) -> None:
         """Go on at another tick: the rack was away, or time has leapt.
 
         Forward, all timers count the time that has passed. Back by a little, they begin at the present tick at the
@@ -318,12 +322,13 @@ class ControlProgram:
         Args:
             tick: Tick of the next scan.
             applied: What the rack applies, read back from it.
+            passed: Ticks since the last scan by our own clock; None in lock-step.
         """
         if tick < self.tick:
             self._set_back(tick)
         self.tick = self.alarms.now = tick
         self._in_scan = False
-        self.guard.begin_at(self.tick, SequenceRow(*applied))
+        self.guard.begin_at(self.tick, SequenceRow(*applied), passed)
 
     def _set_back(self, tick: int) -> None:
         if self.tick - tick > SET_BACK_TICKS:

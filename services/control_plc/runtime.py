@@ -347,6 +347,7 @@ class ControlPlc:
     def _set_clock(self) -> None:
         self._clock.begin(self.sessions.pace.factor, time.monotonic())
         self._finder.look_at_once()
+        self._cycle.begin_time()
         self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
 
     def _show_pace(self) -> None:

@@ -269,6 +269,23 @@ def test_a_frozen_level_is_found_while_others_move_and_a_process_at_rest_is_not_
     assert lively.program.bad_sensors == 1 << L1
 
 
+@pytest.mark.parametrize("rests", [True, False])
+def test_an_image_that_stands_still_as_a_whole_is_an_old_one_unless_the_plant_may_rest(
+    new_bench: NewBench, *, rests: bool
+) -> None:
+    bench = new_bench(InputLimits(), section(sensors={"may_rest": rests}))
+    bench.steady = bench.frozen = True
+    bench.scans(200)
+    assert bool(bench.program.bad_sensors) is not rests
+    bench.program.operate(Operator(OperatorMode.MANUAL, 43.1, 75.0, 36.0))
+    bench.scans(100)
+    assert bench.program.bad_sensors == 2**22 - 1, "the inputs have moved, and nothing else"
+    assert alarm(bench, AlarmKind.SENSOR_BAD) is AlarmState.UNACKNOWLEDGED
+    bench.moving = True
+    bench.scans(20)
+    assert bench.program.bad_sensors == 0
+
+
 def test_a_state_that_is_no_number_is_not_worked_with(rig: "Bench") -> None:
     program = rig.program
     program.begin_scan()
