@@ -6,7 +6,7 @@
 import asyncio
 import contextlib
 import time
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Sequence
 from typing import Final, TypeVar
 
 from coldloop.errors import LinkError, ModelFileError, PeerUnreachableError
@@ -43,6 +43,14 @@ LAST_LOOK_S: Final = 2.0
 LAST_SESSION: Final = 2**32 - 1
 CONTACT_S: Final = 1.0
 """With `tolerant`: how long an answer may take. A process that does not go on must not hold up the rest for long."""
+
+
+def next_session(present: Sequence[int]) -> int:
+    """Return a number for a new session that none of the services is in; after the largest they begin with 1 again."""
+    session = max(present) % 0xFFFF_FFFF + 1
+    while session in present:
+        session += 1
+    return session
 
 
 class SessionClient:
@@ -123,13 +131,9 @@ class SessionClient:
         """Write the load and the settings of a new session to all three; return its number.
 
         Raises:
-            LinkError: A service does not answer or refuses, or no session can follow.
+            LinkError: A service does not answer or refuses.
         """
-        session = 1
-        for client in self.clients.values():
-            session = max(session, (await client.read(Identity)).session + 1)
-        if session > LAST_SESSION:
-            raise LinkError("the rig has had the last number that a session can have: restart its services")
+        session = next_session([(await client.read(Identity)).session for client in self.clients.values()])
         realtime = int(scenario.realtime)
         await self.optimizer.write(
             OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / TICK_S))
