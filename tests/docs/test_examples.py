@@ -3,13 +3,14 @@
 A block of `sh`, `console` or `python` that is not executed here says so in a comment in front of it, with the reason.
 """
 
+import io
 import re
 import shlex
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +21,9 @@ from tests.conftest import Coldloop, first_of_three_ports
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(
-    r"(?:^<!-- (?P<marker>.*?) -->\n)?^```(?P<language>sh|console|python)\n(?P<text>.*?)^```", re.MULTILINE | re.DOTALL
+    r"(?:^<!-- (?P<marker>.*?) -->\n)?^```(?P<language>sh|console|python)\n(?P<text>.*?)^```"
+    r"(?:\n\n```text\n(?P<printed>.*?)^```)?",
+    re.MULTILINE | re.DOTALL,
 )
 NOT_EXECUTED = "not executed: "
 TEST_SUITE = "executed: as a test suite"
@@ -59,6 +62,8 @@ class Example(NamedTuple):
     language: str
     text: str
     line: int
+    printed: str | None
+    """What the page says that it prints; None where it says nothing."""
 
     @property
     def commands(self) -> list[str]:
@@ -69,7 +74,13 @@ class Example(NamedTuple):
 def examples(page: Path) -> list[Example]:
     text = page.read_text(encoding="utf-8")
     return [
-        Example(found["marker"] or "", found["language"], found["text"], text.count("\n", 0, found.start("text")))
+        Example(
+            found["marker"] or "",
+            found["language"],
+            found["text"],
+            text.count("\n", 0, found.start("text")),
+            found["printed"],
+        )
         for found in BLOCK.finditer(text)
     ]
 
@@ -99,7 +110,8 @@ class Reader:
         names: dict[str, object] = {"__name__": "__main__"}
         blocks = examples(page)
         if any("runs/" in each.text for each in blocks):
-            for name in "ab":
+            made = {name for each in blocks for name in re.findall(r"--out runs/(\w+)", each.text)}
+            for name in {"a", "b"} - made:
                 self._run(f"coldloop run --in-process --load {name} --duration 10s --figures png --out runs/{name}")
         for each in blocks:
             if each.marker.startswith(NOT_EXECUTED):
@@ -109,7 +121,9 @@ class Reader:
                 if each.marker == TEST_SUITE:
                     self._test_suite(each)
                 elif each.language == "python":
-                    exec(compile("\n" * each.line + each.text, str(page), "exec"), names)  # noqa: S102 our own page
+                    with redirect_stdout(io.StringIO()) as printed:
+                        exec(compile("\n" * each.line + each.text, str(page), "exec"), names)  # noqa: S102 our own page
+                    assert each.printed in {None, printed.getvalue()}
                 else:
                     for command in each.commands:
                         self._run(shortened(command))
