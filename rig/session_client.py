@@ -40,7 +40,6 @@ QUIET_S: Final = 20.0
 """A rig on which nothing happens for this long is given up."""
 LAST_LOOK_S: Final = 2.0
 """How long the events of a run that has ended are waited for."""
-LAST_SESSION: Final = 2**32 - 1
 CONTACT_S: Final = 1.0
 """With `tolerant`: how long an answer may take. A process that does not go on must not hold up the rest for long."""
 
