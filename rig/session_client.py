@@ -133,6 +133,7 @@ class SessionClient:
             LinkError: A service does not answer or refuses.
         """
         session = next_session([(await client.read(Identity)).session for client in self.clients.values()])
+        self.session = session
         realtime = int(scenario.realtime)
         await self.optimizer.write(
             OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / TICK_S))
@@ -141,11 +142,10 @@ class SessionClient:
         await self.plant.write(PlantSession(session, realtime, scenario.factor, scenario.seed, rows))
         self.load = LoadStream(self.plant, session, scenario.load, sent=rows)
         await self.control.write(ControlSession(session, realtime, scenario.factor))
-        self.session = session
         return session
 
-    async def hold(self, session: int, look_s: float) -> None:
-        """Keep a session in real time supplied with its load until cancelled, or until another one begins.
+    async def hold(self, look_s: float) -> None:
+        """Keep the session that was started last, in real time, supplied with its load until cancelled.
 
         A load that somebody else writes replaces all of it, as it replaces what the plant knows of later ticks.
 
@@ -154,7 +154,7 @@ class SessionClient:
         """
         while True:
             identity = await self.plant.read(Identity)
-            if identity.session != session:
+            if identity.session != self.session:  # somebody has begun another one
                 self.load = None
             elif self.load is not None and not self.load.done:
                 if await self.load.was_replaced():
