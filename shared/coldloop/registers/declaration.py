@@ -65,11 +65,18 @@ class Field:
 
 
 def u16(
-    description: str, *, unit: str = "", low: int = 0, high: int | None = None, values: type[IntEnum] | None = None
+    description: str,
+    *,
+    unit: str = "",
+    low: int | None = None,
+    high: int | None = None,
+    values: type[IntEnum] | None = None,
 ) -> Field:
-    """Declare an unsigned 16-bit register; `values` gives an enumeration's numbers their meaning, and their end."""
-    end = 0xFFFF if values is None else max(values)
-    return Field(Kind.U16, description, unit, low, end if high is None else high, values=values)
+    """Declare an unsigned 16-bit register; `values` gives an enumeration's numbers their meaning, and their range."""
+    lowest, highest = (0, 0xFFFF) if values is None else (min(values), max(values))
+    return Field(
+        Kind.U16, description, unit, lowest if low is None else low, highest if high is None else high, values=values
+    )
 
 
 def u32(description: str, *, unit: str = "", low: int | None = None, high: int | None = None) -> Field:
