@@ -38,9 +38,11 @@ class RunFolder:
     def _document(self, name: str) -> dict[str, Any]:
         try:
             document: dict[str, Any] = json.loads((self.path / name).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise UsageError(f"{self.path / name}: {reason}; name the folder of a run that has ended") from None
+        if not isinstance(document, dict):
+            raise UsageError(f"{self.path / name}: not an object; name the folder of a run that has ended")
         return document
 
     @property

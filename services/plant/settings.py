@@ -146,7 +146,7 @@ class PlantSection(BaseModel):
     server: PlantServer = PlantServer()
     word_order: WordOrder = WordOrder.HIGH_FIRST
     metrics: MetricsSettings = MetricsSettings()
-    load: str = "2h"
+    load: Annotated[str, Field(min_length=1)] = "2h"
     """Named load or CSV file."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     """Seed of the sensors' noise."""
