@@ -11,6 +11,7 @@ from typing import Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
 from coldloop.errors import LinkError
+from rig.compiling_services import show_compiling
 from rig.ports import ReservedPorts
 from rig.recording import Recorder
 from rig.scenario import Scenario
@@ -54,6 +55,7 @@ class LocalServices:
         self._processes: dict[str, asyncio.subprocess.Process] = {}
         self._watchers: set[asyncio.Task[None]] = set()
         self._ended: asyncio.Queue[str] = asyncio.Queue()
+        self._showing: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
         """Start them."""
@@ -61,10 +63,15 @@ class LocalServices:
         for service in SERVICES:
             self.log(service).unlink(missing_ok=True)
             await self.start(service)
+        logs = [self.log(service) for service in SERVICES]
+        self._showing = asyncio.create_task(show_compiling(logs), name="show compiling")
         return self
 
     async def __aexit__(self, *_: object) -> None:
         """End them."""
+        if self._showing is not None:
+            self._showing.cancel()
+            await asyncio.gather(self._showing, return_exceptions=True)
         processes, self._processes = self._processes, {}
         for process in processes.values():
             for number in (signal.SIGTERM, signal.SIGCONT):  # one that is stopped could not end

@@ -16,6 +16,7 @@ from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.settings import TlsSettings
 from hmi.settings import HmiSection, HmiSettings
 from hmi.users import PageRole, write_user
+from rig.private_folder import new_own
 from rig.rig_endpoints import RigEndpoints
 
 GRACE_S: Final = 5.0
@@ -68,18 +69,34 @@ def readers(tls: TlsSettings | None) -> TlsSettings | None:
 
 
 class FirstLogin(NamedTuple):
-    """The operator of a rig whose configuration names no users."""
+    """The operator of a page whose configuration names no users."""
 
     file: Path
     password: str
 
     @classmethod
     def made_in(cls, folder: Path) -> Self:
-        """Write a user with a password of chance into a folder."""
+        """Write a user with a random password into a folder."""
         login = cls(folder / "page-users", secrets.token_urlsafe(9))
         login.file.unlink(missing_ok=True)
         write_user(login.file, OPERATOR, PageRole.OPERATE, login.password)
         return login
+
+    @property
+    def line(self) -> str:
+        """How to log in."""
+        return f"  to operate     user {OPERATOR}, password {self.password} (of this run)\n"
+
+
+def with_own_files(section: HmiSection, folder: Path) -> tuple[HmiSection, FirstLogin | None]:
+    """Return the settings of a page with users and an audit in a private folder, where they name none."""
+    update: dict[str, object] = {}
+    login = None if section.login.users else FirstLogin.made_in(folder)
+    if login is not None:
+        update["login"] = section.login.model_copy(update={"users": login.file})
+    if section.audit is None:
+        update["audit"] = folder / "page-audit.jsonl"
+    return section.model_copy(update=update), login
 
 
 class PageProcess:
@@ -93,14 +110,7 @@ class PageProcess:
 
     def __init__(self, section: HmiSection, endpoints: RigEndpoints, folder: Path) -> None:
         self._log = folder / "logs" / "hmi.log"
-        self._login = None if section.login.users else FirstLogin.made_in(folder)
-        section = pointed_at(section, endpoints)
-        update: dict[str, object] = {}
-        if self._login is not None:
-            update["login"] = section.login.model_copy(update={"users": self._login.file})
-        if section.audit is None:
-            update["audit"] = folder / "page-audit.jsonl"
-        self._section = section.model_copy(update=update)
+        self._section, self._login = with_own_files(pointed_at(section, endpoints), folder)
         self._process: asyncio.subprocess.Process | None = None
 
     async def __aenter__(self) -> Self:
@@ -110,7 +120,7 @@ class PageProcess:
             **to_environment(HmiSettings(hmi=self._section)),
         }
         self._log.parent.mkdir(parents=True, exist_ok=True)
-        with self._log.open("wb") as log:
+        with new_own(self._log) as log:
             self._process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "hmi", "--with-parent", env=environment, start_new_session=True,
                 stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
@@ -155,5 +165,5 @@ class PageProcess:
         scheme = "https" if self._section.https else "http"
         text = f"  page           {scheme}://{self._section.host}:{self._section.port}/\n"
         if self._login is not None:
-            text += f"  to operate     user {OPERATOR}, password {self._login.password} (of this run)\n"
+            text += self._login.line
         return text

@@ -18,7 +18,7 @@ from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, STATION_ROWS, PlantSession, SensorFault, Surroundings
 from plant.own_model import own_header
 from rig.driving import CONTROL, PLANT
-from rig.load_stream import LoadStream, write_table
+from rig.load_stream import LAST_TICK, LoadStream, write_table
 from rig.recording import LinkStatistics, Recorder
 from rig.rig_endpoints import RigEndpoints
 from rig.scenario import Scenario
@@ -40,7 +40,7 @@ QUIET_S: Final = 20.0
 """A rig on which nothing happens for this long is given up."""
 LAST_LOOK_S: Final = 2.0
 """How long the events of a run that has ended are waited for."""
-LAST_TICK: Final = 2**32 - 1
+LAST_SESSION: Final = 2**32 - 1
 CONTACT_S: Final = 1.0
 """With `tolerant`: how long an answer may take. A process that does not go on must not hold up the rest for long."""
 
@@ -120,10 +120,16 @@ class SessionClient:
         recorder.begin()
 
     async def start(self, scenario: Scenario) -> int:
-        """Write the load and the settings of a new session to all three; return its number."""
+        """Write the load and the settings of a new session to all three; return its number.
+
+        Raises:
+            LinkError: A service does not answer or refuses, or no session can follow.
+        """
         session = 1
         for client in self.clients.values():
             session = max(session, (await client.read(Identity)).session + 1)
+        if session > LAST_SESSION:
+            raise LinkError("the rig has had the last number that a session can have: restart its services")
         realtime = int(scenario.realtime)
         await self.optimizer.write(
             OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / TICK_S))

@@ -1,6 +1,5 @@
 """A rig that stays up: three services on fixed ports, in real time, until they are ended."""
 
-import os
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -9,11 +8,11 @@ from typing import Final
 
 from rig.local_services import LocalServices
 from rig.page_process import PageProcess
-from rig.results import write_json
+from rig.private_folder import make_own_folder, make_private
 from rig.running import make_scenario
 from rig.session_client import SessionClient
 from rig.settings import Settings
-from rig.started_rigs import DEFAULT_PORTS, STATE_FILE, state_folder
+from rig.started_rigs import DEFAULT_PORTS, STATE_FILE, RunningRig
 from rig.wiring import SERVICES, START_PATIENCE_S
 
 LOOK_S: Final = 0.5
@@ -28,7 +27,7 @@ class UpRig:
         self._page = page
         self._ports = tuple(ports)
         self._tls = tls
-        self.folder = state_folder(ports[0])
+        self.folder = make_own_folder(str(ports[0]))
 
     async def run(self, *, announce: bool) -> None:
         """Run until cancelled; load steps beyond what the plant holds are written as time goes on.
@@ -36,8 +35,7 @@ class UpRig:
         Raises:
             ColdloopError: A service ended, or the session could not begin.
         """
-        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        services = LocalServices(self._settings, self.folder / "logs", ports=self._ports)
+        services = LocalServices(self._settings, make_private(self.folder / "logs"), ports=self._ports)
         async with services:
             rig = SessionClient(services.endpoints, self._settings)
             page = PageProcess(self._settings.hmi, services.endpoints, self.folder) if self._page else None
@@ -59,7 +57,7 @@ class UpRig:
             sys.stdout.write(whereabouts(self._settings, self._ports, self.folder))
             sys.stdout.write(page.whereabouts if page is not None else "")
             sys.stdout.flush()
-        write_json(self.folder / STATE_FILE, {"pid": os.getpid(), "ports": self._ports, "tls": tls})
+        RunningRig.of_this_process(self._ports, tls).write()
         await rig.hold(session, LOOK_S)
 
 

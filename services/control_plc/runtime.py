@@ -29,6 +29,7 @@ from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.registers.safety import AlarmKind, WatchdogTime
+from coldloop.service import SERVING
 from coldloop.telemetry import Telemetry
 from control_plc.certificate_watch import CertificateWatch
 from control_plc.clients import Clients
@@ -344,7 +345,7 @@ async def serve(settings: ControlSettings) -> None:
         on_departure=plc.clients.on_departure, on_refusal=plc.clients.on_refusal, on_close=plc.clients.on_close,
     )  # fmt: skip
     await server.start()
-    log.info("serving", extra={"host": settings.control_plc.server.host, "port": server.port})
+    log.info(SERVING, extra={"host": settings.control_plc.server.host, "port": server.port})
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(MetricsServer(settings.control_plc.metrics, plc.bank).run(), name="metrics")

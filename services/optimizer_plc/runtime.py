@@ -22,6 +22,7 @@ from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import AwaitUpdate, Update, Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState
 from coldloop.sequence import InputSequence
+from coldloop.service import SERVING
 from coldloop.session import TimeMode
 from coldloop.telemetry import Telemetry
 from optimizer_plc.control_client import ControlClient
@@ -259,7 +260,7 @@ async def serve(settings: OptimizerSettings) -> None:
         shown.bank, settings=settings.optimizer_plc.server, on_write=shown.on_write, identity=identity
     )
     await server.start()
-    log.info("serving", extra={"host": settings.optimizer_plc.server.host, "port": server.port})
+    log.info(SERVING, extra={"host": settings.optimizer_plc.server.host, "port": server.port})
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(MetricsServer(settings.optimizer_plc.metrics, shown.bank).run(), name="metrics")

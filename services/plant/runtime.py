@@ -18,6 +18,7 @@ from coldloop.registers.bank import Caller
 from coldloop.registers.common import SessionPace
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, PlantSession
+from coldloop.service import SERVING
 from coldloop.telemetry import Telemetry
 from plant.kinds import plant_maker
 from plant.own_model import own_header
@@ -141,7 +142,7 @@ async def serve(settings: PlantSettings) -> None:
         on_close=registers.closed,
     )  # fmt: skip
     await server.start()
-    log.info("serving", extra={"host": settings.plant.server.host, "port": server.port})
+    log.info(SERVING, extra={"host": settings.plant.server.host, "port": server.port})
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(MetricsServer(settings.plant.metrics, registers.bank).run(), name="metrics")

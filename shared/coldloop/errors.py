@@ -24,10 +24,19 @@ BUSY: Final = 6
 """Modbus exception code of a server at which somebody else holds the lease of the role."""
 
 
+def printable(text: str) -> str:
+    """Return a text as one line for a terminal: what a peer or a file put into it neither ends it nor controls it."""
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+
+
 class ColdloopError(Exception):
     """Root of the tree; `exit_code` is what a program ends with when it cannot go on."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        """Return the message, which is one line."""
+        return printable(super().__str__())
 
 
 class UsageError(ColdloopError):

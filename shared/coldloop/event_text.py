@@ -26,6 +26,11 @@ def word(member: IntEnum) -> str:
     return member.name.lower().replace("_", " ")
 
 
+def word_of(kind: type[IntEnum], number: int) -> str:
+    """Return the word for a number that a peer tells; a newer one may have numbers without a word here."""
+    return _members(kind)(number)
+
+
 def _listed(words: Sequence[str]) -> Words:
     return lambda number: words[number] if number < len(words) else str(number)
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from pydantic import BaseModel
 
@@ -26,6 +26,14 @@ def environment(settings: BaseModel | None = None, more: Mapping[str, str] | Non
     """Return the variables for a process: no configuration from outside, that of `settings`, and `more`."""
     outside = {name: value for name, value in os.environ.items() if not name.startswith(PREFIX)}
     return {**outside, **(to_environment(settings) if settings else {}), **(more or {})}
+
+
+class Ended(NamedTuple):
+    """What a program left behind that has ended."""
+
+    code: int
+    out: str
+    err: str
 
 
 class Process:
@@ -64,6 +72,11 @@ class Process:
         for pipe in (self.popen.stdout, self.popen.stderr):
             if pipe is not None:
                 pipe.close()
+
+    def ended(self, within_s: float = END_S) -> Ended:
+        """Wait until it ends; return its exit code and what it has written to its pipes."""
+        out, err = self.popen.communicate(timeout=within_s)
+        return Ended(self.popen.returncode, out or "", err or "")
 
     def interrupt(self, number: signal.Signals = signal.SIGINT, within_s: float = END_S) -> int:
         """Send a signal; return the exit code."""
@@ -111,15 +124,22 @@ class Processes:
         words = [sys.executable, "-m", "rig", *map(str, arguments)]
         return self._start(words, "coldloop", env=environment(more=more), cwd=cwd, stdout=stdout, stderr=stderr)
 
-    def python(self, *arguments: str, stdout: int | None = None, stderr: int | None = None) -> Process:
+    def python(
+        self, *arguments: str, stdout: int | None = None, stderr: int | None = None,
+        more: Mapping[str, str] | None = None,
+    ) -> Process:  # fmt: skip
         """Start an interpreter with arguments."""
-        return self._start([sys.executable, *arguments], "python", stdout=stdout, stderr=stderr)
+        words = [sys.executable, *arguments]
+        return self._start(words, "python", env=environment(more=more), stdout=stdout, stderr=stderr)
+
+    def script(self, file: Path, *arguments: str, stdout: int | None = None, stderr: int | None = None) -> Process:
+        """Start a program that is a file, with arguments."""
+        return self._start([str(file), *arguments], file.name, stdout=stdout, stderr=stderr)
 
     def run_python(self, program: str) -> tuple[str, str]:
         """Run lines of Python to their successful end; return what they wrote on standard output and standard error."""
-        process = self.python("-c", program, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        out, err = process.popen.communicate(timeout=PROGRAM_S)
-        assert process.popen.returncode == 0, err
+        code, out, err = self.python("-c", program, stdout=subprocess.PIPE, stderr=subprocess.PIPE).ended(PROGRAM_S)
+        assert code == 0, err
         return out, err
 
     def _start(

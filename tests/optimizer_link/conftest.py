@@ -37,7 +37,7 @@ from coldloop.sequence import InputSequence, checksum
 from optimizer_plc.runtime import OptimizerPlc
 from optimizer_plc.settings import OptimizerSettings
 
-WITHIN_S = 20.0
+WITHIN_S = 60.0
 LONGEST_WAIT_S = 0.1
 """The control PLC played here lets a request for an update wait for so long, s."""
 

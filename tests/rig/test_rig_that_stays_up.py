@@ -3,10 +3,7 @@
 import asyncio
 import json
 import os
-import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,19 +16,22 @@ from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
 from rig import cli
 from rig.started_rigs import running_rig
 from tests.conftest import Coldloop, first_of_three_ports
+from tests.harness.processes import Processes
+
+pytestmark = pytest.mark.usefixtures("realtime", "undrawn")
 
 FACTOR = "5"
+PATIENCE_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def up(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) -> Iterator[str]:
     """The first port of a rig that is up."""
     os.environ["XDG_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
     base = str(first_of_three_ports())
-    command = [sys.executable, "-m", "rig", "up", "--port-base", base, "--load", "e", "--factor", FACTOR]
-    command += ["--set", "plant.sensors.level=0.01"]
+    words = ("up", "--port-base", base, "--load", "e", "--factor", FACTOR, "--set", "plant.sensors.level=0.01")
     try:
-        subprocess.run([*command, "--detach"], check=True, timeout=120, stdout=subprocess.DEVNULL)
+        assert shared_processes.coldloop(*words, "--detach").popen.wait(PATIENCE_S) == 0
         yield base
         assert cli.main(["down", "--port-base", base]) == 0
         assert running_rig(int(base)) is None
@@ -47,7 +47,7 @@ def shown(coldloop: Coldloop, base: str) -> dict[str, str]:
 
 
 def until(coldloop: Coldloop, base: str, row: str, part: str) -> str:
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE_S
     while part not in (text := shown(coldloop, base)[row]):
         assert time.monotonic() < deadline, f"{row} is {text}, not {part}"
     return text
@@ -58,6 +58,13 @@ def test_status_shows_session_mode_load_outputs_and_alarms(coldloop: Coldloop, u
     assert set(rows) == {"session", "mode", "operator", "load", "L1", "T5", "tau_u", "alarms"}
     assert f"{FACTOR} x real time" in rows["session"]
     assert rows["L1"].endswith("%")
+
+
+def test_commands_find_the_one_rig_that_is_up(coldloop: Coldloop, up: str) -> None:
+    for words in (("status",), ("events",), ("events", "--service", "plant"), ("set", "resume")):
+        outcome = coldloop(*words)
+        assert outcome.code == 0, outcome.complaints
+        assert outcome.out.split()[0] == coldloop(*words, "--port-base", up).out.split()[0]
 
 
 def test_a_rig_that_was_started_has_not_lost_anything_yet(coldloop: Coldloop, up: str) -> None:
@@ -126,6 +133,26 @@ def test_a_load_file_begins_now(coldloop: Coldloop, up: str, tmp_path: Path) -> 
     assert coldloop("set", "--port-base", up, "load", "385").code == 0
 
 
+def test_a_load_that_begins_later_is_told_as_it_was_written(coldloop: Coldloop, up: str) -> None:
+    assert coldloop("set", "--port-base", up, "load", "385").code == 0  # nothing else is to come
+    assert coldloop("set", "--port-base", up, "load", "444", "--at", "80000").out.startswith(
+        "load 444 W from 80000 s on ("
+    )
+    outcome = coldloop("set", "--port-base", up, "load", "400", "--at", "90000.25")
+    assert outcome.out.startswith("load 400 W from 90000.2 s on, before it 444 W from 80000 s on (was ")
+    assert coldloop("set", "--port-base", up, "load", "385").code == 0
+    outcome = coldloop("set", "--port-base", up, "load", "400", "--at", "0.25")
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+    assert "plant time is" in outcome.complaints[0]
+
+
+@pytest.mark.parametrize("time", ["-1", "0.1", "nan", "inf", "1e300", "9" * 5000, "soon", str(2**32)])
+def test_a_time_that_no_session_has_is_one_line(coldloop: Coldloop, time: str) -> None:
+    outcome = coldloop("set", "load", "400", "--at", time)
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+    assert "not a number of seconds" in outcome.complaints[0]
+
+
 def test_a_second_rig_on_the_same_ports_is_refused_and_the_holder_named(coldloop: Coldloop, up: str) -> None:
     outcome = coldloop("up", "--port-base", up)
     assert outcome.code == 2
@@ -149,7 +176,7 @@ def test_a_rig_that_was_attached_to_runs_on_in_real_time(coldloop: Coldloop, up:
     outcome = coldloop(*run, tmp_path / "run")
     assert outcome.code == 0, outcome.complaints
     until(coldloop, up, "session", f"{FACTOR} x real time")
-    before, deadline = shown(coldloop, up)["session"], time.monotonic() + 30
+    before, deadline = shown(coldloop, up)["session"], time.monotonic() + PATIENCE_S
     while shown(coldloop, up)["session"] == before:
         assert time.monotonic() < deadline, "plant time goes on"
 
@@ -194,13 +221,10 @@ def test_what_a_rig_runs_may_be_named_again(coldloop: Coldloop, up: str, results
     assert coldloop(*run).code == 0
 
 
-def test_ctrl_c_gives_an_attached_rig_back_too(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
-    ends = [f"127.0.0.1:{int(up) + place}" for place in range(3)]
-    command = [sys.executable, "-m", "rig", "run", "--attach", *ends, "--load", "e", "--duration", "100h"]
-    with subprocess.Popen(
-        [*command, "--figures", "png", "--out", str(tmp_path / "run")], stderr=subprocess.DEVNULL
-    ) as run:
-        until(coldloop, up, "session", "lock-step")
-        run.send_signal(signal.SIGINT)
-        assert run.wait(60) == 130
+def test_ctrl_c_gives_an_attached_rig_back_too(
+    coldloop: Coldloop, up: str, tmp_path: Path, processes: Processes
+) -> None:
+    run = processes.coldloop(*attach(up), "--load", "e", "--duration", "100h", "--out", tmp_path / "run")
+    until(coldloop, up, "session", "lock-step")
+    assert run.interrupt() == 130
     until(coldloop, up, "session", f"{FACTOR} x real time")
