@@ -49,7 +49,7 @@ async function takeTurns() {
     current = text;
     try { await oneCommand(body, atOnce); } finally { current = null; resolve(); }
   }
-  document.body.classList.remove("commanding");
+  setTimeout(() => { if (current === null) document.body.classList.remove("commanding"); }, Math.max(0, closed + TOO_SOON_MS - performance.now()));
 }
 
 const kindOf = (body) => body.kind.replaceAll("_", " ");
