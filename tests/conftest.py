@@ -17,6 +17,7 @@ from hypothesis import settings
 from coldloop.config import PREFIX
 from coldloop.errors import UsageError
 from rig import cli
+from rig.figure_process import FigureProcess
 from rig.ports import ReservedPorts
 from rig.started_rigs import check_ports
 from tests.harness.processes import Processes
@@ -31,14 +32,14 @@ that needs more or fewer names a multiple or a part of them. Each run looks else
 before, but with `CI` set the examples are always the same. None has a deadline: the machine may be busy."""
 
 USES: Final = {
-    "process": {"processes", "shared_processes"},
+    "process": {"processes", "shared_processes", "coldloop_rigs", "live_rig"},
     "realtime": {"realtime"},
     "browser": {"browser"},
     "container": {"_engine"},
 }
 """The mark of a test that requests, itself or through other fixtures, one of these."""
 
-SHARED: Final = ("site", "served", "rack", "three_processes", "up", "client", "_engine")
+SHARED: Final = ("site", "served", "rack", "three_processes", "live_rig", "page_rig", "up", "client", "_engine")
 """Fixtures that start processes for many tests: these tests run in one worker, which starts them once."""
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # whoever started the tests ignores it; what they start must not
@@ -130,6 +131,18 @@ def shared_processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proce
 @pytest.fixture(scope="session")
 def realtime() -> None:
     """Requested where plant time follows the clock: it marks the test."""
+
+
+def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let runs in this process leave no figure: to draw one takes longer than a short run."""
+    monkeypatch.setattr(FigureProcess, "start", lambda _: None)
+    monkeypatch.setattr(FigureProcess, "draw", lambda *_: None)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs in this process leave no figure."""
+    draw_nothing(monkeypatch)
 
 
 @pytest.fixture

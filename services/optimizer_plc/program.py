@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.first_use import kernels_of
 from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
@@ -25,6 +26,7 @@ from coldloop.registers.optimizer_plc import (
 from coldloop.sequence import InputSequence, with_checksum
 from optimizer_plc.arithmetic import real_of
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
+from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.costs import augmented_cost, indicators
 from optimizer_plc.estimator import make_estimator
 from optimizer_plc.prediction import PredictionModel
@@ -41,20 +43,25 @@ LONGEST_GAP_TICKS = 4 * SEQUENCE_ROWS
 """After a longer time without an update nothing is predicted from the last one."""
 
 
+def _described(settings: ProgramSettings) -> str:
+    return f"the {settings.solver} solver{' in single precision' * (settings.arithmetic is Arithmetic.FLOAT32)}"
+
+
 class OptimizerProgram:
     """Estimator, problem, solver and updating rule, put together."""
 
     def __init__(self, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
-        self.settings = settings
-        self.model_digest = model.short_digest
-        self._real = real_of(settings.arithmetic)
-        self.model = PredictionModel(model)
-        self.problem = PredictiveProblem(self.model, settings.design, limits, self._real, settings.penalties)
-        self.solver = make_solver(settings)
-        self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
-        self.estimator = make_estimator(self.model, settings.estimator, self._real)
-        self.model = self.model.rounded(self._real)
-        self._compile_kernels(model)
+        with kernels_of(_described(settings), about_s=15):
+            self.settings = settings
+            self.model_digest = model.short_digest
+            self._real = real_of(settings.arithmetic)
+            self.model = PredictionModel(model)
+            self.problem = PredictiveProblem(self.model, settings.design, limits, self._real, settings.penalties)
+            self.solver = make_solver(settings)
+            self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
+            self.estimator = make_estimator(self.model, settings.estimator, self._real)
+            self.model = self.model.rounded(self._real)
+            self._compile_kernels(model)
         self.restart(settings.updating_period_s)
 
     def _compile_kernels(self, model: LtiModel) -> None:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.errors import ConfigurationError
@@ -220,7 +220,6 @@ def test_a_setting_that_is_no_driver_is_refused() -> None:
         ControlSection.model_validate({"driver": "nobody"})
 
 
-@settings(max_examples=60)
 @given(
     readings=st.lists(
         st.tuples(st.floats(-80.0, 80.0) | st.just(math.nan), st.floats(-8.0, 100.0) | st.just(math.inf)),

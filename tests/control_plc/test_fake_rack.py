@@ -419,4 +419,4 @@ class RackLink(RuleBasedStateMachine):
 
 
 TestRackLink = RackLink.TestCase
-TestRackLink.settings = settings(max_examples=80, stateful_step_count=40)
+TestRackLink.settings = settings(max_examples=4 * settings.default.max_examples, stateful_step_count=40)

@@ -270,4 +270,4 @@ class Link(RuleBasedStateMachine):
 
 
 TestLink = Link.TestCase
-TestLink.settings = settings(max_examples=60, stateful_step_count=60)
+TestLink.settings = settings(max_examples=3 * settings.default.max_examples, stateful_step_count=60)

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from pydantic import BaseModel
 
@@ -18,11 +18,22 @@ from rig.ports import ReservedPorts
 END_S: Final = 60.0
 """A process that is told to end has failed when it takes longer; the machine may be busy with something else."""
 
+PROGRAM_S: Final = 900.0
+"""The same for lines of Python: kernels that are in no cache may have to be compiled."""
+
 
 def environment(settings: BaseModel | None = None, more: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return the variables for a process: no configuration from outside, that of `settings`, and `more`."""
     outside = {name: value for name, value in os.environ.items() if not name.startswith(PREFIX)}
     return {**outside, **(to_environment(settings) if settings else {}), **(more or {})}
+
+
+class Ended(NamedTuple):
+    """What a program left behind that has ended."""
+
+    code: int
+    out: str
+    err: str
 
 
 class Process:
@@ -57,7 +68,15 @@ class Process:
 
     def kill(self) -> None:
         self.popen.kill()
-        self.popen.communicate()
+        self.popen.wait()
+        for pipe in (self.popen.stdout, self.popen.stderr):
+            if pipe is not None:
+                pipe.close()
+
+    def ended(self, within_s: float = END_S) -> Ended:
+        """Wait until it ends; return its exit code and what it has written to its pipes."""
+        out, err = self.popen.communicate(timeout=within_s)
+        return Ended(self.popen.returncode, out or "", err or "")
 
     def interrupt(self, number: signal.Signals = signal.SIGINT, within_s: float = END_S) -> int:
         """Send a signal; return the exit code."""
@@ -112,6 +131,16 @@ class Processes:
         """Start an interpreter with arguments."""
         words = [sys.executable, *arguments]
         return self._start(words, "python", env=environment(more=more), stdout=stdout, stderr=stderr)
+
+    def script(self, file: Path, *arguments: str, stdout: int | None = None, stderr: int | None = None) -> Process:
+        """Start a program that is a file, with arguments."""
+        return self._start([str(file), *arguments], file.name, stdout=stdout, stderr=stderr)
+
+    def run_python(self, program: str) -> tuple[str, str]:
+        """Run lines of Python to their successful end; return what they wrote on standard output and standard error."""
+        code, out, err = self.python("-c", program, stdout=subprocess.PIPE, stderr=subprocess.PIPE).ended(PROGRAM_S)
+        assert code == 0, err
+        return out, err
 
     def _start(
         self, words: Sequence[str], name: str, *, port: int = 0, env: Mapping[str, str] | None = None,

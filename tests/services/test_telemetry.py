@@ -132,6 +132,39 @@ async def test_the_password_is_read_at_each_connection_and_is_not_in_the_configu
     assert "schlüssel" not in caplog.text + TelemetrySettings(**login).model_dump_json()
 
 
+GIANT = b"\x30\xff\xff\xff\x7f\x00\x10coldloop/command" + bytes(10**6)
+"""The beginning of a message of 256 MB."""
+COMMANDS = 10_000 * b"\x30\x14\x00\x10coldloop/command{}"
+UNASKED = b"\x62\x02\x00\x01"
+
+
+@pytest.mark.parametrize("junk", [GIANT, COMMANDS, UNASKED, b"\xff\xff\xff\xff"])
+async def test_a_broker_that_sends_what_nobody_asked_for_is_left_unread(
+    free_port: int, start: "Start", junk: bytes
+) -> None:
+    taken: list[int] = []
+    has_come_again = asyncio.Event()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read(1000)
+        writer.write(b"\x20\x02\0\0")
+        taken.append(0)
+        if len(taken) > 3:
+            has_come_again.set()
+        with contextlib.suppress(ConnectionError):
+            while True:  # until the service has had enough
+                writer.write(junk)
+                await writer.drain()
+                taken[-1] += len(junk)
+        writer.close()
+
+    async with await asyncio.start_server(serve, "127.0.0.1", free_port):
+        start("control_plc", "telemetry.broker=127.0.0.1", f"telemetry.port={free_port}", "telemetry.timeout_s=0.1")
+        async with asyncio.timeout(60):
+            await has_come_again.wait()  # as to any broker that was lost
+    assert max(taken[:3]) < 16e6, "what fits into the buffers of the two systems, and no more"
+
+
 def lost(caplog: pytest.LogCaptureFixture) -> Callable[[], Awaitable[list[str]]]:
     async def reasons() -> list[str]:
         return [str(getattr(record, "reason", "")) for record in caplog.records]
