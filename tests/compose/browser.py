@@ -7,7 +7,7 @@ import urllib.request
 from typing import Any
 
 OPERATOR = {"user": "operator", "password": "test-site-operator"}
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 
 
 class Browser:
@@ -26,7 +26,7 @@ class Browser:
         if self._cookie:
             request.add_header("Cookie", self._cookie)
         try:
-            with urllib.request.urlopen(request, timeout=20) as answer:  # noqa: S310
+            with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:  # noqa: S310
                 self._cookie = (answer.headers["Set-Cookie"] or self._cookie).partition(";")[0]
                 return answer.status, json.loads(answer.read())
         except urllib.error.HTTPError as error:

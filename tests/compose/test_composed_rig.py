@@ -41,6 +41,8 @@ def identity_of_plant(rig: "ComposedRig") -> Identity:
     return read_from_plant(rig, Identity)
 
 
+LATE_S = 2.0
+"""By how much the rack's clock may be late on a busy machine: a rack at another factor is further away after 4 s."""
 START_BROKER = ("sh", "/mosquitto/config/start.sh")
 FOLDER = Path(__file__).parents[2] / "docker" / "test_site"
 """Passwords of the broker's users, those that come with the project."""
@@ -51,7 +53,7 @@ def retained(rig: "ComposedRig", *topics: str) -> dict[str, Any]:
 
     async def read() -> dict[str, Any]:
         found: dict[str, Any] = {}
-        async with asyncio.timeout(20), broker(rig, "operator") as client:
+        async with asyncio.timeout(60), broker(rig, "operator") as client:
             for topic in topics:
                 await client.subscribe(topic)
             async for message in client.messages:
@@ -87,11 +89,12 @@ def ask(rig: "ComposedRig", service: str, host: str, port: int) -> str:
 
 
 def test_it_runs_in_real_time_by_itself(rig: "ComposedRig") -> None:
-    first, started = identity_of_plant(rig), time.monotonic()
-    time.sleep(3.0)
-    second, seconds = identity_of_plant(rig), time.monotonic() - started
+    before, first, after = time.monotonic(), identity_of_plant(rig), time.monotonic()
+    time.sleep(4.0)
+    again, second, end = time.monotonic(), identity_of_plant(rig), time.monotonic()
     assert first.session == second.session == 1
-    assert (second.tick - first.tick) / 4 == pytest.approx(seconds, abs=1.0)
+    passed_s = (second.tick - first.tick) / 4
+    assert again - after - LATE_S <= passed_s <= end - before + LATE_S
 
 
 def test_the_broker_keeps_what_each_service_tells(rig: "ComposedRig") -> None:
@@ -145,7 +148,7 @@ def test_who_may_read_topics_may_not_write_them(rig: "ComposedRig") -> None:
         async with broker(rig, "operator") as client:
             await client.subscribe("coldloop/control_plc/#")
             found = []
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(60):
                 async for message in client.messages:
                     found.append(message.topic.value)
                     if message.topic.value.endswith("telemetry") and not message.retain:
