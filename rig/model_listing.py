@@ -32,16 +32,17 @@ def describe_model(in_use: Path) -> tuple[LtiModel, str]:
         *_eigenvalue_lines(model, error),
         *_gain_lines(model),
         f"model      sha256 {model.digest}",
-        _in_use_line(in_use),
+        *_in_use_line(in_use),
     ]
     return model, "\n".join(lines) + "\n"
 
 
-def _in_use_line(file: Path) -> str:
+def _in_use_line(file: Path) -> list[str]:
+    """Return the digest of the configured model; nothing where there is none, which the command then says."""
     try:
-        return f"in use     sha256 {load(file).digest} ({file})"
-    except ModelFileError as error:
-        return f"in use     {error}"
+        return [f"in use     sha256 {load(file).digest} ({file})"]
+    except ModelFileError:
+        return []
 
 
 def _equilibrium_lines(model: LtiModel, rest: Equilibrium) -> list[str]:

@@ -16,6 +16,8 @@ from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.settings import TlsSettings
 from hmi.settings import HmiSection, HmiSettings
 from hmi.users import PageRole, write_user
+from rig.kept_up import end_of
+from rig.local_services import last_line
 from rig.private_folder import new_own
 from rig.rig_endpoints import RigEndpoints
 
@@ -108,6 +110,8 @@ class PageProcess:
         folder: Where it logs to, and keeps the first login and the audit.
     """
 
+    name: Final = "the page"
+
     def __init__(self, section: HmiSection, endpoints: RigEndpoints, folder: Path) -> None:
         self._log = folder / "logs" / "hmi.log"
         self._section, self._login = with_own_files(pointed_at(section, endpoints), folder)
@@ -115,6 +119,18 @@ class PageProcess:
 
     async def __aenter__(self) -> Self:
         """Start it."""
+        await self.restart()
+        return self
+
+    async def ended(self) -> str:
+        """Wait until it has ended; return how."""
+        if self._process is None:
+            raise RuntimeError("the page was not started")
+        code = await self._process.wait()
+        return f"{end_of(code, last_line(self._log))} (log: {self._log})"
+
+    async def restart(self) -> None:
+        """Start it, or start it again."""
         environment: Mapping[str, str] = {
             **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
             **to_environment(HmiSettings(hmi=self._section)),
@@ -125,7 +141,6 @@ class PageProcess:
                 sys.executable, "-m", "hmi", "--with-parent", env=environment, start_new_session=True,
                 stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
             )  # fmt: skip
-        return self
 
     async def __aexit__(self, *_: object) -> None:
         """End it."""
@@ -149,8 +164,7 @@ class PageProcess:
         """
         while True:
             if self._process is not None and self._process.returncode is not None:
-                lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-                raise LinkError(f"the page has ended: {lines[-1] if lines else 'no reason given'} (log: {self._log})")
+                raise LinkError(f"the page {await self.ended()}")
             try:
                 _, writer = await asyncio.open_connection(self._section.host, self._section.port)
             except OSError:

@@ -8,6 +8,8 @@ import re
 import sys
 from pathlib import Path
 
+from coldloop.errors import UsageError
+
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -38,6 +40,11 @@ def execute(options: argparse.Namespace) -> int:
     from rig.certificate_files import revoke, write_site
 
     if options.revoke or options.renew_list:
+        if options.hosts:
+            raise UsageError(
+                f"--host {options.hosts[0]}: has no effect on a list of revoked certificates; for another host make "
+                "certificates in another folder"
+            )
         count, file = revoke(options.out, options.revoke, options.days)
         sys.stdout.write(f"{count} revoked in {file}; restart the services that use it\n")
         return 0

@@ -16,14 +16,16 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Solve, linearise, print; write the model file when there is --out."""
+    """Solve, linearise, print; write the model file when there is --out; refuse a configured model that is none."""
     from coldloop.errors import UsageError
+    from coldloop.lti_model import load
     from rig.model_listing import describe_model
     from rig.results import require_regular_file
 
     if options.out is not None:
         require_regular_file(options.out)
-    model, text = describe_model(configuration(options).settings.model.file)
+    in_use = configuration(options).settings.model.file
+    model, text = describe_model(in_use)
     sys.stdout.write(text)
     if options.out is not None:
         try:
@@ -31,4 +33,5 @@ def execute(options: argparse.Namespace) -> int:
         except OSError as error:
             raise UsageError(f"{options.out}: {error.strerror}; name a file that can be written with --out") from None
         sys.stdout.write(f"written to {options.out}\n")
+    load(in_use)
     return 0

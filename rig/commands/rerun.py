@@ -3,6 +3,11 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import Final
+
+from coldloop.errors import UsageError
+
+MANIFEST: Final = "manifest.json"
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -18,6 +23,8 @@ def execute(options: argparse.Namespace) -> int:
     from rig.rerun import repeat
 
     path: Path = options.manifest
-    same, text = repeat(path if path.is_dir() else path.parent, options.out, force=options.force)
+    if path.is_file() and path.name != MANIFEST:
+        raise UsageError(f"{path}: not the {MANIFEST} of a run; name that, or its folder")
+    same, text = repeat(path.parent if path.name == MANIFEST else path, options.out, force=options.force)
     sys.stdout.write(text)
     return 0 if same else 1

@@ -213,15 +213,15 @@ class LiveRig:
         await self._stack.enter_async_context(self._proxied)
         await self._proxied.services.during(self._driver.connect(START_PATIENCE_S))
         await self._proxied.connect_links()
-        session = await self._proxied.services.during(self._driver.start(self._scenario))
+        await self._proxied.services.during(self._driver.start(self._scenario))
         if self._scenario.realtime:
-            task = asyncio.create_task(self._fed(session), name="load of the session")
+            task = asyncio.create_task(self._fed(), name="load of the session")
             self._stack.callback(task.cancel)
 
-    async def _fed(self, session: int) -> None:
+    async def _fed(self) -> None:
         while True:
             with contextlib.suppress(LinkError):  # the plant is away on purpose: it is looked at again
-                await self._driver.hold(session, FEED_S)
+                await self._driver.hold(FEED_S)
             await asyncio.sleep(FEED_S)
 
     def _stop(self) -> None:

@@ -12,7 +12,14 @@ from typing import Final, NamedTuple
 
 from coldloop import __version__
 from coldloop.config import selected
-from coldloop.errors import ColdloopError, ConfigurationError, LinkError, ModelFileError
+from coldloop.errors import (
+    ColdloopError,
+    ConfigurationError,
+    LinkError,
+    ModelFileError,
+    RequestRefusedError,
+    UnfitValueError,
+)
 from coldloop.lti_model import load
 from coldloop.metrics_server import MetricsServer
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
@@ -121,6 +128,8 @@ class OptimizerPlc:
         state, reason = self._link.state, str(error)
         if state is not ControlLinkState.FOREIGN:  # its connection may stay: nothing is wrong with it
             self._control.close()
+        if isinstance(error, (RequestRefusedError, UnfitValueError)):
+            self._session = 0  # what it goes on from leads to what is refused: begin the session anew
         if state is not ControlLinkState.SEARCHING:  # others may have had the lease meanwhile
             self._wanted, self._kept = FRESH_UPDATE, None
         else:

@@ -108,14 +108,19 @@ class PlantRuntime:
         self._clock = self._schedule = None
 
     async def _run_clock(self, schedule: Schedule) -> None:
-        pacer = Pacer(schedule)
-        while True:
-            await pacer.until(self.registers.rack.tick + 0.5)
+        pacer, rack = Pacer(schedule), self.registers.rack
+        while not rack.has_ended:
+            await pacer.until(rack.tick + 0.5)
             self.registers.advance()
+        rack.moving, self._schedule = False, None
+        log.warning("the session has reached its last tick: begin another one", extra={"tick": rack.tick})
 
     def _clock_ended(self, clock: "asyncio.Task[None]") -> None:
-        if not clock.cancelled():
-            self._fail(clock.exception() or RuntimeError("it returned"))
+        if clock.cancelled():
+            return
+        error = clock.exception()
+        if error is not None:
+            self._fail(error)
 
     def _fail(self, error: BaseException) -> None:
         if self._failure is not None and not self._failure.done():

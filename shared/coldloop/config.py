@@ -128,6 +128,8 @@ def load_configuration(
     for key, value in flattened(settings.model_dump()).items():
         if not _is_finite(value):
             raise ConfigurationError(f"{_where(key, layers.sources)}: input should be finite (got {value!r})")
+        if value == Path():  # an empty text
+            raise ConfigurationError(f"{_where(key, layers.sources)}: names no file; leave the key out, or name one")
     return Configuration(settings, layers.sources)
 
 

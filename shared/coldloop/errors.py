@@ -13,6 +13,8 @@
         ├── PeerUnreachableError
         │   └── UntrustedPeerError  its certificate does not hold
         ├── DamagedAnswerError      the seal of an answer is broken, or missing
+        │   └── ImplausibleAnswerError  it has a value that its register cannot have
+        ├── UnfitValueError         a value of our own that its register cannot hold
         └── RequestRefusedError     the peer answered with a Modbus exception
 
 A message is one line that says what, where, and what to do.
@@ -91,6 +93,14 @@ class UntrustedPeerError(PeerUnreachableError):
 
 class DamagedAnswerError(LinkError):
     """A record that should be sealed arrived without its seal, or with a broken one."""
+
+
+class ImplausibleAnswerError(DamagedAnswerError):
+    """A record arrived with a value that its register cannot have; its seal says nothing about that."""
+
+
+class UnfitValueError(LinkError):
+    """What was to be written does not fit its register: a number at its end, or too large."""
 
 
 class RequestRefusedError(LinkError):

@@ -110,11 +110,11 @@ class _Publisher:
         self._unasked = UNASKED_BYTES
         await self._client.publish(topic, message, qos=1, retain=True)
 
-    def _limited(self, size: int) -> bytes:
-        """Return at most `size` bytes from the socket; the library takes the error for a lost connection."""
-        if size > LONGEST_ANSWER or self._unasked <= 0:
+    def _limited(self, bufsize: int) -> bytes:
+        """Return at most `bufsize` bytes from the socket; the library takes the error for a lost connection."""
+        if bufsize > LONGEST_ANSWER or self._unasked <= 0:
             raise ConnectionError("the broker sends what nobody has asked for")
-        data: bytes = self._receive(size)
+        data: bytes = self._receive(bufsize)
         self._unasked -= len(data)
         return data
 

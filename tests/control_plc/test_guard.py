@@ -2,7 +2,7 @@ import math
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from coldloop.limits import InputLimits, RateReference
@@ -188,3 +188,20 @@ def test_from_anywhere_at_all_outputs_come_into_their_bounds_within_the_rate(
                 middle = (limits.low[i] + limits.high[i]) / 2
                 assert abs(value - middle) < abs(before[i] - middle), "towards the bounds"
         before = after
+
+
+@settings(max_examples=200)
+@given(jitter=st.lists(st.integers(-6, 6), min_size=40, max_size=120))
+@example(jitter=[0, 3, -3] * 20)
+@example(jitter=[-3] * 19 + [3] * 14 + [-3] * 30)
+def test_a_rack_whose_tick_wavers_moves_no_output_further_than_a_calm_one(jitter: list[int]) -> None:
+    """In calm two windows meet within 5 s: an output may move by its rate at the end of one, and again in the next."""
+    limits, wanted = InputLimits(), SequenceRow(60.0, 150.0, 60.0)
+    guard, told, moves = OutputGuard(limits, INITIAL), 0, [INITIAL]
+    for now, off in enumerate(jitter, start=100):
+        if now + off != told + 1:
+            guard.begin_at(now + off, guard.applied, passed=1)
+        told = now + off
+        moves.append(guard.admit(told, wanted, update=False))
+    for before, after in zip(moves, moves[TICKS_PER_SAMPLE:], strict=False):
+        assert all(abs(new - old) <= 2 * rate + 1e-4 for old, new, rate in zip(before, after, limits.rate, strict=True))

@@ -127,6 +127,20 @@ async def test_an_alarm_with_a_delay_is_raised_also_while_no_scans_are_made() ->
         await until(lambda: alarm(plc, AlarmKind.PLANT_LOST) is AlarmState.UNACKNOWLEDGED)
 
 
+async def test_scans_that_are_not_made_are_alarmed_from_outside_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = asyncio.Event()
+    async with running(SmallRack(1)) as plc:
+        monkeypatch.setattr(plc, "_scan", ended.wait)
+        watch = asyncio.create_task(plc.watch_scans())
+        ask(plc, ControlSession(1, 1, 10.0))
+        await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IN_STEP)
+        await until(lambda: alarm(plc, AlarmKind.SCANS_STOPPED) is AlarmState.UNACKNOWLEDGED)
+        ask(plc, ControlSession(2, 0, 1.0))  # in lock-step nobody expects scans
+        ended.set()
+        await until(lambda: alarm(plc, AlarmKind.SCANS_STOPPED) is AlarmState.RETURNED)
+        watch.cancel()
+
+
 @pytest.mark.usefixtures("realtime")
 async def test_a_new_session_does_not_wait_for_a_tick_that_lasts_long() -> None:
     """At a factor of 0.01 a tick lasts 25 s."""
@@ -254,7 +268,22 @@ async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
 
 
 @pytest.mark.parametrize(
-    "odd", [{"pace": (1, 0.0)}, {"pace": (1, math.nan)}, {"operator": (77, 1, 1, 1)}, {"operator": (2, math.nan, 1, 1)}]
+    "odd",
+    [
+        {"pace": (1, 0.0)},
+        {"pace": (1, math.nan)},
+        {"pace": (1, 1e300)},
+        {"operator": (77, 1, 1, 1)},
+        {"operator": (2, math.nan, 1, 1)},
+        {"operator": (2, 1e300, 1, 1)},
+        {"tick": -5},
+        {"tick": 2**32 - 1},
+        {"updates": 2**32 - 1},
+        {"alarms": [(9, 0, 0, 0, 0, 0, 1, 0)] * len(AlarmKind)},
+        {"alarms": [(0, 0, 0, -1, 0, 0, 1, 2**40)] * len(AlarmKind)},
+        {"playing": ((2**32 - 1, 0, 0, 0, 0, 0, 0), "")},
+    ],
+    ids=str,
 )
 async def test_a_retained_state_that_cannot_be_keeps_nobody_from_starting(tmp_path: Path, odd: dict[str, Any]) -> None:
     file = tmp_path / "state"
@@ -267,3 +296,5 @@ async def test_a_retained_state_that_cannot_be_keeps_nobody_from_starting(tmp_pa
     kept.save({**state, **odd})
     async with running(SmallRack(4), control_plc={"retain": {"file": file}}) as plc:
         await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IDLE)
+        assert alarm(plc, AlarmKind.STATE_NOT_RETAINED) is AlarmState.UNACKNOWLEDGED
+        assert file.with_name("state.refused").exists(), "it is set aside"

@@ -4,12 +4,13 @@ A block of `sh`, `console` or `python` that is not executed here says so in a co
 """
 
 import asyncio
+import io
 import re
 import shlex
 import shutil
 import subprocess
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,7 +25,9 @@ from tests.harness.processes import Process, Processes
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(
-    r"(?:^<!-- (?P<marker>.*?) -->\n)?^```(?P<language>sh|console|python)\n(?P<text>.*?)^```", re.MULTILINE | re.DOTALL
+    r"(?:^<!-- (?P<marker>.*?) -->\n)?^```(?P<language>sh|console|python)\n(?P<text>.*?)^```"
+    r"(?:\n\n```text\n(?P<printed>.*?)^```)?",
+    re.MULTILINE | re.DOTALL,
 )
 PATIENCE_S = 300.0
 """The first run on a machine compiles the kernels."""
@@ -74,6 +77,8 @@ class Example(NamedTuple):
     language: str
     text: str
     line: int
+    printed: str | None
+    """What the page says that it prints; None where it says nothing."""
 
     @property
     def commands(self) -> list[str]:
@@ -102,7 +107,13 @@ class Lesson(NamedTuple):
 def examples(page: Path) -> list[Example]:
     text = page.read_text(encoding="utf-8")
     return [
-        Example(found["marker"] or "", found["language"], found["text"], text.count("\n", 0, found.start("text")))
+        Example(
+            found["marker"] or "",
+            found["language"],
+            found["text"],
+            text.count("\n", 0, found.start("text")),
+            found["printed"],
+        )
         for found in BLOCK.finditer(text)
     ]
 
@@ -150,7 +161,9 @@ class Reader:
             if each.marker == TEST_SUITE:
                 self._test_suite(each)
             elif each.language == "python":
-                exec(compile("\n" * each.line + each.text, str(lesson.page), "exec"), names)  # noqa: S102 our own page
+                with redirect_stdout(io.StringIO()) as printed:
+                    exec(compile("\n" * each.line + each.text, str(lesson.page), "exec"), names)  # noqa: S102 our own page
+                assert each.printed in {None, printed.getvalue()}
             else:
                 self._execute(each.commands, base)
 

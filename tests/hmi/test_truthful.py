@@ -56,6 +56,12 @@ def test_in_manual_nothing_of_mpc_looks_current_and_the_button_says_who_drives(o
     eventually(lambda: operated.locator("#tau-u.stale").count() == 0, "it is current again", 60)
 
 
+def test_why_shows_the_trajectory_that_was_predicted_for_the_update(page: "Page", site: Site) -> None:
+    eventually(lambda: mode(site) == MPC, "MPC drives", 90)
+    view(page, "why")
+    eventually(lambda: page.locator("#why-charts .chart[data-ahead=true]").count() == 2, "both outputs")
+
+
 @pytest.fixture
 def held(operated: "Page") -> "Iterator[list[Route]]":
     """Requests to prepare a command, held until somebody lets them go."""

@@ -54,9 +54,12 @@ ROUNDING: Final = 1e-4
 
 @pytest.fixture(scope="session")
 def shared_rack(shared_processes: Processes) -> Process:
-    """One rack for all tests, each of which has a session of its own; its watchdog leads to `SAFE_STATE`."""
+    """One rack for all tests, each of which has a session of its own; its watchdog leads to `SAFE_STATE`.
+
+    It does not limit what it applies: so it shows what control PLCs do.
+    """
     watchdog = ("plant.watchdog.action=safe", f"plant.watchdog.safe_state={list(SAFE_STATE)}")
-    return shared_processes.service("plant", *watchdog)
+    return shared_processes.service("plant", *watchdog, "plant.rate_limited=false")
 
 
 # -- raw bytes ---------------------------------------------------------------------------------------------------------

@@ -102,7 +102,7 @@ async def test_while_a_read_back_is_no_number_nothing_is_sent_and_afterwards_it_
 
         async def not_finite() -> bool:
             link = await control.link()
-            return (link.state, link.cause) == (PlantLinkState.JOINING, LinkCause.NOT_FINITE)
+            return (link.state, link.cause) == (PlantLinkState.JOINING, LinkCause.IMPLAUSIBLE)
 
         async def looked(reads: int) -> bool:
             return rack.reads >= reads

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from coldloop.errors import PeerUnreachableError, RequestRefusedError
+from coldloop.errors import PeerUnreachableError, RequestRefusedError, UnfitValueError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.codec import WordOrder, as_transmitted
 from coldloop.registers.common import Identity
@@ -242,7 +242,7 @@ async def test_both_ends_send_small_packets_without_delay(serve: "Serve") -> Non
 
 async def test_a_value_that_fits_no_register_is_not_sent(serve: "Serve") -> None:
     async with serve(CONTROL_MAP) as running, client_of(running.server.port, register_map=CONTROL_MAP) as client:
-        with pytest.raises(struct.error):
+        with pytest.raises(UnfitValueError, match="block 'grant' cannot hold"):
             await client.write(Grant(until_tick=-1))
         assert running.written == []
 

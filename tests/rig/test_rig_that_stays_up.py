@@ -1,8 +1,10 @@
 """`coldloop up`, `down`, `status`, `set` and `run --attach`: a rig that stays up, and what is done with it."""
 
 import asyncio
+import contextlib
 import json
 import os
+import signal
 import socket
 import time
 from collections.abc import Iterator
@@ -14,7 +16,7 @@ from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
 from rig import cli
-from rig.started_rigs import running_rig
+from rig.started_rigs import running_rig, state_folder
 from tests.conftest import Coldloop, first_of_three_ports
 from tests.harness.processes import Processes
 
@@ -232,6 +234,37 @@ def test_what_a_rig_runs_may_be_named_again(coldloop: Coldloop, up: str, results
     same = ("--solver", "ode", "--set", "plant.sensors.level=0.01")
     run = (*attach(up), "--load", "e", "--duration", "5s", "--figures", "png", *same, "--out", results)
     assert coldloop(*run).code == 0
+
+
+@pytest.mark.parametrize("service", ["optimizer_plc", "plant", "control_plc"])
+def test_a_service_that_is_killed_is_started_again_and_the_session_goes_on(
+    coldloop: Coldloop, up: str, service: str
+) -> None:
+    session = shown(coldloop, up)["session"].partition(",")[0]
+    rig = running_rig(int(up))
+    assert rig is not None
+    log = state_folder(int(up)) / "up.log"
+    before = log.read_text().count("started again")
+    os.kill(child_of(rig.pid, service), signal.SIGKILL)
+    deadline = time.monotonic() + PATIENCE_S
+    while coldloop("status", "--port-base", up).code or log.read_text().count("started again") == before:
+        assert time.monotonic() < deadline, log.read_text()
+    assert f"the {service} service was ended by SIGKILL" in log.read_text().splitlines()[-1]
+    assert "(1 of 5)" in log.read_text().splitlines()[-1]
+    until(coldloop, up, "mode", "mpc")
+    assert shown(coldloop, up)["session"].partition(",")[0] == session
+    assert running_rig(int(up)) == rig
+
+
+def child_of(parent: int, service: str) -> int:
+    """The process of a service that another one has started."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            words = (folder / "cmdline").read_bytes().split(b"\0")
+            started_by = int((folder / "stat").read_bytes().rpartition(b")")[2].split()[1])
+            if started_by == parent and service.encode() in words:
+                return int(folder.name)
+    raise AssertionError(f"no process of {service}")
 
 
 def test_ctrl_c_gives_an_attached_rig_back_too(

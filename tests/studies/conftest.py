@@ -1,5 +1,6 @@
 """Short runs that studies are made of, and workers to do them."""
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -36,8 +37,14 @@ def store(tmp_path: Path) -> Store:
 
 @pytest.fixture(scope="session")
 def client() -> Iterator[Client]:
-    """Two workers, in processes of their own; they are the same ones for all tests."""
+    """Two workers, in processes of their own; they are the same ones for all tests.
+
+    Dask silences the handlers of its loggers as long as they are there: pytest's are among them, and of all loggers.
+    """
+    levels = {handler: handler.level for handler in logging.getLogger().handlers}
     with Workers(2).connected() as client:
+        for handler, level in levels.items():
+            handler.setLevel(level)
         yield client
 
 

@@ -44,7 +44,7 @@ export function makeChart(holder, lines, options) {
   }, [[], ...lines.map(() => [])], holder);
   if (options.onPick) chart.over.addEventListener("click", () => { if (chart.cursor.left >= 0) options.onPick(chart.posToVal(chart.cursor.left, "x")); });
   new ResizeObserver(() => chart.setSize(size())).observe(holder);
-  return { chart, extra, lines, title: options.title, show(data, more = {}) { Object.assign(extra, more); chart.setData(withoutReplaced(data, lines, extra)); Object.assign(holder.dataset, { substituted: extra.replaced.length, gaps: extra.gaps.length }); } };
+  return { chart, extra, lines, title: options.title, show(data, more = {}) { Object.assign(extra, more); chart.setData(withoutReplaced(data, lines, extra)); Object.assign(holder.dataset, { substituted: extra.replaced.length, gaps: extra.gaps.length, ahead: extra.planned && extra.predictions.length > 0 }); } };
 }
 
 // Where a sensor is bad another value stands in for it: what is not measured is no line like others.

@@ -58,7 +58,7 @@ async function curves(found) {
   }
   for (const one of charts) {
     const predictions = found.prediction ? [{ time: found.prediction.time, curves: [found.prediction[one.name]] }] : [];
-    one.show([trend.time, trend.series[one.name]], { band: trend.bands[one.name], substituted: trend.substituted, predictions, now: found.time_s });
+    one.show([trend.time, trend.series[one.name]], { band: trend.bands[one.name], bandName: "band", substituted: trend.substituted, gaps: trend.gaps, predictions, planned: true, now: found.time_s });
   }
   const came = found.came === null ? "not known yet" : digits(found.came, 5);
   byId("why-cost").textContent = `Cost at the end of this period: predicted ${digits(found.predicted, 5)}, came ${came}. ${found.prediction ? "Dashed: the trajectory that was predicted." : "The predicted trajectory of this update is not kept any more."} Vertical line: the updating instant.`;
