@@ -55,6 +55,15 @@ def pytest_configure(config: pytest.Config) -> None:
         settings.load_profile("all")
 
 
+def keep_together(item: pytest.Item, group: str) -> None:
+    """Have a test done by the worker that does the others of its group."""
+    item.add_marker(pytest.mark.xdist_group(group))
+    identity = getattr(item, "_id", None)
+    if identity is not None and hasattr(item.config, "workerinput"):
+        # pytest 9.2 has the name of a test there; what pytest-xdist 3.8 appends the group to, it does not read any more
+        item._id = type(identity).parse(f"{item.nodeid}@{group}")  # type: ignore[attr-defined]  # noqa: SLF001
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark each test by what it uses, and leave out what only `--all` runs."""
@@ -65,7 +74,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(mark)
         group = next((name for name in SHARED if name in fixtures), None)
         if group:
-            item.add_marker(pytest.mark.xdist_group(group))
+            keep_together(item, group)
         if item.get_closest_marker("exhaustive") or item.get_closest_marker("container"):
             left_out.add(item)
     if left_out and not config.getoption("--all"):

@@ -17,7 +17,8 @@ from tests.harness.processes import Processes
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
 
-PATIENCE_S = 120.0
+PATIENCE_S = 300.0
+"""The first run on a machine compiles the kernels."""
 
 PLAN = """
 name = "short"

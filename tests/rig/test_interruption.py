@@ -24,7 +24,8 @@ from tests.harness.processes import Processes
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
 
-PATIENCE_S = 120.0
+PATIENCE_S = 300.0
+"""The first run on a machine compiles the kernels."""
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -94,9 +95,10 @@ def test_ctrl_c_before_there_is_anything_to_record_leaves_nothing(
     time.sleep(delay_s)
     run.popen.send_signal(signal.SIGINT)
     ended = run.ended(PATIENCE_S)
-    assert ended.code in (130, -signal.SIGINT), "the interpreter itself may not be up yet"
     if ended.code == 130:
         assert "Traceback" not in ended.err
+    else:  # the interpreter itself was not up yet
+        assert ended.code == -signal.SIGINT or "Fatal Python error: init_import_site" in ended.err, ended
 
 
 def fail_after(ticks: int, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,24 +131,33 @@ def test_a_setpoint_beyond_the_bounds_is_refused_by_the_control_plc_itself(up: s
     asyncio.run(write())
 
 
+def let_the_load_be(coldloop: Coldloop, base: str, watts: int) -> None:
+    """Write a load, and wait until it is the present one and no other is to come."""
+    assert coldloop("set", "--port-base", base, "load", str(watts)).code == 0
+    deadline = time.monotonic() + PATIENCE_S
+    while (load := shown(coldloop, base)["load"]) != f"{watts} W":
+        assert time.monotonic() < deadline, load
+
+
 def test_a_load_file_begins_now(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
+    let_the_load_be(coldloop, up, 385)
     file = tmp_path / "load.csv"
     file.write_text("time_s,load_w\n" + "".join(f"{second},{400 + second % 2}\n" for second in range(3000)))
     outcome = coldloop("set", "--port-base", up, "load", str(file), "--at", "90000")
     assert outcome.code == 0, outcome.complaints
     assert "load of 3000 steps from 90000 s to 92999 s" in outcome.out
     assert "400 W from 90000 s" in shown(coldloop, up)["load"]
-    assert coldloop("set", "--port-base", up, "load", "385").code == 0
+    let_the_load_be(coldloop, up, 385)
 
 
 def test_a_load_that_begins_later_is_told_as_it_was_written(coldloop: Coldloop, up: str) -> None:
-    assert coldloop("set", "--port-base", up, "load", "385").code == 0  # nothing else is to come
+    let_the_load_be(coldloop, up, 385)
     assert coldloop("set", "--port-base", up, "load", "444", "--at", "80000").out.startswith(
         "load 444 W from 80000 s on ("
     )
     outcome = coldloop("set", "--port-base", up, "load", "400", "--at", "90000.25")
     assert outcome.out.startswith("load 400 W from 90000.2 s on, before it 444 W from 80000 s on (was ")
-    assert coldloop("set", "--port-base", up, "load", "385").code == 0
+    let_the_load_be(coldloop, up, 385)
     outcome = coldloop("set", "--port-base", up, "load", "400", "--at", "0.25")
     assert (outcome.code, len(outcome.complaints)) == (2, 1)
     assert "plant time is" in outcome.complaints[0]

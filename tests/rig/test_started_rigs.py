@@ -241,6 +241,7 @@ def test_a_second_rig_that_is_started_at_the_same_time_is_refused(coldloop: "Col
     os.close(RigLock(FIRST).descriptor)
 
 
+@pytest.mark.usefixtures("processes", "realtime")
 def test_of_two_that_are_started_together_one_is_up() -> None:
     base = str(first_of_three_ports())
     command = [sys.executable, "-m", "rig", "up", "--detach", "--port-base", base, "--load", "e"]
