@@ -14,7 +14,7 @@ from qp_solvers import Recorded, record
 from scipy.linalg import lapack
 
 from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.solvers.ode import OdeSolver
+from optimizer_plc.solvers.ode import ode_solver
 
 ITERATIONS = 10
 """Of each problem."""
@@ -24,10 +24,9 @@ FLOOR_US = 1.0
 
 def lively(problems: list[Recorded]) -> list[Recorded]:
     """Return the problems that do not stall."""
-    solver, found = OdeSolver(OdeSettings()), []
+    solver, found = ode_solver(OdeSettings()), []
     for one in problems:
-        solver.start(*one)
-        if solver.iterate(ITERATIONS + 1) > ITERATIONS:
+        if solver.solve(*one, (ITERATIONS + 1,)).iterations[-1] > ITERATIONS:
             found.append(one)
     return found
 
@@ -42,10 +41,10 @@ def microseconds(work: Callable[[], object], times: int) -> float:
 
 def iteration_us(problems: list[Recorded]) -> float:
     """Return the mean time of an iteration."""
-    solver, total = OdeSolver(OdeSettings()), 0.0
+    solver, total = ode_solver(OdeSettings()), 0.0
     for one in problems:
-        solver.start(*one)
-        total += microseconds(lambda: solver.iterate(ITERATIONS), 1)
+        start, whole = (microseconds(lambda q=q: solver.solve(*one, (q,)), 1) for q in (0, ITERATIONS))  # noqa: B023
+        total += whole - start
     return total / ITERATIONS / len(problems)
 
 

@@ -14,8 +14,8 @@ from optimizer_plc.problem import Situation
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.scheme import ALGORITHM_1, CONTRACTION, FIXED, OPTIMIZER_STATE, Constants, Memory, Rule
 from optimizer_plc.session_state import Delivery, Period
-from optimizer_plc.solvers.compiled import KINDS, solver_constants
-from optimizer_plc.solvers.hybrid import HybridSolver
+from optimizer_plc.solvers.interface import Costs
+from optimizer_plc.solvers.kernel_solver import KernelSolver
 from optimizer_plc.updating_period import (
     Algorithm1,
     Assessment,
@@ -34,7 +34,7 @@ def is_compiled(program: OptimizerProgram) -> bool:
     if type(program) is not OptimizerProgram:  # who has made another kind of it wants to be asked
         return False
     known_rule = isinstance(program.rule, FixedPeriod | Algorithm1 | ContractionRule)
-    return program.problem.Phi.dtype == np.float64 and type(program.solver) in KINDS and known_rule
+    return program.problem.Phi.dtype == np.float64 and isinstance(program.solver, KernelSolver) and known_rule
 
 
 def is_ordinary(program: OptimizerProgram) -> bool:
@@ -66,7 +66,8 @@ def constants_of(program: OptimizerProgram, limits: InputLimits) -> Constants:
         scaled_rate=problem.scaled_rate,
         rate_shares=np.array([limits.rate_share(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)]),
         n_inputs=problem.n_inputs,
-        solver=solver_constants(program.solver, program.settings, qp),
+        alpha=program.solver.alpha,
+        solver=program.solver.method(qp),
         floor=program.settings.adaptive.cost_floor,
         sequence_ticks=program.settings.sequence_ticks,
         load_step=program.settings.interrupting_load_step_w,
@@ -146,8 +147,7 @@ def give_back(program: OptimizerProgram, m: Memory, update: Update, sequence: In
         program.estimator.since = int(n["since"])
     if isinstance(program.estimator, KalmanFilter | StateFeedback):
         program.estimator.estimate = estimate
-    if isinstance(program.solver, HybridSolver):
-        program.solver.go_on_after(float(n["hot_start"]), float(n["delivered"]))
+    program.solver.before = Costs(float(n["hot_start"]), float(n["delivered"]))
     if isinstance(program.rule, ContractionRule):
         program.rule.contraction = float(n["contraction"])
         program.rule.delivered = float(n["contraction_delivered"])

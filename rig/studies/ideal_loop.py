@@ -66,9 +66,7 @@ def run_ideal_loop(
             estimate = estimator.correct(Update(1, tick, tick, 0, watts, tuple(applied), tuple(applied), y, x))
             situation = Situation(estimate.x, estimate.w, np.array(applied) - model.u0, ticks)
             qp, guess = problem.at(situation), problem.shifted(z, ticks)
-            solver.start(qp, guess)
-            solver.iterate(1)
-            z = solver.solution
+            z = solver.solve(qp, guess, (1,)).z
             if solved is not None:
                 solved(qp, guess, z)
             wanted = SequenceRow(*problem.inputs(z, 1)[0].tolist())

@@ -184,17 +184,14 @@ class OptimizerProgram:
         x = self.estimator.predict(segments)
         situation = Situation(x, period.estimate.w, segments[-1][0], period.ticks)
         qp = self.problem.at(situation)
-        self.solver.start(qp, self.problem.shifted(self.state.playing.z, period.ticks))
-        hot_start = self.solver.cost
-        done = self.solver.iterate(period.iterations - 1)
-        last_but_one = self.solver.cost
-        done += self.solver.iterate(1)
-        z = self.problem.within_first_rate(self.solver.solution, situation)
+        guess = self.problem.shifted(self.state.playing.z, period.ticks)
+        answer = self.solver.solve(qp, guess, (period.iterations - 1, period.iterations))
+        z = self.problem.within_first_rate(answer.z, situation)
         sequence = self._sequence(period, z)
         self.state.sent = Delivery(
             z, situation, sequence.header.first_tick, sequence, qp,
-            self._with_floor(hot_start, qp), self._with_floor(last_but_one, qp), self._with_floor(self.solver.cost, qp),
-            done,
+            self._with_floor(answer.guessed, qp), self._with_floor(answer.costs[0], qp),
+            self._with_floor(answer.costs[1], qp), int(answer.iterations[1]),
         )  # fmt: skip
         return sequence
 

@@ -18,8 +18,8 @@ from optimizer_plc.linear_algebra import respond
 from optimizer_plc.prediction import Transition
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.profile import inputs_of, shifted
-from optimizer_plc.solvers import compiled
-from optimizer_plc.solvers.compiled import Costs, SolverConstants
+from optimizer_plc.solvers.interface import Costs
+from optimizer_plc.solvers.kernel_solver import solve_by
 from optimizer_plc.updating_period import (
     Assessment,
     ContractionParameters,
@@ -98,7 +98,10 @@ class Constants(NamedTuple):
     rate_shares: Array
     """Share of the rate limit after 0, 1, ... ticks, shape (ticks + 1,)."""
     n_inputs: int
-    solver: SolverConstants
+    alpha: float
+    """Penalty weight."""
+    solver: Any
+    """Method of a solver of our own."""
     floor: float
     """Constant added to J."""
     sequence_ticks: int
@@ -161,15 +164,17 @@ def solve(c: Constants, m: Memory) -> int:
     m.u_before[:] = u
     qp = problem_at(c, m.predicted, s.w, u, c.rate_shares[ticks])
     before = Costs(s.hot_start, s.delivered)
-    answer = compiled.solve(c.solver, qp, shifted(c.shifts[ticks], m.z), s.iterations, before)
+    counts = np.array([s.iterations - 1, s.iterations])
+    answer = solve_by(c.solver, qp, shifted(c.shifts[ticks], m.z), counts, before)
+    z = answer.points[1]
     s.hot_start = with_floor(answer.guessed, qp.constant, c.floor)
-    s.last_but_one = with_floor(answer.last_but_one, qp.constant, c.floor)
-    s.delivered = with_floor(answer.delivered, qp.constant, c.floor)
-    s.done = answer.slots
-    keep_first_rate(c.maps, c.scaled_rate, u, c.rate_shares[ticks], answer.z)
-    s.j_dev, s.j_cst, s.violation = predicted_indicators(c.predicted, qp, answer.z, m.predicted, s.w, c.n_inputs)
-    m.answer[:] = answer.z
-    return write_rows(c, answer.z, ticks, m.answer_rows)
+    s.last_but_one = with_floor(answer.costs[0], qp.constant, c.floor)
+    s.delivered = with_floor(answer.costs[1], qp.constant, c.floor)
+    s.done = answer.iterations[1]
+    keep_first_rate(c.maps, c.scaled_rate, u, c.rate_shares[ticks], z)
+    s.j_dev, s.j_cst, s.violation = predicted_indicators(c.predicted, qp, z, m.predicted, s.w, c.n_inputs)
+    m.answer[:] = z
+    return write_rows(c, z, ticks, m.answer_rows)
 
 
 @kernel
@@ -216,7 +221,7 @@ def plan(c: Constants, m: Memory, tick: int, u_before: Array, load: float, y: Ar
     s, rule = m.numbers[0], c.rule
     estimate(c, m, u_before, load, y, x)
     qp = problem_at(c, m.x, s.w, m.u_before, s.played_share)
-    effective = with_floor(augmented_cost(qp, m.z, c.solver.alpha), qp.constant, c.floor)
+    effective = with_floor(augmented_cost(qp, m.z, c.alpha), qp.constant, c.floor)
     o = Observation(s.iterations, s.ticks * TICK_S, s.effective, s.hot_start, s.last_but_one, s.delivered, effective)
     assessment = _assess(o)
     wanted = rule.q_min

@@ -22,7 +22,7 @@ from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings, SolverName
-from optimizer_plc.solvers.ode import OdeSolver
+from optimizer_plc.solvers.ode import ode_solver
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Jump, PenalisedOptimum
@@ -140,10 +140,7 @@ def loss(qp: QuadraticProblem, guess: Array, iterations: int, best: float) -> tu
     alpha = OdeSettings().alpha
     ends = []
     for one, start in ((qp, guess), (rounded(qp), guess.astype(SINGLE))):
-        solver = OdeSolver(OdeSettings())
-        solver.start(one, start)
-        solver.iterate(iterations)
-        z = solver.solution
+        z = ode_solver(OdeSettings()).solve(one, start, (iterations,)).z
         assert z.dtype == one.phi.dtype
         whole = np.clip(z.astype(np.float64), qp.low, qp.high)
         ends.append(augmented_cost(qp, whole, alpha) + qp.constant)
@@ -168,13 +165,7 @@ def test_after_harsh_load_jumps_single_precision_loses_little(
 def test_in_single_precision_the_cost_never_rises_however_long_one_iterates(harsh_jumps: "list[Jump]") -> None:
     for qp, guess in harsh_jumps[:10]:
         single = rounded(qp)
-        solver = OdeSolver(OdeSettings())
-        solver.start(single, guess.astype(SINGLE))
-        before = solver.cost
-        for _ in range(600):
-            solver.iterate(1)
-            assert solver.cost <= before
-            before = solver.cost
-        z = solver.solution
-        assert np.isfinite(z).all()
-        assert ((single.low <= z) & (z <= single.high)).all()
+        answer = ode_solver(OdeSettings()).solve(single, guess.astype(SINGLE), range(601))
+        assert (np.diff(answer.costs) <= 0.0).all()
+        assert np.isfinite(answer.z).all()
+        assert ((single.low <= answer.z) & (answer.z <= single.high)).all()

@@ -4,6 +4,7 @@ The optimiser's solver is one whose answers are known, its estimator believes th
 what it is told. Every update shows another state than the model predicts, so that no two costs are equal by chance.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,11 +18,11 @@ from coldloop.process import TICK_S
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
 from coldloop.sequence import InputSequence
+from optimizer_plc import solvers
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.program import UNDECIDED, OptimizerProgram
 from optimizer_plc.settings import ProgramSettings
-from optimizer_plc.solution import Solution
 from optimizer_plc.updating_period import Assessment, Observation
 
 Array = NDArray[np.float64]
@@ -47,25 +48,13 @@ class KnownSolver:
     def reset(self) -> None:
         pass
 
-    def start(self, problem: QuadraticProblem, guess: Array) -> None:
-        self._problem = problem
-        self._z = np.clip(guess, problem.low, problem.high)
-
-    def iterate(self, count: int) -> int:
-        for _ in range(count):
-            self._z = np.clip(self._z + self.move, self._problem.low, self._problem.high)
-        return count
-
-    @property
-    def solution(self) -> Array:
-        return self._z.copy()
-
-    @property
-    def cost(self) -> float:
-        return cost(self._problem, self._z) - self._problem.constant - FLOOR
-
-    def judged(self) -> Solution:
-        raise NotImplementedError
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> solvers.Answer:
+        path = [np.clip(guess, problem.low, problem.high)]
+        for _ in range(counts[-1]):
+            path.append(np.clip(path[-1] + self.move, problem.low, problem.high))
+        costs = [cost(problem, z) - problem.constant - FLOOR for z in path]
+        chosen = list(counts)
+        return solvers.Answer(costs[0], np.array(path)[chosen], np.array(costs)[chosen], np.array(chosen), np.zeros(94))
 
 
 @dataclass
