@@ -115,6 +115,8 @@ class World(NamedTuple):
     largest_load: float
     watchdog: int
     """Time-out, ticks; 0 is off."""
+    load_step: float
+    """Change of the load that interrupts an updating period, W, or 0."""
 
 
 class Alarms(NamedTuple):
@@ -147,8 +149,6 @@ class Reports(NamedTuple):
     """Update, tick, tau_u, iterations."""
     values: NDArray[np.float32]
     """The numbers of `Optimization` from `j_effective` on."""
-    assessment: Array
-    """Of the update under way: E, D, K, Gamma."""
 
 
 def empty_trace(station: int) -> Trace:
@@ -159,12 +159,12 @@ def empty_trace(station: int) -> Trace:
 
 def empty_reports() -> Reports:
     """Return room for the updates of a block."""
-    return Reports(np.empty((BLOCK_TICKS, 4), np.int64), np.empty((BLOCK_TICKS, 11), np.float32), np.zeros(4))
+    return Reports(np.empty((BLOCK_TICKS, 4), np.int64), np.empty((BLOCK_TICKS, 11), np.float32))
 
 
 def empty_rows() -> Array:
-    """Return room for the longest sequence."""
-    return np.zeros((SEQUENCE_ROWS, len(INPUT_NAMES)))
+    """Return room for two of the longest sequences."""
+    return np.zeros((2, SEQUENCE_ROWS, len(INPUT_NAMES)))
 
 
 def record(kind: Any) -> Any:  # noqa: ANN401 numpy's types of records

@@ -19,7 +19,7 @@ from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample
 from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.updating_period import FixedPeriod
+from optimizer_plc.rules import FixedPeriod
 from plant.kinds import plant_maker
 from plant.own_model import own_header
 from plant.program import LoadProfile

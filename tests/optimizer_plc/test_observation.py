@@ -5,8 +5,10 @@ what it is told. Every update shows another state than the model predicts, so th
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -21,9 +23,10 @@ from coldloop.sequence import InputSequence
 from optimizer_plc import solvers
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
-from optimizer_plc.program import UNDECIDED, OptimizerProgram
+from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.rules import Assessment, Observation
+from optimizer_plc.rules.interface import decides_by
 from optimizer_plc.settings import ProgramSettings
-from optimizer_plc.updating_period import Assessment, Observation
 
 Array = NDArray[np.float64]
 
@@ -57,30 +60,46 @@ class KnownSolver:
         return solvers.Answer(costs[0], np.array(path)[chosen], np.array(costs)[chosen], np.array(chosen), np.zeros(94))
 
 
-@dataclass
-class NotingRule:
+class NotingRule(NamedTuple):
     """Notes what it is told."""
 
-    told: list[Observation] = field(default_factory=list)
-    first: int = FIRST
+    count: NDArray[np.int64]
+    notes: Array
+
+    @property
+    def told(self) -> list[Observation]:
+        rows = self.notes[: self.count[0]].tolist()
+        return [Observation(int(iterations), *others) for iterations, *others in rows]
+
+    @property
+    def first(self) -> int:
+        return FIRST
 
     @property
     def status(self) -> UpdatingRuleStatus:
         return UpdatingRuleStatus(UpdatingRuleKind.FIXED)
 
-    def after_interruption(self) -> int:
+    def after_interruption(self, memory: Array) -> int:
+        memory[0] += 1.0
         return INTERRUPTED
 
-    def next(self, observation: Observation) -> tuple[int, Assessment]:
-        self.told.append(observation)
-        return NEXT, UNDECIDED
+
+@decides_by(NotingRule)
+@numba.njit
+def decide(rule: NotingRule, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001 a kernel
+    note = rule.notes[rule.count[0]]
+    note[0], note[1], note[2], note[3] = o.iterations, o.period_s, o.effective_before, o.hot_start
+    note[4], note[5], note[6] = o.last_but_one, o.delivered, o.effective
+    rule.count[0] += 1
+    return NEXT
 
 
 class Bench:
     """The program, and beside it all that it should know."""
 
     def __init__(self, model: LtiModel, problem: PredictiveProblem, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.rule, self.model, self.problem = NotingRule(), model, problem
+        self.rule = NotingRule(np.zeros(1, np.int64), np.zeros((20, 7)))
+        self.model, self.problem = model, problem
         monkeypatch.setattr(optimizer_plc.program, "make_rule", lambda *_: self.rule)
         monkeypatch.setattr(optimizer_plc.program, "make_solver", lambda _: KnownSolver())
         settings = ProgramSettings(
@@ -88,7 +107,7 @@ class Bench:
         )
         self.program = OptimizerProgram(model, settings, InputLimits())
         self.program.restart(0.0)
-        self.rule.told.clear()
+        self.rule.count[0] = 0
         self._updates = 0
 
     def update(self, tick: int, playing: int, x: Array, watts: float = 0.0) -> Plan:
