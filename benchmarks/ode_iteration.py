@@ -24,11 +24,8 @@ FLOOR_US = 1.0
 
 def lively(problems: list[Recorded]) -> list[Recorded]:
     """Return the problems that do not stall."""
-    solver, found = ode_solver(OdeSettings()), []
-    for one in problems:
-        if solver.solve(*one, (ITERATIONS + 1,)).iterations[-1] > ITERATIONS:
-            found.append(one)
-    return found
+    solver = ode_solver(OdeSettings())
+    return [one for one in problems if solver.solve(*one, (ITERATIONS + 1,)).iterations[-1] > ITERATIONS]
 
 
 def microseconds(work: Callable[[], object], times: int) -> float:

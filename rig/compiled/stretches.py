@@ -4,7 +4,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.limits import InputLimits
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import MAX_LOAD_W
 from control_plc.program import ControlProgram
@@ -33,12 +32,10 @@ class CompiledStretches:
         control: The control PLC.
         optimizer: The optimiser, in its session.
         load: What the plant's load follows.
-        limits: Of the inputs.
     """
 
     def __init__(
-        self, plant: PlantProgram, control_plc: ControlProgram, optimizer_plc: OptimizerProgram, load: LoadProfile,
-        limits: InputLimits,
+        self, plant: PlantProgram, control_plc: ControlProgram, optimizer_plc: OptimizerProgram, load: LoadProfile
     ) -> None:  # fmt: skip
         self._plant, self._control, self._optimizer = plant, control_plc, optimizer_plc
         self._is_compiled = optimizer.is_compiled(optimizer_plc)

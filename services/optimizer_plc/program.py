@@ -60,16 +60,14 @@ class OptimizerProgram:
         self.restart(settings.updating_period_s)
 
     def _compile_kernels(self, model: LtiModel) -> None:
-        """Go through updates at the operating point by each rule, so that no session waits for the compiler."""
+        """Go through two updates at the operating point, so that no session waits for the compiler."""
         u, y, x = (tuple(values.tolist()) for values in (model.u0, model.y0, model.x0))
         first = Update(0, 0, 0, 0, load=model.w0, u_before=u, u=u, y=y, x=x)
-        for period_s in (MAX_PERIOD_TICKS * TICK_S, 0.0):
-            self.restart(period_s)
-            planned = self.plan(first)
-            sequence = self.solve()
-            self.report(Verdict.NONE)
-            self.prediction()
-            self.plan(first._replace(update=1, tick=planned.next_update_tick, playing=sequence.header.number))
+        self.restart(0.0)
+        planned = self.plan(first)
+        sequence = self.solve()
+        self.prediction()
+        self.plan(first._replace(update=1, tick=planned.next_update_tick, playing=sequence.header.number))
 
     def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
         """Forget everything and begin a session at the operating point.

@@ -73,9 +73,8 @@ def empty_memory(n_states: int, size: int, real: Real) -> Memory:
 
     def delivery() -> Delivery:
         rows = np.zeros((SEQUENCE_ROWS, N_INPUTS), np.float32)
-        return Delivery(
-            numbers(DELIVERY), np.zeros(n_states, real), np.zeros(N_INPUTS, real), np.zeros(size, real), rows
-        )
+        x, u, z = (np.zeros(n, real) for n in (n_states, N_INPUTS, size))
+        return Delivery(numbers(DELIVERY), x, u, z, rows)
 
     return Memory(
         numbers(PERIOD), no_belief(n_states, real), delivery(), delivery(), np.zeros(N_INPUTS, real),

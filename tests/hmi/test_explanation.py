@@ -92,9 +92,8 @@ def decided_cases(wanted: int) -> list[Case]:
             continue
         observed = Observation(q, 0.25 * (1 + q), J_k, J_hot, J_last, J_hat, J_next)
         a = assess(observed)
-        assert algorithm_1.decide(Algorithm1(9, 2, 19, 2), np.zeros(2), observed, a) == reference.q, (
-            "the program agrees with the reference"
-        )
+        decided = algorithm_1.decide(Algorithm1(9, 2, 19, 2), np.zeros(2), observed, a)
+        assert decided == reference.q, "the program agrees with the reference"
         before = optimization(7, 100, q, j_effective=J_k, j_hot_start=J_hot, j_delivered=J_hat)
         update = optimization(
             8, 101 + q, reference.q, j_effective=J_next, efficiency=a.efficiency, mismatch=a.mismatch,

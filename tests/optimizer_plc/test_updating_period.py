@@ -85,10 +85,8 @@ def test_a_contraction_that_still_gains_with_the_last_iteration_makes_the_period
 
 def test_without_contraction_the_sign_of_the_contractions_increment_decides() -> None:
     # K = 260 / 200; D = 2.6: dK = 0.5 * 1.6 / 4 + 2.6 * dE is 0.2 - 0.052 with 104 before, 0.2 - 1.04 with 180
-    shorter, better = (
-        Deciding(RULE).next(contracting(effective=260.0)),
-        Deciding(RULE).next(contracting(effective=260.0, last_but_one=180)),
-    )
+    observed = contracting(effective=260.0)
+    shorter, better = (Deciding(RULE).next(one) for one in (observed, observed._replace(last_but_one=180.0)))
     assert (shorter[1].gamma, better[1].gamma) == pytest.approx((0.148, -0.84))
     assert (shorter[0], better[0]) == (2, 6)
 

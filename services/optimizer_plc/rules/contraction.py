@@ -57,9 +57,8 @@ class ContractionRule(NamedTuple):
 def decide(rule: ContractionRule, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001
     """Return q(t_{k+1}): about a dozen operations."""
     zero, one, two = memory.dtype.type(0.0), memory.dtype.type(1.0), memory.dtype.type(2.0)
-    improvement = zero
-    if memory[DELIVERED] != zero:
-        improvement = math.log(memory[DELIVERED] / o.delivered) / o.period_s
+    known = memory[DELIVERED] != zero
+    improvement = math.log(memory[DELIVERED] / o.delivered) / o.period_s if known else zero
     remembered = rule.memory**o.period_s * memory[RATE]
     memory[RATE] = max(min(improvement, two * rule.rate), remembered)
     memory[DELIVERED] = o.delivered
@@ -67,4 +66,4 @@ def decide(rule: ContractionRule, memory: Array, o: Observation, a: Assessment) 
         return rule.q_step
     busy = min(one, memory[RATE] / rule.rate)
     quiet, span = memory.dtype.type(rule.q_quiet), memory.dtype.type(rule.q_quiet - rule.q_busy)
-    return round(quiet - span * busy)
+    return int(round(quiet - span * busy))  # noqa: RUF046 it is no int to the type checker

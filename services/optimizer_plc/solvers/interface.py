@@ -69,8 +69,13 @@ class Solver(Protocol):
 
 
 def collected(
-    problem: QuadraticProblem, alpha: float, guess: Array, points: list[Array], iterations: list[int], multipliers: Array
-) -> Answer:  # fmt: skip
+    problem: QuadraticProblem,
+    alpha: float,
+    guess: Array,
+    points: list[Array],
+    iterations: list[int],
+    multipliers: Array,
+) -> Answer:
     """Return the points of a solver that knows no augmented cost as an answer."""
     costs = [float(augmented_cost(problem, z, alpha)) for z in (guess, *points)]
     return Answer(costs[0], np.array(points), np.array(costs[1:]), np.array(iterations), multipliers)
