@@ -15,11 +15,10 @@ from coldloop.process import L1, T5
 from control_plc.output_limits import admit, admits, copy_state, in_range
 from control_plc.sensors import CONTROLLED, are_inside, watch_standing
 from optimizer_plc import scheme
-from optimizer_plc.rules import UpdatingRule
-from optimizer_plc.scheme import BY_THE_RULE, Constants
+from optimizer_plc.scheme import BY_THE_RULE
 from optimizer_plc.session_state import Memory
 from rig.compiled.plants import advance_plant
-from rig.compiled.records import NOT, Alarms, Array, PlantState, Reports, Trace, World
+from rig.compiled.records import NOT, Alarms, Array, Optimizer, PlantState, Reports, Trace, World
 
 DONE: Final = 0
 UNUSUAL: Final = 1
@@ -104,12 +103,10 @@ def play(
 def go_on(
     w: World,
     alarms: Alarms,
-    c: Constants,
-    rule: UpdatingRule,
+    o: Optimizer,
     scans: Any,  # noqa: ANN401
     guards: Any,  # noqa: ANN401
     rows: Array,
-    m: Memory,
     plant: PlantState,
     trace: Trace,
     reports: Reports,
@@ -130,18 +127,18 @@ def go_on(
         if not look(w, alarms, s, plant, trace):
             break
         if not answered and (instant or s.load_step > 0.0):
-            answered = s.next_update <= until and answer(w, c, s, guard, twin, rows, m, reports)
+            answered = s.next_update <= until and answer(w, o, s, guard, twin, rows, reports)
             if not answered:
                 break
         if instant:
-            begin_sequence(s, rows, m)
+            begin_sequence(s, rows, o.memory)
             answered = False
         if tick - s.first_tick >= s.length:
             break
         u_before[:] = guard.applied
         scan(w, alarms, s, guard, rows[0], plant, trace)
         if instant:
-            latch(w, c, rule, s, m, trace, tick, u_before)
+            latch(w, o, s, trace, tick, u_before)
         outcome = DONE
     if answered:
         s.solved -= 1
@@ -150,10 +147,11 @@ def go_on(
 
 @kernel
 def answer(
-    w: World, c: Constants, s: Any, guard: Any, twin: Any, rows: Array, m: Memory, reports: Reports  # noqa: ANN401
+    w: World, o: Optimizer, s: Any, guard: Any, twin: Any, rows: Array, reports: Reports  # noqa: ANN401
 ) -> bool:  # fmt: skip
     """Solve the problem of the update under way; tell whether the control PLC would accept the sequence."""
-    scheme.solve(c, m)
+    m = o.memory
+    scheme.solve(o.constants, o.method, m)
     offered, length = rows[1], m.sent.numbers[0].length
     offered[:length] = m.sent.rows[:length]
     accepted = s.next_update - s.first_tick <= s.length
@@ -182,16 +180,17 @@ def begin_sequence(s: Any, rows: Array, m: Memory) -> None:  # noqa: ANN401
 
 @kernel
 def latch(
-    w: World, c: Constants, rule: UpdatingRule, s: Any, m: Memory, trace: Trace, tick: int, u_before: Array  # noqa: ANN401
+    w: World, o: Optimizer, s: Any, trace: Trace, tick: int, u_before: Array  # noqa: ANN401
 ) -> None:  # fmt: skip
     """Latch an update at `tick`, whose scan has been done, and plan the updating period that begins there."""
-    row, real = tick - s.first, m.u.dtype.type
+    m, row = o.memory, tick - s.first
+    real = m.u.dtype.type
     s.update_tick, s.update_load = tick, trace.load[row]
     s.u_before[:] = u_before
     for i in range(m.u.shape[0]):
-        m.u[i] = real(trace.u[row, i]) - c.estimator.u0[i]
+        m.u[i] = real(trace.u[row, i]) - o.constants.estimator.u0[i]
     before, y, x = measured(u_before, m), measured(trace.y[row], m), measured(trace.x[row], m)
-    scheme.plan(c, rule, m, BY_THE_RULE, s.updates, tick, before, real(trace.load[row]), y, x)
+    scheme.plan(o.constants, o.rule, m, BY_THE_RULE, s.updates, tick, before, real(trace.load[row]), y, x)
     s.updates += 1
     s.next_update, s.load_step = tick + m.numbers[0].ticks, w.load_step
     trigger(w, s, tick + 1)

@@ -4,7 +4,7 @@ from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.solvers import KernelSolver
-from rig.compiled.records import Reports
+from rig.compiled.records import Optimizer, Reports
 
 
 def is_compiled(program: OptimizerProgram) -> bool:
@@ -18,6 +18,11 @@ def is_ordinary(program: OptimizerProgram) -> bool:
     """Tell whether the update under way is one of many: what is played began at its instant."""
     now, playing = program.state.numbers[0], program.state.playing.numbers[0]
     return bool(now["planned"] and playing["length"] and playing["first_tick"] == now["tick"])
+
+
+def parts_of(program: OptimizerProgram) -> Optimizer:
+    """Return the program as the loop takes it; its state is the program's own."""
+    return Optimizer(program.constants, program.method, program.rule, program.state)
 
 
 def optimizations(reports: Reports, solved: int) -> list[Optimization]:

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from control_plc.output_limits import Limits
+from optimizer_plc.rules import UpdatingRule
+from optimizer_plc.scheme import Constants
+from optimizer_plc.session_state import Memory
 from plant.cold_box import ColdBox
 from plant.helium.properties import Helium
 from plant.refrigerator import Refrigerator
@@ -117,6 +120,17 @@ class World(NamedTuple):
     """Time-out, ticks; 0 is off."""
     load_step: float
     """Change of the load that interrupts an updating period, W, or 0."""
+
+
+class Optimizer(NamedTuple):
+    """The optimiser's program, as kernels take it."""
+
+    constants: Constants
+    method: Any
+    """Of a solver of our own."""
+    rule: UpdatingRule
+    memory: Memory
+    """Its state, which is overwritten."""
 
 
 class Alarms(NamedTuple):

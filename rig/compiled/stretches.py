@@ -85,8 +85,8 @@ class CompiledStretches:
         scans, guards = control.scan_record(program), control.guard_records(program.guard.state)
         rows = control.sequence_rows(playing)
         loops.go_on(
-            self._world, control.alarms_of(program), optimizer_plc.constants, optimizer_plc.rule, scans, guards, rows,
-            optimizer_plc.state, plant, self._trace, self._reports, until,
+            self._world, control.alarms_of(program), optimizer.parts_of(optimizer_plc), scans, guards, rows, plant,
+            self._trace, self._reports, until,
         )  # fmt: skip
         s = scans[0]
         if s["tick"] == s["first"]:

@@ -19,6 +19,7 @@ from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample
 from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.rules import make_rule
 from plant.kinds import plant_maker
 from plant.own_model import own_header
 from plant.program import LoadProfile
@@ -116,7 +117,7 @@ class LoopBranch:
         )
         optimizer = self._programs.optimizer
         iterations = (optimizer.budget.iterations(round(period / TICK_S)) for period in PERIODS_S)
-        self._rules = [optimizer.rule.fixed(q) for q in iterations]
+        self._rules = [make_rule(program, optimizer.budget, 0).fixed(q) for q in iterations]
         optimizer.restart(0.0, self._rules[0])
         self._programs.control.restart(session=1)
         self._sums = CostSums(StageCost(model, program.design), recorder)

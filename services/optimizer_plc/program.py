@@ -54,8 +54,8 @@ class OptimizerProgram:
         self.state = empty_memory(prediction.n_states, self.problem.size, self._real)
         estimator = estimator_of(prediction, settings.estimator, self._real)
         at_rest = self.problem.at(Situation(self.state.belief.x, self._real(0.0), self.state.u))
-        method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
-        self.constants = scheme.constants_of(estimator, self.problem, method, self.solver.alpha, settings, self.budget)
+        self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
+        self.constants = scheme.constants_of(estimator, self.problem, self.solver.alpha, settings, self.budget)
         self._compile_kernels(model)
         self.restart(settings.updating_period_s)
 
@@ -191,7 +191,7 @@ class OptimizerProgram:
         """Predict the state at t_{i+1}, shift the profile, do q iterations; return the sequence to play from there."""
         q = self._iterations
         if isinstance(self.solver, KernelSolver):
-            scheme.solve(self.constants, self.state)
+            scheme.solve(self.constants, self.method, self.state)
         else:
             qp, guess = scheme.pose(self.constants, self.state)
             scheme.deliver(self.constants, self.state, qp, self.solver.solve(qp, guess, (q - 1, q)))

@@ -50,8 +50,6 @@ class Constants(NamedTuple):
     n_inputs: int
     alpha: float
     """Penalty weight."""
-    method: Any
-    """Of a solver of our own; None for a borrowed one."""
     floor: float
     """Constant added to J."""
     sequence_ticks: int
@@ -66,7 +64,6 @@ class Constants(NamedTuple):
 def constants_of(
     estimator: Estimator,
     problem: PredictiveProblem,
-    method: Any,  # noqa: ANN401 of any solver
     alpha: float,
     settings: ProgramSettings,
     budget: PlcBudget,
@@ -82,7 +79,7 @@ def constants_of(
         scaled_rate=problem.scaled_rate,
         rate_shares=np.array([problem.limits.rate_share(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)], real),
         n_inputs=problem.n_inputs,
-        alpha=real(alpha), method=method, floor=real(settings.adaptive.cost_floor),
+        alpha=real(alpha), floor=real(settings.adaptive.cost_floor),
         sequence_ticks=settings.sequence_ticks,
         fixed_ticks=0, most=most,
         periods=np.array([budget.period(iterations) for iterations in range(most + 1)]),
@@ -168,12 +165,12 @@ def deliver(c: Constants, m: Memory, qp: QuadraticProblem, answer: Answer) -> No
 
 
 @kernel
-def solve(c: Constants, m: Memory) -> None:
-    """Pose the problem, do q iterations of a solver of our own, deliver the answer."""
+def solve(c: Constants, method: Any, m: Memory) -> None:  # noqa: ANN401 of any solver of our own
+    """Pose the problem, do q iterations by the method of a solver of our own, deliver the answer."""
     now = m.numbers[0]
     qp, guess = pose(c, m)
     counts = np.array([now.iterations - 1, now.iterations])
-    deliver(c, m, qp, solve_by(c.method, qp, guess, counts, Costs(now.guessed_before, now.delivered_before)))
+    deliver(c, m, qp, solve_by(method, qp, guess, counts, Costs(now.guessed_before, now.delivered_before)))
 
 
 @kernel

@@ -9,6 +9,7 @@ from coldloop.lti_model import LtiModel
 from coldloop.registers.control_plc import Update
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
 from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
+from optimizer_plc.linear_algebra import respond
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.settings import ProgramSettings
 
@@ -98,7 +99,7 @@ def test_the_stationary_gain_is_that_of_the_riccati_equation(
     mismatch = 0.0
     for output, seen in enumerate(np.eye(22)):
         x = estimator.predict([(nothing, ticks)])
-        y = prediction.output(x, nothing, mismatch) + seen
+        y = respond(*prediction.outputs, x, nothing, mismatch) + seen
         estimate = estimator.correct(told(model, np.zeros(28), nothing, y, 0.0))
         gain[:, output] = np.append(estimate.x - x, estimate.mismatch - mismatch)
         mismatch = estimate.mismatch
@@ -189,7 +190,7 @@ def test_state_feedback_returns_the_state_and_believes_the_known_load(
         assert estimate.w == pytest.approx(15.0)
         assert estimate.mismatch == 0.0
         world.move(u, 15.0)
-    assert np.allclose(estimator.predict([(u, 10)]), prediction.advance(estimate.x, u, estimate.w, 10))
+    assert np.allclose(estimator.predict([(u, 10)]), respond(*prediction.transitions[10], estimate.x, u, estimate.w))
 
 
 def test_a_prediction_may_be_cut_into_segments_of_any_length(model: LtiModel, prediction: PredictionModel) -> None:
@@ -210,13 +211,13 @@ def test_a_load_that_is_not_measured_is_estimated(model: LtiModel, prediction: P
     kalman, deaf = Estimating(prediction, settings), Estimating(prediction, settings)
     x, u = np.zeros(28), np.zeros(3)
     for number in range(60):
-        y = prediction.output(x, u, 100.0)
+        y = respond(*prediction.outputs, x, u, 100.0)
         estimate = kalman.correct(told(model, x, u, y, 100.0, number))
         again = deaf.correct(told(model, x, u, y, -55.0, number))
         assert estimate.w == estimate.mismatch == again.w
         for one in (kalman, deaf):
             one.predict([(u, 20)])
-        x = prediction.advance(x, u, 100.0, 20)
+        x = respond(*prediction.transitions[20], x, u, 100.0)
     assert estimate.w == pytest.approx(100.0, rel=0.02)
 
 
