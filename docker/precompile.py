@@ -1,77 +1,171 @@
-"""Compile the numerical kernels of a service or of the rig before they are needed: `python precompile.py SERVICE`."""  # noqa: INP001 a program
+"""Compile numerical kernels before they are needed: `python precompile.py PART...`.
 
+An image takes the part of its service. Several parts are done in parallel, with what is left on standard error, their
+own output on standard output.
+"""  # noqa: INP001 a program
+
+import compileall
+import os
+import signal
+import subprocess
 import sys
-from typing import TYPE_CHECKING
-
-from coldloop.model_file import read_header
-from coldloop.model_settings import DEFAULT_MODEL_FILE
-from coldloop.registers.plant import Measurement
+import sysconfig
+import time
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from optimizer_plc.settings import ProgramSettings
+    from plant.settings import PlantKind
+
+LOOK_S: Final = 0.2
 
 
 def plant() -> None:
-    """Go one tick forward with each plant."""
-    from plant.kinds import plant_maker  # noqa: PLC0415 not in every image
+    """Make each plant, which compiles its kernels."""
+    from plant.settings import PlantKind  # noqa: PLC0415 not in every image
+
+    for kind in PlantKind:
+        _make_plant(kind)
+
+
+def default_plant() -> None:
+    """Make the plant of the default settings."""
+    from plant.settings import PlantSection  # noqa: PLC0415
+
+    import_module("plant.runtime")
+    _make_plant(PlantSection().kind)
+
+
+def _make_plant(kind: "PlantKind") -> None:
+    from coldloop.model_file import read_header  # noqa: PLC0415
+    from coldloop.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
+    from plant.kinds import plant_maker  # noqa: PLC0415
     from plant.program import LoadProfile  # noqa: PLC0415
-    from plant.settings import PlantKind, PlantSection  # noqa: PLC0415
+    from plant.settings import PlantSection  # noqa: PLC0415
 
     header = read_header(DEFAULT_MODEL_FILE)
-    for kind in PlantKind:
-        plant_maker(header, PlantSection(kind=kind))(LoadProfile((0,), (header.w0,)), 1).advance()
+    plant_maker(header, PlantSection(kind=kind))(LoadProfile((0,), (header.w0,)), 1)
 
 
-def control_plc() -> None:
-    """Compile nothing: this service has no kernels."""
+def nothing() -> None:
+    """Compile nothing: the control PLC and the page have no kernels."""
 
 
 def optimizer_plc() -> None:
-    """Let each solver that has kernels of its own answer two updates of a plant that stands still."""
+    """Make the program with each solver that has kernels of its own, in each precision, which compiles them."""
+    from optimizer_plc.computing_settings import Arithmetic  # noqa: PLC0415
     from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings  # noqa: PLC0415
 
-    for solver in SINGLE_PRECISION_SOLVERS:
-        _answer_two_updates(ProgramSettings(solver=solver))
+    for arithmetic in (Arithmetic.FLOAT32, Arithmetic.FLOAT64):
+        for solver in SINGLE_PRECISION_SOLVERS:
+            _make_optimizer(ProgramSettings(solver=solver, arithmetic=arithmetic))
 
 
-def _answer_two_updates(settings: "ProgramSettings") -> None:
+def default_optimizer() -> None:
+    """Make the program of the default settings."""
+    from optimizer_plc.settings import ProgramSettings  # noqa: PLC0415
+
+    import_module("optimizer_plc.runtime")
+    _make_optimizer(ProgramSettings())
+
+
+def _make_optimizer(settings: "ProgramSettings") -> None:
     from coldloop.limits import InputLimits  # noqa: PLC0415
     from coldloop.lti_model import load  # noqa: PLC0415
-    from control_plc.program import make_program  # noqa: PLC0415
-    from control_plc.settings import ControlSection  # noqa: PLC0415
-    from optimizer_plc.computing_settings import Arithmetic  # noqa: PLC0415
+    from coldloop.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
 
-    model = load(DEFAULT_MODEL_FILE)
-    limits = InputLimits()
-    OptimizerProgram(model, settings.model_copy(update={"arithmetic": Arithmetic.FLOAT32}), limits)
-    optimizer = OptimizerProgram(model, settings, limits)
-    header = read_header(DEFAULT_MODEL_FILE)
-    control = make_program(header, ControlSection(), limits)
-    control.restart(1)
-    updates = 0
-    while updates < 2:
-        if control.awaiting_sequence:
-            control.offer(optimizer.solve())
-        tick = control.begin_scan().tick
-        update = control.end_scan(Measurement(tick, header.w0, header.y0, header.x0, 1))
-        if update is not None:
-            control.accept_plan(optimizer.plan(update))
-            updates += 1
+    OptimizerProgram(load(DEFAULT_MODEL_FILE), settings, InputLimits())
 
 
-def hmi() -> None:
-    """Compile nothing: the page has no kernels."""
+def cold_box_in_one_process() -> None:
+    """Let a minute pass in one process with a cold box: the compiled loop, and the programs for what is unusual."""
+    _simulate("cold-box")
 
 
-def rig() -> None:
-    """Let a minute pass in one process with each plant: compiled loops, and the programs for what is unusual."""
-    from plant.settings import PlantKind  # noqa: PLC0415 not in every image
+def refrigerator_in_one_process() -> None:
+    """Let a minute pass in one process with a refrigerator."""
+    _simulate("refrigerator")
+
+
+def _simulate(plant: str) -> None:
     from rig import simulate  # noqa: PLC0415 not in the images
 
-    for kind in PlantKind:
-        simulate(load="a", duration_s=60, plant={"kind": kind})
+    simulate(load="a", duration_s=60, plant={"kind": plant})
+
+
+def run_modules() -> None:
+    """Import what a run needs besides kernels, so that its bytecode is written."""
+    for module in (
+        "control_plc.runtime", "rig.cli", "rig.commands.run", "rig.running", "rig.networked_run", "rig.one_process",
+        "rig.progress", "rig.figure_process", "rig.run_plot",
+    ):  # fmt: skip
+        import_module(module)
+
+
+def all_modules() -> None:
+    """Write the bytecode of the project and of all that is installed."""
+    projects = [find_spec(name) for name in ("coldloop", "plant", "control_plc", "optimizer_plc", "hmi", "rig")]
+    folders = [place for spec in projects if spec for place in spec.submodule_search_locations or ()]
+    for folder in (*folders, sysconfig.get_path("purelib")):
+        compileall.compile_dir(folder, quiet=2)  # some packages have templates that are no Python
+
+
+PARTS: Final[dict[str, tuple[Callable[[], None], int]]] = {
+    "plant": (plant, 20),
+    "control_plc": (nothing, 1),
+    "optimizer_plc": (optimizer_plc, 25),
+    "hmi": (nothing, 1),
+    "default-plant": (default_plant, 9),
+    "default-optimizer": (default_optimizer, 13),
+    "cold-box-in-one-process": (cold_box_in_one_process, 55),
+    "refrigerator-in-one-process": (refrigerator_in_one_process, 27),
+    "run-modules": (run_modules, 4),
+    "all-modules": (all_modules, 13),
+}
+"""What compiles each part, and about how many seconds of a core that takes."""
+
+
+def compile_parts(parts: Sequence[str]) -> bool:
+    """Compile parts in parallel, those first that are named first; tell whether all went well."""
+    waiting, processes, done = list(parts), dict[str, subprocess.Popen[bytes]](), set[str]()
+    cores, began = os.cpu_count() or 1, time.monotonic()
+    total_s = max(sum(PARTS[part][1] for part in parts) / cores, *(PARTS[part][1] for part in parts))
+    try:
+        while len(done) < len(parts):
+            while waiting and len(processes) - len(done) < cores:
+                part = waiting.pop(0)
+                processes[part] = subprocess.Popen((sys.executable, __file__, part), stderr=subprocess.STDOUT)  # noqa: S603 ourselves
+            _show(f"compiling: {len(done)} of {len(parts)} parts, {_left(total_s - time.monotonic() + began)}")
+            time.sleep(LOOK_S)
+            done = {part for part, process in processes.items() if process.poll() is not None}
+    finally:
+        for process in processes.values():
+            process.kill()
+        _show("")
+    return not any(process.returncode for process in processes.values())
+
+
+def _left(seconds: float) -> str:
+    return f"about {seconds:.0f} s left" if seconds > 1 else "almost done"
+
+
+def _show(line: str) -> None:
+    """Show the present state on a terminal, in a line that changes."""
+    if sys.stderr.isatty():
+        sys.stderr.write(f"\r\033[K{line and 'coldloop: '}{line}")
+        sys.stderr.flush()
 
 
 if __name__ == "__main__":
-    {"plant": plant, "control_plc": control_plc, "optimizer_plc": optimizer_plc, "hmi": hmi, "rig": rig}[sys.argv[1]]()
+    if len(sys.argv) == 2:
+        PARTS[sys.argv[1]][0]()
+        sys.exit()
+    try:
+        sys.exit(not compile_parts(sys.argv[1:]))
+    except KeyboardInterrupt:  # who called us ends too when we end by the signal
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGINT)

@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Final, NoReturn
 
 from coldloop import __version__
-from coldloop.errors import ColdloopError
+from coldloop.errors import ColdloopError, printable
 from rig.interruption import INTERRUPTION
 
 COMMANDS: Final = {
@@ -45,7 +45,7 @@ class OneLineParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""
-        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+        self.exit(2, f"{self.prog}: {printable(message)}; see {self.prog} --help\n")
 
 
 def make_parser(chosen: str | None) -> argparse.ArgumentParser:

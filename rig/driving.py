@@ -2,13 +2,14 @@
 
 import math
 from bisect import bisect_right
+from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from coldloop.event_text import word
+from coldloop.event_text import word_of
 from coldloop.process import L1, OUTPUT_NAMES, T5
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
@@ -18,7 +19,7 @@ from rig.arrow_arrays import number_array, text_array
 CONTROL: Final = "control_plc"
 PLANT: Final = "plant"
 
-DRIVERS: Final = {
+DRIVERS: Final[Mapping[int, str]] = {
     Mode.MPC: "optimizer",
     Mode.REST: "optimizer",
     Mode.HOLD: "nobody",
@@ -71,7 +72,7 @@ class DrivingHistory:
         last = self._states[-1]
         if event.kind == EventKind.MODE:
             self._change(last._replace(tick=event.tick, mode=event.subject, cause=event.cause))
-        elif event.kind == EventKind.SENSOR:
+        elif event.kind == EventKind.SENSOR and event.subject < len(OUTPUT_NAMES):
             bad = last.bad | {event.subject} if event.cause else last.bad - {event.subject}
             self._change(last._replace(tick=event.tick, bad=bad))
 
@@ -127,8 +128,8 @@ def _texts(state: Driving) -> dict[str, str | None]:
     bad = " ".join(OUTPUT_NAMES[output] for output in sorted(state.bad))
     if state.mode is None:
         return dict(zip(_TEXTS, (None, None, None, bad), strict=True))
-    mode, cause = Mode(state.mode), Cause(state.cause)
-    return dict(zip(_TEXTS, (word(mode), word(cause), DRIVERS[mode], bad), strict=True))
+    words = (word_of(Mode, state.mode), word_of(Cause, state.cause), DRIVERS.get(state.mode), bad)
+    return dict(zip(_TEXTS, words, strict=True))
 
 
 def _shown_by(fault: Fault | None, true: float, held: float) -> float:

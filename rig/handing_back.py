@@ -1,22 +1,21 @@
 """A rig that ran in real time before somebody attached to it runs on in real time afterwards."""
 
 import logging
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from coldloop.errors import LinkError
 from coldloop.process import TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Operator, OperatorMode
-from coldloop.registers.plant import LiveLoad, LoadStatus, LoadStep, PlantSession
+from coldloop.registers.plant import LOAD_ROWS, LiveLoad, LoadStatus, LoadStep, PlantSession
 from coldloop.seal import sealed
 from plant.program import LoadProfile
 from rig.load_stream import LoadStream
 from rig.operator_client import LEAD_TICKS, write_pace
 from rig.session_client import SessionClient
+from rig.told_records import told
 
 log = logging.getLogger("coldloop.rig")
-
-ROWS_AT_ONCE: Final = 30
 
 
 class Found(NamedTuple):
@@ -34,23 +33,25 @@ async def look_around(rig: SessionClient) -> Found | None:
     Raises:
         LinkError: A service does not answer.
     """
-    identity, pace = await rig.plant.read(Identity), await rig.plant.read(SessionPace)
+    identity, pace = await told(rig.plant, Identity), await told(rig.plant, SessionPace)
     if not identity.session or not pace.realtime:
         return None
-    return Found(pace, await rig.control.read(Operator), await _load_from(rig, identity.tick))
+    return Found(pace, await told(rig.control, Operator), await _load_from(rig, identity.tick))
 
 
 async def _load_from(rig: SessionClient, now: int) -> LoadProfile:
     """Return the load from now on: of the session's table, unless somebody has written another one since."""
-    status, asked = await rig.plant.read(LoadStatus), await rig.plant.read(PlantSession)
+    status, asked = await told(rig.plant, LoadStatus), await told(rig.plant, PlantSession)
     steps: list[LoadStep] = []
     if status.upcoming:
-        for row in range(0, asked.load_steps, ROWS_AT_ONCE):
-            steps += await rig.plant.read_rows(LoadStep, row, min(ROWS_AT_ONCE, asked.load_steps - row))
+        steps = await rig.plant.read_rows(LoadStep, 0, min(asked.load_steps, LOAD_ROWS))
     if not steps or steps[-1].tick != status.last_tick:
         steps = []
     coming = [step for step in steps if step.tick > now]
-    return LoadProfile((0, *(step.tick - now for step in coming)), (status.watts, *(step.watts for step in coming)))
+    try:
+        return LoadProfile((0, *(step.tick - now for step in coming)), (status.watts, *(step.watts for step in coming)))
+    except ValueError as error:
+        raise LinkError(f"{rig.plant.peer}: its load is none: {error}") from None
 
 
 async def give_back(rig: SessionClient, found: Found | None, session: int) -> None:

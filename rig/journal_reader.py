@@ -3,13 +3,17 @@
 from collections.abc import Collection
 from typing import Final
 
-from coldloop.errors import RequestRefusedError
+from coldloop.errors import LinkError, RequestRefusedError
 from coldloop.journal import ANY_SUBJECT
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 
 NO_ROLE: Final = (1, 2)
 """Exceptions with which a server refuses a write to a client that has not the role for it."""
+
+
+MOST_KEPT: Final = 100_000
+"""Events that a journal can be believed to keep; ours keep 10,000."""
 
 
 class JournalReader:
@@ -41,11 +45,17 @@ class JournalReader:
         """Return the events up to the newest one that have not been returned yet.
 
         Raises:
-            LinkError: The service does not answer, or refuses; the next call returns what was read so far.
+            LinkError: The service does not answer, or refuses, or contradicts itself; the next call returns what was
+                read so far.
         """
+        restarts = 0
         while True:
             page, found = await self._page()
+            self._check(page)
             if page.newest < self._newest:
+                restarts += 1
+                if restarts > 1:
+                    raise LinkError(f"{self._client.peer}: its journal ends at another event each time it is asked")
                 self.restarted, self._next, self._newest = True, 1, 0
                 continue
             if 1 < self._next < page.oldest:
@@ -57,6 +67,16 @@ class JournalReader:
                 events, self._read = self._read, []
                 return events
             self._next = page.next_first
+
+    def _check(self, page: JournalPage) -> None:
+        """Refuse a page on which reading would not come to an end."""
+        kept = page.newest - max(page.oldest, 1) + 1
+        ahead = page.next_first <= page.newest if page.next_first else True
+        if not (0 <= kept <= MOST_KEPT and ahead):
+            raise LinkError(
+                f"{self._client.peer}: its journal contradicts itself: events {page.oldest} to {page.newest}, next "
+                f"{page.next_first}"
+            )
 
     async def _page(self) -> tuple[JournalPage, list[Event]]:
         if not self.limited:

@@ -3,7 +3,7 @@
 from bisect import bisect_right
 from typing import TYPE_CHECKING, Final
 
-from coldloop.errors import LinkError, RequestRefusedError
+from coldloop.errors import LinkError, RequestRefusedError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.plant import AHEAD_STEPS, LOAD_ROWS, LoadAhead, LoadStatus, LoadStep
 from coldloop.seal import sealed
@@ -11,6 +11,7 @@ from coldloop.seal import sealed
 if TYPE_CHECKING:  # the simulation behind it takes a second
     from plant.program import LoadProfile
 
+LAST_TICK: Final = 2**32 - 1
 KEPT_AHEAD: Final = LOAD_ROWS
 """Steps that the plant is to know in advance; it keeps twice as many."""
 
@@ -25,6 +26,9 @@ class LoadStream:
         sent: Steps that the plant has already.
         begin: Tick of the session at which the load begins.
         ahead: Steps that the plant is to know in advance.
+
+    Raises:
+        UsageError: A step is beyond the last tick of a session.
     """
 
     def __init__(
@@ -40,6 +44,8 @@ class LoadStream:
         self._plant = plant
         self._session = session
         self._times = [begin + tick for tick in load.times]
+        if self._times[-1] > LAST_TICK:
+            raise UsageError(f"a load with a step at tick {self._times[-1]}: the last tick of a session is {LAST_TICK}")
         self._watts = load.watts
         self._sent = sent
         self._ahead = ahead

@@ -11,6 +11,8 @@ from typing import Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
 from coldloop.errors import LinkError
+from rig.compiling_services import show_compiling
+from rig.kept_up import end_of
 from rig.ports import ReservedPorts
 from rig.recording import Recorder
 from rig.scenario import Scenario
@@ -54,6 +56,7 @@ class LocalServices:
         self._processes: dict[str, asyncio.subprocess.Process] = {}
         self._watchers: set[asyncio.Task[None]] = set()
         self._ended: asyncio.Queue[str] = asyncio.Queue()
+        self._showing: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
         """Start them."""
@@ -61,10 +64,15 @@ class LocalServices:
         for service in SERVICES:
             self.log(service).unlink(missing_ok=True)
             await self.start(service)
+        logs = [self.log(service) for service in SERVICES]
+        self._showing = asyncio.create_task(show_compiling(logs), name="show compiling")
         return self
 
     async def __aexit__(self, *_: object) -> None:
         """End them."""
+        if self._showing is not None:
+            self._showing.cancel()
+            await asyncio.gather(self._showing, return_exceptions=True)
         processes, self._processes = self._processes, {}
         for process in processes.values():
             for number in (signal.SIGTERM, signal.SIGCONT):  # one that is stopped could not end
@@ -137,7 +145,7 @@ class LocalServices:
             await asyncio.wait({task, death}, return_when=asyncio.FIRST_COMPLETED)
             if death.done():  # first: work that needs the service may fail in the same turn
                 dead = death.result()
-                raise LinkError(f"the {dead} service has ended: {self._last_words(dead)} (log: {self.log(dead)})")
+                raise LinkError(f"the {dead} service {self.end_of(dead)}")
             return task.result()
         finally:
             for pending in (task, death):
@@ -153,9 +161,35 @@ class LocalServices:
         """Return the file that a service logs to."""
         return self._logs / f"{service}.log"
 
-    def _last_words(self, service: str) -> str:
-        lines = self.log(service).read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1] if lines else "without a word"
+    def end_of(self, service: str) -> str:
+        """Return how a service has ended, and where its log is."""
+        process = self._processes.get(service)
+        code = 0 if process is None or process.returncode is None else process.returncode
+        return f"{end_of(code, last_line(self.log(service)))} (log: {self.log(service)})"
+
+
+class KeptService:
+    """One of the services, for `rig.kept_up`."""
+
+    def __init__(self, services: LocalServices, service: str) -> None:
+        self.name = f"the {service} service"
+        self._services = services
+        self._service = service
+
+    async def ended(self) -> str:
+        """Wait until it has ended; return how."""
+        await self._services.processes[self._service].wait()
+        return self._services.end_of(self._service)
+
+    async def restart(self) -> None:
+        """Start it where it was before."""
+        await self._services.start(self._service, may_end=True)
+
+
+def last_line(log: Path) -> str:
+    """Return the last line of a log."""
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return lines[-1] if lines else "no reason given"
 
 
 async def _ended(process: asyncio.subprocess.Process) -> None:

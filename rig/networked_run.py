@@ -17,6 +17,7 @@ from rig.rig_endpoints import RigEndpoints
 from rig.scenario import Scenario
 from rig.session_client import SessionClient
 from rig.settings import Settings
+from rig.told_records import answered_in_time
 
 ATTACH_PATIENCE_S: Final = 5.0
 
@@ -31,7 +32,9 @@ def as_attached(effective: Configuration[Settings], endpoints: Sequence[Endpoint
     running: dict[str, Any] = {}
 
     async def read() -> int:
-        running.update(await running_configuration(RigEndpoints(*endpoints), effective.settings, ATTACH_PATIENCE_S))
+        rig = RigEndpoints(*endpoints)
+        async with answered_in_time("to read what the rig runs"):
+            running.update(await running_configuration(rig, effective.settings, ATTACH_PATIENCE_S))
         return 0
 
     run_event_loop(read)
@@ -77,7 +80,8 @@ async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scena
     rig = SessionClient(endpoints, settings)
     try:
         await rig.connect(ATTACH_PATIENCE_S)
-        found = await look_around(rig)
+        async with answered_in_time("to read what the rig does"):
+            found = await look_around(rig)
         try:
             await rig.run(scenario, recorder)
         finally:

@@ -1,7 +1,9 @@
 """The three programs in one process, by direct calls; what would cross the bus is rounded as the bus would round it."""
 
+from contextlib import AbstractContextManager
 from typing import NamedTuple, Protocol
 
+from coldloop.first_use import kernels_of
 from coldloop.lti_model import load as load_model
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
@@ -87,11 +89,21 @@ class OneProcessRig:
         self._header = header
         self._compiled = compiled
         program = settings.optimizer_plc.program
-        self.optimizer = OptimizerProgram(load_model(settings.model.file), program, settings.limits)
+        with self._kernels():
+            self.optimizer = OptimizerProgram(load_model(settings.model.file), program, settings.limits)
         self.control = make_control_program(header, settings.control_plc, settings.limits)
 
     def run(self, scenario: Scenario, recorder: Recorder) -> None:
         """Run a scenario from the operating point, in lock-step."""
+        with self._kernels():
+            self._run(scenario, recorder)
+
+    def _kernels(self) -> AbstractContextManager[None]:
+        """Announce what is compiled as the kernels of a run like this one."""
+        plant, solver = self._settings.plant.kind.replace("-", " "), self._settings.optimizer_plc.program.solver
+        return kernels_of(f"the {plant} and the {solver} solver in one process", about_s=50)
+
+    def _run(self, scenario: Scenario, recorder: Recorder) -> None:
         load = load_table(scenario.load)
         plant = plant_maker(self._header, self._settings.plant)(load, scenario.seed)
         programs = Programs(plant, self.control, self.optimizer)

@@ -18,6 +18,7 @@ from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmComma
 from coldloop.seal import sealed
 from rig.load_stream import LoadStream
 from rig.rig_endpoints import RigEndpoints
+from rig.told_records import told
 
 if TYPE_CHECKING:
     from plant.program import LoadProfile
@@ -78,37 +79,54 @@ class OperatorClient:
         """Change the load from a tick on; return what came back."""
         if not 0.0 <= watts <= MAX_LOAD_W:
             raise UsageError(f"load {watts:g} W: not from 0 to {MAX_LOAD_W:g} W")
-        before = await self.plant.read(LoadStatus)
-        tick = 0 if at_s is None else round(at_s / TICK_S)
+        before = await told(self.plant, LoadStatus)
+        tick = 0 if at_s is None else await self._tick_to_come(at_s)
         await _asked(self.plant.write(sealed(LiveLoad(tick, watts))))
-        return f"{await self._load_text(before)} (was {before.watts:g} W)"
+        return f"{await self._load_text(tick, watts)} (was {before.watts:g} W)"
 
-    async def _load_text(self, before: LoadStatus) -> str:
-        status = await self.plant.read(LoadStatus)
-        if status.upcoming and status != before:
-            return f"load {status.next_watts:g} W from {status.next_tick * TICK_S:g} s on"
-        return f"load {status.watts:g} W now"
+    async def _tick_to_come(self, at_s: float) -> int:
+        """Return the tick of a time that is to come."""
+        tick, now = round(at_s / TICK_S), (await told(self.plant, Identity)).tick
+        if tick <= now:
+            raise UsageError(
+                f"--at {at_s:g}: plant time is {now * TICK_S:g} s already; give a later one, or leave it out"
+            )
+        return tick
+
+    async def _load_text(self, tick: int, watts: float) -> str:
+        """Return what the plant knows of a load that was written from a tick on; 0 is the next one."""
+        status = await told(self.plant, LoadStatus)
+        if not status.upcoming:
+            return f"load {status.watts:g} W now"
+        if tick and status.last_tick != tick:
+            raise LinkError(
+                f"the load from {tick * TICK_S:g} s on is another one: somebody else has written it meanwhile"
+            )
+        text = f"load {watts:g} W from {status.last_tick * TICK_S:g} s on"
+        if status.next_tick == status.last_tick:
+            return text
+        return f"{text}, before it {status.next_watts:g} W from {status.next_tick * TICK_S:g} s on"
 
     async def stream_load(self, load: "LoadProfile", at_s: float | None, say: Callable[[str], None]) -> str:
         """Write a load of any length, as fast as the plant can store it; return what came back."""
-        identity = await self.plant.read(Identity)
+        identity = await told(self.plant, Identity)
         if not identity.session:
             raise UsageError(f"{self.plant.peer} has no session")
-        begin = identity.tick + LEAD_TICKS if at_s is None else round(at_s / TICK_S)
-        free = (await self.plant.read(LoadStatus)).free
+        begin = identity.tick + LEAD_TICKS if at_s is None else await self._tick_to_come(at_s)
+        free = (await told(self.plant, LoadStatus)).free
         stream = LoadStream(self.plant, identity.session, load, begin=begin, ahead=max(0, free - AHEAD_STEPS))
-        told = False
+        said = False
         while True:
-            await stream.feed((await self.plant.read(Identity)).tick)
+            await stream.feed((await told(self.plant, Identity)).tick)
             if stream.done:
                 break
             if await stream.was_replaced():
                 raise LinkError("somebody else has written the load meanwhile: the rest of the file is not written")
-            if not told:
-                told = True
+            if not said:
+                said = True
                 say(f"the plant keeps {free} steps of {stream.steps}: this goes on until it has all of them")
             await asyncio.sleep(LOOK_S)
-        status = await self.plant.read(LoadStatus)
+        status = await told(self.plant, LoadStatus)
         times = f"{begin * TICK_S:g} s to {status.last_tick * TICK_S:g} s"
         return f"load of {stream.steps} steps from {times}; its last value is held"
 
@@ -117,7 +135,7 @@ class OperatorClient:
     async def set_mode(self, name: str) -> str:
         """Let an operator decide who drives; return what came of it."""
         mode = OperatorMode[name.upper()]
-        operator = await self.control.read(Operator)
+        operator = await told(self.control, Operator)
         await _asked(self.control.write(operator._replace(mode=mode)))
         ladder = await self._effect(mode)
         return (
@@ -130,17 +148,17 @@ class OperatorClient:
         expected = {OperatorMode.MANUAL: {Mode.MANUAL}, OperatorMode.CLASSICAL: {Mode.CLASSICAL}}.get(
             wanted, {Mode.MPC, Mode.REST}
         )
-        ladder = await self.control.read(LadderStatus)
+        ladder = await told(self.control, LadderStatus)
         for _ in range(round(EFFECT_S / LOOK_S)):
             if ladder.mode in expected:
                 break
             await asyncio.sleep(LOOK_S)
-            ladder = await self.control.read(LadderStatus)
+            ladder = await told(self.control, LadderStatus)
         return ladder
 
     async def set_setpoint(self, name: str, value: float) -> str:
         """Write a setpoint of manual mode; return what came back."""
-        operator = await self.control.read(Operator)
+        operator = await told(self.control, Operator)
         place = FIELDS[name]
         low, high = self._limits.low[place], self._limits.high[place]
         unit = INPUT_UNITS[place]
@@ -153,19 +171,19 @@ class OperatorClient:
             )
         values = [value if i == place else present for i, present in enumerate(operator[1:])]
         await _asked(self.control.write(Operator(operator.mode, *values)))
-        back = await self.control.read(Operator)
+        back = await told(self.control, Operator)
         return f"setpoint of {INPUT_NAMES[place]} {back[1 + place]:g} {unit} (was {operator[1 + place]:g} {unit})"
 
     # -- time ----------------------------------------------------------------------------------------------------------
 
     async def set_factor(self, factor: float) -> str:
         """Change how fast plant time goes; a session in lock-step changes over to real time."""
-        pace = await self.plant.read(SessionPace)
+        pace = await told(self.plant, SessionPace)
         return await self._set_pace(pace._replace(realtime=1, factor=factor))
 
     async def set_paused(self, *, paused: bool) -> str:
         """Pause or resume plant time."""
-        pace = await self.plant.read(SessionPace)
+        pace = await told(self.plant, SessionPace)
         if not pace.realtime:
             raise UsageError("the session is in lock-step: it goes as far as it is granted")
         return await self._set_pace(pace._replace(paused=int(paused)))
@@ -174,7 +192,7 @@ class OperatorClient:
         if not 0.01 <= pace.factor <= 10_000:
             raise UsageError(f"factor {pace.factor:g}: not from 0.01 to 10000")
         await write_pace((self.plant, self.control, self.optimizer), pace)
-        back, tick = await self.plant.read(SessionPace), (await self.plant.read(Identity)).tick
+        back, tick = await told(self.plant, SessionPace), (await told(self.plant, Identity)).tick
         state = "paused" if back.paused else "real time"
         return f"{state} at {tick * TICK_S:g} s, factor {back.factor:g}"
 

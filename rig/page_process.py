@@ -16,6 +16,9 @@ from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.settings import TlsSettings
 from hmi.settings import HmiSection, HmiSettings
 from hmi.users import PageRole, write_user
+from rig.kept_up import end_of
+from rig.local_services import last_line
+from rig.private_folder import new_own
 from rig.rig_endpoints import RigEndpoints
 
 GRACE_S: Final = 5.0
@@ -68,18 +71,34 @@ def readers(tls: TlsSettings | None) -> TlsSettings | None:
 
 
 class FirstLogin(NamedTuple):
-    """The operator of a rig whose configuration names no users."""
+    """The operator of a page whose configuration names no users."""
 
     file: Path
     password: str
 
     @classmethod
     def made_in(cls, folder: Path) -> Self:
-        """Write a user with a password of chance into a folder."""
+        """Write a user with a random password into a folder."""
         login = cls(folder / "page-users", secrets.token_urlsafe(9))
         login.file.unlink(missing_ok=True)
         write_user(login.file, OPERATOR, PageRole.OPERATE, login.password)
         return login
+
+    @property
+    def line(self) -> str:
+        """How to log in."""
+        return f"  to operate     user {OPERATOR}, password {self.password} (of this run)\n"
+
+
+def with_own_files(section: HmiSection, folder: Path) -> tuple[HmiSection, FirstLogin | None]:
+    """Return the settings of a page with users and an audit in a private folder, where they name none."""
+    update: dict[str, object] = {}
+    login = None if section.login.users else FirstLogin.made_in(folder)
+    if login is not None:
+        update["login"] = section.login.model_copy(update={"users": login.file})
+    if section.audit is None:
+        update["audit"] = folder / "page-audit.jsonl"
+    return section.model_copy(update=update), login
 
 
 class PageProcess:
@@ -91,31 +110,37 @@ class PageProcess:
         folder: Where it logs to, and keeps the first login and the audit.
     """
 
+    name: Final = "the page"
+
     def __init__(self, section: HmiSection, endpoints: RigEndpoints, folder: Path) -> None:
         self._log = folder / "logs" / "hmi.log"
-        self._login = None if section.login.users else FirstLogin.made_in(folder)
-        section = pointed_at(section, endpoints)
-        update: dict[str, object] = {}
-        if self._login is not None:
-            update["login"] = section.login.model_copy(update={"users": self._login.file})
-        if section.audit is None:
-            update["audit"] = folder / "page-audit.jsonl"
-        self._section = section.model_copy(update=update)
+        self._section, self._login = with_own_files(pointed_at(section, endpoints), folder)
         self._process: asyncio.subprocess.Process | None = None
 
     async def __aenter__(self) -> Self:
         """Start it."""
+        await self.restart()
+        return self
+
+    async def ended(self) -> str:
+        """Wait until it has ended; return how."""
+        if self._process is None:
+            raise RuntimeError("the page was not started")
+        code = await self._process.wait()
+        return f"{end_of(code, last_line(self._log))} (log: {self._log})"
+
+    async def restart(self) -> None:
+        """Start it, or start it again."""
         environment: Mapping[str, str] = {
             **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
             **to_environment(HmiSettings(hmi=self._section)),
         }
         self._log.parent.mkdir(parents=True, exist_ok=True)
-        with self._log.open("wb") as log:
+        with new_own(self._log) as log:
             self._process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "hmi", "--with-parent", env=environment, start_new_session=True,
                 stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
             )  # fmt: skip
-        return self
 
     async def __aexit__(self, *_: object) -> None:
         """End it."""
@@ -139,8 +164,7 @@ class PageProcess:
         """
         while True:
             if self._process is not None and self._process.returncode is not None:
-                lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-                raise LinkError(f"the page has ended: {lines[-1] if lines else 'no reason given'} (log: {self._log})")
+                raise LinkError(f"the page {await self.ended()}")
             try:
                 _, writer = await asyncio.open_connection(self._section.host, self._section.port)
             except OSError:
@@ -155,5 +179,5 @@ class PageProcess:
         scheme = "https" if self._section.https else "http"
         text = f"  page           {scheme}://{self._section.host}:{self._section.port}/\n"
         if self._login is not None:
-            text += f"  to operate     user {OPERATOR}, password {self._login.password} (of this run)\n"
+            text += self._login.line
         return text

@@ -26,6 +26,8 @@ DRAWN: Final = ("load_w", "L1", "T5", *INPUT_NAMES, "tau_u_s", "stage_cost")
 """Columns of the trace that are drawn."""
 LEAST_COST: Final = 1e-6
 """Stage costs below it are drawn as it: at rest the cost is rounding."""
+NARROWEST: Final = 1 / 2000
+"""Share of the whole time that can be seen."""
 SMOOTHING_S: Final = 60.0
 """Window of the mean of tau_u: adaptive periods change at nearly every update."""
 LONGEST_TAU_U_S: Final = 5.0
@@ -60,15 +62,17 @@ class RunCurves(NamedTuple):
     title: str
     identity: str
     """Which run it was: a line below the figure."""
+    pressures: Mapping[str, tuple[float, float]] = {}
+    """Of a whole refrigerator: where the station's alarms begin (bar), for each of its pressures in `series`."""
 
 
 def draw_run(curves: RunCurves) -> Figure:
     """Return load, outputs with their bands, inputs with their bounds, updating period, cost, modes and alarms."""
     scale_s, unit = time_unit(curves.series["time_s"])
     time = curves.series["time_s"] / scale_s
-    heights = [1.0] * 8 + ([0.45] if curves.events else [])
+    heights = [1.0] * (8 + len(curves.pressures)) + ([0.45] if curves.events else [])
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 13.5))
+        figure = Figure(figsize=(9.5, 13.5 + 1.6 * len(curves.pressures)))
         axes: list[Axes] = list(
             figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, gridspec_kw=PANELS)
         )
@@ -79,11 +83,14 @@ def draw_run(curves: RunCurves) -> Figure:
         for place, (name, bound), unit_ in zip(axes[3:6], curves.bounds.inputs.items(), INPUT_UNITS, strict=True):
             _curve(place, time, curves.series[name], f"{name} ({unit_})", name)
             limit(place, curves.series[name], bound, f"bounds {bound[0]:g} to {bound[1]:g} {unit_}")
-        _updating_period(axes[6], time, curves.series)
-        _cost(axes[7], time, curves.series["stage_cost"])
+        for place, (name, ends) in zip(axes[6:], curves.pressures.items(), strict=False):
+            _curve(place, time, curves.series[name], f"{name} (bar)", name)
+            limit(place, curves.series[name], ends, f"no alarm from {ends[0]:g} to {ends[1]:g} bar")
+        _updating_period(axes[len(curves.pressures) + 6], time, curves.series)
+        _cost(axes[len(curves.pressures) + 7], time, curves.series["stage_cost"])
         if curves.events:
-            _ribbons(axes[8], curves.events, scale_s, float(time[-1]))
-        for place, letter in zip(axes, "abcdefghi", strict=False):
+            _ribbons(axes[-1], curves.events, scale_s, float(time[-1]))
+        for place, letter in zip(axes, "abcdefghijk", strict=False):
             legend_above(place)
             place.text(LABEL_AT, 1.03, f"({letter})", transform=place.transAxes, fontsize=8, ha="center")
             place.yaxis.set_label_coords(LABEL_AT, 0.5)
@@ -119,7 +126,8 @@ def limit(axes: Axes, values: Series, limits: tuple[float, float], label: str) -
     low, high = view_with_limits(values, limits)
     out_of_view = [edge for edge in limits if not low <= edge <= high]
     note = " (edges outside the view)" if len(out_of_view) == 2 else ""
-    axes.axhspan(*limits, color=BAND, alpha=0.3, linewidth=0, label=label + note)
+    is_seen = limits[0] < high and limits[1] > low
+    axes.axhspan(*limits, color=BAND, alpha=0.3, linewidth=0, label=label + note if is_seen else None)
     for edge in limits:
         axes.axhline(edge, color=ACCENT, linewidth=0.8, linestyle="--")
     axes.set_ylim(low, high)
@@ -198,9 +206,8 @@ def _ribbons(axes: Axes, events: Sequence[Mapping[str, Any]], scale_s: float, en
         axes.broken_barh([(begin, max(until - begin, 0.0))], (0.55, 0.4), color=MODE_COLOURS.get(mode, BAND))
     for begin, until in alarm_times(events, scale_s, end):
         axes.broken_barh([(begin, until - begin)], (0.05, 0.4), color="#b3261e", alpha=0.5)
-    present = [
-        Patch(color=colour, label=mode) for mode, colour in MODE_COLOURS.items() if mode in {m for _, m in modes}
-    ]
+    seen = {mode for (begin, mode), until in zip(modes, ends, strict=False) if until - begin > NARROWEST * end}
+    present = [Patch(color=colour, label=mode) for mode, colour in MODE_COLOURS.items() if mode in seen]
     axes.set_yticks([0.25, 0.75], ["alarms", "mode"])
     axes.set_ylim(0, 1)
     axes.grid(visible=False)

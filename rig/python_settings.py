@@ -13,32 +13,31 @@ Sections = Mapping[str, Mapping[str, object] | object]
 
 def configured(
     *,
-    load: str | Path,
-    solver: str,
-    updating_period: Period,
-    seed: int,
+    load: str | Path | None,
+    solver: str | None,
+    updating_period: Period | None,
+    seed: int | None,
     config: str | Path | None,
     sections: Sections,
     mode: str | None = None,
     factor: float | None = None,
 ) -> Configuration[Settings]:
-    """Return the configuration; the environment has no influence.
+    """Return the configuration; arguments that are None are left to the file, and the environment has no influence.
 
     Raises:
         UsageError: An argument cannot be used; one line that says why.
     """
-    options: dict[str, tuple[object, str]] = {
-        "plant.load": (str(load), "load"),
+    arguments: dict[str, tuple[object, str]] = {
+        "plant.load": (None if load is None else str(load), "load"),
         "plant.seed": (seed, "seed"),
         "optimizer_plc.program.solver": (solver, "solver"),
         "optimizer_plc.program.updating_period_s": (0.0 if updating_period == "adaptive" else updating_period,
                                                     "updating_period"),
-        **_flattened(sections),
+        "session.mode": (mode, "mode"),
+        "session.factor": (factor, "factor"),
     }  # fmt: skip
-    if mode is not None:
-        options["session.mode"] = mode, "mode"
-    if factor is not None:
-        options["session.factor"] = factor, "factor"
+    given = {key: (value, name) for key, (value, name) in arguments.items() if value is not None}
+    options = given | _flattened(sections)
     return load_configuration(Settings, file=None if config is None else Path(config), environment={}, options=options)
 
 

@@ -1,6 +1,6 @@
 """A run folder as the operator's page replays it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from typing import Any, Final
 
@@ -14,6 +14,7 @@ from coldloop.registers.control_plc import Cause, Mode, Process
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
 from coldloop.registers.plant import StationSample
+from coldloop.registers.safety import Alarm
 from hmi.model import Told
 from hmi.replay import Frame
 from optimizer_plc.budget import PlcBudget
@@ -21,6 +22,7 @@ from optimizer_plc.rules import make_rule
 from optimizer_plc.settings import OptimizerSettings
 from optimizer_plc.solvers import make_solver
 from rig.columns import STATION_FILE
+from rig.recorded_alarms import alarms_after
 from rig.run_folder import RunFolder
 
 PROCESS: Final = ("load_w", *INPUT_NAMES, *OUTPUT_NAMES)
@@ -44,6 +46,7 @@ class RecordedPage:
         self._values = np.column_stack([table[name].to_numpy() for name in PROCESS]).astype(np.float32)
         self._modes = table["mode"].to_pylist()
         self._causes = table["cause"].to_pylist()
+        self._since = _beginnings(self._modes)
         self._bad_sensors = [_bits(names) for names in table["bad_sensors"].to_pylist()]
         self._settings = self._read_settings()
         self._station = self._read_station()
@@ -104,13 +107,26 @@ class RecordedPage:
         u, y = tuple(values[: len(INPUT_NAMES)]), tuple(values[len(INPUT_NAMES) :])
         mode = _MODES.get(self._modes[tick], int(Mode.MPC))
         cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
-        return Frame(Process(tick, load, u, y), mode, cause, self._bad_sensors[tick], self._station_at(tick))
+        bad, station = self._bad_sensors[tick], self._station_at(tick)
+        return Frame(Process(tick, load, u, y), mode, cause, self._since[tick], bad, station)
+
+    def alarms(self, events: Sequence[Told]) -> list[Alarm]:
+        """Return the alarms after these events."""
+        return alarms_after(events)
 
     def _station_at(self, tick: int) -> StationSample | None:
         if self._station is None or tick >= len(self._station):
             return None
         *signals, mode, alarms = self._station[tick].tolist()
         return StationSample(tick, tuple(signals), int(mode), int(alarms))
+
+
+def _beginnings(modes: Sequence[str]) -> list[int]:
+    """Return for each tick the one at which its mode began."""
+    found: list[int] = []
+    for tick, mode in enumerate(modes):
+        found.append(found[-1] if tick and mode == modes[tick - 1] else tick)
+    return found
 
 
 @cache

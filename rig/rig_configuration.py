@@ -1,9 +1,15 @@
 """What a rig that is up really runs: the configuration of its services, read from their registers."""
 
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, get_args
 
-from coldloop.config import Configuration, load_configuration
+from pydantic import BaseModel
+
+import control_plc.settings
+import optimizer_plc.settings
+import plant.settings
+from coldloop.config import MOST_SHOWN, Configuration, flattened, load_configuration
 from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
@@ -11,6 +17,12 @@ from rig.rig_endpoints import RigEndpoints
 from rig.session_client import SessionClient
 from rig.settings import Settings
 
+SHOWN: Final[Mapping[str, Sequence[str]]] = {
+    "plant": plant.settings.SHOWN,
+    "control_plc": control_plc.settings.SHOWN,
+    "optimizer_plc": optimizer_plc.settings.SHOWN,
+}
+"""What each service shows."""
 OF_SESSION: Final = (
     "session.mode", "session.factor", "plant.load", "plant.seed", "optimizer_plc.program.updating_period_s",
 )  # fmt: skip
@@ -20,18 +32,47 @@ OF_CLIENT: Final = ("model.", "rig.")
 SOURCE: Final = "the rig"
 
 
-async def read_configuration(client: RegisterClient) -> dict[str, Any]:
+def _files(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    """Yield the dotted keys of all files and folders."""
+    for name, field in model.model_fields.items():
+        kinds = get_args(field.annotation) or (field.annotation,)
+        if Path in kinds:
+            yield prefix + name
+        for kind in kinds:
+            if isinstance(kind, type) and issubclass(kind, BaseModel):
+                yield from _files(kind, f"{prefix}{name}.")
+
+
+FILES: Final = frozenset(_files(Settings))
+"""Keys whose value names a file: what a rig tells of them is compared, and never opened."""
+
+
+async def read_configuration(client: RegisterClient, shown: Sequence[str]) -> dict[str, Any]:
     """Return what the registers of a service show of its configuration, by dotted key.
 
+    Args:
+        client: Of the service.
+        shown: Keys and sections that it may show.
+
     Raises:
-        LinkError: It does not answer, or its text is not whole.
+        LinkError: It does not answer, or its text is not whole, or it shows something else.
     """
     digest = await client.read(ConfigurationDigest)
     lines = await client.read_rows(ConfigurationLine, 0, lines_of(digest))
     try:
-        return configuration_of(digest, lines)
+        values = flattened(configuration_of(digest, lines))
     except ValueError as error:
         raise LinkError(f"{client.peer}: its configuration cannot be read: {error}") from None
+    for key in values:
+        if not f"{key}.".startswith(tuple(f"{one}." for one in shown)):
+            raise LinkError(f"{client.peer}: its configuration has {_text(key)}, which it has not to show")
+    return values
+
+
+def _text(value: object) -> str:
+    """Return what a rig tells, as a message can show it."""
+    text = str(value)
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
 
 
 async def running_configuration(endpoints: RigEndpoints, settings: Settings, patience_s: float) -> dict[str, Any]:
@@ -46,12 +87,13 @@ async def running_configuration(endpoints: RigEndpoints, settings: Settings, pat
     client = SessionClient(endpoints, settings)
     try:
         await client.connect(patience_s)
-        for one in client.clients.values():
-            shown = await read_configuration(one)
+        for service, one in client.clients.items():
+            shown = await read_configuration(one, SHOWN[service])
             for key in running.keys() & shown.keys():
                 if running[key] != shown[key]:
                     raise UsageError(
-                        f"{one.peer} runs {key} = {shown[key]}, another one {running[key]}: give all of them the same"
+                        f"{one.peer} runs {key} = {_text(shown[key])}, another one {_text(running[key])}: give all "
+                        "of them the same"
                     )
             running |= shown
     finally:
@@ -75,11 +117,16 @@ def attached(effective: Configuration[Settings], running: Mapping[str, Any]) -> 
         for key in covered:
             if asked.get(key) != running[key]:
                 raise UsageError(
-                    f"{source}: the rig runs {key} = {running[key]}, which --attach does not change; drop it, or start "
-                    "the rig with it"
+                    f"{source}: the rig runs {key} = {_text(running[key])}, which --attach does not change; drop it, "
+                    "or start the rig with it"
                 )
         if not covered and source.startswith("--") and not given.startswith((*OF_SESSION, *OF_CLIENT)):
             raise UsageError(f"{source}: a rig that is up has its own {given}, which --attach does not change; drop it")
+    for key in FILES & running.keys():
+        if asked.get(key) != running[key]:
+            raise UsageError(
+                f"the rig runs {key} = {_text(running[key])}: name the same file here with --set {key}=FILE"
+            )
     values = {key: (value, source) for key, value, source in effective.effective() if value is not None}
-    values |= {key: (value, SOURCE) for key, value in running.items()}
+    values |= {key: (value, SOURCE) for key, value in running.items() if key not in FILES}
     return load_configuration(Settings, environment={}, options=values)

@@ -2,7 +2,7 @@
 
 from typing import Final, NamedTuple
 
-from coldloop.event_text import alarm_cause, word
+from coldloop.event_text import alarm_cause, word, word_of
 from coldloop.process import L1, T5, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, Process
@@ -55,7 +55,7 @@ async def read_status(client: OperatorClient) -> RigStatus:
 
 def _alarm(kind: AlarmKind, row: Alarm) -> str:
     cause = alarm_cause(kind, row.cause)
-    state = word(AlarmState(row.state))
+    state = word_of(AlarmState, row.state)
     return f"{word(kind)}{f' ({cause})' if cause else ''}, {state}"
 
 
@@ -78,8 +78,8 @@ def page(status: RigStatus) -> str:
     following = f", {load.next_watts:g} W from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
     rows = [
         ("session", f"{status.plant.session}, {_pace(status)}, {status.plant.tick * TICK_S:.2f} s"),
-        ("mode", f"{word(Mode(ladder.mode))} ({word(Cause(ladder.cause))}) since {ladder.since * TICK_S:g} s"),
-        ("operator", word(OperatorMode(status.operator.mode))),
+        ("mode", f"{word_of(Mode, ladder.mode)} ({word_of(Cause, ladder.cause)}) since {ladder.since * TICK_S:g} s"),
+        ("operator", word_of(OperatorMode, status.operator.mode)),
         ("load", f"{load.watts:g} W{following}"),
         ("L1", f"{y[L1]:.3f} %"),
         ("T5", f"{y[T5]:.3f} K"),
@@ -93,7 +93,7 @@ def line(status: RigStatus) -> str:
     """Return the state as one line."""
     y = status.process.y
     return (
-        f"{status.plant.tick * TICK_S:10.2f} s  {word(Mode(status.ladder.mode)):9}  {status.load.watts:6.1f} W  "
+        f"{status.plant.tick * TICK_S:10.2f} s  {word_of(Mode, status.ladder.mode):9}  {status.load.watts:6.1f} W  "
         f"L1 {y[L1]:6.2f} %  T5 {y[T5]:6.2f} K  tau_u {_tau_u(status):>6}  "
         f"{'; '.join(status.alarms) or 'no alarms'}"
     )

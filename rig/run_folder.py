@@ -65,13 +65,15 @@ class RunFolder:
         except (OSError, pa.ArrowException) as error:
             raise UsageError(f"{self.path / name}: {str(error).splitlines()[0]}") from None
 
-    def series(self, columns: Sequence[str], longest: int = DRAWN_TICKS) -> Curves:
-        """Return columns of the trace for drawing, in constant memory: `time_s` and these.
+    def series(self, columns: Sequence[str], longest: int = DRAWN_TICKS, file_name: str = "trace.parquet") -> Curves:
+        """Return columns of the trace, or of another file with a row a tick, for drawing: `time_s` and these.
+
+        It takes constant memory.
 
         A trace of more than `longest` ticks is reduced to two points for each of `longest / 2` intervals.
         """
         names = ["time_s", *columns]
-        with self.file("trace.parquet") as file:
+        with self.file(file_name) as file:
             every = max(1, math.ceil(file.metadata.num_rows / (longest / 2))) if file.metadata.num_rows > longest else 1
             batches = file.iter_batches(batch_size=every * 4096, columns=names)
             parts = [_reduced(batch_series(batch), every) for batch in batches]

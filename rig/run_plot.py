@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from coldloop.process import INPUT_NAMES
+from rig.columns import STATION_FILE
 from rig.plot import DRAWN, Bounds, RunCurves, draw_run
 from rig.results import whole_file
 from rig.run_folder import RunFolder
@@ -46,14 +47,30 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 def curves_of(run: RunFolder) -> RunCurves:
     """Return what is drawn of a run."""
-    manifest = run.manifest
+    pressures = _pressures(run)
+    series = run.series(DRAWN)
+    if pressures:
+        station = run.series(list(pressures), file_name=STATION_FILE)
+        series |= {name: np.interp(series["time_s"], station["time_s"], station[name]) for name in pressures}
     return RunCurves(
-        run.series(DRAWN),
+        series,
         run.events(),
         Bounds.of(run.configuration),
         title_of(run.configuration),
-        identity_of(manifest),
+        identity_of(run.manifest),
+        pressures,
     )
+
+
+def _pressures(run: RunFolder) -> dict[str, tuple[float, float]]:
+    """Return the pressures of a station with the limits of their alarms, bar; none where there is no station."""
+    if not (run.path / STATION_FILE).exists():
+        return {}
+    alarms = {
+        key: float(run.configuration[f"plant.station.alarms.{key}_bar"])
+        for key in ("hp_low", "hp_high", "lp_low", "lp_high")
+    }
+    return {"P12": (alarms["hp_low"], alarms["hp_high"]), "P11": (alarms["lp_low"], alarms["lp_high"])}
 
 
 def title_of(configuration: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@
 import asyncio
 import contextlib
 import time
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Sequence
 from typing import Final, TypeVar
 
 from coldloop.errors import LinkError, ModelFileError, PeerUnreachableError
@@ -18,7 +18,7 @@ from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, STATION_ROWS, PlantSession, SensorFault, Surroundings
 from plant.own_model import own_header
 from rig.driving import CONTROL, PLANT
-from rig.load_stream import LoadStream, write_table
+from rig.load_stream import LAST_TICK, LoadStream, write_table
 from rig.recording import LinkStatistics, Recorder
 from rig.rig_endpoints import RigEndpoints
 from rig.scenario import Scenario
@@ -40,9 +40,16 @@ QUIET_S: Final = 20.0
 """A rig on which nothing happens for this long is given up."""
 LAST_LOOK_S: Final = 2.0
 """How long the events of a run that has ended are waited for."""
-LAST_TICK: Final = 2**32 - 1
 CONTACT_S: Final = 1.0
 """With `tolerant`: how long an answer may take. A process that does not go on must not hold up the rest for long."""
+
+
+def next_session(present: Sequence[int]) -> int:
+    """Return a number for a new session that none of the services is in; after the largest they begin with 1 again."""
+    session = max(present) % 0xFFFF_FFFF + 1
+    while session in present:
+        session += 1
+    return session
 
 
 class SessionClient:
@@ -120,10 +127,13 @@ class SessionClient:
         recorder.begin()
 
     async def start(self, scenario: Scenario) -> int:
-        """Write the load and the settings of a new session to all three; return its number."""
-        session = 1
-        for client in self.clients.values():
-            session = max(session, (await client.read(Identity)).session + 1)
+        """Write the load and the settings of a new session to all three; return its number.
+
+        Raises:
+            LinkError: A service does not answer or refuses.
+        """
+        session = next_session([(await client.read(Identity)).session for client in self.clients.values()])
+        self.session = session
         realtime = int(scenario.realtime)
         await self.optimizer.write(
             OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / TICK_S))
@@ -132,11 +142,10 @@ class SessionClient:
         await self.plant.write(PlantSession(session, realtime, scenario.factor, scenario.seed, rows))
         self.load = LoadStream(self.plant, session, scenario.load, sent=rows)
         await self.control.write(ControlSession(session, realtime, scenario.factor))
-        self.session = session
         return session
 
-    async def hold(self, session: int, look_s: float) -> None:
-        """Keep a session in real time supplied with its load until cancelled, or until another one begins.
+    async def hold(self, look_s: float) -> None:
+        """Keep the session that was started last, in real time, supplied with its load until cancelled.
 
         A load that somebody else writes replaces all of it, as it replaces what the plant knows of later ticks.
 
@@ -145,7 +154,7 @@ class SessionClient:
         """
         while True:
             identity = await self.plant.read(Identity)
-            if identity.session != session:
+            if identity.session != self.session:  # somebody has begun another one
                 self.load = None
             elif self.load is not None and not self.load.done:
                 if await self.load.was_replaced():

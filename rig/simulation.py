@@ -4,10 +4,11 @@ from rig import simulate
 
 result = simulate(load="a", solver="ode", updating_period="adaptive", duration_s=600)
 result.summary["J_BF"]
-result.trace.to_pandas()
+result.trace.to_dict()["T5"]
 result.plot("run.png")
 """
 
+from argparse import ArgumentTypeError
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,6 +24,7 @@ from coldloop.errors import UsageError
 from coldloop.lti_model import load as load_model
 from coldloop.process import TICK_S
 from coldloop.registers.audit import Event
+from rig.commands.options import duration
 from rig.driving import DrivingHistory
 from rig.indicators import RunEvaluation, StageCost
 from rig.one_process import OneProcessRig
@@ -42,6 +44,10 @@ class Table:
     """A table of a result; its columns are those of `rig/columns.py`."""
 
     arrow: pa.Table
+
+    def __repr__(self) -> str:
+        """Return how large it is, and what is in it."""
+        return f"Table({self.arrow.num_rows} rows of {', '.join(self.arrow.column_names)})"
 
     @property
     def units(self) -> dict[str, str]:
@@ -72,6 +78,16 @@ class Simulation:
     """The effective configuration by dotted key."""
     _cost: StageCost
     _events: tuple[tuple[str, Event], ...]
+
+    def __repr__(self) -> str:
+        """Return what was run, for how long, and the trace."""
+        program = "optimizer_plc.program."
+        tau_u = self.configuration[f"{program}updating_period_s"]
+        return (
+            f"Simulation(load={self.configuration['plant.load']!r}, solver={self.configuration[f'{program}solver']!r}, "
+            f"updating_period={tau_u or 'adaptive'!r}, {self.summary['ticks']} ticks, "
+            f"trace {self.summary['trace_sha256'][:12]})"
+        )
 
     @cached_property
     def trace(self) -> Table:
@@ -108,24 +124,25 @@ class Simulation:
 
 
 def simulate(
-    load: str | Path = "2h",
-    solver: str = "ode",
-    updating_period: Period = "adaptive",
+    load: str | Path | None = None,
+    solver: str | None = None,
+    updating_period: Period | None = None,
     *,
-    duration_s: float | None = None,
-    seed: int = 1,
+    duration_s: float | str | None = None,
+    seed: int | None = None,
     config: str | Path | None = None,
     **settings: Mapping[str, Any] | object,
 ) -> Simulation:
     """Run the three programs in this process, in lock-step; return what they did.
 
     Args:
-        load: Named load such as `a`, or a CSV file with the columns time_s and load_w.
-        solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`.
-        updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`.
-        duration_s: Plant time in multiples of 0.25 s; that of the load if not given.
-        seed: Seed of the sensors' noise.
-        config: TOML file with further settings.
+        load: Named load such as `a`, or a CSV file with the columns time_s and load_w; by default `2h`.
+        solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`; by default `ode`.
+        updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`, the default.
+        duration_s: Plant time in seconds, multiples of 0.25, or a text such as `10min`; by default that of the load.
+        seed: Seed of the sensors' noise; by default 1.
+        config: TOML file with further settings, such as one that `coldloop config` has written. An argument that is
+            given comes before it.
         settings: Sections of the configuration, such as `plant={"sensors": {"level": 0.01}}`; they come before the
             file. The environment has no influence.
 
@@ -138,13 +155,18 @@ def simulate(
     return _run(effective, _ticks(duration_s))
 
 
-def _ticks(duration_s: float | None) -> int | None:
+def _ticks(duration_s: float | str | None) -> int | None:
     if duration_s is None:
         return None
+    if isinstance(duration_s, str):
+        try:
+            return duration(duration_s)
+        except ArgumentTypeError as error:
+            raise UsageError(f"duration_s: {error}") from None
     ticks = duration_s / TICK_S
-    if not ticks > 0 or ticks != round(ticks):
+    if not (ticks > 0 and ticks.is_integer()):
         raise UsageError(f"duration_s={duration_s}: not a positive multiple of {TICK_S} s")
-    return round(ticks)
+    return int(ticks)
 
 
 def _run(effective: Configuration[Settings], ticks: int | None) -> Simulation:

@@ -8,8 +8,8 @@ from rig.rig_endpoints import RigEndpoints
 from rig.settings import Settings
 
 SERVICES: Final = ("plant", "control_plc", "optimizer_plc")
-START_PATIENCE_S: Final = 90.0
-"""The first start on a machine compiles the kernels."""
+START_PATIENCE_S: Final = 600.0
+"""Services that need other kernels than before compile them first, on a slow machine for minutes."""
 
 
 class Detours(NamedTuple):

@@ -1,14 +1,15 @@
-"""What all tests share: how Hypothesis searches, coroutines as tests, no configuration from outside, a free port, and
-the command line, and Debian's mbpoll.
+"""What all tests share: which of them run, how Hypothesis searches, coroutines as tests, no configuration from outside,
+processes and a free port, the command line, and Debian's mbpoll.
 """
 
 import asyncio
 import inspect
 import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import pytest
 from hypothesis import settings
@@ -16,17 +17,61 @@ from hypothesis import settings
 from coldloop.config import PREFIX
 from coldloop.errors import UsageError
 from rig import cli
+from rig.figure_process import FigureProcess
 from rig.ports import ReservedPorts
 from rig.started_rigs import check_ports
+from tests.harness.processes import Processes
 
-settings.register_profile("quick", deadline=None, print_blob=True)
-settings.register_profile("fast", settings.get_profile("quick"), max_examples=20)
-settings.register_profile("ci", settings.get_profile("quick"), derandomize=True)
-settings.register_profile("thorough", settings.get_profile("quick"), max_examples=5000)
-settings.load_profile("ci" if "CI" in os.environ else "quick")
-"""Quick looks elsewhere each time, and begins with what failed before; ci tries the same examples always. No example
-has a deadline: this machine may be busy with something else. `--hypothesis-profile=thorough` is for a night, fast for
-the fast lane; both for tests that do not name a number of examples themselves."""
+QUICK: Final = settings(deadline=None, print_blob=True, max_examples=20, derandomize="CI" in os.environ)
+settings.register_profile("quick", QUICK)
+settings.register_profile("all", QUICK, max_examples=100)
+settings.register_profile("thorough", QUICK, max_examples=5000)
+settings.load_profile("quick")
+"""Examples of each property: few by default, more with `--all`; `--hypothesis-profile=thorough` is for a night. A test
+that needs more or fewer names a multiple or a part of them. Each run looks elsewhere and begins with what failed
+before, but with `CI` set the examples are always the same. None has a deadline: the machine may be busy."""
+
+USES: Final = {
+    "process": {"processes", "shared_processes", "coldloop_rigs", "live_rig"},
+    "realtime": {"realtime"},
+    "browser": {"browser"},
+    "container": {"_engine"},
+}
+"""The mark of a test that requests, itself or through other fixtures, one of these."""
+
+SHARED: Final = ("site", "served", "rack", "three_processes", "live_rig", "page_rig", "up", "client", "_engine")
+"""Fixtures that start processes for many tests: these tests run in one worker, which starts them once."""
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # whoever started the tests ignores it; what they start must not
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--all", action="store_true", help="also tests marked exhaustive or container; more examples")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--all") and not config.getoption("--hypothesis-profile"):
+        settings.load_profile("all")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark each test by what it uses, and leave out what only `--all` runs."""
+    left_out: set[pytest.Item] = set()
+    for item in items:
+        fixtures = set(getattr(item, "fixturenames", ()))
+        for mark in (mark for mark, names in USES.items() if names & fixtures):
+            item.add_marker(mark)
+        group = next((name for name in SHARED if name in fixtures), None)
+        if group:
+            item.add_marker(pytest.mark.xdist_group(group))
+        if item.get_closest_marker("exhaustive") or item.get_closest_marker("container"):
+            left_out.add(item)
+    if left_out and not config.getoption("--all"):
+        config.hook.pytest_deselected(items=list(left_out))
+        items[:] = [item for item in items if item not in left_out]
+
 
 PATIENCE_S = 120.0
 """A coroutine has failed when it takes longer; the first one on a bus may have to compile the kernels."""
@@ -65,6 +110,39 @@ def first_of_three_ports() -> int:
             continue
         return base
     raise AssertionError("no three free ports in a row")
+
+
+@pytest.fixture
+def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
+    """Programs that end with the test."""
+    started = Processes(tmp_path_factory.mktemp("processes"))
+    yield started
+    started.end()
+
+
+@pytest.fixture(scope="session")
+def shared_processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
+    """Programs that end with the last test."""
+    started = Processes(tmp_path_factory.mktemp("shared"))
+    yield started
+    started.end()
+
+
+@pytest.fixture(scope="session")
+def realtime() -> None:
+    """Requested where plant time follows the clock: it marks the test."""
+
+
+def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let runs in this process leave no figure: to draw one takes longer than a short run."""
+    monkeypatch.setattr(FigureProcess, "start", lambda _: None)
+    monkeypatch.setattr(FigureProcess, "draw", lambda *_: None)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs in this process leave no figure."""
+    draw_nothing(monkeypatch)
 
 
 @pytest.fixture

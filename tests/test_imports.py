@@ -1,12 +1,12 @@
 """Who may import whom."""
 
 import ast
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.harness.processes import Processes
 
 ROOT = Path(__file__).parents[1]
 SERVICES = ("plant", "control_plc", "optimizer_plc", "hmi")
@@ -47,7 +47,7 @@ def test_a_package_imports_only_what_lies_below_it(package: str) -> None:
     assert not trespasses
 
 
-def test_the_control_plc_runs_without_numpy_numba_and_scipy() -> None:
+def test_the_control_plc_runs_without_numpy_numba_and_scipy(processes: Processes) -> None:
     modules = [
         ".".join(source.relative_to(ROOT / "services").with_suffix("").parts).removesuffix(".__init__")
         for source in (ROOT / "services" / "control_plc").rglob("*.py")
@@ -57,32 +57,29 @@ def test_the_control_plc_runs_without_numpy_numba_and_scipy() -> None:
         f"for name in {modules!r}: importlib.import_module(name)\n"
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    loaded = set(done.stdout.split())
+    loaded = set(processes.run_python(program)[0].split())
     assert "control_plc" in loaded
     assert not loaded & {"numpy", "numba", "scipy", "osqp", "pyarrow", "plant", "optimizer_plc", "rig"}
 
 
-def test_a_short_run_in_one_process_loads_what_it_needs_and_no_more(tmp_path: Path) -> None:
+def test_a_short_run_in_one_process_loads_what_it_needs_and_no_more(tmp_path: Path, processes: Processes) -> None:
     """Each of these would take as long as much of the rest; the figure is drawn by a process of its own."""
     program = (
         "import sys\nfrom rig import cli\n"
         f"assert cli.main(['run', '--in-process', '--duration', '2s', '--out', {str(tmp_path / 'run')!r}]) == 0\n"
         "print(*sorted({name.partition('.')[0] for name in sys.modules}), file=sys.stderr)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    loaded = set(done.stderr.split())
+    loaded = set(processes.run_python(program)[1].split())
     assert {"numba", "pyarrow"} <= loaded
     assert not loaded & {"pandas", "matplotlib", "scipy", "rich", "pymodbus", "asyncio", "cffi", "yaml", "distributed"}
     assert (tmp_path / "run" / "run.png").is_file()
 
 
 @pytest.mark.parametrize("service", ["plant", "control_plc", "optimizer_plc"])
-def test_a_service_loads_what_it_needs_and_no_more(service: str) -> None:
+def test_a_service_loads_what_it_needs_and_no_more(service: str, processes: Processes) -> None:
     program = f"import sys\nsys.argv = ['{service}', '--version']\nimport runpy\nfrom contextlib import suppress\n"
     program += f"with suppress(SystemExit): runpy.run_module('{service}', run_name='__main__')\n"
     program += "print(*sorted({name.partition('.')[0] for name in sys.modules}), file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    loaded = set(done.stderr.split())
+    loaded = set(processes.run_python(program)[1].split())
     assert service in loaded
     assert not loaded & {"pandas", "matplotlib", "pyarrow", "scipy", "rich", "aiomqtt", "cryptography", "cffi", "rig"}

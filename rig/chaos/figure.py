@@ -13,7 +13,7 @@ from coldloop.process import INPUT_NAMES, L1, T5, TICK_S
 from coldloop.registers.control_plc import Mode
 from rig.chaos.evaluation import Bands
 from rig.chaos.trace import ChaosTrace
-from rig.plot import ACCENT, BAND, INK, THIRD, Series
+from rig.plot import ACCENT, BAND, INK, THIRD, Series, legend_above, view
 from rig.recording import Recording
 from rig.results import whole_file
 
@@ -32,11 +32,12 @@ def plot_chaos(path: Path, trace: ChaosTrace, undisturbed: Recording, title: str
         figure = Figure(figsize=(10, 10), layout="constrained")
         axes: list[Axes] = list(figure.subplots(5, 1, sharex=True, height_ratios=[3, 3, 3, 3, 1]))
         for place, output, i, label in ((axes[0], L1, 0, "L1 (%)"), (axes[1], T5, 1, "T5 (K)")):
-            place.axhspan(bands.low[i], bands.high[i], color=BAND, alpha=0.35)
+            band = f"band {bands.low[i]:g} to {bands.high[i]:g}"
+            place.axhspan(bands.low[i], bands.high[i], color=BAND, alpha=0.35, label=band)
             place.plot(minutes, undisturbed.y[:, output], color=THIRD, linewidth=0.8, label="undisturbed")
-            place.plot(minutes, recording.y[:, output], color=INK, linewidth=1)
+            place.plot(minutes, recording.y[:, output], color=INK, linewidth=1, label="with faults")
             place.set_ylabel(label)
-            place.legend(loc="upper right", frameon=False)
+            legend_above(place)
         _inputs(axes[2], axes[3], minutes, recording)
         _modes(axes[4], trace)
         for place in axes[:4]:
@@ -52,8 +53,9 @@ def _inputs(valves: Axes, heater: Axes, minutes: Series, recording: Recording) -
     for i, colour in ((0, INK), (2, THIRD)):
         valves.plot(minutes, recording.u[:, i], color=colour, linewidth=1, label=INPUT_NAMES[i])
     valves.set_ylabel("valves (%)")
-    valves.legend(loc="upper right", frameon=False, ncols=2)
+    legend_above(valves)
     heater.plot(minutes, recording.u[:, 1], color=ACCENT, linewidth=1)
+    heater.set_ylim(*view(recording.u[:, 1]))
     heater.set_ylabel(f"{INPUT_NAMES[1]} (W)")
 
 
@@ -62,8 +64,9 @@ def _modes(axes: Axes, trace: ChaosTrace) -> None:
     ends = [tick for tick, _ in changes[1:]] + [trace.ticks]
     for (tick, mode), end in zip(changes, ends, strict=False):
         axes.axvspan(tick * TICK_S / 60, end * TICK_S / 60, color=COLOURS[mode], linewidth=0)
+    present = {mode for _, mode in changes}
     axes.legend(
-        handles=[Patch(color=colour, label=mode.name) for mode, colour in COLOURS.items()],
+        handles=[Patch(color=colour, label=mode.name) for mode, colour in COLOURS.items() if mode in present],
         loc="upper center", bbox_to_anchor=(0.5, -0.6), ncols=len(COLOURS), frameon=False,
     )  # fmt: skip
     axes.set_yticks([])
@@ -83,6 +86,6 @@ def _name_faults(axes: Axes, trace: ChaosTrace) -> None:
         return
     for mark in trace.marks:
         axes.annotate(
-            mark.fault.label, (mark.begin * TICK_S / 60, 1.02), xycoords=("data", "axes fraction"),
+            mark.fault.label, (mark.begin * TICK_S / 60, 1.14), xycoords=("data", "axes fraction"),
             rotation=35, ha="left", va="bottom", fontsize=7,
         )  # fmt: skip

@@ -1,14 +1,13 @@
 """Chaos plans: TOML files that say what is run, and what goes wrong in it and when."""
 
 import random
-import tomllib
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from coldloop.config import Configuration
+from coldloop.config import Configuration, parsed_toml
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.process import TICK_S
 from coldloop.session import TimeMode
@@ -181,8 +180,8 @@ def find_plan(name: str, changes: dict[str, Any]) -> Plan:
 def parse_plan(text: str, source: str, changes: dict[str, Any]) -> Plan:
     """Return the plan that a TOML text holds, with some of its values changed."""
     try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        content = parsed_toml(text)
+    except ValueError as error:
         raise UsageError(f"{source}: not TOML: {error}") from None
     if "duration_s" in changes:  # a shorter run has fewer faults
         content["faults"] = [

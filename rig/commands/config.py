@@ -1,7 +1,6 @@
 """`coldloop config`: the effective configuration, and where each value comes from."""
 
 import argparse
-import json
 import sys
 
 from coldloop.command_line import add_configuration_options
@@ -16,14 +15,14 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Print one line a value, as TOML with its source behind it."""
+    from coldloop.config import as_toml
+
     rows = configuration(options).effective()
-    texts = [_shown(key, value) for key, value, _ in rows]
+    texts = [
+        f"# {key} = not set" if value is None else f"{key} = {as_toml(value)}"  # TOML has no word for what is not set
+        for key, value, _ in rows
+    ]
     width = min(60, max(len(text) for text in texts))
     for text, (_, _, source) in zip(texts, rows, strict=True):
         sys.stdout.write(f"{text.ljust(width)}  # {source}\n")
     return 0
-
-
-def _shown(key: str, value: object) -> str:
-    """Return a line of TOML, which has no word for what is not set."""
-    return f"# {key} = not set" if value is None else f"{key} = {json.dumps(value, ensure_ascii=False)}"

@@ -3,22 +3,23 @@
 import argparse
 import sys
 
-from rig.commands.options import port_base
+from coldloop.command_line import add_configuration_options
+from rig.commands.options import add_rig_options, first_port_here
 
 PATIENCE_S = 15.0
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--port-base", type=port_base, metavar="PORT",
-                        help="first port of the rig (default: 5020)")  # fmt: skip
+    add_configuration_options(parser)
+    add_rig_options(parser)
     parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:
     """End it, and wait until it has ended."""
-    from rig.started_rigs import ports_from, take_down
+    from rig.started_rigs import take_down
 
-    pid = take_down(ports_from(options.port_base)[0], PATIENCE_S)
+    pid = take_down(first_port_here(options), PATIENCE_S)
     sys.stdout.write(f"the rig is down (process {pid})\n")
     return 0

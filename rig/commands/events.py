@@ -16,9 +16,10 @@ from coldloop.event_text import describe, utc_text
 from coldloop.process import TICK_S
 from coldloop.registers.audit import Event, EventKind
 from rig.commands.choices import SERVICES
-from rig.commands.options import configuration, endpoint
+from rig.commands.options import add_rig_options, endpoint, operator_settings, rig_endpoints
 
 if TYPE_CHECKING:
+    from coldloop.endpoints import Endpoint
     from rig.journal_reader import JournalReader
 
 COLUMNS: Final = ("number", "boot", "utc", "tick", "plant_time_s", "kind", "subject", "cause", "value", "who")
@@ -30,8 +31,9 @@ LOOK_AGAIN_S: Final = 1.0
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument("endpoint", type=endpoint, metavar="HOST:PORT",
-                        help="where the service is; for TLS, set rig.tls in the configuration")  # fmt: skip
+    add_rig_options(parser)
+    parser.add_argument("endpoint", nargs="?", type=endpoint, metavar="HOST:PORT",
+                        help="where the service is, of a rig that is not up here")  # fmt: skip
     parser.add_argument("--service", choices=SERVICES, default="control_plc", help="default: control_plc")
     parser.add_argument("--kind", type=_kinds, default=(), metavar="KIND,...",
                         help="only events of these kinds, such as alarm-raised,mode")  # fmt: skip
@@ -82,16 +84,11 @@ def execute(options: argparse.Namespace) -> int:
 
 
 async def _show(options: argparse.Namespace) -> None:
-    from coldloop.endpoints import Endpoint
     from coldloop.modbus.client import RegisterClient
     from rig.journal_reader import JournalReader
     from rig.register_listing import MAPS
 
-    settings = configuration(options).settings
-    order = getattr(settings, options.service).word_order
-    host, port = options.endpoint
-    where = Endpoint(host=host, port=port, tls=settings.rig.tls, word_order=order)
-    client = RegisterClient.at(MAPS[options.service], where)
+    client = RegisterClient.at(MAPS[options.service], _place(options))
     reader = JournalReader(client, options.since.number, options.kind)
     output = _CsvFile(options.csv) if options.csv else _Lines()
     try:
@@ -100,6 +97,17 @@ async def _show(options: argparse.Namespace) -> None:
     finally:
         client.close()
         output.close()
+
+
+def _place(options: argparse.Namespace) -> "Endpoint":
+    """Return where the service is whose journal is asked for."""
+    settings = operator_settings(options)
+    if options.endpoint is not None and (options.rig or options.port_base):
+        raise UsageError("HOST:PORT, --rig and --port-base: give one of them")
+    if options.endpoint is not None:
+        options.rig = [options.endpoint] * len(SERVICES)
+    place: Endpoint = getattr(rig_endpoints(options, settings), options.service)
+    return place
 
 
 async def _copy(reader: "JournalReader", options: argparse.Namespace, output: "_Lines | _CsvFile", peer: str) -> None:

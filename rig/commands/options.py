@@ -2,10 +2,9 @@
 
 import argparse
 import re
-import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
 from coldloop.process import TICK_S
@@ -17,6 +16,8 @@ if TYPE_CHECKING:
     from rig.rig_endpoints import RigEndpoints
     from rig.settings import Settings
 
+LONGEST_TICKS: Final = 2**32 - 1
+"""Ticks are 32-bit numbers on the bus."""
 _UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 
 KEYS = {
@@ -30,6 +31,9 @@ KEYS = {
     "page_port": ("hmi.port", "--page-port"),
 }
 """Options that set one key of the configuration."""
+
+
+LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
 
 
 class HostPort(NamedTuple):
@@ -47,9 +51,11 @@ def duration(text: str) -> int:
     ticks = float(match[1]) * _UNITS[match[2]] / TICK_S
     if ticks <= 0:
         raise argparse.ArgumentTypeError(f"'{text}' is not positive; write 90s, 15min or 2h")
-    if ticks != round(ticks):
+    if not ticks < LONGEST_TICKS:
+        raise argparse.ArgumentTypeError(f"'{text}' is longer than a session can be, {LONGEST_TICKS * TICK_S:g} s")
+    if not ticks.is_integer():
         raise argparse.ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s")
-    return round(ticks)
+    return int(ticks)
 
 
 def updating_period(text: str) -> float:
@@ -104,9 +110,9 @@ def add_rig_options(parser: argparse.ArgumentParser, *, again: bool = False) -> 
     """Declare where a rig that is up is found; `again` for a subcommand, as `add_configuration_options` has it."""
     default = argparse.SUPPRESS if again else None
     parser.add_argument("--rig", nargs=3, type=endpoint, default=default, metavar="HOST:PORT",
-                        help="plant, control PLC, optimiser PLC (default: ports 5020 to 5022 here)")  # fmt: skip
+                        help="plant, control PLC, optimiser PLC (default: the one rig that is up here)")  # fmt: skip
     parser.add_argument("--port-base", type=port_base, default=default, metavar="PORT",
-                        help="first of three ports in a row here")  # fmt: skip
+                        help="first of its three ports in a row here, where several rigs are up")  # fmt: skip
     parser.add_argument("--tls", type=Path, default=default, metavar="FOLDER",
                         help="folder with the operator's certificate; a rig that is up here tells its own")  # fmt: skip
 
@@ -115,20 +121,22 @@ def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Set
     """Return where a rig that is up is found.
 
     Raises:
-        UsageError: --rig and --port-base were both given, or the folder of --tls has no configuration.
+        UsageError: --rig and --port-base were both given, the folder of --tls has no configuration, no rig is up, or
+            several are.
     """
     from coldloop.endpoints import Endpoint
     from coldloop.modbus.settings import TlsSettings
     from rig.rig_endpoints import RigEndpoints
-    from rig.started_rigs import ports_from, running_rig
+    from rig.started_rigs import find_rig, ports_from, require_listener
 
-    if options.rig and options.port_base:
-        raise UsageError("--rig and --port-base: give one of them")
-    ports = ports_from(options.port_base)
+    _refuse_two_places(options)
     tls, folder = settings.rig.tls, options.tls
-    if not options.rig and folder is None and tls is None:
-        known = running_rig(ports[0])
-        folder = Path(known.tls) if known is not None and known.tls else None
+    known = None if options.rig else find_rig(options.port_base)
+    ports = ports_from(options.port_base) if known is None else known.ports
+    if not options.rig and known is None:
+        require_listener(ports[0])
+    if known is not None and known.tls and folder is None and tls is None:
+        folder = Path(known.tls)
     if options.tls is None and folder is not None:
         own = {key: value for key, (value, _) in _tls_site(folder).items() if key.startswith("rig.tls.")}
         tls = TlsSettings.model_validate({key.removeprefix("rig.tls."): value for key, value in own.items()})
@@ -139,23 +147,37 @@ def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Set
     ))  # fmt: skip
 
 
+def first_port_here(options: argparse.Namespace) -> int | None:
+    """Return the first port of the rig on this machine that `add_rig_options` names, None for the only one.
+
+    Raises:
+        UsageError: --rig and --port-base were both given, or the rig is on another machine.
+    """
+    _refuse_two_places(options)
+    if not options.rig:
+        return None if options.port_base is None else int(options.port_base)
+    plant: HostPort = options.rig[0]
+    if plant.host not in LOOPBACK:
+        raise UsageError(f"--rig {plant.host}:{plant.port}: a rig can be ended on its own machine only")
+    return plant.port
+
+
+def _refuse_two_places(options: argparse.Namespace) -> None:
+    if options.rig and options.port_base:
+        raise UsageError("--rig and --port-base: give one of them")
+
+
 def _tls_site(folder: Path) -> dict[str, tuple[object, str]]:
     """Return the settings of a folder of `coldloop certificates`, and where they come from."""
+    from coldloop.config import flattened, parsed_toml
+
     file = folder / "tls.toml"
     try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
+        content = parsed_toml(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise UsageError(f"{file}: {reason}; make it with `coldloop certificates --out {folder}`") from None
-    return {key: (value, "--tls") for key, value in _flat(content)}
-
-
-def _flat(section: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
-    for name, value in section.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
+    return {key: (value, "--tls") for key, value in flattened(content).items()}
 
 
 def configuration(options: argparse.Namespace) -> "Configuration[Settings]":

@@ -51,10 +51,14 @@ async def _replay(folders: list[Path], settings: "Settings") -> None:
 async def _watch(options: argparse.Namespace, settings: "Settings") -> None:
     from hmi.runtime import serve
     from hmi.settings import HmiSettings
-    from rig.page_process import pointed_at
+    from rig.page_process import pointed_at, with_own_files
+    from rig.private_folder import make_own_folder
 
-    section = pointed_at(settings.hmi, rig_endpoints(options, settings))
+    pointed = pointed_at(settings.hmi, rig_endpoints(options, settings))
+    section, login = with_own_files(pointed, make_own_folder(f"page-{pointed.port}"))
     _say(f"http{'s' if section.https else ''}://{section.host}:{section.port}/")
+    if login is not None:
+        _say(login.line.strip())
     await serve(HmiSettings(hmi=section))
 
 

@@ -113,9 +113,9 @@ def _job(options: argparse.Namespace) -> "Job":
     realtime = settings.session.mode == "realtime"
     if options.in_process and realtime:
         raise UsageError("--in-process runs in lock-step: drop it, or --mode realtime")
-    if not realtime and "session.factor" in effective.sources:
-        source = effective.sources["session.factor"]
-        raise UsageError(f"{source}: a factor has no effect in lock-step; add --mode realtime")
+    factor_from = effective.sources.get("session.factor")
+    if factor_from and not realtime and (settings.session.factor != 1.0 or factor_from.startswith("--")):
+        raise UsageError(f"{factor_from}: a factor has no effect in lock-step; add --mode realtime")
     scenario = make_scenario(settings, options.duration)
     if options.attach:
         ends = [Endpoint(host=end.host, port=end.port, tls=settings.rig.tls) for end in options.attach]

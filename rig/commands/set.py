@@ -6,12 +6,14 @@ Each is a Modbus request that any client with the operator's role can make; the 
 import argparse
 import sys
 from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.command_line import add_configuration_options
 from coldloop.errors import UsageError
-from rig.commands.options import add_rig_options, operator_settings, rig_endpoints
+from coldloop.process import TICK_S
+from rig.commands.options import LONGEST_TICKS, add_rig_options, operator_settings, rig_endpoints
 
 if TYPE_CHECKING:
     from rig.operator_client import OperatorClient
@@ -55,12 +57,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def _seconds(text: str) -> float:
     try:
-        seconds = float(text)
+        ticks = float(text) / TICK_S
     except ValueError:
-        seconds = -1.0
-    if seconds < 0 or seconds * 4 != round(seconds * 4):
+        ticks = -1.0
+    if not (0 <= ticks < LONGEST_TICKS and ticks.is_integer()):
         raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds in multiples of 0.25")
-    return seconds
+    return ticks * TICK_S
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -72,11 +74,17 @@ def execute(options: argparse.Namespace) -> int:
 
 async def _do(options: argparse.Namespace) -> None:
     from rig.operator_client import OperatorClient
+    from rig.told_records import answered_in_time
 
     settings = operator_settings(options)
     command: Callable[[OperatorClient, argparse.Namespace], Done] = options.command
-    async with OperatorClient(rig_endpoints(options, settings), settings.limits) as client:
-        sys.stdout.write(f"{await command(client, options)}\n")
+    client = OperatorClient(rig_endpoints(options, settings), settings.limits)
+    async with AsyncExitStack() as stack:
+        async with answered_in_time("to connect"):
+            await stack.enter_async_context(client)
+        async with nullcontext() if options.command is _load else answered_in_time("the command"):
+            text = await command(client, options)
+    sys.stdout.write(f"{text}\n")
 
 
 def _load(client: "OperatorClient", options: argparse.Namespace) -> Done:

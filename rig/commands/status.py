@@ -3,6 +3,7 @@
 import argparse
 import asyncio
 import sys
+from contextlib import AsyncExitStack
 from typing import Final
 
 from coldloop.command_line import add_configuration_options
@@ -30,12 +31,17 @@ def execute(options: argparse.Namespace) -> int:
 async def _show(options: argparse.Namespace) -> None:
     from rig.operator_client import OperatorClient
     from rig.rig_status import line, page, read_status
+    from rig.told_records import answered_in_time
 
     settings = operator_settings(options)
-    async with OperatorClient(rig_endpoints(options, settings), settings.limits) as client:
-        if not options.follow:
-            sys.stdout.write(page(await read_status(client)))
+    client = OperatorClient(rig_endpoints(options, settings), settings.limits)
+    async with AsyncExitStack() as stack:
+        async with answered_in_time("to read the status"):
+            await stack.enter_async_context(client)
+            status = await read_status(client)
+        sys.stdout.write(f"{line(status)}\n" if options.follow else page(status))
         while options.follow:
-            sys.stdout.write(f"{line(await read_status(client))}\n")
             sys.stdout.flush()
             await asyncio.sleep(LOOK_S)
+            async with answered_in_time("to read the status"):
+                sys.stdout.write(f"{line(await read_status(client))}\n")

@@ -29,6 +29,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--page-port", type=int, metavar="PORT", help="its port (default: 8020); implies --page")
     parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")
     parser.add_argument("--quiet", action="store_true", help="do not say where everything is")
+    parser.add_argument("--locked", type=int, help=argparse.SUPPRESS)  # what --detach has locked for this process
     parser.set_defaults(execute=execute, mode="realtime")
 
 
@@ -37,7 +38,7 @@ def execute(options: argparse.Namespace) -> int:
     check_load(options.load)
     from rig.commands.options import configuration
     from rig.running import check_certificates
-    from rig.started_rigs import check_ports, detached, ports_from
+    from rig.started_rigs import RigLock, check_ports, detached, ports_from
 
     effective = configuration(options)
     refuse_ineffective(
@@ -45,6 +46,7 @@ def execute(options: argparse.Namespace) -> int:
     )
     check_certificates(effective.settings)
     ports = ports_from(options.port_base)
+    lock = RigLock(ports[0], options.locked)
     check_ports(ports)
     page = options.page or options.page_port is not None
     if page:
@@ -52,7 +54,7 @@ def execute(options: argparse.Namespace) -> int:
 
         check_page(effective.settings.hmi)
     if options.detach:
-        return detached(ports)
+        return detached(ports, lock)
     from rig.until_interrupted import run_until_interrupted
     from rig.up import UpRig
 

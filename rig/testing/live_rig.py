@@ -213,15 +213,15 @@ class LiveRig:
         await self._stack.enter_async_context(self._proxied)
         await self._proxied.services.during(self._driver.connect(START_PATIENCE_S))
         await self._proxied.connect_links()
-        session = await self._proxied.services.during(self._driver.start(self._scenario))
+        await self._proxied.services.during(self._driver.start(self._scenario))
         if self._scenario.realtime:
-            task = asyncio.create_task(self._fed(session), name="load of the session")
+            task = asyncio.create_task(self._fed(), name="load of the session")
             self._stack.callback(task.cancel)
 
-    async def _fed(self, session: int) -> None:
+    async def _fed(self) -> None:
         while True:
             with contextlib.suppress(LinkError):  # the plant is away on purpose: it is looked at again
-                await self._driver.hold(session, FEED_S)
+                await self._driver.hold(FEED_S)
             await asyncio.sleep(FEED_S)
 
     def _stop(self) -> None:
@@ -253,13 +253,13 @@ def _parsed(kind: str, parameters: Mapping[str, object]) -> AnyFault:
 
 @contextmanager
 def up(
-    load: str | Path = "2h",
+    load: str | Path | None = None,
     *,
-    mode: Literal["lockstep", "realtime"] = "lockstep",
-    factor: float = 1.0,
-    solver: str = "ode",
-    updating_period: Period = "adaptive",
-    seed: int = 1,
+    mode: Literal["lockstep", "realtime"] | None = None,
+    factor: float | None = None,
+    solver: str | None = None,
+    updating_period: Period | None = None,
+    seed: int | None = None,
     config: str | Path | None = None,
     folder: str | Path | None = None,
     **settings: Mapping[str, object],
@@ -267,13 +267,14 @@ def up(
     """Start plant, control PLC and optimiser PLC on free ports of localhost, and begin a session; stop them at the end.
 
     Args:
-        load: Named load such as `a`, or a CSV file with the columns time_s and load_w; its last value is held.
-        mode: `lockstep`: plant time passes only in `advance` and `wait_until`; `realtime`: by the clock.
-        factor: In real time: seconds of plant time in a second.
-        solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`.
-        updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`.
-        seed: Seed of the sensors' noise, and of which frames a fault hits.
-        config: TOML file with further settings.
+        load: Named load such as `a`, or a CSV file with the columns time_s and load_w, whose last value is held; by
+            default `2h`.
+        mode: `lockstep`, the default: plant time passes only in `advance` and `wait_until`; `realtime`: by the clock.
+        factor: In real time: seconds of plant time in a second; by default 1.
+        solver: `ode`, `qpoases`, `osqp`, `fast-gradient`, `interior-point`, `hybrid` or `daqp`; by default `ode`.
+        updating_period: Seconds from 0.5 to 5 in multiples of 0.25, or `adaptive`, the default.
+        seed: Seed of the sensors' noise, and of which frames a fault hits; by default 1.
+        config: TOML file with further settings. An argument that is given comes before it.
         folder: Takes the logs; a temporary one if not given.
         settings: Sections of the configuration, such as `control_plc={"driver": "classical"}`; they come before the
             file. The environment has no influence.

@@ -42,6 +42,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     AlarmKind.PLANT_LOST: AlarmRule(CRITICAL),  # only the rack's watchdog protects the plant
     AlarmKind.PLANT_FOREIGN: AlarmRule(CRITICAL),  # another master decides the outputs
     AlarmKind.OUTPUTS_NOT_TAKEN: AlarmRule(CRITICAL),  # what is computed is not applied
+    AlarmKind.SCANS_STOPPED: AlarmRule(CRITICAL),  # nothing is computed
     # The process leaves its limits, or is about to without anybody seeing it: act within minutes.
     AlarmKind.LEVEL_BAND: AlarmRule(HIGH),  # the bath may run dry or flood; on-delay: `band_delay_s`
     AlarmKind.T5_BAND: AlarmRule(HIGH),  # the turbines leave their range; on-delay: `band_delay_s`

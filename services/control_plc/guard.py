@@ -20,20 +20,34 @@ from control_plc.output_limits import (
 
 
 class OutputGuard:
-    """Keeps every output inside its bounds, its rate window and the slew limit, whatever is asked."""
+    """Keeps every output inside its bounds, its rate window and the slew limit, whatever is asked.
+
+    Its time is that of the ticks, but never faster than the time that has really passed: it does not go back, and a
+    leap of the tick ends no window.
+    """
 
     def __init__(self, limits: InputLimits, applied: SequenceRow) -> None:
         self.limits = plain(limits)
         self.state = beginning(self.limits, list(map(_inside, applied, limits.low, limits.high)))
         self._twin = beginning(self.limits, applied)
         self.applied = SequenceRow(*self.state.applied)
+        self._tick = self._lag = 0
+        """The last tick, and by how much our time is behind it."""
 
-    def begin_at(self, tick: int, applied: SequenceRow) -> None:
+    def begin_at(self, tick: int, applied: SequenceRow, passed: int | None = None) -> None:
         """Go on from what is applied at `tick`, wherever that is; it counts as having moved just then.
 
         A window that is open stays open: breaks that follow one another would else give a full rate each. A value that
         is not finite is not taken over: the last finite one stays.
+
+        Args:
+            tick: Where to go on.
+            applied: What is applied there.
+            passed: Ticks that have passed since the last scan by another clock; None where there is none.
         """
+        leap = tick - self._tick
+        self._lag += leap - max(0, leap if passed is None else min(leap, passed))
+        self._tick, tick = tick, tick - self._lag
         state, rates = self.state, self.limits.rate
         finite = [value if math.isfinite(value) else last for value, last in zip(applied, self.applied, strict=True)]
         goes_on = 0 <= tick - state.start < TICKS_PER_SAMPLE and _reaches(
@@ -51,7 +65,8 @@ class OutputGuard:
 
     def admit(self, tick: int, wanted: SequenceRow, *, update: bool) -> SequenceRow:
         """Return what may be applied at `tick`, and remember it as applied."""
-        admit(self.state, self.limits, tick, wanted, update)
+        self._tick = tick
+        admit(self.state, self.limits, tick - self._lag, wanted, update)
         self.applied = SequenceRow(*self.state.applied)
         return self.applied
 
@@ -63,7 +78,7 @@ class OutputGuard:
             first_tick: Tick of the first one.
             meanwhile: What will be played in the ticks before, where something will be.
         """
-        twin = self._twin
+        twin, first_tick = self._twin, first_tick - self._lag
         copy_state(self.state, twin, self.limits)
         for tick, row in enumerate(meanwhile, first_tick - len(meanwhile)):
             admit(twin, self.limits, tick, twin.applied if row is None else row, update=False)

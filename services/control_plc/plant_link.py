@@ -46,6 +46,7 @@ REFUSED_OUTPUTS: Final[Mapping[int, tuple[PlantLinkState, LinkCause]]] = {
     OutputVerdict.WRONG_SESSION: (PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION),
     OutputVerdict.UNTIMELY: (PlantLinkState.NOT_TAKEN, LinkCause.UNTIMELY),
     OutputVerdict.CHANGED: (PlantLinkState.JOINING, LinkCause.CHANGED),
+    OutputVerdict.LIMITED: (PlantLinkState.JOINING, LinkCause.LIMITED),
 }
 
 
@@ -82,6 +83,11 @@ class PlantLink:
         """Whether outputs may be written."""
         return self.state is PlantLinkState.IN_STEP
 
+    @property
+    def is_alarmed(self) -> bool:
+        """An alarm of the link is active: it says why no outputs are written."""
+        return any(self._alarms.rows[alarm].active for alarm in ALARMS.values())
+
     # -- events --------------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
@@ -103,7 +109,7 @@ class PlantLink:
             self._enter(PlantLinkState.FOREIGN, cause)
         elif cause is LinkCause.REFUSED:
             self._enter(PlantLinkState.NOT_TAKEN, cause)
-        elif cause is LinkCause.DAMAGED:
+        elif cause in (LinkCause.DAMAGED, LinkCause.IMPLAUSIBLE):
             self._enter(PlantLinkState.JOINING, cause)
         else:
             self._enter(PlantLinkState.SEARCHING, cause)
@@ -133,7 +139,7 @@ class PlantLink:
         if reading.session != session or not session:
             self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
         elif not all(map(math.isfinite, reading.u)):
-            self._enter(PlantLinkState.JOINING, LinkCause.NOT_FINITE)
+            self._enter(PlantLinkState.JOINING, LinkCause.IMPLAUSIBLE)
         elif stopped:
             self._enter(PlantLinkState.FROZEN, LinkCause.STOPPED)
         else:

@@ -6,7 +6,7 @@ Scans can be missed and time can leap, so everything here goes by ticks, never b
 
 from enum import IntEnum
 
-from coldloop.process import TICKS_PER_SAMPLE
+from coldloop.process import LAST_NUMBER, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, SequenceRow, Update, Verdict
 from coldloop.sequence import InputSequence, checksum
 from control_plc.guard import OutputGuard
@@ -82,6 +82,11 @@ class SequencePlayer:
         """The optimiser has planned the update under way, so its sequence is to be expected."""
         return self.phase in (UpdatePhase.PLANNED, UpdatePhase.ANSWERED)
 
+    @property
+    def given_up(self) -> bool:
+        """No sequence is to be expected for the last update: it was abandoned, or what was sent for it refused."""
+        return self.phase in (UpdatePhase.NONE, UpdatePhase.REFUSED, UpdatePhase.ABANDONED)
+
     # -- scan ----------------------------------------------------------------------------------------------------------
 
     def begin(self, tick: int) -> bool:
@@ -124,7 +129,7 @@ class SequencePlayer:
     def latch(self, update: Update) -> Update:
         """Begin an update; return it with its number."""
         self.update = update._replace(update=self._updates, playing=self.playing)
-        self._updates += 1
+        self._updates = self._updates + 1 if self._updates < LAST_NUMBER else 0  # as when a session begins anew
         self.next_update_tick = update.tick + TICKS_PER_SAMPLE  # until the optimiser has planned another
         self.phase = UpdatePhase.LATCHED
         return self.update

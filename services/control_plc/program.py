@@ -29,7 +29,7 @@ from coldloop.registers.control_plc import (
     Update,
     Verdict,
 )
-from coldloop.registers.plant import MAX_LOAD_W, Actuators, Measurement
+from coldloop.registers.plant import MAX_LOAD_W, MAX_STATE, Actuators, Measurement
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.sequence import InputSequence
 from coldloop.watchdog import Watchdog
@@ -42,6 +42,10 @@ from control_plc.process_alarms import ProcessAlarms
 from control_plc.sensors import SensorMonitor
 from control_plc.settings import ControlSection, ControlStrategy
 
+SEEN = 0.1
+"""Share of its rate by which an input must have moved for the process to show it."""
+HANDSHAKE_TICKS = TICKS_PER_SAMPLE
+"""For no longer are the classical loops held for a sequence that is to come."""
 HANDSHAKE_PAUSE_S = 30.0
 """After a handshake that came to nothing the classical loops are not held again for so long."""
 SET_BACK_TICKS = TICKS_PER_SAMPLE
@@ -148,10 +152,16 @@ class ControlProgram:
             self.guard.begin_at(tick, applied)
         self._before = self.guard.applied
         self.player = SequencePlayer(self.guard, self._point.model_digest, updates=updates)
-        self.sensors = SensorMonitor(self._section.sensors, self._point.outputs)
+        self.sensors = SensorMonitor(
+            self._section.sensors, self._point.outputs, [SEEN * rate for rate in self._limits.rate]
+        )
         self._unknown = False
         """The load or the state that was measured last makes no sense."""
         self._failed_handshake = -math.inf
+        self._held_from: int | None = None
+        """Since when the loops have been held for the sequence to come."""
+        self._answer_failed = False
+        """The last handshake came to nothing with a sequence that had been accepted."""
         self._in_scan = False
         self.watchdog.set(self.watchdog.time, tick)
         self._loops.restart()
@@ -235,7 +245,8 @@ class ControlProgram:
             if before is not Mode.CLASSICAL:
                 self._loops.restart()
         elif before is Mode.CLASSICAL:
-            self._failed_handshake = -math.inf
+            self._failed_handshake, self._answer_failed = -math.inf, False
+        self._held_from = None
         self._note_mode(tick)
 
     def _note_mode(self, tick: int) -> None:
@@ -251,18 +262,29 @@ class ControlProgram:
         return self.guard.applied if row is None else row
 
     def _handing_over(self, tick: int) -> bool:
-        """Tell whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows."""
-        if self.player.has_answer:  # it was judged from where the inputs are
-            return True
+        """Tell whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows.
+
+        A handshake fails when its update is abandoned or its sequence refused, and in any case after `HANDSHAKE_TICKS`.
+        """
+        player, held_from = self.player, self._held_from
+        if held_from is not None and (player.given_up or not 0 <= tick - held_from < HANDSHAKE_TICKS):
+            self._failed_handshake, self._held_from = tick, None
+            self._answer_failed = player.has_answer
         rested = tick - self._failed_handshake > HANDSHAKE_PAUSE_S / TICK_S
-        return rested and self.operator.mode == OperatorMode.AUTO and self.player.answering
+        if player.has_answer:  # it was judged from where the inputs are
+            held = rested or not self._answer_failed
+        else:
+            held = rested and self.operator.mode == OperatorMode.AUTO and player.answering
+        if held and self._held_from is None:
+            self._held_from = tick
+        return held
 
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
         applied = tuple(self.guard.applied)
-        y = tuple(self.sensors.check(self.tick, measurement.y))
+        y = tuple(self.sensors.check(self.tick, measurement.y, applied, measurement.x, (measurement.load,)))
         self.process = Process(self.tick, measurement.load, applied, y)
-        self._unknown = not (0.0 <= measurement.load <= MAX_LOAD_W and all(map(math.isfinite, measurement.x)))
+        self._unknown = not (0.0 <= measurement.load <= MAX_LOAD_W and _are_states(measurement.x))
         self._let_play(usable=self._usable)
         latched = None
         if self.player.latches(self.tick, measurement.load):
@@ -291,7 +313,7 @@ class ControlProgram:
         """Give up the scan under way: what the rack has done with its outputs is not known."""
         self._in_scan = False
 
-    def rejoin(self, tick: int, applied: Sequence[float]) -> None:
+    def rejoin(self, tick: int, applied: Sequence[float], passed: int | None = None) -> None:
         """Go on at another tick: the rack was away, or time has leapt.
 
         Forward, all timers count the time that has passed. Back by a little, they begin at the present tick at the
@@ -300,12 +322,13 @@ class ControlProgram:
         Args:
             tick: Tick of the next scan.
             applied: What the rack applies, read back from it.
+            passed: Ticks since the last scan by our own clock; None in lock-step.
         """
         if tick < self.tick:
             self._set_back(tick)
         self.tick = self.alarms.now = tick
         self._in_scan = False
-        self.guard.begin_at(self.tick, SequenceRow(*applied))
+        self.guard.begin_at(self.tick, SequenceRow(*applied), passed)
 
     def _set_back(self, tick: int) -> None:
         if self.tick - tick > SET_BACK_TICKS:
@@ -314,6 +337,7 @@ class ControlProgram:
         self.ladder.set_back(tick)
         self.watchdog.set_back(tick)
         self._failed_handshake = min(self._failed_handshake, tick)
+        self._held_from = None
         self.alarms.begin_at(tick)
 
     # -- the optimiser's side ------------------------------------------------------------------------------------------
@@ -367,6 +391,11 @@ class ControlProgram:
         """Let an operator decide who drives, from the next scan on."""
         self.operator = operator
         self._let_play(usable=self._usable)
+
+
+def _are_states(x: Sequence[float]) -> bool:
+    """Tell whether these can be states: an update that has others is none."""
+    return math.isfinite(sum(x)) and min(x) >= -MAX_STATE and max(x) <= MAX_STATE
 
 
 def make_program(header: ModelHeader, section: ControlSection, limits: InputLimits) -> ControlProgram:

@@ -120,7 +120,10 @@ class RackClock:
         self._position, self._at, self.offset = position, at, 0.0
 
     def observe(self, position: float, at: float, uncertainty_s: float = SUREST_S) -> None:
-        """Take where the rack was, less than a tick from where it should be.
+        """Take where the rack was.
+
+        Further than `LEAP` from where it should be its clock has leapt, or it tells nonsense: the schedule follows by
+        no more than the bound, and nothing is learnt about the rate.
 
         Args:
             position: Its tick, and the share of it that had passed.
@@ -132,6 +135,8 @@ class RackClock:
         self.offset = error = position - expected
         correction = min(max(GAIN * error, -MAX_CORRECTION), MAX_CORRECTION)
         self._position, self._at = expected + correction, at
+        if abs(error) > LEAP + uncertainty_s / self.tick_s:
+            return
         if step_s > 0.0:
             change = RATE_GAIN * min(max(error, -1.0), 1.0) * min(1.0, self.tick_s / step_s)
             self._rate = min(max(self._rate + change, -MAX_RATE), MAX_RATE)

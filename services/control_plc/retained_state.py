@@ -2,7 +2,6 @@
 
 import base64
 import logging
-import math
 import secrets
 import struct
 from collections.abc import Mapping
@@ -12,7 +11,10 @@ from typing import Annotated, Any, Final, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from coldloop.pace import Pace
-from coldloop.registers.control_plc import SEQUENCE_ROWS, Operator, OperatorMode, SequenceHeader, SequenceRow
+from coldloop.process import LAST_NUMBER, LAST_TICK
+from coldloop.registers.codec import check_record
+from coldloop.registers.common import SessionPace
+from coldloop.registers.control_plc import SEQUENCE_ROWS, Operator, SequenceHeader, SequenceRow
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.retained import RetainedFile, RetainedStateError
 from coldloop.retained_writer import RetainedStateWriter
@@ -21,7 +23,7 @@ from control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")
 
-OWNER: Final = "control_plc/3"
+OWNER: Final = "control_plc/4"
 """Who retained states belong to, and the version of what they hold."""
 ROW: Final = struct.Struct(">3f")
 OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing")
@@ -42,9 +44,9 @@ class RetainedState(BaseModel):
     events: Annotated[int, Field(ge=0, lt=2**31)]
     """Number of the last event."""
     session: Count
-    tick: Count
+    tick: Annotated[int, Field(ge=0, le=LAST_TICK)]
     pace: Pace
-    updates: Count
+    updates: Annotated[int, Field(ge=0, le=LAST_NUMBER)]
     """Number of the next update."""
     playing: tuple[SequenceHeader, Annotated[str, Field(max_length=2 * SEQUENCE_ROWS * ROW.size)]] | None
     """Header and rows (base64 of single precision, high byte first) of the sequence being played."""
@@ -55,11 +57,10 @@ class RetainedState(BaseModel):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        if not 0.0 < self.pace.factor < math.inf:
-            raise ValueError(f"no time goes on with a factor of {self.pace.factor}")
-        if not all(map(math.isfinite, self.operator)):
-            raise ValueError("setpoints that are no numbers")
-        OperatorMode(self.operator.mode)
+        for record in (SessionPace.shown(self.session, self.pace), self.operator, *self.alarms):
+            check_record(record)
+        if self.playing is not None:
+            check_record(self.playing[0])
         return self
 
     @classmethod
@@ -97,6 +98,8 @@ class Memory:
         self._file = RetainedFile(file, OWNER, model_digest) if file else None
         self._writer = RetainedStateWriter(self._file) if self._file else None
         self._packed: tuple[InputSequence, tuple[SequenceHeader, str]] | None = None
+        self.refused = False
+        """There was a state before, and it is not used."""
         self.boot = 1
         self.holder = secrets.randbelow(2**32 - 1) + 1
 
@@ -108,7 +111,8 @@ class Memory:
             content = self._file.load()
             state = None if content is None else RetainedState.parsed(content)
         except RetainedStateError as error:
-            log.warning("retained state refused", extra={"reason": str(error)})
+            self.refused = True
+            log.warning("retained state refused", extra={"reason": str(error), "file": self._file.set_aside()})
             return None
         if state is not None:
             self.boot, self.holder = state.boot % 0xFFFF + 1, state.holder

@@ -29,6 +29,7 @@ from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.registers.safety import AlarmKind, WatchdogTime
+from coldloop.service import SERVING
 from coldloop.telemetry import Telemetry
 from control_plc.certificate_watch import CertificateWatch
 from control_plc.clients import Clients
@@ -39,6 +40,7 @@ from control_plc.rack_clock import PHASE, RackClock
 from control_plc.rack_finder import RackFinder
 from control_plc.retained_state import Memory
 from control_plc.scan_cycle import ScanCycle
+from control_plc.scan_watch import LOOK_S, ScanWatch
 from control_plc.sessions import Sessions
 from control_plc.settings import SHOWN, ControlSettings
 
@@ -52,6 +54,10 @@ LONGEST_SLEEP_S: Final = 0.25
 """In real time it is seen so often whether an operator has called meanwhile."""
 KEEP_ALIVE_S: Final = 1.0
 """While paused, the rack is asked something so often."""
+
+
+STATE_REFUSED: Final = 1
+"""Cause of the alarm STATE_NOT_RETAINED: at the start there was one that is not used."""
 
 
 class ControlPlc:
@@ -81,11 +87,14 @@ class ControlPlc:
         self.clients = Clients(program, settings.limits, self.bank, self.publication, self.sessions)
         certificates = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]
         self.certificates = CertificateWatch(certificates, program, self.publication.safety)
+        self._watch = ScanWatch()
         self._lost_lines = 0
         self._awaiting_since: float | None = None
         self.bank.put(program.operator)
         self.bank.put(WatchdogTime(program.watchdog.time))
-        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None))
+        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._memory.refused))
+        if self._memory.refused:
+            program.alarms.raised(AlarmKind.STATE_NOT_RETAINED, STATE_REFUSED)
         self._publish()
 
     def close(self) -> None:
@@ -213,6 +222,7 @@ class ControlPlc:
             self._publish()
             return
         self._finder.look_at_once()
+        self._watch.scanned()
         if self.sessions.pace.realtime and answer.tick:
             self._clock.observe(answer.tick + answer.age, at, (answered_at - asked_at) / 2)
         if update is not None:
@@ -254,6 +264,21 @@ class ControlPlc:
         if lost > self._lost_lines:
             program.journal.note(program.tick, EventKind.LOST, value=lost - self._lost_lines)
             self._lost_lines = lost
+
+    async def watch_scans(self) -> None:
+        """Raise an alarm while scans are not made, until cancelled: by a clock of its own."""
+        while True:
+            await asyncio.sleep(LOOK_S)
+            self._look_for_scans()
+
+    def _look_for_scans(self) -> None:
+        pace, alarms = self.sessions.pace, self._program.alarms
+        if not (self.sessions.running and pace.realtime and not pace.paused):
+            self._watch.scanned()
+        stopped = self._watch.look(self._clock.tick_s) and not self._link.is_alarmed
+        if stopped is not bool(alarms.rows[AlarmKind.SCANS_STOPPED].active):
+            alarms.holds(AlarmKind.SCANS_STOPPED, condition=stopped)
+            self.publication.safety()
 
     @property
     def _patience_s(self) -> float:
@@ -315,6 +340,7 @@ class ControlPlc:
     def _begin(self) -> None:
         """Begin the session that the program has been put into."""
         self._set_clock()
+        self._watch.scanned()
         self.publication.begin()
         self.clients.begin()
         self._show_pace()
@@ -322,6 +348,7 @@ class ControlPlc:
     def _set_clock(self) -> None:
         self._clock.begin(self.sessions.pace.factor, time.monotonic())
         self._finder.look_at_once()
+        self._cycle.begin_time()
         self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
 
     def _show_pace(self) -> None:
@@ -344,11 +371,12 @@ async def serve(settings: ControlSettings) -> None:
         on_departure=plc.clients.on_departure, on_refusal=plc.clients.on_refusal, on_close=plc.clients.on_close,
     )  # fmt: skip
     await server.start()
-    log.info("serving", extra={"host": settings.control_plc.server.host, "port": server.port})
+    log.info(SERVING, extra={"host": settings.control_plc.server.host, "port": server.port})
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(MetricsServer(settings.control_plc.metrics, plc.bank).run(), name="metrics")
             tasks.create_task(plc.run(), name="scan cycle")
+            tasks.create_task(plc.watch_scans(), name="scan watch")
             tasks.create_task(plc.certificates.run(), name="certificates")
             telemetry = Telemetry(settings.telemetry, "control_plc", plc.publication.snapshot)
             tasks.create_task(telemetry.run(), name="telemetry")

@@ -6,7 +6,7 @@ that has a rack of its own. Time is the rack's: after a break the program goes o
 
 from collections.abc import Callable
 
-from coldloop.errors import BUSY, DamagedAnswerError, LinkError, RequestRefusedError
+from coldloop.errors import BUSY, DamagedAnswerError, ImplausibleAnswerError, LinkError, RequestRefusedError
 from coldloop.registers.control_plc import LinkCause, Update
 from coldloop.registers.plant import Actuators, Measurement
 from control_plc.plant_link import PlantLink
@@ -19,6 +19,8 @@ Adopt = Callable[[Measurement], bool]
 
 def cause_of(error: LinkError) -> LinkCause:
     """Return why a request came to nothing."""
+    if isinstance(error, ImplausibleAnswerError):
+        return LinkCause.IMPLAUSIBLE
     if isinstance(error, DamagedAnswerError):
         return LinkCause.DAMAGED
     if isinstance(error, RequestRefusedError):
@@ -40,6 +42,12 @@ class ScanCycle:
         self._link = link
         self._adopt = adopt
         self._sent: Actuators | None = None
+        self._scanned_at: float | None = None
+        """Real time of the last scan, or of the last reading that was gone on from, in ticks."""
+
+    def begin_time(self) -> None:
+        """Note that real time is counted anew: a session begins, or ticks last longer or shorter."""
+        self._scanned_at = None
 
     def begin(self) -> Actuators | None:
         """Return the outputs to be written now, or None: the rack is to be read, and nothing written."""
@@ -67,6 +75,7 @@ class ScanCycle:
             self._read_back(answer, now)
             return None
         if self._link.exchanged(sent, answer, now):
+            self._scanned_at = now
             self._link.settled()
             return self._program.end_scan(answer)
         self._program.interrupt()
@@ -78,5 +87,12 @@ class ScanCycle:
             link.begin()
         if not link.read_back(reading, program.session, now):
             return
-        program.rejoin(reading.tick + (reading.age >= PHASE), reading.u)
+        program.rejoin(reading.tick + (reading.age >= PHASE), reading.u, self._passed(now))
+        self._scanned_at = now
         link.joined()
+
+    def _passed(self, now: float | None) -> int | None:
+        """Return the whole ticks since the last scan by our own clock; None where it does not count."""
+        if now is None:
+            return None
+        return 0 if self._scanned_at is None else max(0, int(now - self._scanned_at))

@@ -1,10 +1,11 @@
 """Measurements that cannot be right: found, replaced by the last good value, and reported.
 
 A measurement is bad when it is no number, outside its sensor's range, or, for the outputs that are controlled, frozen:
-it does not change by a bit for a while in which most of the others move.
+it does not change by a bit for a while in which most of the others move. When nothing at all changes, load and states
+included, the image is an old one: a plant that rests is known by its inputs, which rest too.
 """
 
-from collections.abc import MutableSequence, Sequence
+from collections.abc import Collection, MutableSequence, Sequence
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
@@ -33,6 +34,9 @@ class SensorCheckSettings(BaseModel):
     """bar."""
     frozen_s: Annotated[float, Field(gt=0)] = 20.0
     """A controlled output that does not change for so long, while others move, is frozen."""
+    may_rest: bool = True
+    """While its inputs do not move a plant may stand still bit for bit, as a simulated one with exact sensors does.
+    False for sensors that always tremble: an image that stands for `frozen_s` is then an old one in any case."""
     bridged_s: Annotated[float, Field(ge=0)] = 10.0
     """How long the last good value of a controlled output is worked with; then what needs it is left."""
 
@@ -77,13 +81,57 @@ def moved(before: Numbers, y: Numbers) -> int:
     return count
 
 
+class ImageWatch:
+    """Looks at all that is measured at once: for how many ticks it has stood, and whether the inputs have moved.
+
+    Args:
+        moves: How far each input must have moved for something to be seen of it.
+        may_rest: Otherwise nothing may stand still, whatever the inputs do.
+    """
+
+    def __init__(self, moves: Sequence[float], *, may_rest: bool) -> None:
+        self._moves = moves
+        self._may_rest = may_rest
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin anew: nothing is known of before."""
+        self._image: tuple[Sequence[float], ...] = ()
+        self._inputs: Sequence[float] = ()
+        self._stands = 0
+        self._moved = False
+
+    def stands(self, inputs: Sequence[float], *image: Sequence[float], elapsed: int) -> int:
+        """Return for how many ticks the image has stood although the inputs have moved.
+
+        Args:
+            inputs: Being applied.
+            image: All that is measured.
+            elapsed: Ticks since the last one.
+        """
+        if image != self._image:  # NaN is not the same as NaN: a sensor that fails is for others to find
+            self._image, self._inputs = image, inputs
+            self._stands, self._moved = 0, not self._may_rest
+            return 0
+        self._stands += elapsed
+        if not self._moved:
+            pairs = zip(inputs, self._inputs, self._moves, strict=True)
+            self._moved = any(abs(now - before) > move for now, before, move in pairs)
+        return self._stands if self._moved else 0
+
+
 class SensorMonitor:
     """Looks at every measurement. All its times are plant time: scans can be missed.
 
     `bad` holds the outputs that are substituted now, and since which tick.
+
+    Args:
+        settings: What sensors can tell.
+        initial: The outputs at rest.
+        moves: How far an input must have moved for something to be seen of it.
     """
 
-    def __init__(self, settings: SensorCheckSettings, initial: Sequence[float]) -> None:
+    def __init__(self, settings: SensorCheckSettings, initial: Sequence[float], moves: Sequence[float] = ()) -> None:
         self.low, self.high = zip(*settings.ranges, strict=True)
         self.frozen_ticks = round(settings.frozen_s / TICK_S)
         self._bridged_ticks = round(settings.bridged_s / TICK_S)
@@ -92,15 +140,30 @@ class SensorMonitor:
         self._tick: int | None = None
         self._now = 0
         self.stands = [0] * len(CONTROLLED)
+        self._image = ImageWatch(moves, may_rest=settings.may_rest)
         self._recovering: dict[int, int] = {}
         """Output, and since which tick its measurements have been good again."""
         self.bad: dict[int, int] = {}
 
-    def check(self, tick: int, y: Sequence[float]) -> Sequence[float]:
-        """Return the outputs measured at `tick`, with bad ones replaced by their last good value."""
-        watch_standing(self.stands, self.before, y, 1 if self._tick is None else max(0, tick - self._tick))
+    def check(
+        self, tick: int, y: Sequence[float], inputs: Sequence[float] = (), *others: Sequence[float]
+    ) -> Sequence[float]:
+        """Return the outputs measured at `tick`, with bad ones replaced by their last good value.
+
+        Args:
+            tick: When.
+            y: As they were measured.
+            inputs: Being applied.
+            others: What else was measured.
+        """
+        elapsed = 1 if self._tick is None else max(0, tick - self._tick)
+        watch_standing(self.stands, self.before, y, elapsed)
         self._tick = self._now = tick
-        frozen = [output for output, ticks in zip(CONTROLLED, self.stands, strict=True) if ticks >= self.frozen_ticks]
+        frozen: Collection[int] = [
+            output for output, ticks in zip(CONTROLLED, self.stands, strict=True) if ticks >= self.frozen_ticks
+        ]
+        if self._image.stands(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
+            frozen = range(len(y))
         if not self.bad and not frozen and are_inside(y, self.low, self.high):
             self._good[:] = y
             return y
@@ -128,6 +191,7 @@ class SensorMonitor:
     def seen(self, tick: int, y: Sequence[float]) -> None:
         """Note that all outputs y (22) have been good up to `tick`, and what was measured there."""
         self._tick = self._now = tick
+        self._image.begin()
         self._good[:] = self.before[:] = y
 
     @property

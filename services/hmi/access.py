@@ -1,12 +1,12 @@
 """Who is asking: sessions, the rate of requests, and where a request comes from. No sockets, no clock of its own."""
 
 import hashlib
+import re
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
-from urllib.parse import urlsplit
+from typing import Final, NamedTuple
 
 from hmi.users import PageRole, User
 
@@ -18,6 +18,15 @@ REQUESTS_A_BROWSER: Final = 3.0
 """In a second. Behind a proxy all browsers have one address, and each asks for two trends a second."""
 REQUEST_BURST: Final = 150.0
 LOCAL_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+_HOST: Final = re.compile(r"(?:\[(?P<v6>[0-9a-fA-F:.]+)\]|(?P<name>[A-Za-z0-9._-]+))(?::(?P<port>[0-9]{1,5}))?")
+"""A Host header: a name or an address, and nothing before or after it but a port."""
+
+
+class Party(NamedTuple):
+    """Who shares a bound: a user who has logged in, or all strangers of one address."""
+
+    name: str
+    has_session: bool
 
 
 @dataclass
@@ -88,7 +97,7 @@ def _digest(token: str) -> str:
 
 
 class RateLimit:
-    """A bucket of requests for each address.
+    """A bucket of requests for each address or party.
 
     Args:
         now: Monotonic clock, s.
@@ -100,10 +109,10 @@ class RateLimit:
         self._now = now
         self._per_second = per_second
         self._burst = burst
-        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._buckets: OrderedDict[str | Party, tuple[float, float]] = OrderedDict()
 
-    def allows(self, address: str) -> bool:
-        """Take a request of an address, or refuse it."""
+    def allows(self, address: str | Party) -> bool:
+        """Take a request of an address or a party, or refuse it."""
         now = self._now()
         level, since = self._buckets.pop(address, (self._burst, now))
         level = min(self._burst, level + (now - since) * self._per_second)
@@ -113,7 +122,7 @@ class RateLimit:
             self._buckets.popitem(last=False)
         return allowed
 
-    def give_back(self, address: str) -> None:
+    def give_back(self, address: str | Party) -> None:
         """Give a request back that shall not count."""
         if address in self._buckets:
             level, since = self._buckets[address]
@@ -121,19 +130,15 @@ class RateLimit:
 
 
 def host_of(header: str) -> str:
-    """Return the name in a Host header, without its port; empty when there is none."""
-    try:
-        return urlsplit(f"//{header}").hostname or ""
-    except ValueError:
-        return ""
+    """Return the name in a Host header, without its port; empty when it is not one."""
+    found = _HOST.fullmatch(header)
+    return (found["v6"] or found["name"]).lower() if found else ""
 
 
 def port_of(header: str) -> int | None:
     """Return the port in a Host header; None when there is none."""
-    try:
-        return urlsplit(f"//{header}").port
-    except ValueError:
-        return None
+    found = _HOST.fullmatch(header)
+    return int(found["port"]) if found and found["port"] else None
 
 
 def is_own_origin(origin: str | None, host: str) -> bool:

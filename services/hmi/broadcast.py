@@ -1,18 +1,26 @@
 """One stream of changes for all browsers: encoded once, sent to each; for a slow browser nobody waits."""
 
 import asyncio
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from typing import Final
+
+from hmi.access import Party
 
 WAITING: Final = 16
 """Messages that wait for one browser."""
 
 
 class Stream:
-    """What one browser is sent."""
+    """What one browser is sent.
 
-    def __init__(self) -> None:
-        self._messages: asyncio.Queue[bytes] = asyncio.Queue(WAITING)
+    Args:
+        party: Whose browser it is.
+    """
+
+    def __init__(self, party: Party) -> None:
+        self.party = party
+        self._messages: asyncio.Queue[bytes | None] = asyncio.Queue(WAITING)
         self.is_behind = True
         """It has missed messages: it needs the whole state next."""
 
@@ -21,12 +29,20 @@ class Stream:
         try:
             self._messages.put_nowait(message)
         except asyncio.QueueFull:
-            while not self._messages.empty():
-                self._messages.get_nowait()
+            self._drop()
             self.is_behind = True
 
-    async def next(self) -> bytes:
-        """Return the next message."""
+    def end(self) -> None:
+        """End it: nothing follows."""
+        self._drop()
+        self._messages.put_nowait(None)
+
+    def _drop(self) -> None:
+        while not self._messages.empty():
+            self._messages.get_nowait()
+
+    async def next(self) -> bytes | None:
+        """Return the next message; None at its end."""
         return await self._messages.get()
 
 
@@ -35,21 +51,17 @@ class Broadcast:
 
     Args:
         whole: Returns the whole state as a message, for a browser that begins.
-        most: Streams at a time.
+        most: Streams at a time. When there are so many, a user who has logged in takes the place of a stranger, and
+            within either group a party takes the place of one that has at least two more.
     """
 
     def __init__(self, whole: Callable[[], bytes], most: int) -> None:
         self._whole = whole
         self._most = most
-        self._streams: set[Stream] = set()
+        self._streams: dict[Stream, None] = {}  # the oldest first
 
     def __len__(self) -> int:
         return len(self._streams)
-
-    @property
-    def is_full(self) -> bool:
-        """Whether no more browsers are served."""
-        return len(self._streams) >= self._most
 
     def send(self, message: bytes) -> None:
         """Send a message to all browsers; those that are behind get the whole state in its place."""
@@ -62,14 +74,37 @@ class Broadcast:
             else:
                 stream.offer(message)
 
-    async def messages(self) -> AsyncIterator[bytes]:
-        """Yield the whole state, and then what changes."""
-        stream = Stream()
+    def begin(self, party: Party) -> Stream | None:
+        """Begin a stream with the whole state; return None where there is no room for it."""
+        if len(self._streams) >= self._most:
+            loser = self._giving_way(party)
+            if loser is None:
+                return None
+            del self._streams[loser]
+            loser.end()
+        stream = Stream(party)
         stream.is_behind = False
         stream.offer(self._whole())
-        self._streams.add(stream)
+        self._streams[stream] = None
+        return stream
+
+    def _giving_way(self, party: Party) -> Stream | None:
+        """Return the stream that gives way to a newcomer: the oldest one of the party that has most."""
+        group = [stream for stream in self._streams if stream.party.has_session == party.has_session]
+        least = Counter(stream.party for stream in group)[party] + 2
+        strangers = [stream for stream in self._streams if not stream.party.has_session]
+        if party.has_session and strangers:
+            group, least = strangers, 1
+        counts = Counter(stream.party for stream in group)
+        if not counts:
+            return None
+        largest, count = counts.most_common(1)[0]
+        return next(stream for stream in group if stream.party == largest) if count >= least else None
+
+    async def messages(self, stream: Stream) -> AsyncIterator[bytes]:
+        """Yield the whole state, and then what changes, until the stream ends."""
         try:
-            while True:
-                yield await stream.next()
+            while (message := await stream.next()) is not None:
+                yield message
         finally:
-            self._streams.discard(stream)
+            self._streams.pop(stream, None)

@@ -1,6 +1,5 @@
 """Requests that change something: login, logout, and commands in two steps."""
 
-import asyncio
 from typing import Any, Final
 
 from aiohttp import web
@@ -65,19 +64,14 @@ class Commanding:
 
     async def login(self, request: web.Request) -> web.Response:
         """Begin a session."""
-        address = request.remote or ""
-        if not self._guard.logins.allows(address):
-            self._note(request, "login", "refused", "too many attempts")
-            return refusal(429, "too many attempts to log in: wait a minute")
         asked = await _document(request)
         name, password = asked.get("user"), asked.get("password")
         if not isinstance(name, str) or not isinstance(password, str):
             return refusal(400, "user and password are texts")
-        user = await asyncio.to_thread(self._users.check, name, password)
-        if user is None:
-            self._guard.refuse_login(name, address)
-            return refusal(401, "wrong name or password")
-        self._guard.logins.give_back(address)
+        address = request.remote or ""
+        user = await self._guard.log_in(name, password, address)
+        if isinstance(user, web.Response):
+            return user
         self._guard.sessions.end(request.cookies.get(cookie_name(request)))
         answer = web.json_response({"user": user.name, "role": user.role.value})
         answer.set_cookie(
@@ -89,7 +83,8 @@ class Commanding:
 
     async def logout(self, request: web.Request) -> web.Response:
         """End the session."""
-        self._note(request, "logout", "done", "")
+        if self._guard.who(request):
+            self._note(request, "logout", "done", "")
         self._guard.sessions.end(request.cookies.get(cookie_name(request)))
         answer = web.json_response({})
         answer.del_cookie(cookie_name(request), path="/")
@@ -100,7 +95,7 @@ class Commanding:
         operator = self._operator(request)
         if isinstance(operator, web.Response):
             return operator
-        return json_answer(encoded({"entries": list(self._audit.entries)[::-1]}))
+        return json_answer(encoded({"entries": self._audit.entries[::-1]}))
 
     async def prepare(self, request: web.Request) -> web.Response:
         """Take a command: answer with what it would do and the token that confirms it."""
@@ -111,7 +106,7 @@ class Commanding:
             command = read_command(await _document(request))
             token, text = await self._desk.prepare(command, operator.user.name)
         except (UsageError, LinkError) as error:
-            self._note(request, "command", "refused", str(error))
+            self._refuse(request, str(error))
             return refusal(422, str(error))
         return web.json_response({"token": token, "text": text})
 
@@ -123,7 +118,7 @@ class Commanding:
         try:
             outcome = await self._desk.confirm(request.match_info["token"], operator.user.name)
         except UsageError as error:
-            self._note(request, "command", "refused", str(error))
+            self._refuse(request, str(error))
             return refusal(409, str(error))
         word = "refused" if outcome.refused_because else "uncertain" if outcome.uncertain_because else "done"
         self._note(request, "command", word, f"{outcome.asked}: {' '.join(filter(None, outcome[1:]))}")
@@ -133,12 +128,16 @@ class Commanding:
         """Return the session of an operator, or the refusal."""
         session = self._guard.session(request)
         if session is None:
-            self._note(request, "command", "refused", "nobody has logged in, or the session has ended")
+            self._refuse(request, "nobody has logged in, or the session has ended")
             return refusal(401, "log in first: the session has ended, or there was none")
         if not session.may_operate:
-            self._note(request, "command", "refused", "the user may only look")
+            self._refuse(request, "the user may only look")
             return refusal(403, f"{session.user.name} may look, and not operate")
         return session
+
+    def _refuse(self, request: web.Request, reason: str) -> None:
+        who = self._guard.who(request)
+        self._audit.refuse("command", who=who, address=request.remote or "", reason=reason, has_session=bool(who))
 
     def _note(self, request: web.Request, what: str, outcome: str, detail: str) -> None:
         who = self._guard.who(request)

@@ -5,6 +5,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from itertools import pairwise
 from typing import Any, Final
 
 from coldloop import __version__
@@ -12,14 +13,14 @@ from coldloop.event_text import alarm_cause, word
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode, OperatorMode
-from coldloop.registers.optimizer_plc import BANDED_OUTPUTS, INPUT_SAMPLES, PREDICTED_SAMPLES, Prediction
+from coldloop.registers.optimizer_plc import BANDED_OUTPUTS, INPUT_SAMPLES, PREDICTED_SAMPLES, Optimization, Prediction
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriority, AlarmState
 from hmi.explanation import explain
 from hmi.model import Model, Told
 from hmi.sentences import sentence
 from hmi.signals import MAPS, signals_of
 from hmi.station import plant_document
-from hmi.trends import NAMES, mode_name, rounded, thin
+from hmi.trends import NAMES, Gap, mode_name, rounded, thin
 
 Document = dict[str, Any]
 
@@ -219,6 +220,7 @@ def prediction_document(prediction: Prediction) -> Document:
 def trend_document(model: Model, names: Sequence[str], start: int, end: int, points: int) -> Document:
     """Return everything that is drawn between two ticks."""
     times, series = model.trends.thinned(names, start, end, points)
+    gaps = model.trends.gaps(start, end)
     updates = [update for update in model.updates if start <= update.tick <= end]
     update_times, update_series = thin(
         [update.tick * TICK_S for update in updates],
@@ -229,6 +231,7 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
             "J_predicted": [update.j_delivered for update in updates],
         },
         points,
+        _lost_updates(updates, gaps),
     )
     shown = [one for one in model.predictions if one.tick >= start]
     limits = model.limits
@@ -245,9 +248,20 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
         "substituted": {name: found for name, found in model.trends.substituted(start, end).items() if name in names},
         "marks": _marks(model, start, end),
         "predictions": [prediction_document(one) for one in _some(shown)],
+        "planned": model.is_planned,
+        "gaps": [[max(gap.start, start) * TICK_S, min(gap.end, end) * TICK_S] for gap in gaps],
         "bands": _ranges(BANDED_OUTPUTS, limits.output_low, limits.output_high),
         "bounds": _ranges(INPUT_NAMES, limits.input_low, limits.input_high),
     }
+
+
+def _lost_updates(updates: Sequence[Optimization], gaps: Sequence[Gap]) -> list[float]:
+    """Return the times of the updates, s, before which some are missing because nothing could be read."""
+    return [
+        after.tick * TICK_S
+        for before, after in pairwise(updates)
+        if after.update != before.update + 1 and any(before.tick < gap.end and gap.start < after.tick for gap in gaps)
+    ]
 
 
 def _ranges(names: Sequence[str], low: Sequence[float], high: Sequence[float]) -> Document:

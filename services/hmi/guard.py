@@ -1,5 +1,6 @@
 """What every request passes: whose it is, where it comes from, how often, and the headers of every answer."""
 
+import asyncio
 import re
 import time
 from collections.abc import Awaitable, Callable
@@ -14,6 +15,7 @@ from hmi.access import (
     REQUEST_BURST,
     REQUESTS_A_BROWSER,
     LoginSession,
+    Party,
     RateLimit,
     Sessions,
     host_of,
@@ -21,7 +23,9 @@ from hmi.access import (
     port_of,
 )
 from hmi.audit import Audit
+from hmi.connections import Connections
 from hmi.settings import HmiSection
+from hmi.users import User, Users
 
 HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
@@ -38,6 +42,16 @@ BY_ITSELF: Final = frozenset(
 """What a page asks for without a hand on it: no sign of life of its user."""
 OPEN: Final = frozenset({"/", "/healthz", "/metrics", "/api/catalog", "/api/login", "/api/me", "/favicon.ico"})
 """What is served without a login; `/metrics` looks at it itself."""
+FILES: Final = frozenset({"/", "/api/catalog", "/favicon.ico"})
+UNLIMITED: Final = frozenset({"/api/login", "/healthz"})
+"""Attempts to log in have a limit of their own; whether the page is well costs no more than a refusal."""
+STREAM: Final = "/api/stream"
+LARGEST_OF_STRANGERS: Final = 4096
+"""Bytes of a request of somebody who has not logged in: a name and a password, where a replay shall go."""
+BODY_S: Final = 5.0
+"""Within this time a request is here as a whole."""
+PASSWORDS_AT_ONCE: Final = 2
+"""Passwords that are checked at a time: each takes a core and 16 MB."""
 
 _RUN: Final = re.compile(r"\A/run/\d+/")
 
@@ -49,9 +63,14 @@ def refusal(status: int, message: str) -> web.Response:
     return web.json_response({"error": message}, status=status)
 
 
+def host_header(request: web.Request) -> str:
+    """Return what a request calls the page; empty without a name (`request.host` then asks the name service)."""
+    return request.headers.get(hdrs.HOST, "")
+
+
 def cookie_name(request: web.Request) -> str:
     """Return the name of a session's cookie: browsers send cookies to all ports of a host, so it names the port."""
-    return f"coldloop_session_{port_of(request.host) or 'default'}"
+    return f"coldloop_session_{port_of(host_header(request)) or 'default'}"
 
 
 def path_in_exhibit(request: web.Request) -> str:
@@ -65,15 +84,21 @@ class Guard:
     Args:
         settings: Of the page.
         audit: Where refusals are noted.
+        users: Who may log in.
+        connections: Are told of requests under way.
     """
 
-    def __init__(self, settings: HmiSection, audit: Audit) -> None:
+    def __init__(self, settings: HmiSection, audit: Audit, users: Users, connections: Connections) -> None:
         self._settings = settings
         self._audit = audit
+        self._users = users
+        self._connections = connections
+        self._checking = asyncio.Semaphore(PASSWORDS_AT_ONCE)
         login = settings.login
         self.sessions = Sessions(time.monotonic, login.idle_minutes * 60, login.longest_minutes * 60)
         self.logins = RateLimit(time.monotonic, LOGINS_A_MINUTE / 60, LOGIN_BURST)
         self._requests = RateLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
+        self._files = RateLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
         self._hosts = LOCAL_NAMES | {settings.host, *settings.allowed_hosts}
 
     def session(self, request: web.Request) -> LoginSession | None:
@@ -87,40 +112,78 @@ class Guard:
         session = self.sessions.find(request.cookies.get(cookie_name(request)), is_use=False)
         return session.user.name if session else ""
 
-    def refuse_login(self, name: str, address: str) -> None:
-        """Note a wrong password, or a name that nobody has."""
-        self._audit.note("login", who=name[:40], address=address, outcome="refused", detail="wrong name or password")
+    def party(self, request: web.Request) -> Party:
+        """Return who shares bounds with a request: its user, or strangers of its address."""
+        who = self.who(request)
+        return Party(who, has_session=True) if who else Party(request.remote or "", has_session=False)
 
-    def _refused(self, request: web.Request, status: int, reason: str) -> web.Response:
-        self._audit.note(
-            "request", who=self.who(request), address=request.remote or "", outcome="refused",
-            detail=f"{request.method} {request.path}: {reason}",
+    async def log_in(self, name: str, password: str, address: str) -> User | web.Response:
+        """Return the user with this password, or the refusal; both take as long."""
+        if not self.logins.allows(address):
+            self._audit.refuse("login", who=name[:40], address=address, reason="too many attempts", has_session=False)
+            return refusal(429, "too many attempts to log in: wait a minute")
+        async with self._checking:
+            user = await asyncio.to_thread(self._users.check, name, password)
+        if user is None:
+            self._audit.refuse(
+                "login", who=name[:40], address=address, reason="wrong name or password", has_session=False
+            )
+            return refusal(401, "wrong name or password")
+        self.logins.give_back(address)
+        return user
+
+    def _refused(self, request: web.Request, status: int, reason: str, message: str = "") -> web.Response:
+        party = self.party(request)
+        self._audit.refuse(
+            "request", who=self.who(request), address=request.remote or "", reason=reason,
+            detail=f"{request.method} {request.path} of {host_header(request)}", has_session=party.has_session,
         )  # fmt: skip
-        return refusal(status, reason)
+        return refusal(status, message or reason)
 
     def _judge(self, request: web.Request) -> web.Response | None:
         """Return why a request is refused; None when it is not."""
-        if host_of(request.host) not in self._hosts:
-            return self._refused(request, 421, f"the page is not called '{request.host}': name it in hmi.allowed_hosts")
-        if not self._requests.allows(request.remote or ""):
-            return refusal(429, "too many requests: wait a little")
-        if request.method not in SAFE and not is_own_origin(request.headers.get(hdrs.ORIGIN), request.host):
+        path, host = path_in_exhibit(request), host_header(request)
+        is_file = path in FILES or path.startswith("/static/")
+        limit = self._files if is_file else self._requests
+        if path not in UNLIMITED and not limit.allows(self.party(request)):
+            return self._refused(request, 429, "too many requests: wait a little")
+        if host_of(host) not in self._hosts:
+            reason = "a name that is not the page's"
+            return self._refused(request, 421, reason, f"the page is not called '{host}': name it in hmi.allowed_hosts")
+        if request.method not in SAFE and not is_own_origin(request.headers.get(hdrs.ORIGIN), host):
             return self._refused(request, 403, "a command comes from the page itself, not from another site")
-        path = path_in_exhibit(request)
-        is_open = path in OPEN or path.startswith("/static/")
+        is_open = path in OPEN or is_file
         if not is_open and not self._settings.login.anonymous_view and self.session(request) is None:
             return refusal(401, "log in first")
+        return None
+
+    async def _receive(self, request: web.Request) -> web.Response | None:
+        """Wait for the rest of a request; return why it is refused, None when it is not."""
+        length, is_stranger = request.content_length, not self.party(request).has_session
+        if is_stranger and request.can_read_body and (length is None or length > LARGEST_OF_STRANGERS):
+            return refusal(413, f"a request has at most {LARGEST_OF_STRANGERS} bytes, and says how many: log in first")
+        try:
+            async with asyncio.timeout(BODY_S):
+                await request.read()
+        except TimeoutError:
+            return refusal(408, f"a request is sent within {BODY_S:g} s")
+        except web.RequestPayloadError:
+            return refusal(400, "the request is damaged")
         return None
 
     @web.middleware
     async def middleware(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Judge a request, answer it, and put the headers on the answer."""
         answer: web.StreamResponse | None = self._judge(request)
-        if answer is None:
-            try:
-                answer = await handler(request)
-            except web.HTTPException as error:
-                answer = refusal(error.status, error.reason)
+        try:
+            answer = answer or await self._receive(request)
+            if answer is None:
+                is_stream = path_in_exhibit(request) == STREAM
+                has_session = self.party(request).has_session
+                with self._connections.serving(request, is_stream=is_stream, has_session=has_session):
+                    answer = await handler(request)
+        except web.HTTPException as error:
+            answer = refusal(error.status, error.reason)
         if not answer.prepared:
             add_headers(answer)
         return answer

@@ -12,7 +12,7 @@ from coldloop.event_text import EventText, describe, utc_text
 from coldloop.process import OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import Event
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import LadderStatus, Process
+from coldloop.registers.control_plc import LadderStatus, Mode, Process
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
 from coldloop.registers.plant import StationStatus
 from coldloop.registers.safety import Alarm, AlarmKind
@@ -57,6 +57,8 @@ class Source:
     tick: int = -1
     moved: float = 0.0
     """When its tick moved last."""
+    was_silent: bool = False
+    """It has been silent since its process was last read."""
 
 
 class Model:
@@ -103,10 +105,12 @@ class Model:
         if isinstance(record, Identity):
             self._identity(service, record)
         elif isinstance(record, Process):
+            is_after_gap = source.was_silent or self._is_silent(source) or self.stands_still(service)
+            source.was_silent = False
             self._moved(source, record.tick)
             station = self.record("plant", StationStatus)
             values = station_values(station.signals) if station else NO_STATION
-            self.trends.add(record, self.mode, self.bad_sensors, values)
+            self.trends.add(record, self.mode, self.bad_sensors, values, is_after_gap=is_after_gap)
         elif isinstance(record, Prediction):
             self._predicted(record)
 
@@ -158,8 +162,12 @@ class Model:
     def heard(self, service: str) -> None:
         """Note that a service has answered."""
         source = self.sources[service]
+        source.was_silent = source.was_silent or self._is_silent(source)
         source.heard, source.reason = self.now(), ""
         self.on_change()
+
+    def _is_silent(self, source: Source) -> bool:
+        return source.heard is not None and self.now() - source.heard >= STALE_S
 
     def silent(self, service: str, reason: str) -> None:
         """Note that a service does not answer."""
@@ -224,14 +232,24 @@ class Model:
         return self.now() - self.sources[service].moved > patience
 
     def stale_prefixes(self) -> list[str]:
-        """Return what is not current: names of signals and, with a dot at the end, beginnings of names."""
+        """Return what is not current: names of signals and, with a dot at the end, beginnings of names.
+
+        `update` is the newest updating period: it has no say while something else than MPC drives.
+        """
         stale = [f"{service}." for service in MAPS if not self.is_live(service)]
         if self.is_live("control_plc") and self.stands_still("control_plc"):
             stale.append("control_plc.process.")
         if self.is_live("plant") and self.stands_still("plant"):
             stale += ["plant.measurement.", "plant.station."]
+        if self.mode != Mode.MPC and self.record("control_plc", LadderStatus) is not None:
+            stale.append("update")
         bad = [name for i, name in enumerate(OUTPUT_NAMES) if self.bad_sensors >> i & 1]
         return stale + [f"control_plc.process.y.{name}" for name in bad]
+
+    @property
+    def is_planned(self) -> bool:
+        """Whether the newest prediction is played: the optimiser is heard, and its sequence drives the outputs."""
+        return self.mode == Mode.MPC and self.is_live("control_plc") and self.is_live("optimizer_plc")
 
     def alarm_rows(self) -> list[tuple[AlarmKind, Alarm]]:
         """Return the alarms with their kinds."""

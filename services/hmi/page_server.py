@@ -4,19 +4,23 @@ import asyncio
 import ssl
 import time
 from contextlib import suppress
+from functools import partial
 from typing import Final, NamedTuple
 
 from aiohttp import web
 
 from coldloop.errors import ConfigurationError, PortInUseError
+from coldloop.modbus.refusals import RefusalLog
+from coldloop.modbus.tls_listener import TlsListener
 from hmi.audit import Audit
 from hmi.broadcast import Broadcast
 from hmi.commanding import LONGEST_REQUEST, Commanding
+from hmi.connections import Connections
 from hmi.documents import encoded, state_document
 from hmi.guard import Guard
 from hmi.model import Model
 from hmi.operator_desk import OperatorDesk
-from hmi.reading import STATIC, Reading
+from hmi.reading import STATIC, Reading, static_files
 from hmi.settings import HmiSection
 from hmi.users import Users
 
@@ -25,6 +29,10 @@ SHORTEST_S: Final = 0.1
 LONGEST_S: Final = 0.4
 """Without news the stream says that the page lives, and how old everything is."""
 SHUTDOWN_S: Final = 0.5
+WAITING_S: Final = 30.0
+"""A connection without a whole request, or between two, is closed after this time."""
+LINGERING_S: Final = 1.0
+"""How long the rest of a request that was refused is read, so that the refusal arrives."""
 
 
 class Exhibit(NamedTuple):
@@ -51,19 +59,24 @@ class PageServer:
     def __init__(self, settings: HmiSection, *exhibits: Exhibit) -> None:
         self._settings = settings
         self._audit = Audit(settings.audit)
-        self._guard = Guard(settings, self._audit)
         self._users = Users(settings.login.users)
+        self._connections = Connections(settings.connections, time.monotonic)
+        self._guard = Guard(settings, self._audit, self._users, self._connections)
         self._streams: list[tuple[Model, Broadcast, asyncio.Event]] = []
         app = web.Application(middlewares=[self._guard.middleware], client_max_size=LONGEST_REQUEST)
         if len(exhibits) == 1:
             app.add_routes(self._routes(exhibits[0]))
         else:
-            app.add_routes([web.get("/", _side_by_side), web.static("/static", STATIC)])
+            app.add_routes([web.get("/", _side_by_side), *static_files()])
             for number, exhibit in enumerate(exhibits, 1):
                 part = web.Application()
                 part.add_routes(self._routes(exhibit))
                 app.add_subapp(f"/run/{number}/", part)
-        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S)
+        self._runner = web.AppRunner(
+            app, access_log=None, shutdown_timeout=SHUTDOWN_S, keepalive_timeout=WAITING_S,
+            lingering_time=LINGERING_S, auto_decompress=False,
+        )  # fmt: skip
+        self._listener: asyncio.Server | TlsListener | None = None
         self.port = 0
 
     def _routes(self, exhibit: Exhibit) -> list[web.AbstractRouteDef]:
@@ -72,7 +85,7 @@ class PageServer:
         news = asyncio.Event()
         model.on_change = news.set
         self._streams.append((model, broadcast, news))
-        reading = Reading(self._settings, model, broadcast, self._guard, self._users, replay=desk is None)
+        reading = Reading(self._settings, model, broadcast, self._guard, replay=desk is None)
         commanding = Commanding(self._settings, self._guard, self._users, desk, self._audit)
         return [*reading.routes(), *commanding.routes(), *extra]
 
@@ -84,16 +97,29 @@ class PageServer:
             ConfigurationError: The files for HTTPS cannot be used.
         """
         settings = self._settings
+        https = _https(settings)
         await self._runner.setup()
-        site = web.TCPSite(self._runner, settings.host, settings.port, ssl_context=_https(settings))
         try:
-            await site.start()
+            self._listener = await self._listen(https)
         except OSError as error:
             await self._runner.cleanup()
             raise PortInUseError(
                 f"{settings.host}:{settings.port}: {error.strerror}; give another port with hmi.port"
             ) from None
-        self.port = self._runner.addresses[0][1]
+        self.port = self._listener.sockets[0].getsockname()[1]
+
+    async def _listen(self, https: ssl.SSLContext | None) -> asyncio.Server | TlsListener:
+        """Listen; the places of aiohttp take in everybody who comes, so these are our own."""
+        server, host, port = self._runner.server, self._settings.host, self._settings.port
+        if server is None:
+            raise RuntimeError("the runner is not set up")
+        newcomer = partial(self._connections.newcomer, server)
+        if https is None:
+            return await asyncio.get_running_loop().create_server(newcomer, host, port)
+        refusals = RefusalLog("hmi")
+        return await TlsListener.at(
+            host, port, https, make_protocol=newcomer, limit=self._settings.connections, refusals=refusals
+        )
 
     @property
     def address(self) -> str:
@@ -110,7 +136,10 @@ class PageServer:
 
     async def close(self) -> None:
         """End all streams and stop listening."""
+        if self._listener is not None:
+            self._listener.close()
         await self._runner.cleanup()
+        self._audit.close()
 
 
 async def _send_changes(model: Model, broadcast: Broadcast, news: asyncio.Event) -> None:

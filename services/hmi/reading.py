@@ -3,7 +3,10 @@
 import asyncio
 import csv
 import io
+import time
 from collections.abc import Mapping
+from contextlib import AbstractAsyncContextManager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -23,18 +26,23 @@ from hmi.documents import (
     trend_document,
 )
 from hmi.guard import Guard, add_headers, refusal
+from hmi.long_reads import LongReads
 from hmi.model import Model, Told
 from hmi.page_metrics import page_families
 from hmi.settings import HmiSection
 from hmi.trends import NAMES
-from hmi.users import Users
 
 STATIC: Final = Path(__file__).parent / "static"
 POINTS: Final = 800
 MOST_POINTS: Final = 4000
+MOST_NAMES: Final = 16
+"""Signals of one trend."""
+ROWS_AT_ONCE: Final = 500
+"""Rows of a table that are made and sent at a time."""
 WINDOW_S: Final = 300.0
 EVENTS_SHOWN: Final = 500
 CACHED: Final = 16
+LONGEST_NAME: Final = 60
 STALLED_S: Final = 20.0
 """A browser that takes nothing for so long loses its stream, so that another one can look."""
 
@@ -47,18 +55,15 @@ class Reading:
         model: What is shown.
         broadcast: The stream of changes.
         guard: Knows who is asking.
-        users: Who may log in, for `/metrics`.
         replay: The model shows a recorded run.
     """
 
-    def __init__(
-        self, settings: HmiSection, model: Model, broadcast: Broadcast, guard: Guard, users: Users, *, replay: bool
-    ) -> None:
+    def __init__(self, settings: HmiSection, model: Model, broadcast: Broadcast, guard: Guard, *, replay: bool) -> None:
         self._settings = settings
         self._model = model
         self._broadcast = broadcast
         self._guard = guard
-        self._users = users
+        self._long_reads = LongReads(time.monotonic)
         self._catalog = encoded(catalog(training=settings.training and not replay, replay=replay))
         self._trends: dict[tuple[object, ...], bytes] = {}
 
@@ -66,10 +71,10 @@ class Reading:
         """Return what is served."""
         return [
             web.get("/", self.page),
-            web.static("/static", STATIC),
+            *static_files(),
             web.get("/api/catalog", self.catalog),
             web.get("/api/state", self.state),
-            web.get("/api/stream", self.stream),
+            web.get("/api/stream", self.stream, allow_head=False),
             web.get("/api/trend", self.trend),
             web.get("/api/trend.csv", self.trend_table),
             web.get("/api/explanation", self.explanation),
@@ -94,13 +99,14 @@ class Reading:
 
     async def stream(self, request: web.Request) -> web.StreamResponse:
         """Answer with the state and its changes, as server-sent events, until the browser goes or its session ends."""
-        if self._broadcast.is_full:
+        stream = self._broadcast.begin(self._guard.party(request))
+        if stream is None:
             return refusal(503, f"{len(self._broadcast)} browsers look already: close some, or raise hmi.browsers")
         answer = web.StreamResponse(headers={hdrs.CONTENT_TYPE: "text/event-stream"})
         add_headers(answer)
-        await answer.prepare(request)
         try:
-            async for message in self._broadcast.messages():
+            await answer.prepare(request)
+            async for message in self._broadcast.messages(stream):
                 if not self._settings.login.anonymous_view and self._guard.session(request) is None:
                     break
                 async with asyncio.timeout(STALLED_S):
@@ -115,10 +121,12 @@ class Reading:
         Raises:
             HTTPBadRequest: They are not numbers, or there is no such signal.
         """
-        names = [name for name in query.get("names", "").split(",") if name] or ["L1", "T5", "load"]
+        names = list(dict.fromkeys(name for name in query.get("names", "").split(",") if name)) or ["L1", "T5", "load"]
         unknown = [name for name in names if name not in NAMES]
         if unknown:
-            raise web.HTTPBadRequest(reason=f"no trend is called {unknown[0]}")
+            raise web.HTTPBadRequest(reason=f"no trend is called {printable(unknown[0])}")
+        if len(names) > MOST_NAMES:
+            raise web.HTTPBadRequest(reason=f"a trend has at most {MOST_NAMES} signals, not {len(names)}")
         try:
             seconds = min(float(query.get("seconds", WINDOW_S)), self._settings.kept_s)
             end = round(float(query["end"]) / TICK_S) if "end" in query else self._model.tick
@@ -132,23 +140,43 @@ class Reading:
         names, start, end, points = self._window(request.query)
         key = (*names, start, end, points, len(self._model.updates), self._model.events_told)
         if key not in self._trends:
+            async with self._turn(request):
+                document = encoded(trend_document(self._model, names, start, end, points))
             while len(self._trends) >= CACHED:
                 self._trends.pop(next(iter(self._trends)))
-            self._trends[key] = encoded(trend_document(self._model, names, start, end, points))
+            self._trends[key] = document
         return json_answer(self._trends[key])
 
-    async def trend_table(self, request: web.Request) -> web.Response:
-        """Answer with every sample of a window as CSV."""
+    def _turn(self, request: web.Request) -> AbstractAsyncContextManager[None]:
+        return self._long_reads.turn(has_session=self._guard.party(request).has_session)
+
+    async def trend_table(self, request: web.Request) -> web.StreamResponse:
+        """Answer with every sample of a window as CSV, some rows at a time."""
         names, start, end, _ = self._window(request.query)
-        rows = self._model.trends.between(start, end)
-        columns = [self._model.trends.column(name, rows) for name in names]
+        answer = web.StreamResponse(headers=csv_headers("coldloop-trend.csv"))
+        add_headers(answer)
+        await answer.prepare(request)
+        await answer.write(",".join(["time_s", *names, "substituted"]).encode() + b"\n")
+        with suppress(ConnectionError, TimeoutError):  # nobody takes the rest
+            while start <= end:
+                async with self._turn(request):
+                    rows, start = self._trend_rows(names, start, end)
+                async with asyncio.timeout(STALLED_S):
+                    await answer.write(rows)
+        return answer
+
+    def _trend_rows(self, names: list[str], start: int, end: int) -> tuple[bytes, int]:
+        """Return some rows from tick `start` on, and the tick that the next ones begin with: after `end` at the end."""
+        trends = self._model.trends
+        rows = trends.between(start, end)
+        following = end + 1 if len(rows) <= ROWS_AT_ONCE else trends.ticks[rows[ROWS_AT_ONCE]]
+        rows = rows[:ROWS_AT_ONCE]
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(["time_s", *names, "substituted"])
-        for row, *values in zip(rows, *columns, strict=True):
-            bad = " ".join(name for name in self._model.trends.substituted_at(row) if name in names)
-            writer.writerow([self._model.trends.ticks[row] * TICK_S, *(f"{value:.7g}" for value in values), bad])
-        return csv_answer(text.getvalue(), "coldloop-trend.csv")
+        for row, *values in zip(rows, *(trends.column(name, rows) for name in names), strict=True):
+            bad = " ".join(name for name in trends.substituted_at(row) if name in names)
+            writer.writerow([trends.ticks[row] * TICK_S, *(f"{value:.7g}" for value in values), bad])
+        return text.getvalue().encode(), following
 
     async def explanation(self, request: web.Request) -> web.Response:
         """Answer with why an updating period is as long as it is."""
@@ -159,7 +187,8 @@ class Reading:
         except (ValueError, OverflowError):
             raise web.HTTPBadRequest(reason="update and at are numbers") from None
         if document is None:
-            return refusal(404, f"update {number or at or '(the last one)'} is not known: only the newest are kept")
+            wanted = printable(number or at) or "(the last one)"
+            return refusal(404, f"update {wanted} is not known: only the newest are kept")
         return json_answer(encoded(document))
 
     async def alarms(self, _request: web.Request) -> web.Response:
@@ -178,14 +207,17 @@ class Reading:
 
     async def events(self, request: web.Request) -> web.Response:
         """Answer with the newest events that a search finds."""
-        found = self._events(request.query)
-        return json_answer(
-            encoded({"found": len(found), "events": [event_document(told) for told in found[:EVENTS_SHOWN]]})
-        )
+        async with self._turn(request):
+            found = self._events(request.query)
+            document = encoded({"found": len(found), "events": [event_document(told) for told in found[:EVENTS_SHOWN]]})
+        return json_answer(document)
 
     async def events_table(self, request: web.Request) -> web.Response:
         """Answer with all events that a search finds as CSV."""
-        found = self._events(request.query)
+        async with self._turn(request):
+            return self._events_as_table(self._events(request.query))
+
+    def _events_as_table(self, found: list[Told]) -> web.Response:
         text = io.StringIO()
         names = (
             "service",
@@ -206,7 +238,7 @@ class Reading:
         for told in found:
             row = event_document(told)
             writer.writerow({name: safe_cell(row[name]) for name in names})
-        return csv_answer(text.getvalue(), "coldloop-events.csv")
+        return web.Response(body=text.getvalue().encode(), headers=csv_headers("coldloop-events.csv"))
 
     async def health(self, _request: web.Request) -> web.Response:
         """Answer 200 while all services answer, 503 otherwise."""
@@ -221,13 +253,11 @@ class Reading:
                 auth = BasicAuth.decode(request.headers.get(hdrs.AUTHORIZATION, ""))
             except ValueError:
                 auth = None
-            address = request.remote or ""
-            if auth is None or not self._guard.logins.allows(address):
+            if auth is None:
                 return refusal(401, "log in first, or send name and password (basic)")
-            if await asyncio.to_thread(self._users.check, auth.login, auth.password) is None:
-                self._guard.refuse_login(auth.login, address)
-                return refusal(401, "wrong name or password")
-            self._guard.logins.give_back(address)
+            user = await self._guard.log_in(auth.login, auth.password, request.remote or "")
+            if isinstance(user, web.Response):
+                return user
         text = exposition(page_families(self._model, len(self._broadcast)))
         return web.Response(body=text.encode(), headers={hdrs.CONTENT_TYPE: CONTENT_TYPE})
 
@@ -254,7 +284,27 @@ def json_answer(body: bytes) -> web.Response:
     return web.Response(body=body, content_type="application/json", charset="utf-8")
 
 
-def csv_answer(text: str, name: str) -> web.Response:
-    """Return a file of comma-separated values."""
-    disposition = {hdrs.CONTENT_DISPOSITION: f'attachment; filename="{name}"'}
-    return web.Response(text=text, content_type="text/csv", headers=disposition)
+def csv_headers(name: str) -> dict[str, str]:
+    """Return the headers of a file of comma-separated values."""
+    return {
+        hdrs.CONTENT_TYPE: "text/csv; charset=utf-8",
+        hdrs.CONTENT_DISPOSITION: f'attachment; filename="{name}"',
+    }
+
+
+def printable(text: str) -> str:
+    """Return what somebody asked for as a message names it: short, and on one line."""
+    return "".join(one if one.isprintable() else "?" for one in text[:LONGEST_NAME])
+
+
+def static_files() -> list[web.RouteDef]:
+    """Return a route for each file of the page: no other name is ever looked for."""
+    return [
+        web.get(f"/static/{file.relative_to(STATIC).as_posix()}", partial(_file, file))
+        for file in sorted(STATIC.rglob("*"))
+        if file.is_file()
+    ]
+
+
+async def _file(file: Path, _request: web.Request) -> web.StreamResponse:
+    return web.FileResponse(file)

@@ -15,6 +15,7 @@ from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Process
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
 from coldloop.registers.plant import LoadStatus, StationSample, StationStatus
+from coldloop.registers.safety import Alarm
 from hmi.guard import refusal
 from hmi.model import Model, Told
 from hmi.page_server import Exhibit, PageServer
@@ -33,6 +34,8 @@ class Frame(NamedTuple):
     process: Process
     mode: int
     cause: int
+    since: int
+    """Tick at which the mode began."""
     bad_sensors: int = 0
     """A bit for each output that the control PLC substituted. The process has the true value."""
     station: StationSample | None = None
@@ -78,6 +81,9 @@ class RecordedRun(Protocol):
     def frame(self, tick: int) -> Frame:
         """Return one tick."""
 
+    def alarms(self, events: Sequence[Told]) -> list[Alarm]:
+        """Return the alarms after these events, by number."""
+
 
 class Wish(BaseModel):
     """What a browser asks of a replay."""
@@ -106,7 +112,7 @@ class Replay:
         self._speed = 20.0
         self._tick = -1
         self._begin()
-        self._go_to(min(run.ticks - 1, round(600 / TICK_S)))
+        self._go_to(0)
 
     def routes(self) -> tuple[web.AbstractRouteDef, ...]:
         """Return what is served."""
@@ -189,10 +195,11 @@ class Replay:
         model.put_updates(updates[first:last])
         first, last = (bisect_right(events, one, key=lambda told: told.tick) for one in (before, tick))
         model.put_events(events[first:last])
+        model.put_alarms(run.alarms(events[:last]))
 
     def _put(self, frame: Frame) -> None:
         model, process = self._model, frame.process
-        model.put("control_plc", LadderStatus(frame.mode, frame.cause, 0, 1, frame.bad_sensors, 0))
+        model.put("control_plc", LadderStatus(frame.mode, frame.cause, frame.since, 1, frame.bad_sensors, 0))
         model.put("control_plc", process)
         model.put("plant", LoadStatus(watts=process.load))
         if frame.station is not None:  # what its controller asked for is not recorded

@@ -81,7 +81,9 @@ class HmiSection(BaseModel):
         poll_s: Time between two looks at the process.
         kept_s: How much of the trends is kept, s of plant time.
         training: Offer the sensor faults of the plant as a panel.
-        browsers: Most streams to browsers at a time.
+        browsers: Most streams to browsers at a time; a user who has logged in takes the place of a stranger.
+        connections: Most connections at a time; one that waits gives way to a new one. With all else that is open,
+            fewer than the system's limit of open files.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -101,6 +103,7 @@ class HmiSection(BaseModel):
     kept_s: Annotated[float, Field(ge=300, le=86_400)] = 7200.0
     training: bool = False
     browsers: Annotated[int, Field(ge=1, le=1000)] = 64
+    connections: Annotated[int, Field(ge=16, le=10_000)] = 400
 
     @property
     def is_local(self) -> bool:

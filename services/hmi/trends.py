@@ -3,7 +3,8 @@
 import math
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
@@ -35,6 +36,17 @@ class Substitution(NamedTuple):
     end: float
 
 
+class Gap(NamedTuple):
+    """A stretch in which nothing was read: the ticks of the samples before and after it."""
+
+    start: int
+    end: int
+
+
+Columns = dict[str, list[float | None]]
+"""Values by signal; None where nothing was read."""
+
+
 class TrendStore:
     """Samples of the process in the order of their ticks, at most `kept_s` of plant time of them."""
 
@@ -44,6 +56,7 @@ class TrendStore:
         self._columns: dict[str, array[float]] = {name: array("f") for name in NAMES}
         self._bad = array("L")
         """Sensors whose value is substituted, a bit for each output."""
+        self._gaps: list[Gap] = []
 
     def __len__(self) -> int:
         return len(self.ticks)
@@ -55,14 +68,27 @@ class TrendStore:
 
     def clear(self) -> None:
         """Forget everything."""
-        del self.ticks[:], self._bad[:]
+        del self.ticks[:], self._bad[:], self._gaps[:]
         for column in self._columns.values():
             del column[:]
 
-    def add(self, process: Process, mode: int, bad_sensors: int = 0, station: tuple[float, ...] = NO_STATION) -> None:
-        """Add a sample; one that is not newer than the last one is left out."""
+    def add(
+        self, process: Process, mode: int, bad_sensors: int = 0, station: tuple[float, ...] = NO_STATION, *,
+        is_after_gap: bool = False,
+    ) -> None:  # fmt: skip
+        """Add a sample; one that is not newer than the last one is left out.
+
+        Args:
+            process: The sample.
+            mode: Of the fail-safe ladder.
+            bad_sensors: A bit for each output whose value is substituted.
+            station: Values of the signals of `STATION_NAMES`.
+            is_after_gap: Between the last sample and this one nothing could be read.
+        """
         if process.tick <= self.last_tick:
             return
+        if is_after_gap and process.tick - self.last_tick > 1 and self.ticks:
+            self._gaps.append(Gap(self.last_tick, process.tick))
         self.ticks.append(process.tick)
         self._bad.append(bad_sensors)
         values = (process.load, *process.u, *process.y, float(mode), *station)
@@ -78,6 +104,7 @@ class TrendStore:
             del self.ticks[:drop], self._bad[:drop]
             for column in self._columns.values():
                 del column[:drop]
+            self._gaps = [gap for gap in self._gaps if gap.start >= self.ticks[0]]
 
     def between(self, start: int, end: int) -> range:
         """Return the rows from tick `start` to tick `end`."""
@@ -87,28 +114,33 @@ class TrendStore:
         """Return values of a column."""
         return self._columns[name][rows.start : rows.stop]
 
-    def thinned(
-        self, names: Sequence[str], start: int, end: int, points: int
-    ) -> tuple[list[float], dict[str, list[float]]]:
+    def gaps(self, start: int, end: int) -> list[Gap]:
+        """Return the stretches in which nothing was read that reach into those from tick `start` to `end`."""
+        return [gap for gap in self._gaps if gap.end > start and gap.start < end]
+
+    def thinned(self, names: Sequence[str], start: int, end: int, points: int) -> tuple[list[float], Columns]:
         """Return times (s) and columns from tick `start` to `end`, of about `points` points.
 
-        A longer stretch is reduced to the least and the largest value of each of `points / 2` intervals.
+        A longer stretch is reduced to the least and the largest value of each of `points / 2` intervals. Where a gap
+        begins all columns have None.
         """
         rows = self.between(start, end)
         times = [tick * TICK_S for tick in self.ticks[rows.start : rows.stop]]
         columns = {name: self.column(name, rows) for name in names}
-        return thin(times, columns, points)
+        edges = [gap.end * TICK_S for gap in self.gaps(start, end)]
+        return thin(times, columns, points, edges)
 
     def modes(self, start: int, end: int) -> list[Stretch]:
         """Return the modes between two ticks, stretch by stretch."""
         rows = self.between(start, end)
+        after_gap = {gap.end * TICK_S for gap in self.gaps(start, end)}
         found: list[Stretch] = []
         for tick, value in zip(self.ticks[rows.start : rows.stop], self.column("mode", rows), strict=True):
             time, mode = tick * TICK_S, int(value)
-            if found and found[-1].mode == mode:
+            if found and found[-1].mode == mode and time not in after_gap:
                 found[-1] = found[-1]._replace(end=time)
             else:
-                if found:
+                if found and time not in after_gap:
                     found[-1] = found[-1]._replace(end=time)
                 found.append(Stretch(time, time, mode))
         return found
@@ -120,7 +152,8 @@ class TrendStore:
         if not any(bad):
             return {}
         times = [tick * TICK_S for tick in self.ticks[rows.start : rows.stop]]
-        found = {name: list(_stretches(times, bad, 1 << bit)) for bit, name in enumerate(OUTPUT_NAMES)}
+        after_gap = {gap.end * TICK_S for gap in self.gaps(start, end)}
+        found = {name: list(_stretches(times, bad, 1 << bit, after_gap)) for bit, name in enumerate(OUTPUT_NAMES)}
         return {name: stretches for name, stretches in found.items() if stretches}
 
     def substituted_at(self, row: int) -> list[str]:
@@ -129,17 +162,20 @@ class TrendStore:
         return [name for bit, name in enumerate(OUTPUT_NAMES) if bad >> bit & 1]
 
 
-def _stretches(times: Sequence[float], bad: Sequence[int], mask: int) -> Iterator[Substitution]:
-    """Yield the stretches in which a bit is set; each lasts until the first sample in which it is not."""
-    start: float | None = None
+def _stretches(
+    times: Sequence[float], bad: Sequence[int], mask: int, after_gap: Container[float]
+) -> Iterator[Substitution]:
+    """Yield the stretches in which a bit is set; each lasts until the first sample in which it is not, or a gap."""
+    start, last = None, 0.0
     for time, bits in zip(times, bad, strict=True):
-        if bits & mask:
-            start = time if start is None else start
-        elif start is not None:
-            yield Substitution(start, time)
+        if start is not None and (time in after_gap or not bits & mask):
+            yield Substitution(start, last + TICK_S if time in after_gap else time)
             start = None
+        if bits & mask and start is None:
+            start = time
+        last = time
     if start is not None:
-        yield Substitution(start, times[-1] + TICK_S)
+        yield Substitution(start, last + TICK_S)
 
 
 def station_values(signals: Sequence[float]) -> tuple[float, ...]:
@@ -148,9 +184,33 @@ def station_values(signals: Sequence[float]) -> tuple[float, ...]:
 
 
 def thin(
+    times: Sequence[float], columns: Mapping[str, Sequence[float]], points: int, edges: Sequence[float] = ()
+) -> tuple[list[float], Columns]:
+    """Reduce columns to the least and the largest value of each of `points / 2` intervals, if they are longer.
+
+    No interval reaches across one of the times `edges`, in order, that end a gap; where one begins there is None.
+    """
+    cuts = [0, *(bisect_left(times, edge) for edge in edges), len(times)]
+    found: list[float] = []
+    reduced: Columns = {name: [] for name in columns}
+    for first, end in pairwise(cuts):
+        if first == end:
+            continue
+        if found:
+            found.append(found[-1] + TICK_S)
+            for values in reduced.values():
+                values.append(None)
+        share = max(2, points * (end - first) // len(times))
+        piece_times, piece = _thin_piece(times[first:end], {n: c[first:end] for n, c in columns.items()}, share)
+        found += piece_times
+        for name in reduced:
+            reduced[name] += piece[name]
+    return found, reduced
+
+
+def _thin_piece(
     times: Sequence[float], columns: Mapping[str, Sequence[float]], points: int
 ) -> tuple[list[float], dict[str, list[float]]]:
-    """Reduce columns to the least and the largest value of each of `points / 2` intervals, if they are longer."""
     count = len(times)
     if count <= points:
         return list(times), {name: [rounded(value) for value in column] for name, column in columns.items()}

@@ -43,7 +43,7 @@ def alpha_of(penalties: PenaltySettings, design: ControlDesign) -> float:
 
 
 class Preset(StrEnum):
-    """Sets of settings by name; what is set explicitly comes before the preset's."""
+    """Sets of settings by name; what is set explicitly in the same place comes before the preset's."""
 
     TUNED = "tuned"
     """The defaults: as good as this project knows how to make the truncated solver."""
@@ -60,6 +60,12 @@ PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
     },
 }
 """Settings of each preset by section of `optimizer_plc.program`."""
+OF_PRESETS: Final = tuple(
+    f"{section}.{key}" for section, values in PRESETS[Preset.AS_PRINTED].items() for key in values
+)
+"""Keys of `optimizer_plc.program` that a preset decides."""
+OF_ALPHA: Final = ("penalties.output_rows", "design.violation_weight")
+"""Keys that decide alpha: see `alpha_of`."""
 
 
 def completed(section: BaseModel, values: Mapping[str, Any]) -> BaseModel:

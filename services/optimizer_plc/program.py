@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.first_use import kernels_of
 from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
@@ -26,6 +27,7 @@ from coldloop.sequence import InputSequence, with_checksum
 from optimizer_plc import scheme
 from optimizer_plc.arithmetic import real_of
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
+from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import estimator_of
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, Situation
@@ -40,23 +42,28 @@ LONGEST_GAP_TICKS: Final = 4 * SEQUENCE_ROWS
 """After a longer time without an update nothing is predicted from the last one."""
 
 
+def _described(settings: ProgramSettings) -> str:
+    return f"the {settings.solver} solver{' in single precision' * (settings.arithmetic is Arithmetic.FLOAT32)}"
+
+
 class OptimizerProgram:
     """Estimator, problem, solver and updating rule, put together."""
 
     def __init__(self, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
-        self.settings = settings
-        self.model_digest = model.short_digest
-        self._real = real_of(settings.arithmetic)
-        prediction = PredictionModel(model)
-        self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
-        self.solver = make_solver(settings)
-        self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
-        self.state = empty_memory(prediction.n_states, self.problem.size, self._real)
-        estimator = estimator_of(prediction, settings.estimator, self._real)
-        at_rest = self.problem.at(Situation(self.state.belief.x, self._real(0.0), self.state.u))
-        self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
-        self.constants = scheme.constants_of(estimator, self.problem, self.solver.alpha, settings, self.budget)
-        self._compile_kernels(model)
+        with kernels_of(_described(settings), about_s=15):
+            self.settings = settings
+            self.model_digest = model.short_digest
+            self._real = real_of(settings.arithmetic)
+            prediction = PredictionModel(model)
+            self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
+            self.solver = make_solver(settings)
+            self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
+            self.state = empty_memory(prediction.n_states, self.problem.size, self._real)
+            estimator = estimator_of(prediction, settings.estimator, self._real)
+            at_rest = self.problem.at(Situation(self.state.belief.x, self._real(0.0), self.state.u))
+            self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
+            self.constants = scheme.constants_of(estimator, self.problem, self.solver.alpha, settings, self.budget)
+            self._compile_kernels(model)
         self.restart(settings.updating_period_s)
 
     def _compile_kernels(self, model: LtiModel) -> None:

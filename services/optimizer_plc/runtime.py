@@ -12,7 +12,14 @@ from typing import Final, NamedTuple
 
 from coldloop import __version__
 from coldloop.config import selected
-from coldloop.errors import ColdloopError, ConfigurationError, LinkError, ModelFileError
+from coldloop.errors import (
+    ColdloopError,
+    ConfigurationError,
+    LinkError,
+    ModelFileError,
+    RequestRefusedError,
+    UnfitValueError,
+)
 from coldloop.lti_model import load
 from coldloop.metrics_server import MetricsServer
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
@@ -22,6 +29,7 @@ from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import AwaitUpdate, Update, Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState
 from coldloop.sequence import InputSequence
+from coldloop.service import SERVING
 from coldloop.session import TimeMode
 from coldloop.telemetry import Telemetry
 from optimizer_plc.control_client import ControlClient
@@ -120,6 +128,8 @@ class OptimizerPlc:
         state, reason = self._link.state, str(error)
         if state is not ControlLinkState.FOREIGN:  # its connection may stay: nothing is wrong with it
             self._control.close()
+        if isinstance(error, (RequestRefusedError, UnfitValueError)):
+            self._session = 0  # what it goes on from leads to what is refused: begin the session anew
         if state is not ControlLinkState.SEARCHING:  # others may have had the lease meanwhile
             self._wanted, self._kept = FRESH_UPDATE, None
         else:
@@ -259,7 +269,7 @@ async def serve(settings: OptimizerSettings) -> None:
         shown.bank, settings=settings.optimizer_plc.server, on_write=shown.on_write, identity=identity
     )
     await server.start()
-    log.info("serving", extra={"host": settings.optimizer_plc.server.host, "port": server.port})
+    log.info(SERVING, extra={"host": settings.optimizer_plc.server.host, "port": server.port})
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(MetricsServer(settings.optimizer_plc.metrics, shown.bank).run(), name="metrics")

@@ -1,7 +1,8 @@
 """Configuration of the optimiser PLC, checked when it is made and immutable after."""
 
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated, Final, Self
+from typing import Annotated, ClassVar, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -28,7 +29,7 @@ from optimizer_plc.computing_settings import (
     QpoasesSettings,
 )
 from optimizer_plc.design import ControlDesign
-from optimizer_plc.penalties import PRESETS, PenaltySettings, Preset, alpha_of, completed
+from optimizer_plc.penalties import OF_ALPHA, OF_PRESETS, PRESETS, PenaltySettings, Preset, alpha_of, completed
 
 SHOWN: Final = ("limits", "optimizer_plc.program")
 """What of the configuration decides results: shown in the registers."""
@@ -103,6 +104,17 @@ class AdaptiveSettings(BaseModel):
         return self
 
 
+ALPHAS: Final = (
+    "ode.alpha",
+    "qpoases.alpha",
+    "osqp.alpha",
+    "fast_gradient.alpha",
+    "interior_point.alpha",
+    "daqp.alpha",
+)
+"""The weight of broken constraints, by solver: keys of `optimizer_plc.program` that follow from the penalties."""
+
+
 class ProgramSettings(BaseModel):
     """What the optimiser's program is to do."""
 
@@ -133,6 +145,12 @@ class ProgramSettings(BaseModel):
     hybrid: HybridSettings = HybridSettings()
     daqp: DaqpSettings = DaqpSettings()
 
+    decides: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "preset": (*OF_PRESETS, *ALPHAS),
+        **dict.fromkeys(OF_ALPHA, ALPHAS),
+    }
+    """What follows from other settings, for `coldloop.config`."""
+
     @field_validator("updating_period_s")
     @classmethod
     def _whole_ticks(cls, value: float) -> float:
@@ -146,9 +164,9 @@ class ProgramSettings(BaseModel):
         for name, values in PRESETS[self.preset].items():
             self.__dict__[name] = completed(getattr(self, name), values)  # before anybody sees it: it is frozen then
         alpha = alpha_of(self.penalties, self.design)
-        for name in type(self).model_fields:
-            if "alpha" in getattr(type(getattr(self, name)), "model_fields", ()):
-                self.__dict__[name] = completed(getattr(self, name), {"alpha": alpha})
+        for key in ALPHAS:
+            name = key.partition(".")[0]
+            self.__dict__[name] = completed(getattr(self, name), {"alpha": alpha})
         return self
 
     @model_validator(mode="after")

@@ -4,6 +4,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import ConfigurationError, ModelFileError
+from coldloop.first_use import kernels_of
 from coldloop.model_file import COLD_BOX, ModelHeader
 from plant.cold_box import REFERENCE, ColdBox
 from plant.components.valve import Valve
@@ -52,7 +53,8 @@ def make_program(
     mismatch: MismatchSettings = NO_MISMATCH,
 ) -> PlantProgram:
     """Return the cold box at the operating point of its model file."""
-    return PlantProgram(box=_box(mismatch), x0=header.x0, u0=header.u0, load=load, noise=_noise(sensors, seed))
+    with kernels_of("the cold box", about_s=10):
+        return PlantProgram(box=_box(mismatch), x0=header.x0, u0=header.u0, load=load, noise=_noise(sensors, seed))
 
 
 def _box(mismatch: MismatchSettings) -> ColdBox:
@@ -76,14 +78,15 @@ def _make_refrigerator(
     from plant.refrigerator_program import RefrigeratorProgram  # noqa: PLC0415
 
     happening = section.refrigerator
-    return RefrigeratorProgram(
-        file=file,
-        u0=header.u0,
-        load=load,
-        station=section.station,
-        events=EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k),
-        noise=_noise(section.sensors, seed),
-    )
+    with kernels_of("the refrigerator", about_s=20):
+        return RefrigeratorProgram(
+            file=file,
+            u0=header.u0,
+            load=load,
+            station=section.station,
+            events=EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k),
+            noise=_noise(section.sensors, seed),
+        )
 
 
 def _noise(sensors: SensorSettings, seed: int) -> MeasurementNoise | None:

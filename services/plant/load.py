@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.errors import LoadFileError
-from coldloop.process import TICK_S
+from coldloop.process import LAST_TICK, TICK_S
 from coldloop.registers.plant import MAX_LOAD_W, LoadStep
 from plant.program import LoadProfile
 
-MAX_TICK: Final = 2**32
 HOUR_TICKS: Final = int(3600 / TICK_S)
 
 
@@ -157,8 +156,8 @@ def read_load_file(path: Path) -> LoadProfile:
 def _step(row: dict[str, str | None], before: list[LoadStep], where: str) -> LoadStep:
     """Return the step that a line tells, if it may follow those before."""
     time, load = (_number(row[column], f"{where}, {column}") for column in ("time_s", "load_w"))
-    if not 0 <= time < MAX_TICK * TICK_S:
-        raise LoadFileError(f"{where}: {time:g} s is outside 0 to {MAX_TICK * TICK_S:g} s")
+    if not 0 <= time < LAST_TICK * TICK_S:
+        raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * TICK_S:g} s")
     if not 0 <= load <= MAX_LOAD_W:
         raise LoadFileError(f"{where}: {load:g} W is outside 0 to {MAX_LOAD_W:g} W; loads are heat into the bath")
     tick = round(time / TICK_S)

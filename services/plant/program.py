@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process import INPUT_NAMES, LAST_TICK, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.plant import StationSample, StationStatus, Surroundings
 from plant.cold_box import ColdBox, outputs
 from plant.helium.properties import load_helium
@@ -29,7 +29,8 @@ class LoadProfile:
     """The heat load over time, in steps that are held.
 
     Raises:
-        ValueError: times do not start at 0 or do not increase, lengths differ, or a load is negative or not finite.
+        ValueError: times do not start at 0, do not increase or are after the last tick of a session, lengths differ, or
+            a load is negative or not finite.
     """
 
     times: tuple[int, ...]
@@ -42,6 +43,8 @@ class LoadProfile:
             raise ValueError("a load profile needs a load for each time, the first at tick 0")
         if any(later <= earlier for earlier, later in zip(self.times, self.times[1:], strict=False)):
             raise ValueError("the times of a load profile must increase")
+        if self.times[-1] > LAST_TICK:
+            raise ValueError(f"tick {self.times[-1]} is after the last one of a session, {LAST_TICK}")
         if not all(0.0 <= load < inf for load in self.watts):
             raise ValueError("loads are finite and not negative")
 

@@ -4,12 +4,13 @@ In lock-step, outputs that are taken make the plant due for one tick. In real ti
 whatever the control PLC does.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from coldloop.journal import Journal
 from coldloop.pace import Pace
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
+from coldloop.process import INPUT_NAMES, LAST_TICK, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import pace_subject
@@ -39,6 +40,8 @@ from plant.settings import SafeAction, WatchdogSettings
 MakePlant = Callable[[HeatLoad, int], PlantProgram]
 """Returns the plant at tick 0, for a load and a seed of the sensors' noise."""
 
+APPLIED: Final = (OutputVerdict.TAKEN, OutputVerdict.LIMITED)
+"""Verdicts on outputs that move the plant."""
 UNWATCHED_SILENCE_S: Final = 10.0
 """Real time after which a silent client loses its lease when the watchdog is off."""
 
@@ -62,6 +65,7 @@ class Rack:
         make_plant: Makes the simulation of a session.
         session: The one to begin with.
         journal: Takes the events.
+        rate: Largest change of the outputs in one tick; None does not limit.
         generation: Number of the first generation of outputs.
     """
 
@@ -73,14 +77,16 @@ class Rack:
         session: Session,
         *,
         journal: Journal,
+        rate: Inputs | None = None,
         generation: int = 1,
     ) -> None:
+        self._rate = rate
         self._safety = watchdog
         self._u0 = u0
         self._make_plant = make_plant
         self.journal = journal
         self.watchdog = Watchdog(watchdog.ticks)
-        self.outputs = AppliedOutputs(u0, generation=generation)
+        self.outputs = AppliedOutputs(u0, rate=rate, generation=generation)
         self._set_up(session)
 
     def _set_up(self, session: Session) -> None:
@@ -98,6 +104,11 @@ class Rack:
     def tick(self) -> int:
         """The present tick."""
         return self._program.tick
+
+    @property
+    def has_ended(self) -> bool:
+        """The session has reached its last tick: the plant moves again in another one."""
+        return self.tick >= LAST_TICK
 
     @property
     def station(self) -> StationSample | None:
@@ -126,10 +137,12 @@ class Rack:
         """Go on where a session was when the rack was ended; a new generation of outputs begins.
 
         Raises:
-            KeyError, TypeError, ValueError: It is not the state of such a plant; nothing has changed.
+            ArithmeticError, AttributeError, LookupError, TypeError, ValueError: It is not the state of such a plant, or
+                one from which no plant goes on; nothing has changed.
         """
         load = LoadProfile(state.times, state.watts)
         schedule = LoadSchedule(load)
+        _try_a_tick(self._make_plant(schedule, state.seed), state)
         program = self._make_plant(schedule, state.seed)
         program.resume(**state.program)
         cv155, ncr22, cv156 = state.program["u"]
@@ -137,9 +150,9 @@ class Rack:
         self._program, self.load = program, schedule
         self.watchdog.set(state.watchdog, program.tick)
         self.outputs = AppliedOutputs(
-            (cv155, ncr22, cv156), holder=state.holder, generation=next_generation(state.generation)
+            (cv155, ncr22, cv156), rate=self._rate, holder=state.holder, generation=next_generation(state.generation)
         )
-        self.moving = state.pace.realtime and program.tick > 0
+        self.moving = state.pace.realtime and program.tick > 0 and not self.has_ended
 
     def retained(self) -> RetainedState:
         """Return what `resume` needs."""
@@ -154,11 +167,12 @@ class Rack:
     # -- outputs -------------------------------------------------------------------------------------------------------
 
     def offer(self, asked: Actuators, caller: Caller) -> OutputVerdict:
-        """Judge outputs, and apply them from the present tick on if they are taken."""
+        """Judge outputs, and apply them from the present tick on if they are taken: at the last one none are."""
         verdict = self.outputs.offer(
-            asked, caller, session=self.session.number, tick=self.tick, realtime=self.session.pace.realtime
-        )
-        if verdict is OutputVerdict.TAKEN:
+            asked, caller, session=self.session.number, tick=self.tick, realtime=self.session.pace.realtime,
+            ended=self.has_ended,
+        )  # fmt: skip
+        if verdict in APPLIED:
             self._program.apply(self.outputs.u)
             self.watchdog.trigger(self.tick)
             self.moving = True
@@ -171,6 +185,7 @@ class Rack:
         self.moving = self.session.pace.realtime
         before = program.station
         program.advance()
+        self.outputs.begin_tick()
         if before is not None and program.station is not None:
             self._note_station(before, program.station)
         if self.watchdog.check(program.tick):
@@ -284,6 +299,14 @@ class Rack:
             "outputs": dict(zip(OUTPUT_NAMES, program.measure(), strict=True)),
             **({} if station is None else {"station": station_snapshot(station)}),
         }
+
+
+def _try_a_tick(program: PlantProgram, state: RetainedState) -> None:
+    """Move a plant, which is not used any further, on from a state that may be nonsense."""
+    program.resume(**state.program)
+    program.advance()
+    if not all(map(math.isfinite, (*program.measure(), *program.state))):
+        raise ValueError("from there the plant goes nowhere")
 
 
 def station_snapshot(station: StationSample) -> Mapping[str, object]:

@@ -40,8 +40,8 @@ from plant.faults import HEALTHY
 from plant.load import find_load
 from plant.outputs import next_generation
 from plant.program import LoadProfile
-from plant.rack import MakePlant, Rack, Session
-from plant.retained_state import Memory, refused
+from plant.rack import APPLIED, MakePlant, Rack, Session
+from plant.retained_state import Memory
 from plant.settings import SHOWN, PlantSettings
 
 log = logging.getLogger("coldloop.plant")
@@ -81,7 +81,7 @@ class RackRegisters:
             settings, header, make_plant, utc, first_generation or secrets.randbelow(2**31) + 1
         )
         self._journal = JournalPublication(self.rack.journal, self.bank)
-        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed))
+        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed), int(self._memory.refused))
         self.lease = WriterLease("the outputs", lambda: self.rack.silence_s, self._note_lease, now)
         self._written_row = 0
         self._outdated = True
@@ -110,18 +110,23 @@ class RackRegisters:
         load = find_load(section.load, header.w0)
         session = Session(1 if configured.autostart else 0, pace, load, section.seed)
         state = self._memory.recall()
-        journal = Journal(now=utc) if state is None else Journal(boot=state.boot + 1, count=state.events, now=utc)
+        journal = (
+            Journal(now=utc)
+            if state is None
+            else Journal(boot=state.boot % 0xFFFF_FFFF + 1, count=state.events, now=utc)
+        )
         generation = first_generation if state is None else next_generation(state.generation)
         cv155, ncr22, cv156 = header.u0
         rack = Rack(
-            section.watchdog, (cv155, ncr22, cv156), make_plant, session, journal=journal, generation=generation
-        )
+            section.watchdog, (cv155, ncr22, cv156), make_plant, session, journal=journal,
+            rate=settings.limits.rate if section.rate_limited else None, generation=generation,
+        )  # fmt: skip
         if state is None or not state.session:
             return rack, False
         try:
             rack.resume(state)
-        except (KeyError, TypeError, ValueError) as error:
-            refused(repr(error))
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            self._memory.refuse(repr(error))
             return rack, False
         return rack, True
 
@@ -211,7 +216,7 @@ class RackRegisters:
     def _take_outputs(self, asked: Actuators, caller: Caller) -> None:
         self.move_on()  # the next request may come before the plant has moved on
         verdict = self.rack.offer(asked, caller)
-        if verdict in {OutputVerdict.TAKEN, OutputVerdict.CHANGED}:
+        if verdict in {*APPLIED, OutputVerdict.CHANGED}:
             self.lease.take(caller, asked.holder)
         if verdict is not OutputVerdict.TAKEN or not asked.crc:
             self._show_applied()

@@ -2,11 +2,15 @@
 
 import logging
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from coldloop.pace import Pace
+from coldloop.process import LAST_TICK
+from coldloop.registers.codec import check_record
+from coldloop.registers.common import SessionPace
+from coldloop.registers.plant import MAX_LOAD_W
 from coldloop.retained import RetainedFile, RetainedStateError
 
 log = logging.getLogger("coldloop.plant")
@@ -31,12 +35,20 @@ class RetainedState(BaseModel):
     pace: Pace
     watchdog: Annotated[int, Field(ge=0, lt=2**16)]
     """Its time-out, in ticks."""
-    times: tuple[int, ...]
+    times: tuple[Annotated[int, Field(ge=0, le=LAST_TICK)], ...]
     """Ticks of the load's steps."""
-    watts: tuple[float, ...]
+    watts: tuple[Annotated[float, Field(ge=0, le=MAX_LOAD_W)], ...]
     seed: Count
     program: dict[str, Any]
     """What `PlantProgram.resume` takes."""
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        check_record(SessionPace.shown(self.session, self.pace))
+        tick = self.program.get("tick", 0)
+        if not isinstance(tick, int) or not 0 <= tick <= LAST_TICK:
+            raise ValueError(f"no session has a tick {tick!r}")
+        return self
 
 
 class Memory:
@@ -45,6 +57,8 @@ class Memory:
     def __init__(self, file: Path | None, model_digest: int) -> None:
         self._file = RetainedFile(file, OWNER, model_digest) if file else None
         self.active = file is not None
+        self.refused = False
+        """There was a state before, and it is not used."""
 
     def recall(self) -> RetainedState | None:
         """Return the state of before, if there is one."""
@@ -54,10 +68,16 @@ class Memory:
             content = self._file.load()
             return None if content is None else RetainedState.model_validate(content)
         except RetainedStateError as error:
-            refused(str(error))
+            self.refuse(str(error))
         except ValidationError as error:
-            refused(error.errors()[0]["msg"])
+            self.refuse(error.errors()[0]["msg"])
         return None
+
+    def refuse(self, reason: str) -> None:
+        """Do without the state of before: the file is set aside, and the log says why."""
+        self.refused = True
+        if self._file is not None:
+            log.warning("retained state refused", extra={"reason": reason, "file": self._file.set_aside()})
 
     def keep(self, state: RetainedState) -> None:
         """Keep the state of now: it is the memory of a simulation, so every tick counts and no disk is waited for."""
@@ -67,8 +87,3 @@ class Memory:
             self._file.save(state.model_dump(), synced=False)
         except RetainedStateError as error:
             log.error("the state is not retained", extra={"reason": str(error)})  # noqa: TRY400 one line
-
-
-def refused(reason: str) -> None:
-    """Log that a retained state is not used."""
-    log.warning("retained state refused", extra={"reason": reason})

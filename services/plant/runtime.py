@@ -18,6 +18,7 @@ from coldloop.registers.bank import Caller
 from coldloop.registers.common import SessionPace
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, PlantSession
+from coldloop.service import SERVING
 from coldloop.telemetry import Telemetry
 from plant.kinds import plant_maker
 from plant.own_model import own_header
@@ -107,14 +108,19 @@ class PlantRuntime:
         self._clock = self._schedule = None
 
     async def _run_clock(self, schedule: Schedule) -> None:
-        pacer = Pacer(schedule)
-        while True:
-            await pacer.until(self.registers.rack.tick + 0.5)
+        pacer, rack = Pacer(schedule), self.registers.rack
+        while not rack.has_ended:
+            await pacer.until(rack.tick + 0.5)
             self.registers.advance()
+        rack.moving, self._schedule = False, None
+        log.warning("the session has reached its last tick: begin another one", extra={"tick": rack.tick})
 
     def _clock_ended(self, clock: "asyncio.Task[None]") -> None:
-        if not clock.cancelled():
-            self._fail(clock.exception() or RuntimeError("it returned"))
+        if clock.cancelled():
+            return
+        error = clock.exception()
+        if error is not None:
+            self._fail(error)
 
     def _fail(self, error: BaseException) -> None:
         if self._failure is not None and not self._failure.done():
@@ -141,7 +147,7 @@ async def serve(settings: PlantSettings) -> None:
         on_close=registers.closed,
     )  # fmt: skip
     await server.start()
-    log.info("serving", extra={"host": settings.plant.server.host, "port": server.port})
+    log.info(SERVING, extra={"host": settings.plant.server.host, "port": server.port})
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(MetricsServer(settings.plant.metrics, registers.bank).run(), name="metrics")

@@ -7,6 +7,7 @@ from typing import Annotated, Final
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from coldloop.endpoints import PLANT_PORT
+from coldloop.limits import InputLimits
 from coldloop.metrics_settings import MetricsSettings
 from coldloop.modbus.settings import ServerSettings
 from coldloop.model_settings import ModelSettings
@@ -20,7 +21,7 @@ from plant.station_settings import StationSettings
 
 SHOWN: Final = (
     "plant.kind", "plant.station", "plant.refrigerator", "plant.mismatch", "plant.sensors", "plant.clock_error_ppm",
-    "plant.watchdog",
+    "plant.watchdog", "plant.rate_limited", "limits.rate",
 )  # fmt: skip
 """What of the configuration decides results: shown in the registers. Load and seed are those of a session."""
 
@@ -155,6 +156,8 @@ class PlantSection(BaseModel):
     clock_error_ppm: Annotated[float, Field(ge=-50_000, le=50_000)] = 0.0
     """How much too fast the rack's clock is in real time, in millionths: for tests of those who follow it."""
     watchdog: WatchdogSettings = WatchdogSettings()
+    rate_limited: bool = True
+    """No output moves by more than `limits.rate` in one tick of the rack, whoever writes; the safe state does."""
     retain: RetainSettings = RetainSettings()
 
 
@@ -163,6 +166,7 @@ class PlantSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    limits: InputLimits = InputLimits()
     model: ModelSettings = ModelSettings()
     session: SessionSettings = SessionSettings()
     plant: PlantSection = PlantSection()

@@ -6,20 +6,31 @@ written: the same inputs give the same bits in every process and on every proces
 The cache lives in `COLDLOOP_CACHE_DIR`, or in the user's cache directory, in a folder named after a digest of the
 sources of all compiled modules: numba itself does not notice that a kernel called from another file has changed. What
 takes long to compute and depends on those sources is kept there too.
+
+Processes that need the same kernel at once compile it once: one does, the others wait for it (`SharedCache`).
 """
 
 import contextlib
 import hashlib
 import os
 import tempfile
+import zlib
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import ParamSpec, TypeVar, cast
+from typing import IO, Any, ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core.caching import FunctionCache
 from numpy.typing import NDArray
+
+from coldloop.first_use import needs_compiling
+
+try:
+    import fcntl
+except ImportError:  # Windows: processes may compile the same kernel twice
+    fcntl = None  # type: ignore[assignment]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -34,7 +45,7 @@ COMPILED_MODULES = (
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile `function` in nopython mode on its first call for given types, or load it from the cache."""
-    return cast("Callable[P, R]", numba.njit(cache=True, error_model="numpy")(function))
+    return _cached(function, numba.njit(error_model="numpy")(function))
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
@@ -42,7 +53,58 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
 
     For small functions in inner loops: a call that passes tables costs more than reading them. The bits are the same.
     """
-    return cast("Callable[P, R]", numba.njit(cache=True, error_model="numpy", forceinline=True)(function))
+    return _cached(function, numba.njit(error_model="numpy", forceinline=True)(function))
+
+
+def _cached(function: Callable[P, R], dispatcher: Any) -> Callable[P, R]:  # noqa: ANN401 numba has no types
+    cache = SharedCache(function)  # type: ignore[no-untyped-call]
+    compile_kernel = dispatcher.compile
+
+    def compile_in_turn(signature: Any) -> Any:  # noqa: ANN401
+        try:
+            return compile_kernel(signature)
+        finally:
+            cache.unlock()
+
+    dispatcher._cache = cache  # noqa: SLF001 as numba's enable_caching does
+    dispatcher.compile = compile_in_turn
+    return cast("Callable[P, R]", dispatcher)
+
+
+class SharedCache(FunctionCache):
+    """numba's cache of one function, locked by the process that compiles a kernel until it is saved.
+
+    Without the lock two processes compile the same kernel, and may save different ones under the same name. It is one
+    byte of a file, for each function another; a process that ends lets go of it. Locks are taken from callers to what
+    they call, so no two processes wait for each other.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401
+        """Return the kernel for a signature; None, with the lock, when this process is to compile it."""
+        found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        if found is None:
+            self._lock()
+            # another process may have compiled it meanwhile
+            found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+            if found is None:
+                needs_compiling()
+        return found
+
+    def _lock(self) -> None:
+        if _locks is not None:
+            with contextlib.suppress(OSError):  # a file system without locks: a kernel may be compiled twice
+                fcntl.lockf(_locks, fcntl.LOCK_EX, 1, self._place)
+
+    def unlock(self) -> None:
+        """Let others compile."""
+        if _locks is not None:
+            with contextlib.suppress(OSError):
+                fcntl.lockf(_locks, fcntl.LOCK_UN, 1, self._place)
+
+    @property
+    def _place(self) -> int:
+        """The byte that is this function's."""
+        return zlib.crc32(f"{self.cache_path}/{self._impl.filename_base}".encode())
 
 
 def _sources_digest() -> str:
@@ -94,10 +156,21 @@ def _cache_directory() -> Path:
         folder = root / f"kernels-{_sources_digest()}"
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
         except OSError:
             continue
         return folder
     return Path(tempfile.mkdtemp(prefix="coldloop-kernels-"))
 
 
+def _file_of_locks(folder: Path) -> IO[bytes] | None:
+    if fcntl is None:
+        return None
+    try:
+        return (folder / "locks").open("ab")
+    except OSError:  # another user's, who shares the folder
+        return None
+
+
 numba.config.CACHE_DIR = str(_cache_directory())  # type: ignore[attr-defined]
+_locks = _file_of_locks(Path(numba.config.CACHE_DIR))  # type: ignore[attr-defined]

@@ -2,6 +2,10 @@
 
 The environment spells `COLDLOOP__SECTION__KEY=value`, the command line `--set section.key=value`; both read the
 value as TOML, and as text when it is none. Every value remembers where it came from.
+
+Some settings decide others, as a preset does. A section says so in a class variable `decides`: by key, the keys that
+follow from it, both relative to the section. Such a setting on the command line also replaces what the environment and
+the file have of them.
 """
 
 import json
@@ -11,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -20,6 +24,10 @@ from coldloop.errors import ConfigurationError
 PREFIX = "COLDLOOP__"
 DEFAULT = "default"
 DERIVED = "follows from other settings"
+MOST_LEVELS: Final = 32
+"""Tables and arrays within one another that a TOML text may have."""
+MOST_SHOWN: Final = 200
+"""Characters of a wrong value that a message shows."""
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -47,9 +55,10 @@ class _Layers:
     def __init__(self) -> None:
         self.values: dict[str, Any] = {}
         self.sources: dict[str, str] = {}
+        self._layers: dict[str, int] = {}
 
-    def put(self, key: str, value: object, source: str) -> None:
-        """Set the value of a dotted key."""
+    def put(self, layer: int, key: str, value: object, source: str) -> None:
+        """Set the value of a dotted key; a layer of a higher number overrides."""
         *sections, last = key.split(".")
         place = self.values
         for section in sections:
@@ -58,6 +67,23 @@ class _Layers:
                 raise ConfigurationError(f"{source}: {key} is not a section; see `coldloop config` for the keys")
         place[last] = value
         self.sources[key] = source
+        self._layers |= dict.fromkeys(flattened({key: value}), layer)
+
+    def drop_decided(self, decides: Mapping[str, Iterable[str]]) -> None:
+        """Drop values that follow from others which were set in a higher layer."""
+        for key, followers in decides.items():
+            for follower in followers:
+                if self._layers.get(follower, 0) < self._layers.get(key, 0):
+                    self._drop(follower)
+
+    def _drop(self, key: str) -> None:
+        *sections, last = key.split(".")
+        place: Any = self.values
+        for section in sections:
+            place = place.get(section) if isinstance(place, dict) else None
+        if isinstance(place, dict):
+            place.pop(last, None)
+        self.sources.pop(key, None)
 
 
 def load_configuration(
@@ -83,13 +109,16 @@ def load_configuration(
         ConfigurationError: One line that names the key, its source and the remedy.
     """
     layers = _Layers()
-    for key, value, source in [
-        *_from_file(file),
-        *_from_environment(os.environ if environment is None else environment),
+    command_line = [
         *(_assigned(assignment) for assignment in assignments),
         *((key, value, option) for key, (value, option) in (options or {}).items()),
-    ]:
-        layers.put(key, value, source)
+    ]
+    for layer, entries in enumerate(
+        (_from_file(file), _from_environment(os.environ if environment is None else environment), command_line)
+    ):
+        for entry in entries:
+            layers.put(layer, *entry)
+    layers.drop_decided(_decided(model))
     for section in set(others) - set(model.model_fields):
         layers.values.pop(section, None)
     try:
@@ -100,6 +129,18 @@ def load_configuration(
         if not _is_finite(value):
             raise ConfigurationError(f"{_where(key, layers.sources)}: input should be finite (got {value!r})")
     return Configuration(settings, layers.sources)
+
+
+def _decided(model: type[BaseModel], prefix: str = "") -> dict[str, list[str]]:
+    """Return the keys that follow from others, by the key that decides."""
+    found = {
+        prefix + key: [prefix + follower for follower in followers]
+        for key, followers in getattr(model, "decides", {}).items()
+    }
+    for name, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            found |= _decided(field.annotation, f"{prefix}{name}.")
+    return found
 
 
 def _is_finite(value: object) -> bool:
@@ -136,35 +177,62 @@ def _assigned(assignment: str) -> Entry:
 def to_environment(settings: BaseModel) -> dict[str, str]:
     """Return the variables that make a process load these settings."""
     flat = flattened(settings.model_dump(mode="json"))
-    return {
-        PREFIX + key.upper().replace(".", "__"): _as_toml(value) for key, value in flat.items() if value is not None
-    }
+    return {PREFIX + key.upper().replace(".", "__"): as_toml(value) for key, value in flat.items() if value is not None}
 
 
-def _as_toml(value: object) -> str:
+def as_toml(value: object) -> str:
     """Return a value as TOML writes it in one line."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {_as_toml(part)}" for key, part in value.items() if part is not None) + "}"
+        return "{" + ", ".join(f"{key} = {as_toml(part)}" for key, part in value.items() if part is not None) + "}"
     if isinstance(value, list):
-        return "[" + ", ".join(map(_as_toml, value)) + "]"
-    return json.dumps(value)
+        return "[" + ", ".join(map(as_toml, value)) + "]"
+    text = json.dumps(value, ensure_ascii=False)
+    return text.replace("\x7f", "\\u007f")  # the one control character that JSON lets pass and TOML does not
+
+
+def parsed_toml(text: str) -> dict[str, Any]:
+    """Return what a TOML text holds.
+
+    Raises:
+        ValueError: It is not TOML, or beyond what can be read: a number of thousands of digits, thousands of levels.
+    """
+    try:
+        tree = tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        raise
+    except ValueError:
+        raise ValueError("a number has too many digits") from None
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    level: list[object] = [tree]
+    for _ in range(MOST_LEVELS):
+        level = [part for one in level for part in _parts(one)]
+        if not level:
+            return tree
+    raise ValueError("nested too deeply")
+
+
+def _parts(value: object) -> Iterable[object]:
+    if isinstance(value, Mapping):
+        return value.values()
+    return value if isinstance(value, list) else ()
 
 
 def _read_toml(file: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
+        return parsed_toml(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigurationError(f"{file}: {error.strerror}; name a readable TOML file with --config") from None
     except UnicodeDecodeError:
         raise ConfigurationError(f"{file}: not UTF-8 text; save it as UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise ConfigurationError(f"{file}: not TOML: {error}") from None
 
 
 def _parsed(value: str) -> object:
     try:
-        return tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+        return parsed_toml(f"value = {value}")["value"]
+    except ValueError:
         return value
 
 
@@ -192,7 +260,10 @@ def _explained(error: ValidationError, sources: Mapping[str, str]) -> str:
     if first["type"] == "extra_forbidden":
         return f"{where}: no such key; `coldloop config` lists the keys"
     message = first["msg"].removeprefix("Value error, ")
-    return f"{where}: {message[0].lower()}{message[1:]} (got {first['input']!r})"
+    given = repr(first["input"])
+    if len(given) > MOST_SHOWN:
+        given = f"{given[:MOST_SHOWN]}... of {len(given)} characters"
+    return f"{where}: {message[0].lower()}{message[1:]} (got {given})"
 
 
 def _where(key: str, sources: Mapping[str, str]) -> str:

@@ -13,6 +13,8 @@
         ├── PeerUnreachableError
         │   └── UntrustedPeerError  its certificate does not hold
         ├── DamagedAnswerError      the seal of an answer is broken, or missing
+        │   └── ImplausibleAnswerError  it has a value that its register cannot have
+        ├── UnfitValueError         a value of our own that its register cannot hold
         └── RequestRefusedError     the peer answered with a Modbus exception
 
 A message is one line that says what, where, and what to do.
@@ -24,10 +26,19 @@ BUSY: Final = 6
 """Modbus exception code of a server at which somebody else holds the lease of the role."""
 
 
+def printable(text: str) -> str:
+    """Return a text as one line for a terminal: what a peer or a file put into it neither ends it nor controls it."""
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+
+
 class ColdloopError(Exception):
     """Root of the tree; `exit_code` is what a program ends with when it cannot go on."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        """Return the message, which is one line."""
+        return printable(super().__str__())
 
 
 class UsageError(ColdloopError):
@@ -82,6 +93,14 @@ class UntrustedPeerError(PeerUnreachableError):
 
 class DamagedAnswerError(LinkError):
     """A record that should be sealed arrived without its seal, or with a broken one."""
+
+
+class ImplausibleAnswerError(DamagedAnswerError):
+    """A record arrived with a value that its register cannot have; its seal says nothing about that."""
+
+
+class UnfitValueError(LinkError):
+    """What was to be written does not fit its register: a number at its end, or too large."""
 
 
 class RequestRefusedError(LinkError):

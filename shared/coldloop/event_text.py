@@ -26,6 +26,11 @@ def word(member: IntEnum) -> str:
     return member.name.lower().replace("_", " ")
 
 
+def word_of(kind: type[IntEnum], number: int) -> str:
+    """Return the word for a number that a peer tells; a newer one may have numbers without a word here."""
+    return _members(kind)(number)
+
+
 def _listed(words: Sequence[str]) -> Words:
     return lambda number: words[number] if number < len(words) else str(number)
 
@@ -80,7 +85,9 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
     EventKind.ALARM_UNSHELVED: _SUPPRESSION,
     EventKind.ALARM_OUT_OF_SERVICE: _SUPPRESSION,
     EventKind.ALARM_IN_SERVICE: _SUPPRESSION,
-    EventKind.BOOT: _Wording(_listed(("fresh", "with a retained state"))),
+    EventKind.BOOT: _Wording(
+        _listed(("fresh", "with a retained state")), _listed(("", "the state of before is set aside"))
+    ),
     EventKind.SESSION: _Wording(_listed(("lock-step", "real time")), unit="x real time"),
     EventKind.OPERATOR_MODE: _Wording(_members(OperatorMode)),
     EventKind.SETPOINT: _Wording(_listed(INPUT_NAMES), unit=""),
@@ -101,6 +108,7 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
     EventKind.PACE: _Wording(_listed(("lock-step", "real time", "paused")), unit="x real time"),
 }
 _ALARM_CAUSES: Final[Mapping[int, Words]] = {
+    AlarmKind.STATE_NOT_RETAINED: _listed(("", "that of before is set aside")),
     AlarmKind.MODE: _causes(Cause),
     AlarmKind.SENSOR_BAD: _listed(OUTPUT_NAMES),
     AlarmKind.SEQUENCE_REJECTED: _causes(Verdict),

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import time
 from typing import Final
 
 from coldloop.errors import PortInUseError
@@ -13,6 +14,11 @@ log = logging.getLogger("coldloop.metrics")
 
 LONGEST_REQUEST: Final = 4096
 PATIENCE_S: Final = 2.0
+"""Within this time a request is here, and its answer read."""
+MOST_OPEN: Final = 16
+"""Connections at a time; the oldest gives way. The service itself needs the others that the system allows."""
+KEPT_S: Final = 0.2
+"""An answer serves all who ask within this time: however many do, scans are not late because of them."""
 
 
 class MetricsServer:
@@ -26,6 +32,9 @@ class MetricsServer:
     def __init__(self, settings: MetricsSettings, bank: RegisterBank) -> None:
         self._settings = settings
         self._bank = bank
+        self._open: dict[asyncio.StreamWriter, None] = {}  # the oldest first
+        self._exposition = ""
+        self._kept_until = 0.0
 
     async def run(self) -> None:
         """Serve until cancelled; return at once where it is off.
@@ -37,7 +46,7 @@ class MetricsServer:
         if not port:
             return
         try:
-            server = await asyncio.start_server(self._answer, host, port, limit=LONGEST_REQUEST)
+            server = await asyncio.start_server(self._answer, host, port, limit=LONGEST_REQUEST, backlog=MOST_OPEN)
         except OSError as error:
             raise PortInUseError(
                 f"{host}:{port}: {error.strerror}; give another one to `metrics.port` of the service"
@@ -46,25 +55,38 @@ class MetricsServer:
             await server.serve_forever()
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._open) >= MOST_OPEN:
+            oldest = next(iter(self._open))
+            del self._open[oldest]
+            oldest.transport.abort()
+        self._open[writer] = None
         try:
             async with asyncio.timeout(PATIENCE_S):
                 head = await reader.readuntil(b"\r\n\r\n")
                 writer.write(self._response(head.partition(b"\r\n")[0].decode("latin-1").split(" ")))
-                await writer.drain()
+                writer.close()
+                await writer.wait_closed()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             log.debug("a request for metrics that was none")
         finally:
-            writer.close()
+            self._open.pop(writer, None)
+            writer.transport.abort()
 
     def _response(self, line: list[str]) -> bytes:
         method, path = (line[0], line[1].partition("?")[0]) if len(line) > 1 else ("", "")
         if method != "GET":
             return _encoded("405 Method Not Allowed", "only GET\n")
         if path == "/metrics":
-            return _encoded("200 OK", exposition(bank_families(self._bank)))
+            return _encoded("200 OK", self._registers())
         if path == "/healthz":
             return _encoded("200 OK", "live\n")
         return _encoded("404 Not Found", "there are /metrics and /healthz\n")
+
+    def _registers(self) -> str:
+        now = time.monotonic()
+        if now >= self._kept_until:
+            self._exposition, self._kept_until = exposition(bank_families(self._bank)), now + KEPT_S
+        return self._exposition
 
 
 def _encoded(status: str, text: str) -> bytes:

@@ -8,6 +8,12 @@ TICK_S: Final = 0.25
 SAMPLING_PERIOD_S: Final = 5.0
 """Sampling period of the prediction model, in seconds of plant time."""
 
+LAST_TICK: Final = 2**32 - 2**16 - 1
+"""Last tick of a session, after 34 years: what is planned from there still fits a register."""
+
+LAST_NUMBER: Final = LAST_TICK
+"""Largest number of an update, or of a sequence."""
+
 TICKS_PER_SAMPLE: Final = int(SAMPLING_PERIOD_S / TICK_S)
 
 INPUT_NAMES: Final = ("CV155", "NCR22_A", "CV156")

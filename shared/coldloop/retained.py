@@ -2,22 +2,29 @@
 
 A draft is written beside it, synced to the disk and renamed over it, and the folder is synced: a process that is killed
 at any byte, or a power cut, leaves the old state or the new one. What cannot be trusted (torn, of another program or
-model) is refused with a reason. `RetainedStateWriter` of `retained_writer.py` does this off the scan's way.
+model, no state, no ordinary file) is refused with a reason, and set aside. `RetainedStateWriter` of
+`retained_writer.py` does this off the scan's way.
 """
 
 import contextlib
 import json
 import os
+import stat
 import zlib
 from collections.abc import Mapping
+from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict
 
 from coldloop.errors import ColdloopError
 
 MAGIC = "coldloop-retained"
+MOST_BYTES: Final = 2**26
+"""No state is larger."""
+ORDINARY: Final = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
+"""Neither waits for the other end of a FIFO, nor follows a link."""
 
 
 class RetainedStateError(ColdloopError):
@@ -43,12 +50,17 @@ def decoded(data: bytes, owner: str, digest: int) -> dict[str, Any]:
     """Return the state that these bytes hold.
 
     Raises:
-        RetainedStateError: They are torn, or not ours.
+        RetainedStateError: They are torn, not ours, or no state.
     """
     line, _, content = data.partition(b"\n")
     if line + b"\n" != _description(content, owner, digest):
         raise RetainedStateError(f"{_complaint(line, owner, digest)}; it is not used")
-    state: dict[str, Any] = json.loads(content)
+    try:
+        state = json.loads(content)
+    except (ValueError, RecursionError):
+        raise RetainedStateError("what it holds is no state; it is not used") from None
+    if not isinstance(state, dict):
+        raise RetainedStateError("what it holds is no state; it is not used")
     return state
 
 
@@ -103,7 +115,7 @@ class RetainedFile:
             RetainedStateError: The file is torn, or not ours.
         """
         try:
-            return decoded(self.path.read_bytes(), self._owner, self._digest)
+            return decoded(_read(self.path), self._owner, self._digest)
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -111,12 +123,41 @@ class RetainedFile:
         except RetainedStateError as error:
             raise RetainedStateError(f"{self.path}: {error}") from None
 
+    def set_aside(self) -> str:
+        """Give a file that cannot be used another name, so that it is not overwritten; return words for it."""
+        aside = self.path.with_name(f"{self.path.name}.refused")
+        try:
+            self.path.replace(aside)
+        except OSError as error:
+            return f"left where it is: {error.strerror}"
+        return f"set aside as {aside.name}"
+
+
+def _read(path: Path) -> bytes:
+    """Return the content of an ordinary file."""
+    with open(path, "rb", opener=lambda name, _flags: os.open(name, ORDINARY)) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise RetainedStateError("no ordinary file; it is not used")
+        if status.st_size > MOST_BYTES:
+            raise RetainedStateError(f"{status.st_size} bytes are no state; it is not used")
+        return file.read(MOST_BYTES)
+
+
+def _new(path: Path) -> FileIO:
+    """Create a draft; one that was left there, whatever it is, is removed and not followed."""
+    try:
+        return path.open("xb", buffering=0)
+    except FileExistsError:
+        path.unlink()
+        return path.open("xb", buffering=0)
+
 
 def _replace(path: Path, data: bytes, *, synced: bool) -> None:
     """Let a file have this content, or the one that it had."""
     draft = path.with_name(f"{path.name}.draft")
     try:
-        with draft.open("wb", buffering=0) as file:
+        with _new(draft) as file:
             rest = memoryview(data)
             while rest:
                 rest = rest[file.write(rest) :]

@@ -7,7 +7,7 @@ import logging
 import signal
 import sys
 from collections.abc import Awaitable, Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from pydantic import BaseModel
 
@@ -15,12 +15,17 @@ from coldloop import __version__
 from coldloop.command_line import add_configuration_options
 from coldloop.config import load_configuration
 from coldloop.errors import ColdloopError
+from coldloop.first_use import Kernels, announce_with
 from coldloop.logs import end_logs, set_up_logs
 
 S = TypeVar("S", bound=BaseModel)
 
 log = logging.getLogger("coldloop.service")
 
+COMPILING: Final = "compiling kernels"
+"""Logged when a service compiles kernels, with `kernels`, whose they are, and `about_s`, the seconds that it takes."""
+SERVING: Final = "serving"
+"""Logged when a service answers."""
 SECTIONS = ("limits", "model", "session", "plant", "control_plc", "optimizer_plc", "telemetry", "rig", "hmi")
 """Sections of a configuration file; each service reads those that concern it."""
 
@@ -36,6 +41,7 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
     parser.add_argument("--version", action="version", version=__version__)
     options = parser.parse_args(arguments)
     set_up_logs(name, options.log_level)
+    announce_with(_log_kernels)
     code, last_line = 1, None
     try:
         configuration = load_configuration(
@@ -48,6 +54,10 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
         log.exception("failed")
     end_logs(last_line)
     return code
+
+
+def _log_kernels(kernels: Kernels) -> None:
+    log.info(COMPILING, extra={"kernels": kernels.owner, "about_s": kernels.about_s})
 
 
 def run_event_loop(start: Callable[[], Any]) -> int:

@@ -12,7 +12,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from coldloop.telemetry_settings import TelemetrySettings
 
@@ -21,8 +21,12 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("coldloop.telemetry")
 
-FAREWELL_S = 1.0
+FAREWELL_S: Final = 1.0
 """How long a service that ends waits for its broker."""
+LONGEST_ANSWER: Final = 2
+"""Bytes after the header of what a broker sends to one who publishes: CONNACK and PUBACK of MQTT 3.1.1."""
+UNASKED_BYTES: Final = 256
+"""A broker may send so much between two messages of ours."""
 
 Snapshot = Callable[[], Mapping[str, object]]
 
@@ -56,7 +60,8 @@ class Telemetry:
             try:
                 await self._publish()
             except Exception as error:  # noqa: BLE001 - a service never ends because of its telemetry
-                log.warning("broker lost", extra={"broker": self._settings.broker, "reason": str(error)})
+                reason = str(error) or "no answer in time"
+                log.warning("broker lost", extra={"broker": self._settings.broker, "reason": reason})
             await asyncio.sleep(self._settings.timeout_s)
 
     async def _publish(self) -> None:
@@ -65,25 +70,53 @@ class Telemetry:
         s = self._settings
         offline = aiomqtt.Will(f"{self._topic}/state", json.dumps({"state": "offline"}), qos=1, retain=True)
         name = s.username or None
-        async with aiomqtt.Client(
+        client = aiomqtt.Client(
             s.broker, s.port, username=name, password=s.password(), will=offline, timeout=s.timeout_s
-        ) as client:
-            await client.publish(f"{self._topic}/state", json.dumps({"state": "online"}), qos=1, retain=True)
+        )
+        broker = _Publisher(client)
+        async with client:
+            await broker.publish(f"{self._topic}/state", json.dumps({"state": "online"}))
             try:
-                await self._forward(client)
+                await self._forward(broker)
             except asyncio.CancelledError:  # a clean end calls for no last will
                 with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
                     async with asyncio.timeout(FAREWELL_S):
-                        await client.publish(f"{self._topic}/state", offline.payload, qos=1, retain=True)
+                        await broker.publish(f"{self._topic}/state", str(offline.payload))
                 raise
 
-    async def _forward(self, client: "aiomqtt.Client") -> None:
+    async def _forward(self, broker: "_Publisher") -> None:
         while True:
             await self._arrived.wait()
             self._arrived.clear()
             while self._waiting:
-                await client.publish(f"{self._topic}/telemetry", self._waiting[0], qos=1, retain=True)
+                await broker.publish(f"{self._topic}/telemetry", self._waiting[0])
                 self._waiting.popleft()
+
+
+class _Publisher:
+    """Publishes with a client that reads acknowledgements alone; anything else from the broker ends the connection.
+
+    The client's library takes messages of up to 256 MB, as many as a broker sends, although nothing was subscribed to.
+    """
+
+    def __init__(self, client: "aiomqtt.Client") -> None:
+        self._client = client
+        self._unasked = UNASKED_BYTES
+        library = client._client  # noqa: SLF001 it has no public limit
+        self._receive = library._sock_recv  # noqa: SLF001
+        library._sock_recv = self._limited  # type: ignore[method-assign] # noqa: SLF001
+
+    async def publish(self, topic: str, message: str) -> None:
+        self._unasked = UNASKED_BYTES
+        await self._client.publish(topic, message, qos=1, retain=True)
+
+    def _limited(self, bufsize: int) -> bytes:
+        """Return at most `bufsize` bytes from the socket; the library takes the error for a lost connection."""
+        if bufsize > LONGEST_ANSWER or self._unasked <= 0:
+            raise ConnectionError("the broker sends what nobody has asked for")
+        data: bytes = self._receive(bufsize)
+        self._unasked -= len(data)
+        return data
 
 
 def _finite(value: object) -> object:

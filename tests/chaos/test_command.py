@@ -1,39 +1,41 @@
 """`coldloop chaos`."""
 
-import contextlib
 import json
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pandas as pd
 import pyarrow.parquet as pq
+import pytest
 
 from rig.chaos.plan import shipped_plans
+from tests.harness.processes import Processes
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
+
+PATIENCE_S = 120.0
 
 PLAN = """
 name = "short"
 description = "An optimiser that stands still is waited for, a late frame too"
 load = "a"
-duration_s = 420
+duration_s = 90
 standstill_s = 0.5
 
 [[faults]]
 kind = "pause"
 process = "optimizer"
 at_s = 5
-duration_s = 60
+duration_s = 30
 
 [[faults]]
 kind = "delay"
 link = "plant"
-at_s = 70
+at_s = 40
 duration_s = 5
 delay_ms = 1
 """
@@ -47,12 +49,13 @@ def test_list_names_the_shipped_plans(coldloop: "Coldloop") -> None:
 
 def test_a_plan_that_cannot_be_used_is_one_line(coldloop: "Coldloop", tmp_path: Path) -> None:
     bad = tmp_path / "bad.toml"
-    bad.write_text(PLAN.replace("duration_s = 60", "duration = 60"))
+    bad.write_text(PLAN.replace("duration_s = 30", "duration = 30"))
     for arguments in ((), ("no-such-plan",), (bad,), ("kill", "--seed", "x"), ("kill", "--load", "no-load")):
         outcome = coldloop("chaos", *arguments, *(["--out", tmp_path / "out"] if arguments else []))
         assert (outcome.code, outcome.out, len(outcome.complaints)) == (2, "", 1), arguments
 
 
+@pytest.mark.usefixtures("processes", "undrawn")
 def test_faults_that_only_cost_time_leave_the_trace_as_it_is(coldloop: "Coldloop", tmp_path: Path) -> None:
     plan, out = tmp_path / "short.toml", tmp_path / "out"
     plan.write_text(PLAN)
@@ -68,7 +71,7 @@ def test_faults_that_only_cost_time_leave_the_trace_as_it_is(coldloop: "Coldloop
 
 def assert_recorded_as_an_ordinary_run(coldloop: "Coldloop", out: Path, ordinary: Path, trace: str) -> None:
     """Compare the files of a run whose trace is undisturbed with those of the same run without faults."""
-    run = ("run", "--in-process", "--load", "a", "--duration", "7min", "--figures", "png", "--out", ordinary)
+    run = ("run", "--in-process", "--load", "a", "--duration", "90s", "--figures", "png", "--out", ordinary)
     assert coldloop(*run).code == 0
     summary, manifest = (json.loads((out / name).read_text()) for name in ("summary.json", "manifest.json"))
     assert (summary["trace_sha256"], manifest["hashes"]["trace_sha256"]) == (trace, trace)
@@ -93,25 +96,28 @@ def assert_recorded_as_an_ordinary_run(coldloop: "Coldloop", out: Path, ordinary
     assert "coldloop chaos" in again.complaints[0]
 
 
-def test_ctrl_c_in_the_middle_of_a_plan_leaves_what_was_recorded(tmp_path: Path) -> None:
+SOON_ON_DISK = """
+import sys, rig.file_sinks
+rig.file_sinks.GROUP_TICKS = rig.file_sinks.HELD_BACK_TICKS = 256
+from rig.__main__ import main
+sys.exit(main())
+"""
+"""The program `coldloop`, which writes ticks in small groups: the first ones are in the file after a minute."""
+
+
+def test_ctrl_c_in_the_middle_of_a_plan_leaves_what_was_recorded(tmp_path: Path, processes: Processes) -> None:
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "rig", "chaos", "undisturbed", "--duration", "10h", "--out", str(out)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 120
-    while (
-        not (out / "logs" / "optimizer_plc.log").exists()
-        or "session" not in (out / "logs" / "optimizer_plc.log").read_text()
-    ):
-        assert process.poll() is None, process.communicate()
+    words = ("chaos", "undisturbed", "--duration", "10h", "--out", str(out))
+    run = processes.python("-c", SOON_ON_DISK, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    deadline = time.monotonic() + PATIENCE_S
+    while not (out / "trace.parquet").exists() or (out / "trace.parquet").stat().st_size < 10_000:
+        assert run.alive, run.ended()
         assert time.monotonic() < deadline
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(0.05)
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(3)
-    process.send_signal(signal.SIGINT)
-    _, complaints = process.communicate(timeout=120)
-    assert process.returncode == 130
-    assert "Traceback" not in complaints
+        time.sleep(0.05)
+    run.popen.send_signal(signal.SIGINT)
+    ended = run.ended(PATIENCE_S)
+    assert ended.code == 130
+    assert "Traceback" not in ended.err
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["complete"], summary["reason"]) == (False, "interrupted by SIGINT")
     assert len(pd.read_parquet(out / "trace.parquet")) == summary["ticks"] > 0
@@ -131,6 +137,7 @@ faults = [
 """
 
 
+@pytest.mark.usefixtures("processes", "undrawn")
 def test_whatever_is_killed_the_plant_is_not_hurt_and_mpc_comes_back(coldloop: "Coldloop", tmp_path: Path) -> None:
     plan, out = tmp_path / "kills.toml", tmp_path / "out"
     plan.write_text(KILLS)

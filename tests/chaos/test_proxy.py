@@ -31,7 +31,7 @@ class Line(NamedTuple):
 
 
 @contextlib.asynccontextmanager
-async def line(timeout_s: float = 10.0) -> AsyncIterator[Line]:
+async def line(timeout_s: float = 60.0) -> AsyncIterator[Line]:
     bank = RegisterBank(CONTROL_MAP)
     bank.put(Identity(map_digest=CONTROL_MAP.digest, map_version=CONTROL_MAP.version))
     grants: list[int] = []
@@ -107,14 +107,16 @@ async def test_what_is_sent_into_a_frozen_link_arrives_when_it_thaws() -> None:
 
 
 async def test_a_lost_answer_is_a_time_out_and_a_lost_request_is_never_served() -> None:
-    async with line(timeout_s=0.2) as it:
+    async with line(timeout_s=1.0) as it:
         for direction, served in ((Direction.REQUESTS, []), (Direction.ANSWERS, [5])):
             fault = Drop(kind="drop", share=1.0, direction=direction, **COMMON)
             it.proxy.begin(fault)
             with pytest.raises(PeerUnreachableError):
                 await it.client.write(Grant(5))
             it.proxy.end(fault)
-            assert it.grants == served
+            async with asyncio.timeout(60.0):  # the client may have given up before a busy server has come to it
+                while it.grants != served:  # noqa: ASYNC110 nothing tells
+                    await asyncio.sleep(0.01)
 
 
 async def test_a_client_takes_the_answer_to_its_request_though_all_arrive_twice() -> None:
@@ -156,7 +158,7 @@ async def test_without_a_server_behind_it_a_client_is_told_so() -> None:
     async with line() as it:
         dead = LinkProxy(0, 1, "1")
         await dead.start()
-        client = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=dead.port, timeout_s=10.0)
+        client = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=dead.port, timeout_s=60.0)
         with pytest.raises(PeerUnreachableError):
             await client.read(Grant)
         client.close()

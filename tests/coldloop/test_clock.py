@@ -49,7 +49,7 @@ def test_a_minute_passes_in_a_second_at_factor_60() -> None:
     assert Schedule(5.0, 1.0).due(0.5) == 5.125
 
 
-@settings(max_examples=200)
+@settings(max_examples=2 * settings.default.max_examples)
 @given(values=latenesses, share=st.floats(0.01, 1.0))
 def test_a_percentile_is_numpys_rounded_up_to_its_bin(values: list[float], share: float) -> None:
     record = LatenessRecord()

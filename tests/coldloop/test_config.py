@@ -3,7 +3,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -260,7 +260,6 @@ def refusal(assignment: str) -> str:
     return ""
 
 
-@settings(max_examples=50)
 @given(text=st.text(max_size=20))
 def test_whatever_stands_behind_the_equals_sign_is_a_value_or_a_refusal_in_one_line(text: str) -> None:
     reason = refusal(f"solver.alpha={text}")
@@ -268,7 +267,6 @@ def test_whatever_stands_behind_the_equals_sign_is_a_value_or_a_refusal_in_one_l
     assert not reason or reason.startswith("--set solver.alpha")
 
 
-@settings(max_examples=50)
 @given(key=st.text(st.characters(categories=["L", "N", "P", "S"]), min_size=1, max_size=20))
 def test_whatever_stands_before_the_equals_sign_is_a_key_or_a_refusal_in_one_line(key: str) -> None:
     reason = refusal(f"{key}=3")

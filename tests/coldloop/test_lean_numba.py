@@ -1,10 +1,9 @@
 """numba is loaded without the packages that it takes along, and these can be had afterwards."""
 
-import subprocess
-import sys
+from tests.harness.processes import Processes
 
 
-def test_what_was_hidden_from_numba_can_be_imported_afterwards() -> None:
+def test_what_was_hidden_from_numba_can_be_imported_afterwards(processes: Processes) -> None:
     program = (
         "import sys\n"
         "from coldloop.lean_numba import TAKEN_ALONG, load_numba_alone\n"
@@ -15,15 +14,15 @@ def test_what_was_hidden_from_numba_can_be_imported_afterwards() -> None:
         "import numba, numpy\n"
         "print(numba.njit(lambda A: A @ A)(2.0 * numpy.eye(2))[0, 0])\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.stdout.split() == ["4.0"], done.stderr
+    out, _ = processes.run_python(program)
+    assert out.split() == ["4.0"]
 
 
-def test_what_was_loaded_before_stays() -> None:
+def test_what_was_loaded_before_stays(processes: Processes) -> None:
     program = (
         "import sys, scipy\n"
         "from coldloop.lean_numba import load_numba_alone\n"
         "load_numba_alone()\n"
         "assert sys.modules['scipy'] is scipy\n"
     )
-    assert not subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode
+    processes.run_python(program)

@@ -185,8 +185,7 @@ def same_party(one: int, other: int) -> bool:
     return one == other or NUMBERS[one] == NUMBERS[other] != SIMPLE_CLIENT
 
 
-@pytest.mark.slow
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=5 * settings.default.max_examples)
 @given(story=steps)
 def test_another_party_writes_only_after_the_silence_or_the_departure_of_the_one_before(  # noqa: C901 - a model
     story: list[Step],

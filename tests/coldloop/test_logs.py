@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 from coldloop.line_writer import CAPACITY
-from coldloop.logs import JsonFormatter, dropped, end_logs, set_up_logs
+from coldloop.logs import JsonFormatter, QueueingHandler, dropped, end_logs, set_up_logs
+from tests.harness.processes import END_S, Processes
 
 
 @pytest.fixture
@@ -33,9 +34,15 @@ def fail(message: str) -> None:
     raise ValueError(message)
 
 
-def lines(stream: io.StringIO) -> list[dict[str, Any]]:
+def await_lines() -> None:
+    """Wait until all lines are written, for longer than the end of a program does."""
     for handler in logging.getLogger().handlers:
-        handler.flush()
+        if isinstance(handler, QueueingHandler):  # pytest has its own
+            assert handler.writer.flush(END_S)
+
+
+def lines(stream: io.StringIO) -> list[dict[str, Any]]:
+    await_lines()
     return [json.loads(line) for line in stream.getvalue().splitlines()]
 
 
@@ -122,7 +129,7 @@ class Stalled(io.StringIO):
 
     def write(self, text: str) -> int:
         self.reached.set()
-        self.read.wait(20)
+        self.read.wait(END_S)
         return super().write(text)
 
 
@@ -132,7 +139,7 @@ def stalled(stream: io.StringIO) -> Iterator[Stalled]:  # noqa: ARG001 - which r
     one = Stalled()
     set_up_logs("plant", "info", one)
     logging.getLogger("coldloop").info("first")
-    assert one.reached.wait(20)
+    assert one.reached.wait(END_S)
     yield one
     one.read.set()
 
@@ -157,6 +164,7 @@ def test_while_nobody_reads_the_newest_lines_are_dropped_and_the_next_line_tells
 def test_drops_that_no_line_has_told_are_told_by_the_last_one(stalled: Stalled) -> None:
     log_many(CAPACITY + 3)
     stalled.read.set()
+    await_lines()
     end_logs()
     last = json.loads(stalled.getvalue().splitlines()[-1])
     assert (last["event"], last["dropped"]) == ("lines dropped", 3)
@@ -181,16 +189,15 @@ end_logs("the end")
 """
 
 
-@pytest.mark.slow
-def test_a_program_whose_lines_nobody_reads_goes_on_and_ends() -> None:
-    with subprocess.Popen([sys.executable, "-c", PROGRAM], stderr=subprocess.PIPE, text=True) as process:
-        assert process.wait(timeout=20) == 0
-        assert process.stderr is not None
-        assert '"event": "xxx' in process.stderr.readline()
+def test_a_program_whose_lines_nobody_reads_goes_on_and_ends(processes: Processes) -> None:
+    program = processes.python("-c", PROGRAM, stderr=subprocess.PIPE).popen
+    assert program.wait(END_S) == 0
+    assert program.stderr is not None
+    assert '"event": "xxx' in program.stderr.readline()
 
 
-def test_a_program_whose_reader_has_gone_goes_on_and_ends() -> None:
-    with subprocess.Popen([sys.executable, "-c", PROGRAM], stderr=subprocess.PIPE) as process:
-        assert process.stderr is not None
-        process.stderr.close()
-        assert process.wait(timeout=20) == 0
+def test_a_program_whose_reader_has_gone_goes_on_and_ends(processes: Processes) -> None:
+    program = processes.python("-c", PROGRAM, stderr=subprocess.PIPE).popen
+    assert program.stderr is not None
+    program.stderr.close()
+    assert program.wait(END_S) == 0

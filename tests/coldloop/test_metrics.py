@@ -1,6 +1,7 @@
 """Registers for Prometheus: what the text says, and who is answered."""
 
 import asyncio
+import contextlib
 import math
 import shutil
 import subprocess
@@ -9,7 +10,7 @@ import pytest
 
 from coldloop.errors import PortInUseError
 from coldloop.metrics import Family, Sample, bank_families, exposition
-from coldloop.metrics_server import MetricsServer
+from coldloop.metrics_server import MOST_OPEN, MetricsServer
 from coldloop.metrics_settings import MetricsSettings
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
@@ -76,6 +77,36 @@ async def test_the_server_answers_two_paths_and_survives_what_is_no_request(free
     finally:
         server.cancel()
         await asyncio.gather(server, return_exceptions=True)
+
+
+@pytest.mark.parametrize("text", [b"", b"GET /metr", b"GET /metrics HTTP/1.1\r\n\r\n"])
+async def test_whoever_holds_connections_gives_way_to_who_asks(free_port: int, text: bytes) -> None:
+    server = asyncio.create_task(MetricsServer(MetricsSettings(port=free_port), bank()).run())
+    held: list[tuple[asyncio.StreamReader, asyncio.StreamWriter]] = []
+    try:
+        while len(held) < 5 * MOST_OPEN:
+            try:
+                held.append(await asyncio.open_connection("127.0.0.1", free_port, limit=1))  # reads next to nothing
+            except ConnectionError:
+                await asyncio.sleep(0)
+            else:
+                held[-1][1].write(text)
+        assert "200 OK" in await asked(free_port, b"GET /healthz HTTP/1.1\r\n\r\n")
+        ended = [asyncio.create_task(ends(reader)) for reader, _ in held[: 4 * MOST_OPEN]]
+        async with asyncio.timeout(60):
+            await asyncio.gather(*ended)
+    finally:
+        for _, writer in held:
+            writer.transport.abort()
+        server.cancel()
+        await asyncio.gather(server, return_exceptions=True)
+
+
+async def ends(reader: asyncio.StreamReader) -> None:
+    """Read until the server has closed the connection."""
+    with contextlib.suppress(ConnectionError):
+        while await reader.read(1000):
+            pass
 
 
 async def test_without_a_port_it_is_off() -> None:

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 import pytest
 
-from coldloop.retained import RetainedFile, RetainedStateError, encoded
+from coldloop.retained import RetainedFile, RetainedStateError, _description, encoded
 
 OLD = {"session": 3, "tick": 1000, "applied": [43.0, 75.0, 36.0]}
 NEW = {"session": 3, "tick": 1001, "applied": [43.1, 76.0, 36.0]}
@@ -30,6 +30,43 @@ def test_what_is_saved_is_read_back_and_nothing_is_nothing(tmp_path: Path) -> No
     file.save(NEW)
     assert file.load() == NEW
     assert [path.name for path in tmp_path.iterdir()] == ["state"]
+
+
+def sealed_nonsense(content: bytes) -> bytes:
+    """Return a file whose description is right for a content that is no state."""
+    return _description(content, *OURS) + content
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"no JSON", b"\xff\xfe", b"[1, 2]", b"7", b"[" * 100_000, b"9" * 5000, b'{"a":' * 50_000], ids=len
+)
+def test_what_is_sealed_and_no_state_is_refused(tmp_path: Path, content: bytes) -> None:
+    file = kept(tmp_path / "state")
+    file.path.write_bytes(sealed_nonsense(content))
+    with pytest.raises(RetainedStateError, match="no state"):
+        file.load()
+    assert file.set_aside() == "set aside as state.refused"
+    assert file.load() is None
+
+
+@pytest.mark.parametrize("kind", ["fifo", "link", "folder"])
+def test_what_is_no_ordinary_file_is_neither_waited_for_nor_followed(tmp_path: Path, kind: str) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    kept(elsewhere).save(OLD)
+    file = kept(tmp_path / "state")
+    for place in (file.path, tmp_path / "state.draft"):
+        if kind == "fifo":
+            os.mkfifo(place)
+        elif kind == "link":
+            place.symlink_to(elsewhere)
+        elif place == file.path:
+            place.mkdir()
+    with pytest.raises(RetainedStateError):
+        file.load()
+    assert file.set_aside() == "set aside as state.refused"
+    file.save(NEW)
+    assert file.load() == NEW
+    assert kept(elsewhere).load() == OLD, "nothing was written through a link"
 
 
 class KilledError(BaseException):

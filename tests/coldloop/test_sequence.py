@@ -33,7 +33,7 @@ def test_any_flipped_bit_of_the_header_changes_the_crc(field: int, bits: int) ->
         assert checksum(SequenceHeader(*values), ROWS) != expected
 
 
-@settings(max_examples=200)
+@settings(max_examples=2 * settings.default.max_examples)
 @given(row=st.integers(0, 19), column=st.integers(0, 2), bit=st.integers(0, 31))
 def test_any_flipped_bit_of_a_row_changes_the_crc(row: int, column: int, bit: int) -> None:
     values: list[float] = list(ROWS[row])

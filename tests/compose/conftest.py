@@ -95,7 +95,7 @@ def rig(_engine: None) -> Iterator[ComposedRig]:
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def certificate_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Certificates for the rig; the containers' user can read the keys."""
     folder = tmp_path_factory.mktemp("certificates") / "site"
     asked_by_the_page = [f"{service}.operators" for service in SERVICES]
@@ -107,10 +107,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def secured_rig(_engine: None, site: Path) -> Iterator[ComposedRig]:
+def secured_rig(_engine: None, certificate_folder: Path) -> Iterator[ComposedRig]:
     """The rig with TLS, and its page."""
     files = ("docker-compose.yml", "docker-compose.tls.yml")
-    with composed("172.29", files, COLDLOOP_CERTIFICATES=str(site), **WITH_PAGE) as one:
+    with composed("172.29", files, COLDLOOP_CERTIFICATES=str(certificate_folder), **WITH_PAGE) as one:
         yield one
 
 

@@ -23,8 +23,8 @@ READ_MAGIC = bytes.fromhex("000100000006ff0300000002")
 MAGIC = bytes.fromhex("42f6e979")
 
 
-def certificates(site: Path, name: str) -> TlsSettings:
-    return TlsSettings(certificate=site / f"{name}.crt", key=site / f"{name}.key", ca=site / "ca.crt")
+def certificates(folder: Path, name: str) -> TlsSettings:
+    return TlsSettings(certificate=folder / f"{name}.crt", key=folder / f"{name}.key", ca=folder / "ca.crt")
 
 
 def function_of_answer(rig: "ComposedRig", tls: TlsSettings, request: bytes) -> int:
@@ -45,16 +45,18 @@ def write_of(record: type[tuple[object, ...]]) -> bytes:
 
 @pytest.mark.parametrize(("name", "answer"), [("operator", 16), ("control", 0x90), ("reader", 0x90)])
 def test_certificates_say_who_may_write_the_load(
-    secured_rig: "ComposedRig", site: Path, name: str, answer: int
+    secured_rig: "ComposedRig", certificate_folder: Path, name: str, answer: int
 ) -> None:
-    tls = certificates(site, name)
+    tls = certificates(certificate_folder, name)
     assert function_of_answer(secured_rig, tls, READ_MAGIC[7:]) == 3
     assert function_of_answer(secured_rig, tls, write_of(LoadStep)) == answer
 
 
 @pytest.mark.parametrize("name", ["operator", "optimizer", "reader"])
-def test_none_but_the_control_plc_may_write_outputs(secured_rig: "ComposedRig", site: Path, name: str) -> None:
-    assert function_of_answer(secured_rig, certificates(site, name), write_of(Actuators)) == 0x90
+def test_none_but_the_control_plc_may_write_outputs(
+    secured_rig: "ComposedRig", certificate_folder: Path, name: str
+) -> None:
+    assert function_of_answer(secured_rig, certificates(certificate_folder, name), write_of(Actuators)) == 0x90
 
 
 def test_nobody_is_answered_without_tls(secured_rig: "ComposedRig") -> None:
@@ -73,12 +75,12 @@ def test_no_service_has_the_keys_of_another(secured_rig: "ComposedRig") -> None:
 
 
 def test_a_run_attaches_with_the_certificates_of_the_site(
-    secured_rig: "ComposedRig", site: Path, coldloop: "Callable[..., None]", tmp_path: Path
+    secured_rig: "ComposedRig", certificate_folder: Path, coldloop: "Callable[..., None]", tmp_path: Path
 ) -> None:
     rig = secured_rig
     endpoints = [f"127.0.0.1:{port}" for port in (rig.plant, rig.control_plc, rig.optimizer_plc)]
     scenario = ["--load", "a", "--duration", "1min", "--out", str(tmp_path / "run")]
-    coldloop("--config", str(site / "tls.toml"), "--attach", *endpoints, *scenario)
+    coldloop("--config", str(certificate_folder / "tls.toml"), "--attach", *endpoints, *scenario)
 
 
 def test_the_page_reads_as_a_reader_and_commands_as_an_operator(secured_rig: "ComposedRig") -> None:

@@ -1,16 +1,13 @@
 """What the containers' health check says of servers, right and wrong; needs no container."""
 
 import asyncio
-import os
 import runpy
 import socket
-import subprocess
-import sys
 import threading
-from collections.abc import AsyncIterator, Mapping
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -24,26 +21,38 @@ from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.plant import PLANT_MAP, PlantSession
 from rig.certificates import Authority
+from tests.harness.processes import END_S, Processes
 
 PROGRAM = Path(__file__).parents[2] / "docker" / "healthcheck.py"
 MAPS = {"plant": PLANT_MAP, "control_plc": CONTROL_MAP, "optimizer_plc": OPTIMIZER_MAP}
 RUNNING, READY = ServiceState.RUNNING, ServiceState.READY
 
 
-def check(
-    port: int, environment: Mapping[str, str], service: str = "control_plc"
-) -> "subprocess.CompletedProcess[str]":
-    own = {"SERVICE": service, f"COLDLOOP__{service.upper()}__SERVER__PORT": str(port)}
-    command = [sys.executable, "-I", "-S", str(PROGRAM)]
-    return subprocess.run(
-        command, env={**os.environ, **own, **environment}, check=False, capture_output=True, text=True, timeout=30
-    )
+class Checked(NamedTuple):
+    """What the health check says."""
+
+    code: int
+    complaint: str
+
+
+Check = Callable[[int, Mapping[str, str], str], Checked]
+
+
+@pytest.fixture
+def check(processes: Processes) -> Check:
+    def checked(port: int, environment: Mapping[str, str], service: str) -> Checked:
+        own = {"SERVICE": service, f"COLDLOOP__{service.upper()}__SERVER__PORT": str(port)}
+        done = processes.python("-I", "-S", str(PROGRAM), more={**own, **environment})
+        return Checked(done.popen.wait(END_S), done.said)
+
+    return checked
 
 
 class Service:
     """A server of a service, whose scans a test decides on."""
 
-    def __init__(self, register_map: RegisterMap, order: WordOrder, tls: TlsSettings | None) -> None:
+    def __init__(self, check: Check, register_map: RegisterMap, order: WordOrder, tls: TlsSettings | None) -> None:
+        self._check = check
         self.map = register_map
         self.bank = RegisterBank(register_map, order)
         self.server = ModbusServer(
@@ -62,77 +71,92 @@ class Service:
             self.show(tick)
             await asyncio.sleep(0.01)
 
-    async def check(self, environment: Mapping[str, str] | None = None) -> "subprocess.CompletedProcess[str]":
+    async def check(self, environment: Mapping[str, str] | None = None) -> Checked:
         how = {"COLDLOOP__SESSION__MODE": "realtime", **(environment or {})}
-        return await asyncio.to_thread(check, self.server.port, how, self.map.service)
+        return await asyncio.to_thread(self._check, self.server.port, how, self.map.service)
 
 
-@asynccontextmanager
-async def served(
-    service: str = "control_plc", order: WordOrder = WordOrder.HIGH_FIRST, tls: TlsSettings | None = None
-) -> AsyncIterator[Service]:
-    one = Service(MAPS[service], order, tls)
-    one.show(7)
-    await one.server.start()
-    try:
-        yield one
-    finally:
-        await one.server.close()
+Show = Callable[..., AbstractAsyncContextManager[Service]]
 
 
-@asynccontextmanager
-async def scanning(*which: Any, **how: Any) -> AsyncIterator[Service]:  # noqa: ANN401 - those of served
-    async with served(*which, **how) as one:
-        task = asyncio.create_task(one.scan())
+@pytest.fixture
+def standing(check: Check) -> Show:
+    """Serve a service that stands at tick 7."""
+
+    @asynccontextmanager
+    async def served(
+        service: str = "control_plc", order: WordOrder = WordOrder.HIGH_FIRST, tls: TlsSettings | None = None
+    ) -> AsyncIterator[Service]:
+        one = Service(check, MAPS[service], order, tls)
+        one.show(7)
+        await one.server.start()
         try:
             yield one
         finally:
-            task.cancel()
+            await one.server.close()
+
+    return served
+
+
+@pytest.fixture
+def scanning(standing: Show) -> Show:
+    """Serve a service that goes from tick to tick."""
+
+    @asynccontextmanager
+    async def served(*which: Any, **how: Any) -> AsyncIterator[Service]:  # noqa: ANN401 - those of `standing`
+        async with standing(*which, **how) as one:
+            task = asyncio.create_task(one.scan())
+            try:
+                yield one
+            finally:
+                task.cancel()
+
+    return served
 
 
 @pytest.mark.parametrize("order", WordOrder)
 @pytest.mark.parametrize("service", ["plant", "control_plc"])
-async def test_a_service_that_goes_from_tick_to_tick_is_healthy(service: str, order: WordOrder) -> None:
+async def test_a_service_that_goes_from_tick_to_tick_is_healthy(service: str, order: WordOrder, scanning: Show) -> None:
     async with scanning(service, order) as one:
         done = await one.check()
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.complaint
 
 
 @pytest.mark.parametrize("order", WordOrder)
 @pytest.mark.parametrize("service", ["plant", "control_plc"])
-async def test_one_that_stands_is_not_though_it_answers(service: str, order: WordOrder) -> None:
-    async with served(service, order) as one:
+async def test_one_that_stands_is_not_though_it_answers(service: str, order: WordOrder, standing: Show) -> None:
+    async with standing(service, order) as one:
         done = await one.check()
-    assert done.returncode == 1
-    assert f"{service} on port" in done.stderr
-    assert "stands at tick 7" in done.stderr
+    assert done.code == 1
+    assert f"{service} on port" in done.complaint
+    assert "stands at tick 7" in done.complaint
 
 
-async def test_in_lock_step_a_service_may_stand_whatever_its_configuration_says() -> None:
-    async with served() as one:
+async def test_in_lock_step_a_service_may_stand_whatever_its_configuration_says(standing: Show) -> None:
+    async with standing() as one:
         one.bank.put(ControlSession(70_000, 0, 1.0))
-        assert (await one.check()).returncode == 0
+        assert (await one.check()).code == 0
         one.bank.put(ControlSession(70_000, 1, 1.0))
-        assert (await one.check({"COLDLOOP__SESSION__MODE": "lockstep"})).returncode == 1
+        assert (await one.check({"COLDLOOP__SESSION__MODE": "lockstep"})).code == 1
 
 
 @pytest.mark.parametrize("state", ServiceState)
-async def test_an_optimiser_may_have_nothing_to_do(state: ServiceState) -> None:
-    async with served("optimizer_plc") as one:
+async def test_an_optimiser_may_have_nothing_to_do(state: ServiceState, standing: Show) -> None:
+    async with standing("optimizer_plc") as one:
         one.show(7, state)
-        assert (await one.check()).returncode == 0
+        assert (await one.check()).code == 0
 
 
 @pytest.mark.parametrize("service", ["plant", "control_plc"])
-async def test_without_a_session_nothing_is_scanned(service: str) -> None:
-    async with served(service) as one:
+async def test_without_a_session_nothing_is_scanned(service: str, standing: Show) -> None:
+    async with standing(service) as one:
         one.show(0, READY, session=0)
         done = await one.check()
-    assert done.returncode == 1
-    assert "runs no session" in done.stderr
+    assert done.code == 1
+    assert "runs no session" in done.complaint
 
 
-async def test_it_speaks_tls_and_trusts_no_other_server(tmp_path: Path) -> None:
+async def test_it_speaks_tls_and_trusts_no_other_server(tmp_path: Path, scanning: Show) -> None:
     def kept(folder: str) -> tuple[TlsSettings, dict[str, str]]:
         authority = Authority.new("site", 1)
         pairs = {
@@ -151,18 +175,18 @@ async def test_it_speaks_tls_and_trusts_no_other_server(tmp_path: Path) -> None:
 
     (tls, ours), (_, others) = kept("ours"), kept("others")
     async with scanning(tls=tls) as one:
-        assert (await one.check(ours)).stderr == ""
-        assert "certificate verify failed" in (await one.check(others)).stderr
-        assert (await one.check()).returncode == 1
+        assert (await one.check(ours)).complaint == ""
+        assert "certificate verify failed" in (await one.check(others)).complaint
+        assert (await one.check()).code == 1
 
 
-def test_a_port_on_which_nobody_listens_is_not_healthy(free_port: int) -> None:
-    done = check(free_port, {})
-    assert done.returncode == 1
-    assert "control_plc on port" in done.stderr
+def test_a_port_on_which_nobody_listens_is_not_healthy(free_port: int, check: Check) -> None:
+    done = check(free_port, {}, "control_plc")
+    assert done.code == 1
+    assert "control_plc on port" in done.complaint
 
 
-def test_nor_is_a_server_of_something_else() -> None:
+def test_nor_is_a_server_of_something_else(check: Check) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def answer() -> None:
@@ -172,10 +196,10 @@ def test_nor_is_a_server_of_something_else() -> None:
 
         thread = threading.Thread(target=answer)
         thread.start()
-        done = check(server.getsockname()[1], {})
+        done = check(server.getsockname()[1], {}, "control_plc")
         thread.join()
-    assert done.returncode == 1
-    assert "not a register map of ours" in done.stderr
+    assert done.code == 1
+    assert "not a register map of ours" in done.complaint
 
 
 def test_the_addresses_it_reads_are_those_of_the_register_maps() -> None:

@@ -34,6 +34,8 @@ class Bench:
         self.level = self.temperature = 0.0
         self.moving = False
         """Everything trembles about that."""
+        self.frozen = False
+        """Load and states stand still, too."""
         self.readings: dict[int, float] = {}
         """What single sensors show instead."""
 
@@ -43,7 +45,7 @@ class Bench:
         return SequenceRow(*actuators[1:4]), self.program.end_scan(self.measurement(actuators))
 
     def measurement(self, actuators: Actuators) -> Measurement:
-        x = tuple(float(i) for i in range(28))
+        x = (0.0 if self.frozen else float(actuators.tick), *[float(i) for i in range(1, 28)])
         return Measurement(actuators.tick, self.load, self.outputs(), x, actuators.session)
 
     def outputs(self) -> tuple[float, ...]:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.errors import ConfigurationError
@@ -220,7 +220,6 @@ def test_a_setting_that_is_no_driver_is_refused() -> None:
         ControlSection.model_validate({"driver": "nobody"})
 
 
-@settings(max_examples=60)
 @given(
     readings=st.lists(
         st.tuples(st.floats(-80.0, 80.0) | st.just(math.nan), st.floats(-8.0, 100.0) | st.just(math.inf)),
@@ -248,7 +247,6 @@ def test_whatever_the_sensors_tell_bounds_and_rates_are_kept(
             assert abs(value - window[i]) <= limits.rate[i]
 
 
-@pytest.mark.slow
 def test_the_loops_hold_the_plant_by_themselves_on_load_a() -> None:
     load = find_load("a", HEADER.w0)
     plant = make_plant(HEADER, SensorSettings(), load, seed=1)

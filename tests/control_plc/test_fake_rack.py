@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
@@ -419,5 +418,5 @@ class RackLink(RuleBasedStateMachine):
         assert self.fake.rack.outputs.holder == self.link.holder
 
 
-TestRackLink = pytest.mark.slow(RackLink.TestCase)
-TestRackLink.settings = settings(max_examples=80, stateful_step_count=40)
+TestRackLink = RackLink.TestCase
+TestRackLink.settings = settings(max_examples=4 * settings.default.max_examples, stateful_step_count=40)

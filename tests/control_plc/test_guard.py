@@ -2,7 +2,7 @@ import math
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from coldloop.limits import InputLimits, RateReference
@@ -65,7 +65,7 @@ def check(limits: InputLimits, initial: SequenceRow, history: list[tuple[Sequenc
 
 
 @each_reference
-@settings(max_examples=80)
+@settings(max_examples=4 * settings.default.max_examples)
 @given(history=scans)
 def test_whatever_is_asked_every_output_is_inside_its_bounds_and_its_rate_window(
     reference: RateReference, history: list[tuple[SequenceRow, bool, int]]
@@ -73,7 +73,7 @@ def test_whatever_is_asked_every_output_is_inside_its_bounds_and_its_rate_window
     check(InputLimits(rate_reference=reference), INITIAL, history)
 
 
-@settings(max_examples=80)
+@settings(max_examples=4 * settings.default.max_examples)
 @given(limits=odd_limits(), history=scans, share=st.floats(0.0, 1.0))
 def test_rates_that_single_precision_cannot_represent_are_kept_too(
     limits: InputLimits, history: list[tuple[SequenceRow, bool, int]], share: float
@@ -95,7 +95,6 @@ def test_bounds_that_single_precision_cannot_represent_are_kept_too() -> None:
                 assert low <= value <= high
 
 
-@settings(max_examples=50)
 @given(history=scans)
 def test_with_elapsed_rates_the_outputs_never_drift_faster_than_the_rate(
     history: list[tuple[SequenceRow, bool, int]],
@@ -114,7 +113,6 @@ def test_with_elapsed_rates_the_outputs_never_drift_faster_than_the_rate(
 
 
 @each_reference
-@settings(max_examples=30)
 @given(target=rows)
 def test_a_value_that_can_be_reached_is_reached_and_then_held(reference: RateReference, target: SequenceRow) -> None:
     limits = InputLimits(rate=(5.0, 20.0, 5.0), rate_reference=reference)
@@ -167,7 +165,7 @@ def test_what_is_applied_outside_an_open_window_begins_a_new_one() -> None:
     assert guard.admit(6, SequenceRow(43.0, 75.0, 36.0), update=False).cv155 == pytest.approx(49.5)
 
 
-@settings(max_examples=200)
+@settings(max_examples=2 * settings.default.max_examples)
 @given(
     applied=st.tuples(*[st.floats(0.0, 200.0, width=32)] * 3),
     wanted=st.tuples(*[st.floats(0.0, 200.0)] * 3),
@@ -190,3 +188,20 @@ def test_from_anywhere_at_all_outputs_come_into_their_bounds_within_the_rate(
                 middle = (limits.low[i] + limits.high[i]) / 2
                 assert abs(value - middle) < abs(before[i] - middle), "towards the bounds"
         before = after
+
+
+@settings(max_examples=200)
+@given(jitter=st.lists(st.integers(-6, 6), min_size=40, max_size=120))
+@example(jitter=[0, 3, -3] * 20)
+@example(jitter=[-3] * 19 + [3] * 14 + [-3] * 30)
+def test_a_rack_whose_tick_wavers_moves_no_output_further_than_a_calm_one(jitter: list[int]) -> None:
+    """In calm two windows meet within 5 s: an output may move by its rate at the end of one, and again in the next."""
+    limits, wanted = InputLimits(), SequenceRow(60.0, 150.0, 60.0)
+    guard, told, moves = OutputGuard(limits, INITIAL), 0, [INITIAL]
+    for now, off in enumerate(jitter, start=100):
+        if now + off != told + 1:
+            guard.begin_at(now + off, guard.applied, passed=1)
+        told = now + off
+        moves.append(guard.admit(told, wanted, update=False))
+    for before, after in zip(moves, moves[TICKS_PER_SAMPLE:], strict=False):
+        assert all(abs(new - old) <= 2 * rate + 1e-4 for old, new, rate in zip(before, after, limits.rate, strict=True))

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -108,6 +108,44 @@ def test_a_handshake_that_comes_to_nothing_does_not_keep_the_loops_from_working(
         applied = rig.scans(20)  # planned, and nothing sent
         moved.append(len(set(applied)) > 1)
     assert moved.count(True) >= 4
+
+
+WAYS = ("silence", "abandoned", "interrupted", "interrupted answers", "an answer far ahead")
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_an_optimiser_that_plans_and_never_delivers_does_not_hold_the_loops(
+    rig: "Bench", way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program, far = rig.program, way in {"silence", "an answer far ahead"}
+    rig.level = 1.0
+    rig.scans(2 + 20 + HOLD_TICKS + 30)
+    assert program.mode is Mode.CLASSICAL
+    program.abandon()
+    at_work: list[int] = []
+    wanted = program._loops.wanted  # noqa: SLF001 - what is held is not seen where the rate holds as well
+
+    def working(tick: int, *arguments: Any, **named: Any) -> SequenceRow:  # noqa: ANN401 - as they are
+        at_work.append(tick)
+        return wanted(tick, *arguments, **named)
+
+    monkeypatch.setattr(program._loops, "wanted", working)  # noqa: SLF001
+    begun = program.tick
+    for tick in range(1200):
+        if program.player.awaiting_plan:
+            rig.plan(239 if far else 20, load_step=0.5 if "interrupted" in way else 0.0)
+        if "answer" in way and not program.player.has_answer:
+            rig.offer(rig.sequence([program.applied] * 20))
+        if way == "abandoned" and tick % 15 == 14:
+            program.abandon()
+        if "interrupted" in way and tick % 15 == 14:
+            rig.load = 768.5 - rig.load
+        rig.scan()
+        if program.mode is not Mode.CLASSICAL:
+            break
+    ticks = program.tick - begun
+    assert max(after - before for before, after in pairwise([begun, *at_work])) <= 20 + 1, "5 s"
+    assert ticks - len(at_work) <= ticks * 20 / 140 + 40, "and then not for 30 s"
 
 
 @pytest.mark.parametrize("mode", [OperatorMode.CLASSICAL, OperatorMode.MANUAL])
@@ -229,6 +267,23 @@ def test_a_frozen_level_is_found_while_others_move_and_a_process_at_rest_is_not_
     assert lively.program.bad_sensors == 0
     lively.scans(3)
     assert lively.program.bad_sensors == 1 << L1
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_an_image_that_stands_still_as_a_whole_is_an_old_one_unless_the_plant_may_rest(
+    new_bench: NewBench, *, rests: bool
+) -> None:
+    bench = new_bench(InputLimits(), section(sensors={"may_rest": rests}))
+    bench.steady = bench.frozen = True
+    bench.scans(200)
+    assert bool(bench.program.bad_sensors) is not rests
+    bench.program.operate(Operator(OperatorMode.MANUAL, 43.1, 75.0, 36.0))
+    bench.scans(100)
+    assert bench.program.bad_sensors == 2**22 - 1, "the inputs have moved, and nothing else"
+    assert alarm(bench, AlarmKind.SENSOR_BAD) is AlarmState.UNACKNOWLEDGED
+    bench.moving = True
+    bench.scans(20)
+    assert bench.program.bad_sensors == 0
 
 
 def test_a_state_that_is_no_number_is_not_worked_with(rig: "Bench") -> None:

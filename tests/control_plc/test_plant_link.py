@@ -86,8 +86,8 @@ def test_a_request_that_comes_to_nothing_leads_out_of_step(
     [
         (reading(session=2), S.FOREIGN, C.WRONG_SESSION),
         (reading(session=0), S.FOREIGN, C.WRONG_SESSION),
-        (reading(u=(math.nan, 75.0, 36.0)), S.JOINING, C.NOT_FINITE),
-        (reading(u=(43.0, math.inf, 36.0)), S.JOINING, C.NOT_FINITE),
+        (reading(u=(math.nan, 75.0, 36.0)), S.JOINING, C.IMPLAUSIBLE),
+        (reading(u=(43.0, math.inf, 36.0)), S.JOINING, C.IMPLAUSIBLE),
     ],
 )
 def test_only_a_finite_reading_of_this_session_leads_back(

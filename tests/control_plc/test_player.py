@@ -2,12 +2,15 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.limits import InputLimits
+from coldloop.process import LAST_NUMBER
 from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import Mode, Plan, SequenceRow, Verdict
+from coldloop.registers.control_plc import Mode, Plan, SequenceRow, Update, Verdict
+from control_plc.guard import OutputGuard
+from control_plc.player import SequencePlayer
 
 if TYPE_CHECKING:
     from tests.control_plc.conftest import Bench
@@ -28,7 +31,6 @@ def test_a_session_begins_with_the_initial_inputs_and_an_update_at_tick_0(
     assert bench.program.awaiting_plan
 
 
-@settings(max_examples=30)
 @given(ticks=st.integers(1, 30), length=st.integers(1, 40))
 def test_a_sequence_takes_effect_exactly_at_its_first_tick_and_plays_a_row_a_tick(
     new_bench: "Callable[[InputLimits], Bench]", at: At, ticks: int, length: int
@@ -63,6 +65,13 @@ def test_the_update_at_the_first_tick_of_a_sequence_tells_both_inputs(bench: "Be
     assert (update.u_before, update.u) == (tuple(at()), tuple(at(0.5)))
     assert (update.load, update.y, update.x) == (measurement.load, measurement.y, measurement.x)
     assert bench.program.player.update == update
+
+
+def test_updates_are_numbered_from_0_again_after_the_last_number() -> None:
+    limits = InputLimits()
+    player = SequencePlayer(OutputGuard(limits, SequenceRow(43.0, 75.0, 36.0)), 0, updates=LAST_NUMBER)
+    empty = Update(1, 0, 0, 0, 385.0, (43.0,) * 3, (43.0,) * 3, (0.0,) * 22, (0.0,) * 28)
+    assert [player.latch(empty).update for _ in range(2)] == [LAST_NUMBER, 0]
 
 
 def test_the_process_image_is_that_of_the_last_scan(bench: "Bench", at: At) -> None:

@@ -53,6 +53,14 @@ def test_no_single_measurement_moves_the_schedule_by_more_than_the_bound(errors:
         assert abs(clock.position_at(at) - before) <= MAX_CORRECTION + 1e-12
 
 
+def test_one_position_that_cannot_be_teaches_nothing_about_the_rate() -> None:
+    clock, _ = follow(200.0, 20.0, 4000)
+    before, at = clock.skew(), clock.due(4000)
+    clock.observe(clock.position_at(at) + 1000.0, at)
+    assert clock.skew() == before
+    assert clock.offset == pytest.approx(1000.0)
+
+
 def test_after_a_break_the_next_scan_is_the_first_one_that_is_still_due() -> None:
     clock = RackClock(2.0, 0.0)
     clock.synchronise(117.2, at=50.0)

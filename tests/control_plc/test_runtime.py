@@ -32,11 +32,12 @@ from coldloop.seal import sealed
 from control_plc.certificate_watch import EXPIRES_SOON, UNREADABLE
 from control_plc.retained_state import OWNER
 from control_plc.runtime import ControlPlc
+from control_plc.sessions import ADOPT_AFTER_S
 from control_plc.settings import ControlSettings
 from rig.certificates import Authority
 from rig.ports import ReservedPorts
 
-WITHIN_S = 20.0
+WITHIN_S = 60.0
 HEADER = read_header(DEFAULT_MODEL_FILE)
 
 
@@ -106,9 +107,9 @@ def ask(plc: ControlPlc, record: tuple[Any, ...]) -> None:
     plc.clients.on_write(CONTROL_MAP.block_of(type(record)), ANYBODY)
 
 
-async def until(condition: Callable[[], object], within_s: float = WITHIN_S) -> None:
+async def until(condition: Callable[[], object]) -> None:
     """Wait for a condition."""
-    deadline = time.monotonic() + within_s
+    deadline = time.monotonic() + WITHIN_S
     while not condition():
         assert time.monotonic() < deadline
         await asyncio.sleep(0.01)
@@ -126,13 +127,30 @@ async def test_an_alarm_with_a_delay_is_raised_also_while_no_scans_are_made() ->
         await until(lambda: alarm(plc, AlarmKind.PLANT_LOST) is AlarmState.UNACKNOWLEDGED)
 
 
+async def test_scans_that_are_not_made_are_alarmed_from_outside_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = asyncio.Event()
+    async with running(SmallRack(1)) as plc:
+        monkeypatch.setattr(plc, "_scan", ended.wait)
+        watch = asyncio.create_task(plc.watch_scans())
+        ask(plc, ControlSession(1, 1, 10.0))
+        await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IN_STEP)
+        await until(lambda: alarm(plc, AlarmKind.SCANS_STOPPED) is AlarmState.UNACKNOWLEDGED)
+        ask(plc, ControlSession(2, 0, 1.0))  # in lock-step nobody expects scans
+        ended.set()
+        await until(lambda: alarm(plc, AlarmKind.SCANS_STOPPED) is AlarmState.RETURNED)
+        watch.cancel()
+
+
+@pytest.mark.usefixtures("realtime")
 async def test_a_new_session_does_not_wait_for_a_tick_that_lasts_long() -> None:
+    """At a factor of 0.01 a tick lasts 25 s."""
     rack = SmallRack(1)
     async with running(rack, session={"autostart": True, "mode": "realtime", "factor": 0.01}) as plc:
         await until(lambda: rack.written)
         rack.begin(2)
         ask(plc, ControlSession(2, 1, 0.01))
-        await until(lambda: rack.written[-1].session == 2, within_s=5.0)
+        await until(lambda: rack.written[-1].session == 2)
+        assert [outputs.session for outputs in rack.written] == [1, 2], "a scan each"
 
 
 async def test_a_new_session_of_an_operator_is_no_loss_of_the_plant() -> None:
@@ -147,20 +165,35 @@ async def test_a_new_session_of_an_operator_is_no_loss_of_the_plant() -> None:
         assert alarm(plc, AlarmKind.PLANT_LOST) is AlarmState.NORMAL
 
 
-@pytest.mark.slow
-async def test_autostart_leaves_a_session_to_the_operator_who_is_about_to_ask_for_it() -> None:
+class StandingClock:
+    """A clock that the test moves on, and that counts who looks at it."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+        self.looks = 0
+
+    def monotonic(self) -> float:
+        self.looks += 1
+        return self.now
+
+
+@pytest.mark.usefixtures("realtime")
+async def test_autostart_leaves_a_session_to_the_operator_who_is_about_to_ask_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """He writes to the rack first, and then to the control PLC."""
-    rack = SmallRack(1)
+    rack, clock = SmallRack(1), StandingClock()
+    monkeypatch.setattr("control_plc.sessions.time", clock)
     async with running(rack, session={"autostart": True, "mode": "realtime", "factor": 50.0}) as plc:
         await until(lambda: rack.written)
         rack.begin(2)
-        await asyncio.sleep(0.4)
+        await until(lambda: clock.looks >= 4)  # four times the rack is found in the other session
         assert rack.written[-1].session == 1
+        clock.now += ADOPT_AFTER_S
         await until(lambda: rack.written[-1].session == 2)  # nobody has asked
         assert plc.sessions.running
 
 
-@pytest.mark.slow
 async def test_no_number_of_a_start_or_of_an_event_is_given_out_twice(tmp_path: Path) -> None:
     """Whether scans are made or not: here there is no rack."""
     given: list[tuple[int, int]] = []
@@ -206,7 +239,8 @@ async def test_a_session_is_gone_on_with_after_several_starts_without_the_rack(t
         assert plc.bank.get(Operator).mode == OperatorMode.CLASSICAL
     async with running(SmallRack(5), control_plc=settings) as plc:
         await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IDLE)
-        await asyncio.sleep(0.1)
+        for _ in range(100):
+            await asyncio.sleep(0)
         assert not plc.sessions.running
         assert plc.bank.get(Operator).mode == OperatorMode.AUTO
 
@@ -234,7 +268,22 @@ async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
 
 
 @pytest.mark.parametrize(
-    "odd", [{"pace": (1, 0.0)}, {"pace": (1, math.nan)}, {"operator": (77, 1, 1, 1)}, {"operator": (2, math.nan, 1, 1)}]
+    "odd",
+    [
+        {"pace": (1, 0.0)},
+        {"pace": (1, math.nan)},
+        {"pace": (1, 1e300)},
+        {"operator": (77, 1, 1, 1)},
+        {"operator": (2, math.nan, 1, 1)},
+        {"operator": (2, 1e300, 1, 1)},
+        {"tick": -5},
+        {"tick": 2**32 - 1},
+        {"updates": 2**32 - 1},
+        {"alarms": [(9, 0, 0, 0, 0, 0, 1, 0)] * len(AlarmKind)},
+        {"alarms": [(0, 0, 0, -1, 0, 0, 1, 2**40)] * len(AlarmKind)},
+        {"playing": ((2**32 - 1, 0, 0, 0, 0, 0, 0), "")},
+    ],
+    ids=str,
 )
 async def test_a_retained_state_that_cannot_be_keeps_nobody_from_starting(tmp_path: Path, odd: dict[str, Any]) -> None:
     file = tmp_path / "state"
@@ -247,3 +296,5 @@ async def test_a_retained_state_that_cannot_be_keeps_nobody_from_starting(tmp_pa
     kept.save({**state, **odd})
     async with running(SmallRack(4), control_plc={"retain": {"file": file}}) as plc:
         await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IDLE)
+        assert alarm(plc, AlarmKind.STATE_NOT_RETAINED) is AlarmState.UNACKNOWLEDGED
+        assert file.with_name("state.refused").exists(), "it is set aside"

@@ -3,7 +3,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from coldloop.limits import InputLimits, RateReference
@@ -230,7 +230,6 @@ STILL = [(0.0, 0.0, 0.0)]
 updates = st.tuples(st.integers(1, 20), st.lists(moves, min_size=1, max_size=4))
 
 
-@settings(max_examples=60)
 @example(
     reference=RateReference.PER_UPDATE, script=[(15, STILL), (15, STILL), (18, STILL), (18, STILL), (15, STILL * 4)]
 )

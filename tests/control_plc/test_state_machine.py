@@ -4,7 +4,6 @@ import json
 import math
 from itertools import pairwise
 
-import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -270,5 +269,5 @@ class Link(RuleBasedStateMachine):
             assert events[-1].subject == self.program.mode
 
 
-TestLink = pytest.mark.slow(Link.TestCase)
-TestLink.settings = settings(max_examples=60, stateful_step_count=60)
+TestLink = Link.TestCase
+TestLink.settings = settings(max_examples=3 * settings.default.max_examples, stateful_step_count=60)

@@ -4,11 +4,9 @@ import contextlib
 import json
 import os
 import shutil
-import signal
 import socket
 import struct
 import subprocess
-import sys
 import threading
 import time
 import urllib.error
@@ -20,10 +18,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
 import pytest
 
-from coldloop.config import PREFIX, to_environment
 from hmi.users import PageRole, write_user
-from rig.ports import ReservedPorts
+from rig import cli
+from rig.figure_process import FigureProcess
 from rig.settings import Settings
+from tests.harness.processes import END_S, Process, Processes
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -39,11 +38,11 @@ RECORDED_S = 120
 """Length of the run that is replayed."""
 
 
-def eventually(condition: Callable[[], T], what: str, patience_s: float = 30.0) -> T:
+def eventually(condition: Callable[[], T], what: str) -> T:
     """Wait until a condition holds; return what it returned."""
-    deadline = time.monotonic() + patience_s
+    deadline = time.monotonic() + PATIENCE_S
     while not (found := condition()):
-        assert time.monotonic() < deadline, f"{what}: not within {patience_s:g} s"
+        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE_S:g} s"
         time.sleep(0.02)
     return found
 
@@ -59,7 +58,8 @@ class Answer(NamedTuple):
 class Site:
     """Services and page as processes on ports of their own; each can be killed, stopped and started again."""
 
-    def __init__(self, folder: Path, ports: list[int], overrides: Mapping[str, object], kind: str = "cold-box") -> None:
+    def __init__(self, processes: Processes, folder: Path, overrides: Mapping[str, object], kind: str) -> None:
+        ports = [processes.free_port() for _ in SERVICES]
         self.ports = dict(zip(SERVICES, ports, strict=True))
         self.audit = folder / "audit.jsonl"
         users = folder / "users"
@@ -67,7 +67,7 @@ class Site:
         write_user(users, VIEWER[0], PageRole.VIEW, VIEWER[1])
         plant, control, optimizer, page = ports
         ends = {"plant": {"port": plant}, "control_plc": {"port": control}, "optimizer_plc": {"port": optimizer}}
-        settings = Settings.model_validate(
+        self._settings = Settings.model_validate(
             {
                 "session": {"autostart": True, "mode": "realtime", "factor": FACTOR},
                 "plant": {
@@ -85,12 +85,8 @@ class Site:
                 },
             }
         )  # fmt: skip
-        self._environment = {
-            **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
-            **to_environment(settings),
-        }
-        self._folder = folder
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._processes = processes
+        self._running: dict[str, Process] = {}
 
     @property
     def address(self) -> str:
@@ -98,28 +94,23 @@ class Site:
         return f"http://127.0.0.1:{self.ports['hmi']}"
 
     def start(self, service: str) -> None:
-        with (self._folder / f"{service}.log").open("ab") as log:
-            self._processes[service] = subprocess.Popen(
-                [sys.executable, "-m", service], env=self._environment, stdin=subprocess.DEVNULL, stderr=log
-            )
+        self._running[service] = self._processes.service(service, port=self.ports[service], settings=self._settings)
 
     def kill(self, service: str) -> None:
-        process = self._processes.pop(service)
-        process.kill()
-        process.wait()
+        self._running.pop(service).kill()
 
     def freeze(self, service: str) -> None:
-        self._processes[service].send_signal(signal.SIGSTOP)
+        self._running[service].pause()
 
     def thaw(self, service: str) -> None:
-        self._processes[service].send_signal(signal.SIGCONT)
+        self._running[service].resume()
 
     def end(self) -> None:
-        for process in self._processes.values():
-            process.terminate()
-            process.send_signal(signal.SIGCONT)
-        for process in self._processes.values():
-            process.wait(20)
+        for process in self._running.values():
+            process.popen.terminate()
+            process.resume()
+        for process in self._running.values():
+            assert process.popen.wait(END_S) == 0, process.said
 
     def ask(
         self, path: str, body: object = None, *, cookie: str = "", origin: str | None = None,
@@ -134,7 +125,7 @@ class Site:
         if cookie:
             request.add_header("Cookie", cookie)
         try:
-            with urllib.request.urlopen(request, timeout=20) as answer:  # noqa: S310
+            with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:  # noqa: S310
                 return _answer(answer.status, answer.read(), answer.headers)
         except urllib.error.HTTPError as error:
             return _answer(error.code, error.read(), error.headers)
@@ -161,25 +152,25 @@ def _answer(status: int, raw: bytes, headers: Message) -> Answer:
 
 
 @pytest.fixture(scope="session")
-def start_site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Site]]:
+def start_site(
+    shared_processes: Processes,
+    tmp_path_factory: pytest.TempPathFactory,
+    realtime: None,  # noqa: ARG001 a mark
+) -> Iterator[Callable[..., Site]]:
     """Start sites with settings of the page that differ; they end with the tests."""
     started: list[Site] = []
-    reserved: list[ReservedPorts] = []
 
     def start(*, kind: str = "cold-box", **overrides: object) -> Site:
-        reserved.append(ReservedPorts(len(SERVICES)))
-        one = Site(tmp_path_factory.mktemp("site"), list(reserved[-1].numbers), overrides, kind)
+        one = Site(shared_processes, tmp_path_factory.mktemp("site"), overrides, kind)
         started.append(one)
         for service in SERVICES:
             one.start(service)
-        eventually(one.is_live, "all services answer the page", PATIENCE_S)
+        eventually(one.is_live, "all services answer the page")
         return one
 
     yield start
     for one in started:
         one.end()
-    for ports in reserved:
-        ports.release()
 
 
 @pytest.fixture(scope="session")
@@ -245,41 +236,46 @@ class Witness:
 # -- recorded runs -----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="session")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "a run"
-    command = [sys.executable, "-m", "rig", "run", "--in-process", "--load", "a", "--duration", f"{RECORDED_S}s"]
-    subprocess.run([*command, "--figures", "png", "--out", str(folder)], check=True, stderr=subprocess.DEVNULL)
+def record(folder: Path, *options: str) -> Path:
+    """Run in this process, and draw no figure; return the folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("start", "draw"):
+            patch.setattr(FigureProcess, name, lambda *_: None)
+        assert cli.main(["run", "--in-process", *options, "--out", str(folder)]) == 0
     return folder
+
+
+@pytest.fixture(scope="session")
+def recorded_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "a run"
+    return record(folder, "--load", "a", "--duration", f"{RECORDED_S}s")
 
 
 class Served:
     """`coldloop page` with its arguments, as a process."""
 
-    def __init__(self, *arguments: str) -> None:
-        with ReservedPorts(1) as reserved:
-            self.port = reserved.numbers[0]
-        command = [sys.executable, "-m", "rig", "page", *arguments, "--page-port", str(self.port)]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        assert self._process.stdout is not None
-        self.address = self._process.stdout.readline().strip().rstrip("/")
+    def __init__(self, processes: Processes, *runs: Path) -> None:
+        words = ("page", *runs, "--page-port", processes.free_port())
+        self._process = processes.coldloop(*words, stdout=subprocess.PIPE)
+        assert self._process.popen.stdout is not None
+        self.address = self._process.popen.stdout.readline().strip().rstrip("/")
 
     def end(self) -> None:
-        self._process.terminate()
-        self._process.communicate(timeout=20)
+        self._process.popen.terminate()
+        self._process.popen.communicate(timeout=END_S)
 
     def ask(self, path: str, body: object = None) -> Any:  # noqa: ANN401 JSON
         request = urllib.request.Request(self.address + path)  # noqa: S310 our own page
         if body is not None:
             request.data = json.dumps(body).encode()
             request.add_header("Origin", self.address)
-        with urllib.request.urlopen(request, timeout=20) as answer:  # noqa: S310
+        with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:  # noqa: S310
             return json.loads(answer.read())
 
 
-@pytest.fixture(scope="module")
-def served(run: Path) -> Iterator[Served]:
-    one = Served(str(run))
+@pytest.fixture(scope="session")
+def served(shared_processes: Processes, recorded_run: Path) -> Iterator[Served]:
+    one = Served(shared_processes, recorded_run)
     yield one
     one.end()
 
@@ -314,7 +310,7 @@ def opened(browser: "Browser", address: str, **context: Any) -> "Iterator[Page]"
     """The page in a browser context of its own; an error in its scripts and a request to another host fail the test."""
     look = browser.new_context(**{"viewport": {"width": 1280, "height": 720}, **context})
     page = look.new_page()
-    page.set_default_timeout(20_000)
+    page.set_default_timeout(1000 * PATIENCE_S)
     errors: list[str] = []
     foreign: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))

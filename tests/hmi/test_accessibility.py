@@ -23,8 +23,18 @@ def findings(page: "Page") -> list[dict[str, Any]]:
     ]
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("size", [(1280, 720), (390, 844)], ids=["wide", "phone"])
+WIDE, PHONE = (1280, 720), (390, 844)
+
+
+@pytest.mark.parametrize(
+    ("size", "scheme"),
+    [
+        pytest.param(WIDE, "light", id="wide-light"),
+        pytest.param(PHONE, "dark", id="phone-dark"),
+        pytest.param(WIDE, "dark", id="wide-dark", marks=pytest.mark.exhaustive),
+        pytest.param(PHONE, "light", id="phone-light", marks=pytest.mark.exhaustive),
+    ],
+)
 def test_no_view_has_a_serious_finding(browser: "Browser", site: Site, scheme: str, size: tuple[int, int]) -> None:
     with opened(
         browser, site.address, viewport={"width": size[0], "height": size[1]}, color_scheme=scheme, bypass_csp=True

@@ -14,9 +14,10 @@ from coldloop.metrics import exposition
 from coldloop.process import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalPage
 from coldloop.registers.common import Identity, SessionPace
-from coldloop.registers.control_plc import LadderStatus, Process
+from coldloop.registers.control_plc import LadderStatus, Mode, Process
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
+from hmi.access import Party
 from hmi.broadcast import WAITING, Broadcast
 from hmi.commands import read_load
 from hmi.documents import alarms_document, encoded, state_document, trend_document
@@ -185,6 +186,33 @@ def test_modes_are_told_stretch_by_stretch() -> None:
     ]
 
 
+def test_where_nothing_was_read_there_is_no_line_however_much_is_thinned(model: Model, clock: Clock) -> None:
+    for tick in range(2, 400):
+        model.put("control_plc", process(tick))
+        model.heard("control_plc")
+    clock.time += 35.0
+    model.put("control_plc", LadderStatus(1, 0, 0, 1, 1 << OUTPUT_NAMES.index("L1"), 0))
+    for tick in range(540, 900):
+        model.put("control_plc", process(tick, 61.0))
+        model.heard("control_plc")
+    for points in (20, 4000):
+        trend = trend_document(model, ["L1"], 0, 900, points)
+        assert trend["gaps"] == [[399 * 0.25, 540 * 0.25]]
+        level = dict(zip(trend["time"], trend["series"]["L1"], strict=True))
+        assert [time for time, value in level.items() if value is None] == [400 * 0.25]
+        assert {value for time, value in level.items() if time < 100} == {60.0}
+        assert {value for time, value in level.items() if time > 100} == {61.0}
+    assert [(one["from"], one["to"]) for one in trend["modes"]] == [(0.25, 399 * 0.25), (540 * 0.25, 899 * 0.25)]
+    assert trend["substituted"]["L1"] == [(540 * 0.25, 900 * 0.25)]
+
+
+def test_the_updating_period_is_not_current_while_mpc_does_not_drive(model: Model) -> None:
+    for mode in Mode:
+        model.put("control_plc", LadderStatus(mode, 0, 0, 1, 0, 0))
+        assert ("update" in model.stale_prefixes()) is (mode != Mode.MPC)
+        assert model.is_planned is (mode == Mode.MPC)
+
+
 def test_a_value_that_is_substituted_is_told_stretch_by_stretch_and_no_other(model: Model) -> None:
     t5, l1 = (OUTPUT_NAMES.index(name) for name in ("T5", "L1"))
     for tick, bad in ((2, 0), (3, 1 << t5), (4, 1 << t5), (5, 0), (6, 1 << l1 | 1 << t5)):
@@ -246,16 +274,33 @@ def test_loads_and_alarms_are_marked_on_the_trends(model: Model) -> None:
 async def test_a_browser_that_is_too_slow_is_begun_anew_and_others_do_not_wait() -> None:
     whole: Iterator[int] = iter(range(100))
     broadcast = Broadcast(lambda: b"whole %d" % next(whole), most=2)
-    slow, quick = broadcast.messages(), broadcast.messages()
+    streams = [broadcast.begin(Party(address, has_session=False)) for address in ("10.0.0.1", "10.0.0.2")]
+    slow, quick = (broadcast.messages(stream) for stream in streams if stream is not None)
     assert await anext(slow) == b"whole 0"
     assert await anext(quick) == b"whole 1"
-    assert broadcast.is_full
+    assert broadcast.begin(Party("10.0.0.3", has_session=False)) is None, "as many as there may be"
     for number in range(WAITING + 2):
         broadcast.send(b"change %d" % number)
         assert await asyncio.wait_for(anext(quick), 1) == b"change %d" % number
     assert (await anext(slow)).startswith(b"whole"), "what waited is void: it gets the whole state"
     await quick.aclose()
     assert len(broadcast) == 1
+
+
+def test_a_stream_gives_way_to_who_has_logged_in_and_to_who_has_fewer() -> None:
+    broadcast = Broadcast(lambda: b"", most=4)
+    greedy, other, anna, lena = (
+        Party(name, has_session=name in {"anna", "lena"}) for name in ("10.0.0.1", "10.0.0.2", "anna", "lena")
+    )
+    assert all(broadcast.begin(greedy) for _ in range(4))
+    assert broadcast.begin(greedy) is None, "the same address has them all already"
+    streams = [broadcast.begin(party) for party in (other, anna, lena, anna)]
+    assert all(streams), "each of them takes the place of one of the address that has most"
+    assert [broadcast.begin(party) for party in (greedy, other)] == [None, None]
+    assert broadcast.begin(anna) is not None, "the last stranger's"
+    assert broadcast.begin(anna) is None, "she has three, and nobody has more"
+    assert broadcast.begin(lena) is not None
+    assert len(broadcast) == 4
 
 
 def test_load_files_are_read_or_refused_with_the_row() -> None:

@@ -1,10 +1,8 @@
 """A recorded run on the page, without servers; two side by side; and the page of `coldloop up`."""
 
 import json
-import os
 import re
 import subprocess
-import sys
 import urllib.request
 from pathlib import Path
 
@@ -13,15 +11,15 @@ import pytest
 
 from coldloop.process import OUTPUT_NAMES
 from hmi.explanation import Branch
-from rig.ports import ReservedPorts
 from rig.recorded_page import RecordedPage, _bits
 from rig.run_folder import RunFolder
 from tests.conftest import Coldloop, first_of_three_ports
+from tests.harness.processes import END_S, Processes
 from tests.hmi.conftest import RECORDED_S, Served, eventually
 
 
-def test_the_page_shows_what_the_files_of_the_run_have(served: Served, run: Path) -> None:
-    table = pq.read_table(run / "trace.parquet", columns=["L1", "T5", "CV155", "load_w"]).to_pylist()
+def test_the_page_shows_what_the_files_of_the_run_have(served: Served, recorded_run: Path) -> None:
+    table = pq.read_table(recorded_run / "trace.parquet", columns=["L1", "T5", "CV155", "load_w"]).to_pylist()
     for tick in (0, 100, 4 * RECORDED_S - 1):
         served.ask("/api/replay", {"tick": tick})
         values = served.ask("/api/state")["values"]
@@ -41,9 +39,9 @@ def test_the_replay_goes_on_at_its_speed_and_ends_at_the_end(served: Served) -> 
     assert served.ask("/api/replay")["tick"] == 4 * RECORDED_S - 1
 
 
-def test_updates_of_a_run_are_explained(served: Served, run: Path) -> None:
+def test_updates_of_a_run_are_explained(served: Served, recorded_run: Path) -> None:
     served.ask("/api/replay", {"tick": 4 * RECORDED_S - 1})
-    rows = pq.read_table(run / "updates.parquet").to_pylist()
+    rows = pq.read_table(recorded_run / "updates.parquet").to_pylist()
     first, second = (served.ask(f"/api/explanation?update={row['update']}") for row in rows[:2])
     assert first["branch"] == Branch.FIRST
     assert second["branch"] in {Branch.UP, Branch.DOWN}
@@ -55,8 +53,8 @@ def test_a_replay_takes_no_commands(served: Served) -> None:
     assert not served.ask("/api/me")["operates"]
 
 
-def test_recorded_settings_give_rule_and_limits(run: Path) -> None:
-    recorded = RecordedPage(RunFolder(run))
+def test_recorded_settings_give_rule_and_limits(recorded_run: Path) -> None:
+    recorded = RecordedPage(RunFolder(recorded_run))
     assert (recorded.rule.q_first, recorded.rule.delta, recorded.rule.iteration) == (9, 2, 0.25)
     assert recorded.limits.output_high == (61.0, 16.0)
 
@@ -76,28 +74,26 @@ def test_what_cannot_be_shown_is_one_line(coldloop: Coldloop, arguments: tuple[s
     assert part in outcome.complaints[0]
 
 
-def test_up_with_its_page_prints_where_it_is_and_a_password_that_operates(tmp_path: Path) -> None:
-    with ReservedPorts(1) as reserved:
-        port = str(reserved.numbers[0])
-    base = first_of_three_ports()
-    words = ["--port-base", str(base)]
-    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "rig", "up", *words, "--page-port", port, "--detach"]
-    up = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=True)
+def test_up_with_its_page_prints_where_it_is_and_a_password_that_operates(processes: Processes, tmp_path: Path) -> None:
+    port = processes.free_port()
+    words, more = ("--port-base", first_of_three_ports()), {"XDG_RUNTIME_DIR": str(tmp_path)}
+    up = processes.coldloop("up", *words, "--page-port", port, "--detach", stdout=subprocess.PIPE, more=more)
     try:
+        said, _ = up.popen.communicate(timeout=2 * END_S)
+        assert up.popen.returncode == 0, up.said
         address = f"http://127.0.0.1:{port}"
-        assert address in up.stdout
-        found = re.search(r"user (\S+), password (\S+)", up.stdout)
+        assert address in said
+        found = re.search(r"user (\S+), password (\S+)", said)
         assert found is not None
         body = json.dumps({"user": found[1], "password": found[2]}).encode()
         request = urllib.request.Request(f"{address}/api/login", body, {"Origin": address})  # noqa: S310 our own page
-        with urllib.request.urlopen(request, timeout=20) as answer:  # noqa: S310
+        with urllib.request.urlopen(request, timeout=END_S) as answer:  # noqa: S310
             assert json.loads(answer.read())["role"] == "operate"
     finally:
-        subprocess.run([sys.executable, "-m", "rig", "down", *words], env=environment, check=True, timeout=60)
+        assert processes.coldloop("down", *words, more=more).popen.wait(END_S) == 0
 
 
-def test_a_recorded_run_says_which_sensors_were_bad(run: Path) -> None:
-    recorded = RecordedPage(RunFolder(run))
+def test_a_recorded_run_says_which_sensors_were_bad(recorded_run: Path) -> None:
+    recorded = RecordedPage(RunFolder(recorded_run))
     assert {recorded.frame(tick).bad_sensors for tick in range(recorded.ticks)} == {0}
     assert _bits("L1 T5") == 1 << OUTPUT_NAMES.index("L1") | 1 << OUTPUT_NAMES.index("T5")

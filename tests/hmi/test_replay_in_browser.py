@@ -8,6 +8,8 @@ from tests.hmi.conftest import Served, eventually, opened
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
+    from tests.harness.processes import Processes
+
 
 def test_a_replay_looks_like_a_rig_and_has_a_bar_of_its_own(browser: "Browser", served: Served) -> None:
     with opened(browser, served.address) as page:
@@ -19,8 +21,8 @@ def test_a_replay_looks_like_a_rig_and_has_a_bar_of_its_own(browser: "Browser", 
         eventually(lambda: int(page.get_attribute("body", "data-tick") or 0) > 100, "it plays")
 
 
-def test_two_runs_are_replayed_side_by_side(browser: "Browser", run: Path) -> None:
-    both = Served(str(run), str(run))
+def test_two_runs_are_replayed_side_by_side(browser: "Browser", processes: "Processes", recorded_run: Path) -> None:
+    both = Served(processes, recorded_run, recorded_run)
     try:
         page = browser.new_page()
         page.goto(both.address + "/")

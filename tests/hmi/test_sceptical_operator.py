@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 @pytest.fixture
 def operated(page: "Page", site: Site) -> "Page":
     log_in_by_clicks(page)
-    eventually(lambda: mode(site) == MPC, "MPC drives", 90)
+    eventually(lambda: mode(site) == MPC, "MPC drives")
     view(page, "commands")
     eventually(lambda: page.input_value("#load-number") != "385", "the fields follow")
     return page
@@ -58,8 +58,12 @@ def test_enter_that_is_held_down_confirms_nothing(operated: "Page", site: Site) 
     operated.focus("#load-set")
     for _ in range(8):
         operated.keyboard.press("Enter")
-    operated.keyboard.press("Escape")
-    operated.wait_for_selector("body:not(.commanding)")
+
+    def is_given_up() -> bool:
+        operated.keyboard.press("Escape")
+        return operated.locator("body.commanding").count() == 0
+
+    eventually(is_given_up, "no command is under way")
     assert load(site) == before
 
 
@@ -92,8 +96,8 @@ def test_a_service_that_dies_between_the_two_steps_has_not_taken_the_command(ope
         eventually(lambda: not site.is_live(), "the page knows that it is gone")
     finally:
         site.start("control_plc")
-    eventually(site.is_live, "all services answer the page", 60)
-    eventually(lambda: mode(site) == MPC, "MPC drives as before", 90)
+    eventually(site.is_live, "all services answer the page")
+    eventually(lambda: mode(site) == MPC, "MPC drives as before")
 
 
 def test_a_plant_that_freezes_while_it_is_written_to_is_not_told_as_what_it_has_not_done(
@@ -108,7 +112,7 @@ def test_a_plant_that_freezes_while_it_is_written_to_is_not_told_as_what_it_has_
     operated.route("**/api/commands/*", freeze)
     try:
         operated.click("#confirm-yes")
-        eventually(lambda: outcome(operated).count("437") > 0, "it is told", 60)
+        eventually(lambda: outcome(operated).count("437") > 0, "it is told")
     finally:
         site.thaw("plant")
     told = outcome(operated)
@@ -128,7 +132,7 @@ def test_the_page_that_dies_between_the_two_steps_says_that_nobody_knows(operate
         eventually(lambda: "UNCERTAIN: the page's own server did not answer" in outcome(operated), "it is told")
     finally:
         site.start("hmi")
-    eventually(site.is_live, "the page answers", 60)
+    eventually(site.is_live, "the page answers")
     assert load(site) == before
 
 
@@ -143,7 +147,7 @@ def test_manual_that_somebody_else_has_ended_takes_no_setpoint(operated: "Page",
     confirm(second)
     operated.click("#confirm-yes")
     eventually(lambda: "take over in manual first" in outcome(operated), "it is refused, and why")
-    eventually(lambda: mode(site) == MPC, "MPC drives", 60)
+    eventually(lambda: mode(site) == MPC, "MPC drives")
 
 
 def test_an_alarm_that_somebody_else_has_put_out_of_service_is_not_told_as_shelved(
@@ -196,7 +200,7 @@ def test_a_load_file_at_a_high_factor_begins_in_time(operated: "Page", site: Sit
         cookie = site.log_in()
         token = site.ask("/api/commands", {"kind": "factor", "factor": 2.0}, cookie=cookie).document["token"]
         assert site.ask(f"/api/commands/{token}", {}, cookie=cookie).document["applied"]
-    eventually(lambda: mode(site) == MPC, "MPC drives", 90)
+    eventually(lambda: mode(site) == MPC, "MPC drives")
 
 
 # -- what is shown -----------------------------------------------------------------------------------------------------
@@ -236,14 +240,14 @@ WIDE = """() => [...document.querySelectorAll("main .scroll, main details")].fil
 
 
 def test_the_updating_period_is_crossed_out_when_the_control_plc_is_silent(page: "Page", site: Site) -> None:
-    eventually(lambda: page.locator("#tau-u.stale").count() == 0, "it is current", 60)
+    eventually(lambda: page.locator("#tau-u.stale").count() == 0, "it is current")
     site.freeze("control_plc")
     try:
         for name in ("#tau-u", "#tau-u-q", "#tau-u-sentence"):
             eventually(lambda: page.locator(f"{name}.stale").count() == 1, f"{name} is crossed out")  # noqa: B023
     finally:
         site.thaw("control_plc")
-    eventually(lambda: page.locator("#tau-u.stale").count() == 0, "it is current again", 60)
+    eventually(lambda: page.locator("#tau-u.stale").count() == 0, "it is current again")
 
 
 def test_a_substituted_value_is_no_line_like_others(operated: "Page", site: Site) -> None:

@@ -2,22 +2,16 @@
 
 import asyncio
 import contextlib
-import os
-import signal
 import socket
 import struct
-import subprocess
-import sys
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AbstractAsyncContextManager
 from enum import Enum
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
 import pytest
 
-from coldloop.config import PREFIX
 from coldloop.errors import LinkError
 from coldloop.limits import InputLimits
 from coldloop.modbus.client import RegisterClient
@@ -38,15 +32,16 @@ from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, LoadStep, Measurement, PlantSample, PlantSession
 from coldloop.registers.safety import Alarm, AlarmKind, LeaseState, LeaseStatus, WatchdogTime
 from rig.chaos.disturbance import take_frames
-from rig.ports import ReservedPorts
+from tests.harness.processes import Process, Processes
 
 HOST: Final = "127.0.0.1"
 HEADER: Final = read_header(DEFAULT_MODEL_FILE)
 LIMITS: Final = InputLimits()
 SAFE_STATE: Final = (30.0, 50.0, 40.0)
-WATCHDOG_TICKS: Final = 40
-FACTOR: Final = 25.0
-PATIENCE_S: Final = 20.0
+WATCHDOG_TICKS: Final = 60
+FACTOR: Final = 10.0
+"""A tick is 25 ms: a process that has to wait for 200 ms is in time for its peer (8 ticks) and for its watchdog."""
+PATIENCE_S: Final = 100.0
 """A condition that is waited for has failed after this real time."""
 START_S: Final = 90.0
 """The first start on a machine compiles the kernels."""
@@ -57,77 +52,14 @@ ROUNDING: Final = 1e-4
 # -- processes ---------------------------------------------------------------------------------------------------------
 
 
-class Service:
-    """A service as a process, on a port of its own."""
-
-    def __init__(self, name: str, port: int, log: Path, assignments: Sequence[str], stderr: int | None) -> None:
-        self.name = name
-        self.port = port
-        with log.open("ab") as lines:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", name, *[f"--set={text}" for text in assignments]],
-                env={name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
-                stdin=subprocess.DEVNULL, stdout=lines, stderr=lines if stderr is None else stderr,
-            )  # fmt: skip
-
-    @property
-    def alive(self) -> bool:
-        return self.process.poll() is None
-
-    def pause(self) -> None:
-        self.process.send_signal(signal.SIGSTOP)
-
-    def resume(self) -> None:
-        self.process.send_signal(signal.SIGCONT)
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.wait()
-
-    async def terminated(self, within_s: float) -> int:
-        """Tell it to stop; return its exit code."""
-        self.process.terminate()
-        return await asyncio.to_thread(self.process.wait, within_s)
-
-
-class Services:
-    """Starts services; each gets a port that nobody else gets, or that of the one it replaces."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._ports: list[ReservedPorts] = []
-        self._started: list[Service] = []
-
-    def start(self, name: str, *assignments: str, port: int | None = None, stderr: int | None = None) -> Service:
-        if port is None:
-            self._ports.append(ReservedPorts(1))
-            port = self._ports[-1].numbers[0]
-        log = self._folder / f"{name}-{port}.log"
-        own = (f"{name}.server.port={port}", *assignments)
-        self._started.append(Service(name, port, log, own, stderr))
-        return self._started[-1]
-
-    def end(self) -> None:
-        for service in self._started:
-            service.kill()
-        for ports in self._ports:
-            ports.release()
-
-
-@pytest.fixture
-def services(tmp_path: Path) -> Iterator[Services]:
-    """Services that end with the test."""
-    started = Services(tmp_path)
-    yield started
-    started.end()
-
-
 @pytest.fixture(scope="session")
-def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """One rack for all tests, each of which has a session of its own; its watchdog leads to `SAFE_STATE`."""
-    started = Services(tmp_path_factory.mktemp("plant"))
-    yield started.start("plant", "plant.watchdog.action=safe", f"plant.watchdog.safe_state={list(SAFE_STATE)}")
-    started.end()
+def shared_rack(shared_processes: Processes) -> Process:
+    """One rack for all tests, each of which has a session of its own; its watchdog leads to `SAFE_STATE`.
+
+    It does not limit what it applies: so it shows what control PLCs do.
+    """
+    watchdog = ("plant.watchdog.action=safe", f"plant.watchdog.safe_state={list(SAFE_STATE)}")
+    return shared_processes.service("plant", *watchdog, "plant.rate_limited=false")
 
 
 # -- raw bytes ---------------------------------------------------------------------------------------------------------
@@ -289,11 +221,14 @@ class Rack:
         identity = await self.client.read(Identity)
         if identity.session != self.session:
             return
-        for tick in range(self.tick, identity.tick):
-            (sample,) = await self.client.read_rows(PlantSample, tick % HISTORY_ROWS, 1)
-            assert sample.tick == tick, f"tick {tick} was overwritten before it was read"
-            self.applied[tick] = sample.u
-        self.tick = identity.tick
+        while self.tick < identity.tick:
+            row = self.tick % HISTORY_ROWS
+            for sample in await self.client.read_rows(
+                PlantSample, row, min(identity.tick - self.tick, HISTORY_ROWS - row)
+            ):
+                assert sample.tick == self.tick, f"tick {self.tick} was overwritten before it was read"
+                self.applied[self.tick] = sample.u
+                self.tick += 1
 
     async def until(self, condition: Callable[[], Awaitable[bool]], within_s: float = PATIENCE_S) -> None:
         """Wait for a condition, and read the history meanwhile."""
@@ -337,7 +272,7 @@ class Rack:
 class Control:
     """A control PLC, and what its registers show."""
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: Process) -> None:
         self.service = service
         self.client = RegisterClient(CONTROL_MAP, host=HOST, port=service.port, timeout_s=5.0)
 
@@ -373,7 +308,7 @@ class Control:
 
 
 @pytest.fixture(scope="session")
-def control_at() -> Callable[[Service], Control]:
+def control_at() -> Callable[[Process], Control]:
     return Control
 
 
@@ -383,15 +318,15 @@ def control_at() -> Callable[[Service], Control]:
 class Field:
     """A rack, a link to it that can be disturbed, and control PLCs behind the link."""
 
-    def __init__(self, services: Services, port: int, link: Link) -> None:
-        self.services = services
+    def __init__(self, processes: Processes, port: int, link: Link) -> None:
+        self.processes = processes
         self.rack = Rack(port)
         self.link = link
         self._clients: list[RegisterClient] = [self.rack.client]
 
     def control(self, *assignments: str, port: int | None = None, stderr: int | None = None) -> Control:
         """Start a control PLC that is pointed at the link."""
-        service = self.services.start(
+        service = self.processes.service(
             "control_plc", f"control_plc.plant.port={self.link.port}", *assignments, port=port, stderr=stderr
         )
         made = Control(service)
@@ -432,17 +367,17 @@ FieldAt = Callable[..., AbstractAsyncContextManager[Field]]
 
 
 @pytest.fixture
-def field(services: Services, plant: Service) -> FieldAt:
+def field(processes: Processes, shared_rack: Process, realtime: None) -> FieldAt:  # noqa: ARG001 a mark
     """The rack of all tests, or another one, with a link in front of it."""
 
     @contextlib.asynccontextmanager
-    async def made(at: Service = plant) -> AsyncIterator[Field]:
+    async def made(at: Process = shared_rack) -> AsyncIterator[Field]:
         async with Link(at.port) as link:
-            field = Field(services, at.port, link)
+            field = Field(processes, at.port, link)
             try:
                 yield field
             finally:
-                services.end()
+                processes.end()
                 field.close()
 
     return made

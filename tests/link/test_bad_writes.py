@@ -12,7 +12,8 @@ from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import PLANT_MAP, LoadStep, PlantSession
 
 if TYPE_CHECKING:
-    from tests.link.conftest import FieldAt, Services, WireTo
+    from tests.harness.processes import Processes
+    from tests.link.conftest import FieldAt, WireTo
 
 ILLEGAL_VALUE = 3
 START_S = 90.0
@@ -32,10 +33,10 @@ async def test_real_time_without_a_factor_is_refused_and_the_service_lives(
     service: str,
     register_map: RegisterMap,
     session: type[tuple[object, ...]],
-    services: "Services",
+    processes: "Processes",
     wire: "WireTo",
 ) -> None:
-    process = services.start(service)
+    process = processes.service(service)
     client = RegisterClient(register_map, host="127.0.0.1", port=process.port, timeout_s=5.0)
     await client.connect(START_S)
     async with wire(process.port) as simple:
@@ -70,11 +71,11 @@ async def test_a_number_of_load_steps_that_makes_no_load_is_refused_and_the_cloc
 
 
 async def test_an_updating_period_out_of_range_is_refused_and_the_optimiser_serves_the_next_session(
-    field: "FieldAt", services: "Services", wire: "WireTo"
+    field: "FieldAt", processes: "Processes", wire: "WireTo"
 ) -> None:
     async with field() as site:
         control = site.control()
-        optimizer = services.start("optimizer_plc", f"optimizer_plc.control_plc.port={control.service.port}")
+        optimizer = processes.service("optimizer_plc", f"optimizer_plc.control_plc.port={control.service.port}")
         client = RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=optimizer.port, timeout_s=5.0)
         await client.connect(START_S)
         await site.rack.begin(factor=5.0)

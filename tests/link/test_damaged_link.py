@@ -93,7 +93,7 @@ async def test_a_link_that_loses_cuts_and_damages_frames_both_ways_moves_no_outp
         return draw.choice((None, b"", frame[: len(frame) // 2], flipped(frame, draw.randrange(8 * len(frame)))))
 
     async with field() as site:
-        control = await site.joined()
+        control = await site.joined(factor=25.0)
         await control.drive(46.0, 100.0, 36.5)
         site.link.treat = treat
         await site.rack.passes(LOSSY_TICKS)

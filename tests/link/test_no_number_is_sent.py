@@ -22,11 +22,13 @@ from coldloop.registers.safety import AlarmKind
 from coldloop.seal import sealed
 
 if TYPE_CHECKING:
-    from tests.link.conftest import Control, Services
+    from tests.harness.processes import Processes
+    from tests.link.conftest import Control
 
 HEADER = read_header(DEFAULT_MODEL_FILE)
 HOST = "127.0.0.1"
 START_S = 90.0
+PATIENCE_S = 100.0
 POLL_S = 0.01
 
 
@@ -65,42 +67,42 @@ class FakeRack:
 
 @contextlib.asynccontextmanager
 async def faked(
-    services: "Services", control_at: "Callable[..., Control]"
+    processes: "Processes", control_at: "Callable[..., Control]"
 ) -> AsyncIterator[tuple[FakeRack, "Control"]]:
     """A control PLC that drives a fake rack."""
     rack = FakeRack()
     await rack.server.start()
     settings = (f"control_plc.plant.port={rack.server.port}", "control_plc.ladder.optimizer_patience_s=0.05")
-    control = control_at(services.start("control_plc", *settings))
+    control = control_at(processes.service("control_plc", *settings))
     try:
         await control.client.connect(START_S)
         await control.client.write(ControlSession(1, 0, 1.0))
         await control.client.write(Grant(1_000_000))
         yield rack, control
     finally:
-        services.end()
+        processes.end()
         control.client.close()
         await rack.server.close()
 
 
 async def until(condition: Callable[[], Awaitable[bool]]) -> None:
-    async with asyncio.timeout(20.0):
+    async with asyncio.timeout(PATIENCE_S):
         while not await condition():  # noqa: ASYNC110 - another process is waited for
             await asyncio.sleep(POLL_S)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 async def test_while_a_read_back_is_no_number_nothing_is_sent_and_afterwards_it_goes_on_from_what_is_applied(
-    value: float, services: "Services", control_at: "Callable[..., Control]"
+    value: float, processes: "Processes", control_at: "Callable[..., Control]"
 ) -> None:
-    async with faked(services, control_at) as (rack, control):
+    async with faked(processes, control_at) as (rack, control):
 
         async def sent(number: int) -> bool:
             return len(rack.taken) >= number
 
         async def not_finite() -> bool:
             link = await control.link()
-            return (link.state, link.cause) == (PlantLinkState.JOINING, LinkCause.NOT_FINITE)
+            return (link.state, link.cause) == (PlantLinkState.JOINING, LinkCause.IMPLAUSIBLE)
 
         async def looked(reads: int) -> bool:
             return rack.reads >= reads

@@ -13,9 +13,10 @@ from coldloop.registers.plant import PLANT_MAP, Actuators
 from coldloop.registers.safety import AlarmKind, WatchdogTime
 
 if TYPE_CHECKING:
-    from tests.link.conftest import FieldAt, Service, Way, WireTo
+    from tests.harness.processes import Process
+    from tests.link.conftest import FieldAt, Way, WireTo
 
-PATIENCE_S = 20.0
+PATIENCE_S = 100.0
 POLL_S = 0.02
 SAFE_STATE = (30.0, 50.0, 40.0)
 SETPOINTS = (44.0, 85.0, 36.2)
@@ -70,7 +71,7 @@ async def test_a_control_plc_that_was_restarted_goes_on_from_where_a_simple_clie
         "autostart": "session.autostart=true",
         "the same session": "session.autostart=false",
     }[goes_on_by]
-    pace = ("session.mode=realtime", "session.factor=25")
+    pace = ("session.mode=realtime", "session.factor=10")
     async with field() as site:
         control, rack = await site.joined(settings, *pace), site.rack
         await control.drive(*SETPOINTS)
@@ -93,24 +94,26 @@ async def test_a_control_plc_that_was_restarted_goes_on_from_where_a_simple_clie
             await again.begin(rack.session)
         await site.follows(again)
         await again.drive(*SETPOINTS)
-        await rack.passes(100)
+        await rack.passes(60)
         assert rack.violations(since=moved_at) == []
         assert rack.applied[moved_at - 1] == MOVED
         assert rack.applied[rack.tick - 1] > MOVED, "it drives"
 
 
-async def test_a_rack_that_stood_still_is_gone_on_with_from_what_it_applies(field: "FieldAt", plant: "Service") -> None:
+async def test_a_rack_that_stood_still_is_gone_on_with_from_what_it_applies(
+    field: "FieldAt", shared_rack: "Process"
+) -> None:
     async with field() as site:
         control, rack = await site.joined(), site.rack
         await control.drive(*SETPOINTS)
         await rack.passes(30)
-        plant.pause()
+        shared_rack.pause()
         try:
             async with asyncio.timeout(PATIENCE_S):
                 while (await control.link()).state != PlantLinkState.SEARCHING:  # noqa: ASYNC110 - a process
                     await asyncio.sleep(POLL_S)
         finally:
-            plant.resume()
+            shared_rack.resume()
         await site.follows(control)
         await rack.passes(60)
         await site.follows(control)

@@ -2,22 +2,27 @@
 
 import asyncio
 import contextlib
+from statistics import median
 from typing import TYPE_CHECKING
 
-from coldloop.registers.audit import EventKind
+from coldloop.process import TICK_S
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import LinkCause
 from coldloop.registers.plant import PLANT_MAP, Actuators
 from coldloop.registers.safety import AlarmKind
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from tests.link.conftest import Control, FieldAt, Rack, Services, Wire, WireTo
+    from tests.harness.processes import Processes
+    from tests.link.conftest import Control, FieldAt, Rack, Wire, WireTo
 
 OPERATING_POINT = (43.0, 75.0, 36.0)
 START_S = 90.0
-FAST_PPM = 25_000
+PATIENCE_S = 60.0
+FAST_PPM = 50_000
+SLOW = 2.0
+"""Factor at which a tick, 125 ms, is longer than a busy machine lets a process wait."""
+LOOKS = 30
 
 
 async def test_the_same_session_written_again_in_real_time_goes_on_where_the_rack_is(field: "FieldAt") -> None:
@@ -35,19 +40,18 @@ async def test_the_same_session_written_again_in_real_time_goes_on_where_the_rac
 
 
 async def test_a_rack_whose_clock_is_fast_is_followed_and_its_skew_is_told(
-    field: "FieldAt", services: "Services"
+    field: "FieldAt", processes: "Processes"
 ) -> None:
-    fast = services.start("plant", f"plant.clock_error_ppm={FAST_PPM}")
+    fast = processes.service("plant", f"plant.clock_error_ppm={FAST_PPM}")
     async with field(fast) as site:
-        control, rack = await site.joined(factor=30.0), site.rack
-        await rack.passes(700)
+        control, rack = await site.joined(factor=SLOW), site.rack
+        offsets_ms = []
+        for _ in range(LOOKS):
+            await rack.passes(2)
+            offsets_ms.append(abs((await control.link()).offset))
+        tick_ms = 1000.0 * TICK_S / SLOW
+        assert median(offsets_ms) < tick_ms / 4, "a rack that is not followed gains a tick in 20: offsets up to a tick"
         await site.follows(control)
-        leaps = [
-            event
-            for event in await control.events(EventKind.PLANT_LINK)
-            if event.cause in {LinkCause.LEAPT, LinkCause.UNTIMELY}
-        ]
-        assert len(leaps) < 4, "a rack that is not followed leaps every 40 ticks"
         await rack.until(lambda: told(control))
         assert rack.violations() == []
 
@@ -59,22 +63,23 @@ async def told(control: "Control") -> bool:
 
 
 async def test_at_a_rate_that_nobody_can_follow_rack_and_control_plc_answer_and_end_in_good_order(
-    field: "FieldAt", services: "Services", wire: "WireTo"
+    field: "FieldAt", processes: "Processes", wire: "WireTo"
 ) -> None:
-    racing = services.start("plant")
+    racing = processes.service("plant")
     async with field(racing) as site, wire_when_up(site.rack, wire) as simple:
         control, rack = site.control(), site.rack
         await rack.begin(factor=10_000.0)
         await simple.write(PLANT_MAP, Actuators(0, *OPERATING_POINT, rack.session))
         await control.begin(rack.session, factor=10_000.0)
-        async with asyncio.timeout(10.0):
+        async with asyncio.timeout(PATIENCE_S):
             for client in (rack.client, control.client):
                 for _ in range(20):
                     shown = await client.read(Identity)
                 assert shown.session == rack.session
-            assert (await rack.client.read(Identity)).tick > 100
-        assert await control.service.terminated(10.0) == 0
-        assert await racing.terminated(10.0) == 0
+            while (await rack.client.read(Identity)).tick <= 100:
+                pass
+        assert await control.service.terminated() == 0
+        assert await racing.terminated() == 0
 
 
 @contextlib.asynccontextmanager

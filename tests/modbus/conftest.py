@@ -28,7 +28,7 @@ from coldloop.registers.declaration import Block, RegisterMap, Role
 from coldloop.registers.plant import PLANT_MAP
 from rig.certificates import Authority, Pair
 
-PATIENCE_S = 20.0
+PATIENCE_S = 100.0
 
 
 def frame(pdu: bytes, transaction: int = 1, unit: int = 1) -> bytes:
@@ -187,7 +187,7 @@ def plug() -> Plug:
     return plugged
 
 
-class Site:
+class Pki:
     """Certificates of a site, as files."""
 
     def __init__(self, folder: Path) -> None:
@@ -208,8 +208,8 @@ class Site:
 
 
 @pytest.fixture(scope="session")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
-    return Site(tmp_path_factory.mktemp("site"))
+def pki(tmp_path_factory: pytest.TempPathFactory) -> Pki:
+    return Pki(tmp_path_factory.mktemp("pki"))
 
 
 def written_by_the_operator(register_map: RegisterMap) -> RegisterMap:
@@ -219,11 +219,11 @@ def written_by_the_operator(register_map: RegisterMap) -> RegisterMap:
 
 
 @pytest.fixture(params=["tcp", "tls"])
-def serve_either(request: pytest.FixtureRequest, site: Site) -> Serve:
+def serve_either(request: pytest.FixtureRequest, pki: Pki) -> Serve:
     """Serve over plain TCP, and over TLS to a client who may write everything."""
     if request.param == "tcp":
         return served
-    return partial(served, written_by_the_operator(PLANT_MAP), tls=site.server, client=site.client("operator"))
+    return partial(served, written_by_the_operator(PLANT_MAP), tls=pki.server, client=pki.client("operator"))
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from coldloop.errors import PeerUnreachableError, RequestRefusedError
+from coldloop.errors import PeerUnreachableError, RequestRefusedError, UnfitValueError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.codec import WordOrder, as_transmitted
 from coldloop.registers.common import Identity
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from coldloop.registers.declaration import Block
     from tests.modbus.conftest import Running, Serve
 
+PATIENCE_S = 60.0
 ACTUATORS = sealed(Actuators(tick=7, cv155=50.0, ncr22=100.0, cv156=60.0, session=1))
 MEASUREMENT = sealed(
     as_transmitted(Measurement(7, 40.5, tuple(float(i) for i in range(22)), tuple(i / 3 for i in range(28)), 1))
@@ -159,7 +160,7 @@ IMPOSTORS = {
 
 @pytest.mark.parametrize(("answer", "message"), IMPOSTORS.values(), ids=IMPOSTORS.keys())
 async def test_something_else_answers(answer: bytes | None, message: str) -> None:
-    async with impostor(answer) as port, client_of(port, timeout_s=0.1) as client:
+    async with impostor(answer) as port, client_of(port, timeout_s=1.0) as client:
         with pytest.raises(PeerUnreachableError, match=message) as failure:
             await client.connect(0.0)
         assert f"plant at 127.0.0.1:{port}" in str(failure.value)
@@ -172,11 +173,10 @@ async def test_a_silent_peer_is_noticed_within_the_timeout(serve: "Serve") -> No
     async def wait(_block: "Block", _caller: "Caller") -> None:
         await never.wait()
 
-    async with serve(on_write=wait) as running, client_of(running.server.port, timeout_s=0.2) as client:
-        begin = asyncio.get_running_loop().time()
+    async with serve(on_write=wait) as running, client_of(running.server.port, timeout_s=1.0) as client:
+        await client.connect(PATIENCE_S)
         with pytest.raises(PeerUnreachableError, match="did not answer in time at a request for block 'actuators'"):
             await client.write(ACTUATORS)
-        assert asyncio.get_running_loop().time() - begin < 2.0
         assert await client.read(Actuators) == ACTUATORS  # on a new connection
 
 
@@ -185,8 +185,9 @@ async def test_an_exchange_may_be_given_more_patience_than_other_requests(serve:
         await asyncio.sleep(0.4)
 
     async with serve(on_write=wait) as running, client_of(running.server.port, timeout_s=0.1) as client:
+        await client.connect(PATIENCE_S)
         running.bank.put(MEASUREMENT)
-        assert (await client.exchange(ACTUATORS, Measurement, patience_s=10.0)) == MEASUREMENT
+        assert (await client.exchange(ACTUATORS, Measurement, patience_s=PATIENCE_S)) == MEASUREMENT
         with pytest.raises(PeerUnreachableError):
             await client.exchange(ACTUATORS, Measurement)
 
@@ -241,7 +242,7 @@ async def test_both_ends_send_small_packets_without_delay(serve: "Serve") -> Non
 
 async def test_a_value_that_fits_no_register_is_not_sent(serve: "Serve") -> None:
     async with serve(CONTROL_MAP) as running, client_of(running.server.port, register_map=CONTROL_MAP) as client:
-        with pytest.raises(struct.error):
+        with pytest.raises(UnfitValueError, match="block 'grant' cannot hold"):
             await client.write(Grant(until_tick=-1))
         assert running.written == []
 

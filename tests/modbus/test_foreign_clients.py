@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from coldloop.registers.declaration import Register
     from tests.modbus.conftest import Running, Serve
 
-pytestmark = pytest.mark.slow
 
 KELVIN = 20.25
 MEASURED = Measurement(

@@ -63,7 +63,7 @@ def carried_out(handler: RequestHandler, pdu: bytes) -> bytes | Written | int:
 
 
 @pytest.mark.parametrize("service", MAPS)
-@settings(max_examples=300)
+@settings(max_examples=3 * settings.default.max_examples)
 @given(pdu=pdus, roles=role_sets)
 def test_a_request_is_carried_out_or_refused_and_only_writers_store(
     service: str, pdu: bytes, roles: frozenset[Role]
@@ -84,7 +84,6 @@ def test_a_request_is_carried_out_or_refused_and_only_writers_store(
 
 
 @pytest.mark.parametrize("service", MAPS)
-@settings(max_examples=100)
 @given(segments=st.lists(st.binary(max_size=300), max_size=8), reader=st.booleans())
 def test_any_bytes_are_taken_and_every_answer_is_whole(
     plug: "Plug",
@@ -112,7 +111,6 @@ def test_any_bytes_are_taken_and_every_answer_is_whole(
     asyncio.run(story())
 
 
-@settings(max_examples=100)
 @given(pipeline=st.lists(pdus, min_size=1, max_size=30), cuts=st.lists(st.integers(0, 3000), max_size=8))
 def test_a_pipeline_cut_anywhere_is_answered_in_order_each_with_its_function(
     plug: "Plug", pipeline: list[bytes], cuts: list[int]

@@ -5,18 +5,17 @@ import struct
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Running, Serve
 
-pytestmark = pytest.mark.slow
 
 READ_MAGIC = bytes.fromhex("03 0000 0002")
 FUNCTIONS = [1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 43]
-bounded = settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+PATIENCE_S = 60.0
+bounded = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 words = st.sampled_from([0, 1, 2, 8, 100, 102, 104, 121, 125, 126, 200, 400, 0x7FFF, 0xFFFF]).map(
     lambda word: struct.pack(">H", word)
@@ -39,7 +38,7 @@ async def still_serves(running: "Running") -> bool:
 def test_random_bytes(serve: "Serve", conversations: list[list[bytes]]) -> None:
     async def story(complaints: list[Any]) -> None:
         asyncio.get_running_loop().set_exception_handler(lambda _, context: complaints.append(context))
-        async with asyncio.timeout(20), serve(connection_limit=4) as running:
+        async with asyncio.timeout(PATIENCE_S), serve(connection_limit=4) as running:
             for segments in conversations:
                 wire = await running.connect()
                 for segment in segments:
@@ -60,7 +59,7 @@ def test_random_requests_in_sound_frames_each_get_one_answer_of_their_function(
     serve: "Serve", pdus: list[bytes]
 ) -> None:
     async def story() -> None:
-        async with asyncio.timeout(20), serve() as running:
+        async with asyncio.timeout(PATIENCE_S), serve() as running:
             wire = await running.connect()
             for transaction, pdu in enumerate(pdus):
                 wire.send(struct.pack(">HHHB", transaction, 0, len(pdu) + 1, 1) + pdu)
@@ -81,7 +80,7 @@ def test_random_requests_in_sound_frames_each_get_one_answer_of_their_function(
 @given(pdu=plausible_pdus, cut=st.integers(0, 20))
 def test_a_client_may_go_away_at_any_byte(serve: "Serve", pdu: bytes, cut: int) -> None:
     async def story() -> None:
-        async with asyncio.timeout(20), serve() as running:
+        async with asyncio.timeout(PATIENCE_S), serve() as running:
             wire = await running.connect()
             wire.send((struct.pack(">HHHB", 1, 0, len(pdu) + 1, 1) + pdu)[:cut])
             with suppress(ConnectionError):

@@ -62,7 +62,6 @@ async def test_a_client_that_keeps_its_rate_is_not_limited(serve: "Serve") -> No
         assert running.server.counters.idle_timeout == 0
 
 
-@pytest.mark.slow
 async def test_one_that_is_made_to_wait_costs_bounded_memory_and_is_not_idle(serve: "Serve") -> None:
     requests = numbered(1) * 2_000_000  # 24 MB
     async with serve(request_rate=0.1, request_burst=1, idle_timeout_s=1.0) as running:

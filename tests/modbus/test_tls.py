@@ -18,7 +18,7 @@ from coldloop.registers.control_plc import CONTROL_MAP, AwaitUpdate, Grant, Sequ
 from rig.certificates import Authority
 
 if TYPE_CHECKING:
-    from tests.modbus.conftest import Running, Serve, Site
+    from tests.modbus.conftest import Pki, Running, Serve
 
 READ_MAGIC = bytes.fromhex("03 0000 0002")
 MAGIC = bytes.fromhex("03 04 42f6e979")
@@ -30,17 +30,17 @@ def client_of(running: "Running", tls: TlsSettings | None) -> RegisterClient:
     return RegisterClient.at(CONTROL_MAP, Endpoint(port=running.server.port, timeout_s=5.0, tls=tls))
 
 
-def bare_context(site: "Site") -> ssl.SSLContext:
+def bare_context(pki: "Pki") -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.load_verify_locations(site.folder / "ca.crt")
+    context.load_verify_locations(pki.folder / "ca.crt")
     return context
 
 
 @pytest.mark.parametrize(("role", "grant", "row"), [("operator", 16, 0x90), ("optimizer", 0x90, 16)])
 async def test_the_role_in_the_certificate_counts_and_not_the_address(
-    serve: "Serve", site: "Site", caplog: pytest.LogCaptureFixture, role: str, grant: int, row: int
+    serve: "Serve", pki: "Pki", caplog: pytest.LogCaptureFixture, role: str, grant: int, row: int
 ) -> None:
-    async with serve(CONTROL_MAP, tls=site.server, client=site.client(role)) as running:
+    async with serve(CONTROL_MAP, tls=pki.server, client=pki.client(role)) as running:
         wire = await running.connect()
         assert (await wire.ask(WRITE_GRANT))[0] == grant
         assert (await wire.ask(WRITE_ROW))[0] == row
@@ -54,9 +54,9 @@ async def test_the_role_in_the_certificate_counts_and_not_the_address(
 
 @pytest.mark.parametrize("role", [None, "", "Operator", "janitor", "optimizer,operator", "x" * 127])
 async def test_without_a_role_that_is_known_a_certificate_lets_read_and_no_more(
-    serve: "Serve", site: "Site", role: str | None
+    serve: "Serve", pki: "Pki", role: str | None
 ) -> None:
-    async with serve(CONTROL_MAP, tls=site.server, client=site.client(role)) as running:
+    async with serve(CONTROL_MAP, tls=pki.server, client=pki.client(role)) as running:
         wire = await running.connect()
         assert await wire.ask(READ_MAGIC) == MAGIC
         assert await wire.ask(WRITE_GRANT) == b"\x90\x01"
@@ -83,52 +83,50 @@ async def refused_for(running: "Running", caplog: pytest.LogCaptureFixture) -> s
     return next(line for line in caplog.messages if "kind=tls_refused" in line)
 
 
-async def test_no_certificate(serve: "Serve", site: "Site", caplog: pytest.LogCaptureFixture) -> None:
-    async with serve(CONTROL_MAP, tls=site.server, client=site.client(None)) as running:
-        await turned_away(running, bare_context(site))
+async def test_no_certificate(serve: "Serve", pki: "Pki", caplog: pytest.LogCaptureFixture) -> None:
+    async with serve(CONTROL_MAP, tls=pki.server, client=pki.client(None)) as running:
+        await turned_away(running, bare_context(pki))
         assert "peer did not return a certificate" in await refused_for(running, caplog)
 
 
-async def test_an_expired_certificate(serve: "Serve", site: "Site", caplog: pytest.LogCaptureFixture) -> None:
-    files = site.keep("expired", site.authority.issue_client("expired", "operator", days=-1))
-    context = bare_context(site)
+async def test_an_expired_certificate(serve: "Serve", pki: "Pki", caplog: pytest.LogCaptureFixture) -> None:
+    files = pki.keep("expired", pki.authority.issue_client("expired", "operator", days=-1))
+    context = bare_context(pki)
     context.load_cert_chain(files.certificate, files.key)
-    async with serve(CONTROL_MAP, tls=site.server, client=site.client(None)) as running:
+    async with serve(CONTROL_MAP, tls=pki.server, client=pki.client(None)) as running:
         await turned_away(running, context)
         assert "certificate has expired" in await refused_for(running, caplog)
 
 
-async def test_a_certificate_of_another_authority(
-    serve: "Serve", site: "Site", caplog: pytest.LogCaptureFixture
-) -> None:
-    files = site.keep("foreign", Authority.new("site", 1).issue_client("foreign", "operator"))
-    context = bare_context(site)
+async def test_a_certificate_of_another_authority(serve: "Serve", pki: "Pki", caplog: pytest.LogCaptureFixture) -> None:
+    files = pki.keep("foreign", Authority.new("site", 1).issue_client("foreign", "operator"))
+    context = bare_context(pki)
     context.load_cert_chain(files.certificate, files.key)
-    async with serve(CONTROL_MAP, tls=site.server, client=site.client(None)) as running:
+    async with serve(CONTROL_MAP, tls=pki.server, client=pki.client(None)) as running:
         await turned_away(running, context)
         assert "its certificate does not hold" in await refused_for(running, caplog)
 
 
 async def test_a_server_certificate_does_not_make_a_client(
-    serve: "Serve", site: "Site", caplog: pytest.LogCaptureFixture
+    serve: "Serve", pki: "Pki", caplog: pytest.LogCaptureFixture
 ) -> None:
-    context = bare_context(site)
-    context.load_cert_chain(site.server.certificate, site.server.key)
-    async with serve(CONTROL_MAP, tls=site.server, client=site.client(None)) as running:
+    context = bare_context(pki)
+    context.load_cert_chain(pki.server.certificate, pki.server.key)
+    async with serve(CONTROL_MAP, tls=pki.server, client=pki.client(None)) as running:
         await turned_away(running, context)
         assert "certificate purpose" in await refused_for(running, caplog)
 
 
-async def test_tls_before_1_3(serve: "Serve", site: "Site", caplog: pytest.LogCaptureFixture) -> None:
-    context = bare_context(site)
+async def test_tls_before_1_3(serve: "Serve", pki: "Pki", caplog: pytest.LogCaptureFixture) -> None:
+    context = bare_context(pki)
     context.maximum_version = ssl.TLSVersion.TLSv1_2
-    async with serve(CONTROL_MAP, tls=site.server, client=site.client(None)) as running:
+    async with serve(CONTROL_MAP, tls=pki.server, client=pki.client(None)) as running:
         await turned_away(running, context)
         assert "unsupported protocol" in await refused_for(running, caplog)
 
 
-async def test_plain_modbus_where_tls_is_spoken(serve: "Serve", site: "Site", caplog: pytest.LogCaptureFixture) -> None:
-    async with serve(CONTROL_MAP, tls=site.server, client=site.client(None)) as running:
+async def test_plain_modbus_where_tls_is_spoken(serve: "Serve", pki: "Pki", caplog: pytest.LogCaptureFixture) -> None:
+    async with serve(CONTROL_MAP, tls=pki.server, client=pki.client(None)) as running:
         client = client_of(running, None)
         with pytest.raises(PeerUnreachableError, match="closed the connection"):
             await client.connect(0.0)
@@ -136,8 +134,8 @@ async def test_plain_modbus_where_tls_is_spoken(serve: "Serve", site: "Site", ca
         assert "kind=tls_refused" in await refused_for(running, caplog)
 
 
-async def test_tls_where_plain_modbus_is_spoken(serve: "Serve", site: "Site") -> None:
-    files = site.keep("operator", site.authority.issue_client("operator", "operator"))
+async def test_tls_where_plain_modbus_is_spoken(serve: "Serve", pki: "Pki") -> None:
+    files = pki.keep("operator", pki.authority.issue_client("operator", "operator"))
     async with serve(CONTROL_MAP) as running:
         client = client_of(running, files)
         with pytest.raises(PeerUnreachableError, match=r"does not speak TLS 1\.3: check server.tls there"):
@@ -145,8 +143,8 @@ async def test_tls_where_plain_modbus_is_spoken(serve: "Serve", site: "Site") ->
         assert running.server.counters.malformed_frame == 1
 
 
-async def test_handshakes_under_way_are_bounded_and_do_not_keep_others_out(serve: "Serve", site: "Site") -> None:
-    async with serve(CONTROL_MAP, tls=site.server, client=site.client("operator"), connection_limit=3) as running:
+async def test_handshakes_under_way_are_bounded_and_do_not_keep_others_out(serve: "Serve", pki: "Pki") -> None:
+    async with serve(CONTROL_MAP, tls=pki.server, client=pki.client("operator"), connection_limit=3) as running:
         silent = [await asyncio.open_connection("127.0.0.1", running.server.port) for _ in range(5)]
         assert await silent[0][0].read() == b""
         assert await silent[1][0].read() == b""
@@ -156,9 +154,9 @@ async def test_handshakes_under_way_are_bounded_and_do_not_keep_others_out(serve
             writer.close()
 
 
-async def test_our_client_reads_and_writes_by_its_role(serve: "Serve", site: "Site") -> None:
-    files = site.keep("optimizer", site.authority.issue_client("optimizer", "optimizer"))
-    async with serve(CONTROL_MAP, tls=site.server) as running:
+async def test_our_client_reads_and_writes_by_its_role(serve: "Serve", pki: "Pki") -> None:
+    files = pki.keep("optimizer", pki.authority.issue_client("optimizer", "optimizer"))
+    async with serve(CONTROL_MAP, tls=pki.server) as running:
         client = client_of(running, files)
         await client.connect(1.0)
         await client.write_rows([SequenceRow(float(row), 0.0, 0.0) for row in range(100)])
@@ -170,40 +168,40 @@ async def test_our_client_reads_and_writes_by_its_role(serve: "Serve", site: "Si
 
 
 async def test_our_client_trusts_no_server_of_another_authority_and_does_not_go_on_trying(
-    serve: "Serve", site: "Site"
+    serve: "Serve", pki: "Pki"
 ) -> None:
     foreign = Authority.new("other", 1)
-    files = site.keep("of-other", foreign.issue_client("operator", "operator"))
-    (site.folder / "other-ca.crt").write_bytes(foreign.pair.certificate_pem)
-    async with serve(CONTROL_MAP, tls=site.server) as running:
-        client = client_of(running, files.model_copy(update={"ca": site.folder / "other-ca.crt"}))
+    files = pki.keep("of-other", foreign.issue_client("operator", "operator"))
+    (pki.folder / "other-ca.crt").write_bytes(foreign.pair.certificate_pem)
+    async with serve(CONTROL_MAP, tls=pki.server) as running:
+        client = client_of(running, files.model_copy(update={"ca": pki.folder / "other-ca.crt"}))
         with pytest.raises(UntrustedPeerError, match=r"cannot be trusted: .*: check the host name, and tls.ca here$"):
             await client.connect(60.0)
 
 
-async def test_our_client_without_the_trust_of_the_server_is_told_what_to_check(serve: "Serve", site: "Site") -> None:
-    files = site.keep("of-other", Authority.new("other", 1).issue_client("operator", "operator"))
-    async with serve(CONTROL_MAP, tls=site.server) as running:
+async def test_our_client_without_the_trust_of_the_server_is_told_what_to_check(serve: "Serve", pki: "Pki") -> None:
+    files = pki.keep("of-other", Authority.new("other", 1).issue_client("operator", "operator"))
+    async with serve(CONTROL_MAP, tls=pki.server) as running:
         client = client_of(running, files)
         with pytest.raises(PeerUnreachableError, match="that it accepts our certificate"):
             await client.connect(0.0)
         client.close()
 
 
-def changed(site: "Site", name: str, **files: Path) -> TlsSettings:
-    good = site.keep(name, site.authority.issue_client(name, "operator"))
+def changed(pki: "Pki", name: str, **files: Path) -> TlsSettings:
+    good = pki.keep(name, pki.authority.issue_client(name, "operator"))
     return good.model_copy(update=files)
 
 
-def bad_files(site: "Site", case: str) -> TlsSettings:
-    here = site.folder
+def bad_files(pki: "Pki", case: str) -> TlsSettings:
+    here = pki.folder
     if case == "missing":
-        return changed(site, "bad", certificate=here / "none.crt")
+        return changed(pki, "bad", certificate=here / "none.crt")
     if case == "a folder":
-        return changed(site, "bad", key=here)
+        return changed(pki, "bad", key=here)
     if case == "passphrase":
-        pair = site.authority.issue_client("secret", None)
-        files = site.keep("secret", pair)
+        pair = pki.authority.issue_client("secret", None)
+        files = pki.keep("secret", pair)
         files.key.write_bytes(
             pair.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret"))
         )
@@ -211,10 +209,10 @@ def bad_files(site: "Site", case: str) -> TlsSettings:
     junk = here / "junk.pem"
     junk.write_bytes(b"-----BEGIN CERTIFICATE-----\nnot base64!\n-----END CERTIFICATE-----\n")
     return {
-        "junk certificate": changed(site, "bad", certificate=junk),
-        "junk key": changed(site, "bad", key=junk),
-        "junk ca": changed(site, "bad", ca=junk),
-        "another key": changed(site, "bad", key=site.server.key),
+        "junk certificate": changed(pki, "bad", certificate=junk),
+        "junk key": changed(pki, "bad", key=junk),
+        "junk ca": changed(pki, "bad", ca=junk),
+        "another key": changed(pki, "bad", key=pki.server.key),
     }[case]
 
 
@@ -230,8 +228,8 @@ def bad_files(site: "Site", case: str) -> TlsSettings:
         ("another key", r"key .* does not belong to certificate .*: name a pair"),
     ],
 )
-async def test_bad_files_are_told_in_one_line(serve: "Serve", site: "Site", case: str, message: str) -> None:
-    files = bad_files(site, case)
+async def test_bad_files_are_told_in_one_line(serve: "Serve", pki: "Pki", case: str, message: str) -> None:
+    files = bad_files(pki, case)
     with pytest.raises(ConfigurationError, match=rf"^control_plc.server.tls: {message}") as of_the_server:
         async with serve(CONTROL_MAP, tls=files):
             pass

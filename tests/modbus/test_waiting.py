@@ -126,7 +126,7 @@ async def test_closing_the_server_cancels_waits(serve: "Serve") -> None:
 
 async def test_a_waiting_connection_is_not_idle(serve: "Serve") -> None:
     gate = Gate()
-    async with serve(on_write=gate.on_write, idle_timeout_s=0.05) as running:
+    async with serve(on_write=gate.on_write, idle_timeout_s=0.5) as running:
         waiting, idle = await running.connect(), await running.connect()
         waiting.send(framed(STEP, 5))
         await gate.waiting.wait()

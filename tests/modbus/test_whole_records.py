@@ -10,7 +10,7 @@ import zlib
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.errors import DamagedAnswerError, RequestRefusedError
@@ -148,9 +148,7 @@ def bank_with(register_map: RegisterMap, block: Block, before: str, row: int) ->
     return bank
 
 
-@pytest.mark.slow
 @each_command
-@settings(max_examples=100, deadline=None)
 @given(data=st.data(), before=st.sampled_from(BEFORE))
 def test_a_part_of_a_command_makes_a_valid_record_or_is_refused_and_nothing_has_happened(
     plug: "Plug", register_map: RegisterMap, block: Block, data: st.DataObject, before: str

@@ -37,7 +37,7 @@ from coldloop.sequence import InputSequence, checksum
 from optimizer_plc.runtime import OptimizerPlc
 from optimizer_plc.settings import OptimizerSettings
 
-WITHIN_S = 20.0
+WITHIN_S = 60.0
 LONGEST_WAIT_S = 0.1
 """The control PLC played here lets a request for an update wait for so long, s."""
 
@@ -68,6 +68,8 @@ class PlayedControlPlc:
         self.beats: list[Heartbeat] = []
         self.plans: list[Plan] = []
         self.headers: list[SequenceHeader] = []
+        self.poison: Callable[[Update], Update] | None = None
+        """What the next update that is latched is changed into."""
         self.verdicts: list[Verdict] = []
         """Those to come, instead of a judgement."""
         self._latched = asyncio.Event()
@@ -93,7 +95,8 @@ class PlayedControlPlc:
 
     def latch(self, tick: int = 0) -> None:
         """Latch the next update."""
-        update = self._update(self.session, tick)
+        update, poison, self.poison = self._update(self.session, tick), self.poison, None
+        update = update if poison is None else poison(update)
         self.bank.put(sealed(update))
         self.bank.put(sealed(LatchedUpdate(update.session, update.update, tick)))
         self.updates += 1

@@ -1,7 +1,6 @@
 """What an operator writes to the optimiser: judged whole, and nothing that is accepted can end the program."""
 
 import asyncio
-import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
@@ -169,6 +168,4 @@ async def test_a_new_session_does_not_wait_for_the_answer_of_a_slow_one(
         control.plans.clear()
         control.session, control.updates = 2, 0
         control.latch()
-        before = time.monotonic()
-        await until(lambda: control.plans)
-        assert time.monotonic() - before < 5.0
+        await until(lambda: control.plans)  # the answer of the slow one would take 200 s

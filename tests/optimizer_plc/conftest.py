@@ -45,14 +45,6 @@ class Jump(NamedTuple):
     guess: Array
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep those that need the recorded jumps out of the fast lane: two hours are run for them."""
-    for item in items:
-        if isinstance(item, pytest.Function) and "harsh_jumps" in item.fixturenames:
-            item.add_marker(pytest.mark.slow)
-
-
 @pytest.fixture(scope="session")
 def model() -> LtiModel:
     return load(DEFAULT_MODEL_FILE)

@@ -1,28 +1,26 @@
 """Single precision: no double is computed with on line, little is lost by it, and the loop works."""
 
-import importlib
-import pkgutil
-import re
+import json
 from collections.abc import Callable
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
 import pytest
-from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-import optimizer_plc
 from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel
-from coldloop.registers.control_plc import Update, Verdict
 from optimizer_plc.arithmetic import real_of
-from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings, OdeSettings
+from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, OdeSettings
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings, SolverName
 from optimizer_plc.solvers.ode import ode_solver
+from tests.harness.processes import Processes
+from tests.optimizer_plc.single_precision import code, has_double
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Jump, PenalisedOptimum
@@ -31,92 +29,52 @@ Array = NDArray[np.float64]
 
 SINGLE = real_of(Arithmetic.FLOAT32)
 
-ROWS = "array(float32, 2d, C)"
-ON_LINE = {
-    "add_product", "add_transposed_product", "assess", "augmented_cost", "cholesky", "cholesky_solve", "correct",
-    "corrected", "cost_with_excess", "decide", "decouple", "deliver", "descend", "deviation_cost",
-    "excess_by_columns", "follow", "gradient", "gradient_with_excess", "hold_at_bounds", "inputs_of", "instance",
-    "is_far", "largest_violation", "plan", "pose", "positive_squares", "predict", "predicted_indicators",
-    "problem_at", "quadratic_cost", "respond", "row_excess", "shifted", "solve", "stage_matrix", "step", "velocity",
-    "violation_cost", "warm_start", "with_floor", "write_rows",
-}  # fmt: skip
+ON_LINE = {"instance.instance", "profile.inputs_of", "scheme.plan", "scheme.solve"}
+"""Kernels that the program calls; those that they call, solvers and rules among them, are part of their code."""
 
 
-def kernels() -> dict[str, Any]:
-    found = {}
-    for info in pkgutil.walk_packages(optimizer_plc.__path__, "optimizer_plc."):
-        if not info.name.endswith("__main__"):
-            module = importlib.import_module(info.name)
-            own = (value for value in vars(module).values() if isinstance(value, Dispatcher))
-            found |= {f"{value.py_func.__module__}.{value.py_func.__name__}": value for value in own}
-    return found
+def test_no_kernel_of_the_default_solver_computes_with_a_double_in_single_precision(processes: Processes) -> None:
+    check([(SolverName.ODE, EstimatorKind.KALMAN)], processes)
 
 
-def body(kernel: Dispatcher, signature: tuple[Any, ...]) -> str:
-    """Return the LLVM code of a kernel for a signature, without the wrapper that turns its results into Python's."""
-    fresh = numba.njit(error_model="numpy")(kernel.py_func)
-    fresh.compile(signature)
-    functions = fresh.inspect_llvm(fresh.signatures[0]).split("\ndefine ")[1:]
-    own = [text for text in functions if "cpython" not in text.split("(")[0] and "cfunc" not in text.split("(")[0]]
-    assert own
-    return "\n".join(own)
+@pytest.mark.exhaustive
+def test_no_kernel_computes_with_a_double_in_single_precision(processes: Processes) -> None:
+    check(list(product(SINGLE_PRECISION_SOLVERS, EstimatorKind)), processes)
 
 
-def in_single(types: str) -> bool:
-    """Tell whether a kernel was compiled for single precision; the rows of a sequence are single in either."""
-    return "float32" in types.replace(ROWS, "") or ("float32" in types and "float64" not in types)
+def check(cases: list[tuple[SolverName, EstimatorKind]], processes: Processes) -> None:
+    """Let these pairs compute in an interpreter of their own, which has compiled nothing for other tests."""
+    names = [(solver.value, estimator.value) for solver, estimator in cases]
+    program = f"from tests.optimizer_plc.single_precision import main; main({names})"
+    called, faults = json.loads(processes.run_python(program)[0])
+    assert not faults
+    assert set(called) >= {f"optimizer_plc.{name}" for name in ON_LINE}
+    assert called.count("optimizer_plc.scheme.solve") == len({solver for solver, _ in cases}), "one method a solver"
 
 
-def compiled_in_single() -> set[tuple[str, str]]:
-    return {
-        (name, str(signature))
-        for name, kernel in kernels().items()
-        for signature in kernel.signatures
-        if in_single(str(signature))
-    }
+@numba.njit
+def halved(x: NDArray[Any]) -> float:
+    return float(x[0] * 0.3)
 
 
-def single_program(
-    model: LtiModel, kind: EstimatorKind = EstimatorKind.KALMAN, solver: SolverName = SolverName.ODE
-) -> OptimizerProgram:
-    chosen = ProgramSettings(arithmetic=Arithmetic.FLOAT32, estimator=EstimatorSettings(kind=kind), solver=solver)
-    return OptimizerProgram(model, chosen, InputLimits())
+@numba.njit
+def halved_twice(x: NDArray[Any]) -> float:
+    return halved(x) + halved(x)
 
 
-def update_twice(program: OptimizerProgram, model: LtiModel) -> None:
-    """Answer two updates of a plant that is away from its operating point."""
-    u, y, x = (tuple(values.tolist()) for values in (model.u0 + 1.0, model.y0 * 1.01, model.x0 * 1.01))
-    program.restart(0.0)
-    for number, tick in enumerate((0, 10)):
-        program.plan(Update(number, tick, 0, number, load=model.w0 + 100.0, u_before=u, u=u, y=y, x=x))
-        program.solve()
-        program.report(Verdict.NONE)
-
-
-@pytest.mark.slow
-def test_no_kernel_computes_with_a_double_in_single_precision(model: LtiModel) -> None:
-    for kind in EstimatorKind:
-        update_twice(single_program(model, kind), model)
-    for solver in SINGLE_PRECISION_SOLVERS:
-        update_twice(single_program(model, solver=solver), model)
-    checked: set[tuple[str, str]] = set()
-    while unchecked := compiled_in_single() - checked:  # compiling a kernel afresh brings up those it calls
-        for name, types in unchecked:
-            kernel = kernels()[name]
-            signature = next(one for one in kernel.signatures if str(one) == types)
-            assert "float64" not in types, f"{name} is called with both types: {types}"
-            assert not re.search(r"\bdouble\b", body(kernel, signature)), f"{name} computes with a double"
-        checked |= unchecked
-    assert {name.rpartition(".")[2] for name, _ in checked} >= ON_LINE, "other tests may have compiled more"
-
-
-def test_the_check_finds_a_constant_in_double() -> None:
-    def halved(x: NDArray[Any]) -> float:
-        return float(x[0] * 0.3)
-
-    kernel = numba.njit(halved)
+@pytest.mark.parametrize("kernel", [halved, halved_twice])
+def test_the_check_finds_a_constant_in_double(kernel: Any) -> None:  # noqa: ANN401 - numba has no types
     kernel(np.ones(1, np.float32))
-    assert re.search(r"\bdouble\b", body(kernel, kernel.signatures[0]))
+    assert has_double(code(kernel, kernel.signatures[0]))
+
+
+def test_the_check_finds_nothing_in_single_precision() -> None:
+    def halved_in_single(x: NDArray[Any]) -> Any:  # noqa: ANN401
+        return x[0] * np.float32(0.3)
+
+    kernel = numba.njit(halved_in_single)
+    kernel(np.ones(1, np.float32))
+    assert not has_double(code(kernel, kernel.signatures[0]))
 
 
 def rounded(qp: QuadraticProblem) -> QuadraticProblem:
@@ -127,7 +85,7 @@ def rounded(qp: QuadraticProblem) -> QuadraticProblem:
 def test_an_instance_in_single_precision_is_that_in_double_rounded(
     model: LtiModel, problem: PredictiveProblem, situations: Callable[..., Any]
 ) -> None:
-    program = single_program(model)
+    program = OptimizerProgram(model, ProgramSettings(arithmetic=Arithmetic.FLOAT32), InputLimits())
     single = program.problem
     rng = np.random.default_rng(21)
     for _ in range(20):

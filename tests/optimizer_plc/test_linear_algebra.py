@@ -2,7 +2,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -29,7 +29,6 @@ def matrix(rng: np.random.Generator, rows: int, columns: int, precision: Precisi
 
 
 @each_precision
-@settings(max_examples=60)
 @given(n=sizes, k=sizes, m=sizes, seed=seeds)
 def test_a_product_is_numpys(precision: Precision, tolerance: float, n: int, k: int, m: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -40,7 +39,6 @@ def test_a_product_is_numpys(precision: Precision, tolerance: float, n: int, k: 
 
 
 @each_precision
-@settings(max_examples=60)
 @given(n=sizes, k=sizes, seed=seeds)
 def test_applying_a_transposed_matrix_adds_to_the_result(
     precision: Precision, tolerance: float, n: int, k: int, seed: int
@@ -55,7 +53,6 @@ def test_applying_a_transposed_matrix_adds_to_the_result(
 
 
 @each_precision
-@settings(max_examples=60)
 @given(n=sizes, k=sizes, seed=seeds)
 def test_a_product_by_columns_has_the_bits_of_the_plain_sums(
     precision: Precision, tolerance: float, n: int, k: int, seed: int
@@ -72,7 +69,6 @@ def test_a_product_by_columns_has_the_bits_of_the_plain_sums(
     assert np.allclose(summed, start + A @ x, rtol=tolerance, atol=tolerance)
 
 
-@settings(max_examples=60)
 @given(n=sizes, dense=st.integers(0, 30), seed=seeds)
 def test_zeros_that_are_left_out_change_no_bit_of_the_factor(n: int, dense: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -92,7 +88,6 @@ def test_zeros_that_are_left_out_change_no_bit_of_the_factor(n: int, dense: int,
 
 
 @each_precision
-@settings(max_examples=60)
 @given(n=sizes, seed=seeds)
 def test_the_factor_is_numpys_and_solves_its_system(precision: Precision, tolerance: float, n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -107,7 +102,6 @@ def test_the_factor_is_numpys_and_solves_its_system(precision: Precision, tolera
     assert np.abs(residual).max() <= 100 * tolerance * (1 + np.abs(x).max() * np.abs(S).max())
 
 
-@settings(max_examples=30)
 @given(n=sizes, seed=seeds)
 def test_only_the_upper_triangle_is_read(n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -2,7 +2,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -73,14 +73,12 @@ def test_the_cost_never_rises_and_the_box_is_never_left_on_random_problems(block
         descend(qp, rng.normal(size=len(qp.phi)) * spread(rng, -1, 2), settings_for(rng), iterations=20)
 
 
-@settings(max_examples=25)
 @given(seed=seeds)
 def test_the_cost_never_rises_on_random_problems_of_the_real_size(seed: int) -> None:
     rng = np.random.default_rng(seed)
     descend(random_problem(rng, 49, 94), rng.normal(size=49) * spread(rng, -1, 1), settings_for(rng), iterations=20)
 
 
-@settings(max_examples=25)
 @given(seed=seeds)
 def test_the_cost_never_rises_on_the_controllers_own_problem(
     problem: PredictiveProblem, situations: "Situations", seed: int

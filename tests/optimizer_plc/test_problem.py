@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -235,7 +235,6 @@ def test_the_optimum_is_that_of_the_uncondensed_problem_within_1e_6_in_100_rando
 # -- the cost ---------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40)
 @given(seed=seeds)
 def test_the_condensed_cost_is_that_of_the_simulated_profile(
     problem: PredictiveProblem, model: LtiModel, situations: "Situations", seed: int
@@ -248,7 +247,6 @@ def test_the_condensed_cost_is_that_of_the_simulated_profile(
     assert quadratic_cost(qp.Phi, qp.phi, z) + qp.constant == pytest.approx(expected, rel=1e-9)
 
 
-@settings(max_examples=40)
 @given(seed=seeds)
 def test_the_rows_are_the_simulated_outputs_and_moves_against_their_limits(
     problem: PredictiveProblem, model: LtiModel, situations: "Situations", seed: int
@@ -269,7 +267,6 @@ def test_the_rows_are_the_simulated_outputs_and_moves_against_their_limits(
     assert ((rates[1::2] > 1e-9) == (moves < -RATE - 1e-9)[kept]).all()
 
 
-@settings(max_examples=40)
 @given(seed=seeds)
 def test_the_indicators_come_from_the_simulated_outputs_and_not_from_the_slacks(
     problem: PredictiveProblem, model: LtiModel, situations: "Situations", seed: int
@@ -286,7 +283,6 @@ def test_the_indicators_come_from_the_simulated_outputs_and_not_from_the_slacks(
     assert (lied.j_dev, lied.j_cst) == pytest.approx((found.j_dev, found.j_cst), rel=1e-12)
 
 
-@settings(max_examples=20)
 @given(seed=seeds)
 def test_the_gradient_of_the_augmented_cost_is_that_of_its_formula(
     problem: PredictiveProblem, situations: "Situations", seed: int
@@ -314,7 +310,6 @@ def test_the_quadratic_form_is_symmetric_and_well_conditioned(problem: Predictiv
 # -- the box ----------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40)
 @given(seed=seeds)
 def test_the_first_knot_stays_within_its_rate_of_the_input_before_it(
     problem: PredictiveProblem, model: LtiModel, situations: "Situations", seed: int
@@ -352,7 +347,6 @@ def test_the_rate_limit_of_an_update_is_whole_or_shrinks_with_the_time_that_pass
 # -- profiles ---------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=30)
 @given(seed=seeds)
 def test_sent_inputs_follow_the_profile_where_it_keeps_its_rates_and_keep_them_where_it_does_not(
     problem: PredictiveProblem, model: LtiModel, seed: int

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from optimizer_plc.profile import interpolation, shift
@@ -41,7 +41,6 @@ def test_shifts_of_an_affine_profile_add_up_up_to_the_end_of_the_horizon(
     assert shift(KNOTS, a) @ affine == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
-@settings(max_examples=50)
 @given(values=st.lists(st.floats(-100, 100), min_size=7, max_size=7), by=st.floats(0.0, 120.0))
 def test_a_shifted_knot_reads_the_old_profile_later_and_the_last_value_behind_the_horizon(
     values: list[float], by: float

@@ -1,8 +1,6 @@
 """What holds for each of the solvers, and what the borrowed ones need to be told."""
 
 import importlib
-import subprocess
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -30,6 +28,7 @@ from rig.scenario import Scenario
 from rig.settings import Settings
 
 if TYPE_CHECKING:
+    from tests.harness.processes import Processes
     from tests.optimizer_plc.conftest import Jump, Optimum, PenalisedOptimum, Situations
 
 Array = NDArray[np.float64]
@@ -272,8 +271,7 @@ def test_a_problem_without_solution_leaves_the_guess_and_the_next_one_is_solved(
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.slow
-def test_no_solver_prints() -> None:
+def test_no_solver_prints(processes: "Processes") -> None:
     program = (
         "import numpy as np\n"
         "from optimizer_plc.problem import QuadraticProblem\n"
@@ -286,8 +284,7 @@ def test_no_solver_prints() -> None:
         "        problem = QuadraticProblem(np.eye(1), phi * one, np.eye(1), one, -one, one, 0.0)\n"
         "        solver.solve(problem, 0 * one, (5,))\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == ("", "")
+    assert processes.run_python(program) == ("", "")
 
 
 def test_without_casadi_qpoases_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,8 +300,7 @@ def test_without_casadi_qpoases_says_what_to_do(monkeypatch: pytest.MonkeyPatch)
     assert all(part in message for part in ("optimizer_plc.program.solver", "CasADi", "coldloop[qpoases]"))
 
 
-@pytest.mark.slow
-def test_casadi_is_not_imported_unless_it_is_needed() -> None:
+def test_casadi_is_not_imported_unless_it_is_needed(processes: "Processes") -> None:
     program = (
         "import sys\n"
         "from optimizer_plc.settings import ProgramSettings\n"
@@ -312,8 +308,7 @@ def test_casadi_is_not_imported_unless_it_is_needed() -> None:
         "make_solver(ProgramSettings())\n"
         "print('casadi' in sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
+    assert processes.run_python(program)[0].strip() == "False"
 
 
 def test_qpoases_gets_ten_iterations_from_five_seconds_on_the_reference_plc() -> None:
@@ -339,7 +334,6 @@ def test_without_momentum_a_step_never_raises_the_cost(harsh_jumps: "list[Jump]"
         assert first.cost <= first.guessed
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "make",
     [

@@ -166,7 +166,8 @@ class RackOnTheBus:
 
     def __init__(self, **configuration: Any) -> None:  # noqa: ANN401 - any part of the configuration
         session = {"autostart": True} | configuration.pop("session", {})
-        settings = PlantSettings.model_validate({"session": session, "plant": {"load": "a", **configuration}})
+        plant = {"load": "a", "rate_limited": False, **configuration}  # most tests are about who may move the outputs
+        settings = PlantSettings.model_validate({"session": session, "plant": plant})
         make_plant = plant_maker(HEADER, settings.plant)
         self.now = 1000.0
         self.registers = RackRegisters(

@@ -120,7 +120,6 @@ def test_the_error_stays_small_where_the_second_law_limits_a_cell(plant: Plant, 
     assert integration_error(plant, rest, [5.0, 20.0, -5.0], 0.25) < 5e-5
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("u", [(20.0, 0.0, 20.0), (60.0, 150.0, 60.0), (60.0, 0.0, 20.0), (20.0, 150.0, 60.0)])
 @pytest.mark.parametrize("extra", [-200.0, 300.0])
 def test_the_plant_stays_finite_at_the_corners_of_its_range(

@@ -1,8 +1,6 @@
 """A model file comes back as it was saved, or says what is wrong with it."""
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +12,7 @@ import pytest
 from coldloop.errors import ModelFileError
 from coldloop.lti_model import LtiModel, load
 from coldloop.model_file import digest_of, read_header
+from tests.harness.processes import Processes
 
 
 def test_a_model_survives_saving_and_loading_to_the_bit(model: LtiModel, tmp_path: Path) -> None:
@@ -26,7 +25,7 @@ def test_a_model_survives_saving_and_loading_to_the_bit(model: LtiModel, tmp_pat
     assert [entry.name for entry in tmp_path.iterdir()] == ["model.json"]
 
 
-def test_the_header_is_read_without_numpy(model: LtiModel, model_path: Path) -> None:
+def test_the_header_is_read_without_numpy(model: LtiModel, model_path: Path, processes: Processes) -> None:
     header = read_header(model_path)
     assert (header.digest, header.short_digest) == (model.digest, int(model.digest[:8], 16))
     assert header.x0 == tuple(model.x0)
@@ -34,8 +33,7 @@ def test_the_header_is_read_without_numpy(model: LtiModel, model_path: Path) -> 
 import sys; from pathlib import Path
 from coldloop.model_file import read_header
 read_header(Path({str(model_path)!r})); print("numpy" in sys.modules)"""
-    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert answer.stdout.strip() == "False"
+    assert processes.run_python(program)[0].strip() == "False"
 
 
 def test_a_failed_save_leaves_the_old_file(model: LtiModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,15 +2,19 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from coldloop.process import L1, T5
+from coldloop.process import L1, LAST_TICK, T5
 from coldloop.registers.audit import EventKind
 from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import (
     Actuators,
+    LiveLoad,
+    LoadAhead,
+    LoadStatus,
+    LoadStep,
     Measurement,
     OutputVerdict,
     PlantSample,
@@ -19,7 +23,10 @@ from coldloop.registers.plant import (
     SensorFaultKind,
 )
 from coldloop.registers.safety import WatchdogState, WatchdogStatus, WatchdogTime
+from coldloop.retained import RetainedFile
 from coldloop.seal import sealed
+from plant.retained_state import OWNER
+from tests.plant.conftest import HEADER
 
 if TYPE_CHECKING:
     from tests.plant.conftest import RackOnTheBus
@@ -101,6 +108,63 @@ def test_in_real_time_what_a_network_held_up_is_not_applied(switch_on: "SwitchOn
     rack.passes(40)
     for tick, verdict in ((31, "UNTIMELY"), (49, "UNTIMELY"), (32, "TAKEN"), (48, "TAKEN")):
         assert plc.send(*U, tick=tick).verdict == OutputVerdict[verdict], tick
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_a_session_ends_at_its_last_tick_and_another_one_begins(switch_on: "SwitchOn", mode: str) -> None:
+    rack = switch_on(session={"mode": mode})
+    plc = rack.client("control PLC", 77)
+    rack.registers.rack._program.tick = LAST_TICK - 1  # noqa: SLF001 - 34 years are too long
+    assert plc.send(*U).verdict == OutputVerdict.TAKEN
+    if mode == "realtime":
+        rack.registers.advance()
+    assert (rack.tick, rack.registers.rack.has_ended) == (LAST_TICK, True)
+    assert plc.send(*U).verdict == OutputVerdict.UNTIMELY
+    assert rack.tick == LAST_TICK
+    assert plc.exchange(plc.outputs(*U, tick=LAST_TICK + 1)) == (3,)
+    assert rack.operator.read(LoadStatus).watts > 0
+    assert rack.operator.write(PlantSession(0xFFFF_FFFF, 0, 1.0, 1, 1)) is None
+    assert plc.send(*U).verdict == OutputVerdict.TAKEN
+    assert rack.operator.write(PlantSession(1, 0, 1.0, 1, 1)) is None
+
+
+def test_no_load_is_taken_for_a_tick_that_never_comes(switch_on: "SwitchOn") -> None:
+    rack = switch_on()
+    assert rack.operator.write(LoadStep(LAST_TICK + 1, 300.0), 1) == (3,)
+    assert rack.operator.write(LiveLoad(0xFFFF_FFFF, 300.0)) == (3,)
+    ahead = LoadAhead.first_of(1, [LAST_TICK - 1, LAST_TICK + 60_000], [300.0, 310.0])
+    assert rack.operator.write(ahead) == (3,)
+    assert rack.operator.write(LoadAhead.first_of(1, [LAST_TICK - 1, LAST_TICK], [300.0, 310.0])) is None
+    assert rack.operator.read(LoadStatus).last_tick == LAST_TICK
+
+
+def test_nobody_moves_an_output_by_more_than_its_rate_in_a_tick_however_often_it_is_written(
+    switch_on: "SwitchOn",
+) -> None:
+    rack = switch_on(session=REALTIME, rate_limited=True)
+    plc = rack.client("control PLC", 77)
+    start = rack.shown().u
+    plc.send(*start)
+    rack.passes(1)
+    first = plc.send(*map(float.__add__, start, (0.5, -10.0, 0.1)))
+    assert first.verdict == OutputVerdict.TAKEN
+    for _ in range(3):  # within the same tick
+        again = plc.send(*map(float.__add__, first.u, (0.5, -10.0, 0.1)), generation=0)
+        assert (again.verdict, again.u) == (OutputVerdict.LIMITED, pytest.approx(first.u, rel=1e-6))
+    rack.passes(1)
+    far = plc.send(0.0, 1000.0, 100.0)
+    assert far.verdict == OutputVerdict.LIMITED
+    assert far.u == pytest.approx([again.u[0] - 0.5, again.u[1] + 10.0, again.u[2] + 0.1], rel=1e-6)
+    assert (far.holder, far.generation) == (77, first.generation + 4), "it is to be read back"
+    assert plc.send(*far.u, generation=first.generation).verdict == OutputVerdict.CHANGED
+    assert rack.operator.read(WatchdogStatus).lowest >= 38, "outputs that are limited are a sign of life"
+
+
+def test_the_safe_state_is_applied_in_one_step_also_by_a_rack_that_limits(switch_on: "SwitchOn") -> None:
+    rack = switch_on(session=REALTIME, watchdog=SAFE_AFTER_5_S, rate_limited=True)
+    rack.client("control PLC", 77).send(*U)
+    rack.passes(20)
+    assert rack.shown().u == SAFE
 
 
 # -- breaks ------------------------------------------------------------------------------------------------------------
@@ -296,6 +360,42 @@ def test_no_generation_comes_twice_when_the_rack_is_killed_behind_an_answer(
     generation = rack.client("another control PLC", 78).send(44.0, 80.0, 36.0, generation=1).generation
     assert generation == 2
     assert switch_on(**retained).shown().generation > generation
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"pace": (1, 1e300)},
+        {"times": (0, 2**33), "watts": (385.0, 300.0)},
+        {"watts": (1e300,)},
+        {"program": {}},
+        {"program": {"tick": -5}},
+        {"program": {"x": [1e300] * 28}},
+        {"program": {"x": [0.0] * 28}},
+        {"program": {"x": [10**400] * 28}},
+        {"program": {"u": [43.0]}},
+        {"program": {"noise_state": {}}},
+        {"program": {"noise_state": {"bit_generator": "PCG64", "state": {"state": -1, "inc": 2**200}}}},
+        {"program": {"noise_state": 7}},
+    ],
+    ids=str,
+)
+def test_a_sealed_state_that_cannot_be_is_set_aside_and_the_rack_starts_without(
+    switch_on: "SwitchOn", tmp_path: Path, odd: dict[str, Any]
+) -> None:
+    file = tmp_path / "plant"
+    switch_on(retain={"file": str(file)}).client("control PLC", 77).send(*U)
+    kept = RetainedFile(file, OWNER, HEADER.short_digest)
+    state = kept.load()
+    assert state is not None
+    if odd.get("program"):
+        odd = {"program": state["program"] | odd["program"]}
+    kept.save(state | odd)
+    rack = switch_on(retain={"file": str(file)})
+    assert (rack.tick, file.with_name("plant.refused").exists()) == (0, True)
+    (boot,) = rack.events(EventKind.BOOT)
+    assert (boot.subject, boot.cause) == (0, 1)
+    assert rack.client("control PLC", 77).send(*U).verdict == OutputVerdict.TAKEN
 
 
 @pytest.mark.parametrize("content", [b"", b"coldloop-retained plant/2", b"\x00" * 100])

@@ -4,7 +4,6 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -16,6 +15,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
+from coldloop.limits import InputLimits
 from coldloop.registers.audit import EventKind
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict, PlantSession
 from coldloop.registers.safety import LeaseState, LeaseStatus, WatchdogStatus, WatchdogTime
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 Outputs = tuple[float, float, float]
 SAFE = (30.0, 50.0, 40.0)
+RATE = InputLimits().rate
 NUMBERS = (77, 78, 0, 0)
 """Two control PLCs and two simple clients."""
 
@@ -54,10 +55,13 @@ class RackMachine(RuleBasedStateMachine):
     def teardown(self) -> None:
         self._folder.cleanup()
 
-    @initialize(realtime=st.booleans(), safe=st.booleans())
-    def begin(self, *, realtime: bool, safe: bool) -> None:
+    @initialize(realtime=st.booleans(), safe=st.booleans(), limited=st.booleans())
+    def begin(self, *, realtime: bool, safe: bool, limited: bool) -> None:
         self.action = "safe" if safe else "hold"
         self.mode = "realtime" if realtime else "lockstep"
+        self.limited = limited
+        self.beginning: tuple[int, tuple[float, ...]] = (-1, ())
+        """The last tick in which somebody wrote, and what was applied when it began."""
         self.rack = self.switched_on()
         self.writers = [Writer(self.rack.client(f"client {place}", number)) for place, number in enumerate(NUMBERS)]
         self.applied = self.rack.shown()
@@ -66,6 +70,7 @@ class RackMachine(RuleBasedStateMachine):
         return self._switch_on(
             session={"mode": self.mode},
             watchdog={"timeout_s": 3.0, "action": self.action, "safe_state": SAFE},
+            rate_limited=self.limited,
             retain={"file": str(Path(self._folder.name) / "plant")},
         )
 
@@ -92,6 +97,8 @@ class RackMachine(RuleBasedStateMachine):
         )  # fmt: skip
         timely = abs(sent.tick - present.tick) <= (8 if present.session.pace.realtime else 0)
         lease = self.rack.operator.read(LeaseStatus)
+        if self.beginning[0] != present.tick:
+            self.beginning = present.tick, self.applied.u
         answer = writer.connection.exchange(sent)
         if not isinstance(answer, Measurement):
             assert answer == (6,)
@@ -114,6 +121,13 @@ class RackMachine(RuleBasedStateMachine):
             assert (answer.u, answer.holder) == (sent[1:4], writer.connection.number)
             assert sent.generation in (0, answer.generation)
             assert not sent.generation or before.u in writer.believed, "it did not know what was applied"
+            return
+        if verdict == OutputVerdict.LIMITED:
+            assert self.limited
+            assert answer.u != sent[1:4]
+            moves = [abs(after - base) for after, base in zip(answer.u, self.beginning[1], strict=True)]
+            assert all(move <= rate + 1e-4 for move, rate in zip(moves, RATE, strict=True))
+            assert answer.generation > before.generation, "its writer does not know what is applied"
             return
         assert (answer.u, answer.holder) == (before.u, before.holder)
         if verdict == OutputVerdict.CHANGED:
@@ -167,6 +181,7 @@ class RackMachine(RuleBasedStateMachine):
         number = self.applied.session + (not same)
         assert self.rack.operator.write(PlantSession(number, int(realtime), 1.0, 1, 1)) is None
         self.read()
+        self.beginning = (-1, ())
         assert (self.applied.tick, self.applied.session, self.applied.holder) == (0, number, 0)
         assert self.applied.generation == self.before.generation + 1
         assert self.applied.verdict == OutputVerdict.NONE
@@ -185,6 +200,7 @@ class RackMachine(RuleBasedStateMachine):
         for place, writer in enumerate(self.writers):
             writer.connection = self.rack.client(f"client {place}", NUMBERS[place])
         self.read()
+        self.beginning = (-1, ())
         assert self.applied.generation > self.before.generation
         assert self.applied.verdict == OutputVerdict.NONE
         (boot,) = self.rack.events(EventKind.BOOT)
@@ -202,8 +218,8 @@ class RackMachine(RuleBasedStateMachine):
             assert any(lease.who)
 
 
-@pytest.mark.slow
 def test_nobody_moves_the_outputs_who_does_not_know_what_is_applied(switch_on: "type[RackOnTheBus]") -> None:
     run_state_machine_as_test(
-        lambda: RackMachine(switch_on), settings=settings(max_examples=40, stateful_step_count=40, deadline=None)
+        lambda: RackMachine(switch_on),
+        settings=settings(max_examples=2 * settings.default.max_examples, stateful_step_count=40),
     )

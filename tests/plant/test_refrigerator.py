@@ -112,7 +112,6 @@ def test_electrical_power_leaves_as_heat_but_for_what_warms_the_gas(rest: Point)
     assert s["E_NC"] - s["Q_NC"] == pytest.approx(warmed, rel=1e-6)
 
 
-@pytest.mark.slow
 def test_the_shipped_file_is_that_of_the_reference_refrigerator(rest: Point) -> None:
     assert FILE.parameters_digest == refrigerator_digest(PLANT, HELIUM)
     model = build_model()
@@ -223,7 +222,6 @@ def test_a_trip_is_integrated_well_too(rest: Point) -> None:
     assert np.max(error) < 0.05, STATE_NAMES[int(np.argmax(error))]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("ambient", [275.0, 320.0])
 @pytest.mark.parametrize("run", [(0.0, 1.0), (1.0, 1.0)])
 @pytest.mark.parametrize("nitrogen", [0.0, 1.0])

@@ -99,7 +99,6 @@ def test_without_compressors_the_valves_shut_and_stay_shut() -> None:
     assert program.commands[:3] == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.slow
 def test_nitrogen_that_runs_out_raises_its_alarm_and_comes_back() -> None:
     program = make(events=[event(10.0, "nitrogen", 0), event(1800.0, "nitrogen", 1)])
     run(program, 1700.0)

@@ -52,7 +52,7 @@ def test_what_is_written_is_what_is_read(
     assert bank.read(address, block.row_words) == raw
 
 
-@settings(max_examples=200)
+@settings(max_examples=2 * settings.default.max_examples)
 @given(address=st.integers(0, 0xFFFF), data=st.binary(min_size=1, max_size=123).map(lambda half: half + half))
 def test_a_refused_write_stores_nothing_and_an_accepted_one_everything(address: int, data: bytes) -> None:
     bank = BANKS[WordOrder.HIGH_FIRST][CONTROL_MAP]

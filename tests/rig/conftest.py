@@ -2,10 +2,7 @@
 
 import asyncio
 import contextlib
-import os
-import subprocess
-import sys
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -16,7 +13,6 @@ from pydantic import BaseModel
 import control_plc.runtime
 import optimizer_plc.runtime
 import plant.runtime
-from coldloop.config import PREFIX, to_environment
 from coldloop.model_file import read_header
 from coldloop.registers.codec import WordOrder
 from control_plc.settings import ControlSettings
@@ -31,8 +27,8 @@ from rig.rig_endpoints import RigEndpoints
 from rig.scenario import Scenario
 from rig.session_client import SessionClient
 from rig.settings import Settings
-from rig.testing import up
 from rig.wiring import SERVICES, endpoints_on, wired
+from tests.harness.processes import Processes
 
 PATIENCE_S = 120.0
 """A test on the bus has failed when it takes longer; the first one may have to compile the kernels."""
@@ -154,44 +150,14 @@ def on_the_bus() -> OnTheBus:
     return services_in_this_loop
 
 
-Start = Callable[[str, Settings], "subprocess.Popen[bytes]"]
-
-
-@contextlib.contextmanager
-def processes() -> Iterator[Start]:
-    """Start services as processes; they end with the context."""
-    started: list[subprocess.Popen[bytes]] = []
-
-    def start(service: str, settings: Settings) -> subprocess.Popen[bytes]:
-        environment = {name: value for name, value in os.environ.items() if not name.startswith(PREFIX)}
-        started.append(
-            subprocess.Popen(
-                [sys.executable, "-m", service, "--log-level", "error"],
-                env={**environment, **to_environment(settings)}, stdin=subprocess.DEVNULL,
-            )
-        )  # fmt: skip
-        return started[-1]
-
-    try:
-        yield start
-    finally:
-        for process in started:
-            process.terminate()
-        for process in started:
-            process.wait(10)
-
-
-@pytest.fixture
-def start_service() -> Iterator[Start]:
-    with processes() as start:
-        yield start
-
-
 @pytest.fixture(scope="session")
-def three_processes() -> Iterator[Bus]:
+def three_processes(shared_processes: Processes) -> Bus:
     """One rig of three processes for all tests; each test runs sessions of its own on it."""
-    with up() as rig:
-        yield Bus(rig.endpoints, rig.settings)
+    endpoints = endpoints_on([shared_processes.free_port() for _ in SERVICES], Settings())
+    settings = wired(Settings(), endpoints)
+    for service, endpoint in zip(SERVICES, endpoints, strict=True):
+        shared_processes.service(service, port=endpoint.port, settings=settings, level="error")
+    return Bus(endpoints, settings)
 
 
 # -- the command line --------------------------------------------------------------------------------------------------

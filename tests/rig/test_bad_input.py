@@ -1,10 +1,8 @@
 """Whatever is asked for wrongly: one line on standard error, the right exit code, no results half written."""
 
 import asyncio
-import os
 import socket
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +13,7 @@ import pytest
 import rig.networked_run
 from coldloop.model_file import read_document, write_document
 from coldloop.model_settings import DEFAULT_MODEL_FILE
+from tests.harness.processes import Processes
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop, Outcome
@@ -303,12 +302,11 @@ def test_a_run_that_fails_says_nothing_but_why(coldloop: "Coldloop", results: Pa
         (["run", "--set", "model.file=absent.json"], FAILURE),
     ],
 )
-def test_the_program_ends_with_the_code_and_one_line(arguments: list[str], code: int, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "rig", *arguments], cwd=tmp_path, env=os.environ, check=False, capture_output=True,
-        text=True,
-    )  # fmt: skip
-    assert done.returncode == code
-    assert len(done.stderr.splitlines()) == 1
-    assert "Traceback" not in done.stderr
+def test_the_program_ends_with_the_code_and_one_line(
+    arguments: list[str], code: int, tmp_path: Path, processes: Processes
+) -> None:
+    ended = processes.coldloop(*arguments, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE).ended()
+    assert ended.code == code
+    assert len(ended.err.splitlines()) == 1
+    assert "Traceback" not in ended.err
     assert not list(tmp_path.iterdir())

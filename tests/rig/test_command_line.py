@@ -1,8 +1,7 @@
 """The command line: it starts at once, completes, and writes no control sequences where nobody sees them."""
 
-import os
 import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,17 +17,28 @@ from rig.commands import choices
 from rig.register_listing import FORMATS, MAPS
 from rig.studies import APART, STUDIES
 from rig.tag_exports import EXPORTS
+from tests.harness.processes import Ended, Processes
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
 
 HEAVY = {"numpy", "numba", "scipy", "matplotlib", "pydantic", "pyarrow", "distributed", "rich", "plotly", "argcomplete"}
+PATIENCE_S = 300.0
+"""The first run on a machine compiles the kernels."""
 
 
-def python(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(
-        [sys.executable, *arguments], env=os.environ | environment, check=False, capture_output=True, text=True
-    )
+Python = Callable[..., Ended]
+
+
+@pytest.fixture
+def python(processes: Processes) -> Python:
+    """An interpreter of its own, with arguments and further variables."""
+
+    def run(*arguments: str, **environment: str) -> Ended:
+        pipe = subprocess.PIPE
+        return processes.python(*arguments, stdout=pipe, stderr=pipe, more=environment).ended(PATIENCE_S)
+
+    return run
 
 
 def test_the_names_that_are_offered_are_those_that_exist() -> None:
@@ -44,7 +54,7 @@ def test_the_names_that_are_offered_are_those_that_exist() -> None:
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, None])
-def test_help_imports_nothing_that_takes_time(command: str | None) -> None:
+def test_help_imports_nothing_that_takes_time(command: str | None, python: Python) -> None:
     words = ["--help"] if command is None else [command, "--help"]
     program = (
         "import sys, atexit\n"
@@ -53,8 +63,8 @@ def test_help_imports_nothing_that_takes_time(command: str | None) -> None:
         f"main({words!r})\n"
     )
     done = python("-c", program)
-    assert "usage: coldloop" in done.stdout
-    assert not HEAVY & set(done.stderr.split())
+    assert "usage: coldloop" in done.out
+    assert not HEAVY & set(done.err.split())
 
 
 @pytest.mark.parametrize(
@@ -65,7 +75,7 @@ def test_help_imports_nothing_that_takes_time(command: str | None) -> None:
         ["budget", "--updating-period", "adaptive"], ["run", "--in-process", "--attach", "a:1", "b:2", "c:3"],
     ],
 )  # fmt: skip
-def test_a_typo_is_told_before_anything_that_takes_time_is_imported(words: list[str]) -> None:
+def test_a_typo_is_told_before_anything_that_takes_time_is_imported(words: list[str], python: Python) -> None:
     program = (
         "import sys\n"
         "from rig.cli import main\n"
@@ -74,12 +84,12 @@ def test_a_typo_is_told_before_anything_that_takes_time_is_imported(words: list[
         f"sys.exit(100 if {HEAVY!r} & set(sys.modules) else code)\n"
     )
     done = python("-c", program, *words)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
+    assert done.code == 2
+    assert len(done.err.splitlines()) == 1
 
 
 @pytest.mark.parametrize("words", [["status"], ["set", "load", "400"], ["set", "mode", "manual"], ["down"]])
-def test_commands_to_a_rig_import_nothing_that_takes_time(words: list[str], free_port: int) -> None:
+def test_commands_to_a_rig_import_nothing_that_takes_time(words: list[str], free_port: int, python: Python) -> None:
     program = (
         "import sys\n"
         "from rig.cli import main\n"
@@ -87,8 +97,8 @@ def test_commands_to_a_rig_import_nothing_that_takes_time(words: list[str], free
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))\n"
     )
     done = python("-c", program, *words, "--port-base", str(free_port))
-    assert "nobody listens" in done.stderr or "no rig was started" in done.stderr
-    loaded = set(done.stdout.split())
+    assert "no rig" in done.err
+    loaded = set(done.out.split())
     assert "coldloop" in loaded
     assert not loaded & (HEAVY - {"pydantic"} | {"plant", "control_plc", "optimizer_plc"})
 
@@ -124,7 +134,7 @@ def test_a_shell_gets_a_script_for_completion(shell: str, coldloop: "Coldloop") 
     [("coldloop re", "rerun"), ("coldloop run --so", "--solver"), ("coldloop run --solver fa", "fast-gradient"),
      ("coldloop study tra", "trade-off"), ("coldloop chaos ki", "kill")],
 )  # fmt: skip
-def test_a_line_is_completed(line: str, offered: str, tmp_path: Path) -> None:
+def test_a_line_is_completed(line: str, offered: str, tmp_path: Path, python: Python) -> None:
     answer = tmp_path / "answer"
     answer.touch()
     python(
@@ -134,24 +144,23 @@ def test_a_line_is_completed(line: str, offered: str, tmp_path: Path) -> None:
     assert offered in answer.read_text().split()
 
 
-@pytest.mark.parametrize("environment", [{}, {"NO_COLOR": "1"}, {"COLUMNS": "20"}, {"TERM": "dumb"}])
-def test_a_run_that_is_piped_writes_no_control_sequences(environment: dict[str, str], tmp_path: Path) -> None:
+@pytest.mark.parametrize("environment", [{}, {"NO_COLOR": "1", "COLUMNS": "20", "TERM": "dumb"}])
+def test_a_run_that_is_piped_writes_no_control_sequences(
+    environment: dict[str, str], tmp_path: Path, python: Python
+) -> None:
     out = tmp_path / "run"
     done = python("-m", "rig", "run", "--in-process", "--duration", "2s", "--out", str(out), **environment)
-    assert done.returncode == 0
-    assert "\x1b" not in done.stdout + done.stderr
-    assert "\r" not in done.stdout + done.stderr
+    assert done.code == 0
+    assert "\x1b" not in done.out + done.err
+    assert "\r" not in done.out + done.err
 
 
 @pytest.mark.parametrize("command", ["registers", "version", "study --list"])
-def test_a_full_standard_output_is_one_line(command: str) -> None:
+def test_a_full_standard_output_is_one_line(command: str, processes: Processes) -> None:
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "rig", *command.split()], check=False, stdout=full, stderr=subprocess.PIPE,
-            text=True,
-        )  # fmt: skip
-    assert done.returncode == 1
-    assert done.stderr == "coldloop: standard output: No space left on device\n"
+        done = processes.coldloop(*command.split(), stdout=full.fileno(), stderr=subprocess.PIPE).ended()
+    assert done.code == 1
+    assert done.err == "coldloop: standard output: No space left on device\n"
 
 
 @pytest.mark.parametrize(

@@ -156,6 +156,7 @@ def test_the_configuration_shown_is_a_configuration_file_that_gives_the_same_aga
     assert tomllib.loads(again.out) == tomllib.loads(shown)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_model_written_is_the_model_in_use_and_can_be_run(coldloop: "Coldloop", tmp_path: Path) -> None:
     file = tmp_path / "model.json"
     outcome = coldloop("model", "--out", file)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import rig.compiled.portable  # noqa: F401 lets numba compile what is plain Python
@@ -125,8 +125,21 @@ def left_by(assignments: tuple[str, ...], load: LoadProfile, ticks: int, *, comp
     return Left(recording.trace_sha256, recording.updates, events)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [*COMPILED, *LEFT_TO_PROGRAMS, *UNUSUAL])
+USUALLY = {
+    "adaptive", "noise", "interior point, cut off", "hybrid", "fast gradient", "load steps that interrupt",
+    "refrigerator", "as printed", "single precision", "osqp", "sequences that are refused", "an impatient watchdog",
+    "the classical loops",
+}  # fmt: skip
+"""One of each kind; the others differ from one of them in a part of the configuration."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in USUALLY else pytest.mark.exhaustive)
+        for name in (*COMPILED, *LEFT_TO_PROGRAMS, *UNUSUAL)
+    ],
+)
 def test_the_compiled_loop_leaves_what_the_programs_leave(name: str, lively: LoadProfile) -> None:
     assignments = (COMPILED | LEFT_TO_PROGRAMS | UNUSUAL)[name]
     assert left_by(assignments, lively, 1500, compiled=True) == left_by(assignments, lively, 1500, compiled=False)
@@ -198,7 +211,6 @@ anything = st.floats(-20.0, 180.0) | st.floats(allow_nan=True, allow_infinity=Tr
 scans = st.lists(st.tuples(st.tuples(anything, anything, anything), st.booleans(), st.integers(1, 30)), max_size=30)
 
 
-@settings(max_examples=100)
 @given(history=scans, slew_s=st.sampled_from([0.25, 0.5, 2.0, 5.0]), reference=st.sampled_from(RateReference))
 def test_the_guard_is_the_same_compiled(
     history: list[tuple[tuple[float, float, float], bool, int]], slew_s: float, reference: RateReference

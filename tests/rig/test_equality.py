@@ -105,6 +105,7 @@ async def test_the_classical_loops_leave_one_trace_too_and_no_updates(
     assert first.trace_sha256 != simulate(scenario).trace_sha256
 
 
+@pytest.mark.usefixtures("undrawn", "processes")
 def test_the_command_starts_three_services_and_gets_the_trace_of_one_process(
     coldloop: "Coldloop", tmp_path: Path
 ) -> None:
@@ -121,6 +122,7 @@ def test_the_command_starts_three_services_and_gets_the_trace_of_one_process(
     }  # fmt: skip
 
 
+@pytest.mark.usefixtures("undrawn", "processes")
 def test_tls_on_every_connection_changes_nothing_about_the_trace(coldloop: "Coldloop", tmp_path: Path) -> None:
     assert coldloop("certificates", "--out", tmp_path / "site").code == 0
     traces = []

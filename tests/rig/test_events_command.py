@@ -5,7 +5,6 @@ import csv
 import signal
 import socket
 import subprocess
-import sys
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -27,6 +26,7 @@ from coldloop.registers.plant import PLANT_MAP
 from coldloop.registers.safety import AlarmKind
 from rig.commands.events import COLUMNS
 from rig.journal_reader import JournalReader
+from tests.harness.processes import Processes
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -83,12 +83,12 @@ def serve() -> Serve:
         thread = threading.Thread(target=loop.run_forever)
         thread.start()
         try:
-            asyncio.run_coroutine_threadsafe(service.server.start(), loop).result(10)
+            asyncio.run_coroutine_threadsafe(service.server.start(), loop).result(60)
             yield service
         finally:
-            asyncio.run_coroutine_threadsafe(service.server.close(), loop).result(10)
+            asyncio.run_coroutine_threadsafe(service.server.close(), loop).result(60)
             loop.call_soon_threadsafe(loop.stop)
-            thread.join(10)
+            thread.join(60)
             loop.close()
 
     return serving
@@ -175,18 +175,16 @@ def test_over_tls_the_certificate_decides(coldloop: "Coldloop", serve: Serve, tm
     assert (plain.code, len(plain.complaints)) == (FAILURE, 1)
 
 
-def test_follow_goes_on_with_new_events_until_it_is_interrupted(serve: Serve) -> None:
+def test_follow_goes_on_with_new_events_until_it_is_interrupted(serve: Serve, processes: Processes) -> None:
     with serve(2) as service:
-        command = [sys.executable, "-m", "rig", "events", at(service), "--follow"]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-            assert process.stdout is not None
-            assert process.stderr is not None
-            seen = [process.stdout.readline(), process.stdout.readline()]
-            service.fill(1)
-            seen.append(process.stdout.readline())
-            process.send_signal(signal.SIGINT)
-            assert process.wait(20) == 0
-            assert process.stderr.read() == ""
+        pipe = subprocess.PIPE
+        process = processes.coldloop("events", at(service), "--follow", stdout=pipe, stderr=pipe)
+        assert process.popen.stdout is not None
+        seen = [process.popen.stdout.readline(), process.popen.stdout.readline()]
+        service.fill(1)
+        seen.append(process.popen.stdout.readline())
+        process.popen.send_signal(signal.SIGINT)
+        assert process.ended() == (0, "", "")
     assert numbers("".join(seen)) == [1, 2, 3]
 
 
@@ -246,7 +244,7 @@ def test_nobody_there_is_told_in_one_line_and_no_file_is_made(coldloop: "Coldloo
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "HOST:PORT"),
+        (["127.0.0.1:1", "--port-base", "5020"], "give one of them"),
         (["localhost"], "'localhost' is not HOST:PORT"),
         (["127.0.0.1:1", "--kind", "alarms"], "no kind is called 'alarms'; there are mode, alarm-raised, "),
         (["127.0.0.1:1", "--since", "yesterday"], "'yesterday' is neither the number of an event nor a time"),
@@ -267,7 +265,7 @@ def test_what_is_asked_for_wrongly_is_told_in_one_line(
 
 
 def reader_of(service: Service, first: int = 1) -> JournalReader:
-    return JournalReader(RegisterClient(CONTROL_MAP, host="127.0.0.1", port=service.server.port, timeout_s=5.0), first)
+    return JournalReader(RegisterClient(CONTROL_MAP, host="127.0.0.1", port=service.server.port, timeout_s=60.0), first)
 
 
 @pytest.mark.parametrize("access", [AccessSettings(), NO_OPERATORS], ids=["operator", "reader"])

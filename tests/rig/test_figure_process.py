@@ -10,9 +10,13 @@ import pytest
 from coldloop.errors import ResultsError, UsageError
 from rig import figure_process
 from rig.figure_process import FigureProcess
+from tests.conftest import draw_nothing
 
 if TYPE_CHECKING:
     from tests.rig.conftest import Coldloop
+
+
+pytestmark = pytest.mark.usefixtures("processes")
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +25,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from rig import cli  # noqa: PLC0415
 
     folder = tmp_path_factory.mktemp("recorded") / "run"
-    assert cli.main(["run", "--in-process", "--duration", "2s", "--out", str(folder)]) == 0
-    (folder / "run.png").unlink()
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        draw_nothing(monkeypatch)
+        assert cli.main(["run", "--in-process", "--duration", "2s", "--out", str(folder)]) == 0
     return folder
 
 

@@ -1,11 +1,8 @@
 """What is left of a run that a signal, a failure or a full disk ended: records that can be read and say so."""
 
-import contextlib
 import json
-import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,6 +19,7 @@ from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
 from rig.one_process import OneProcessRig
 from rig.recording import BLOCK_TICKS, KEPT_TICKS, Recorder, SampleBlock, Sink
+from tests.harness.processes import Processes
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -50,39 +48,55 @@ def assert_incomplete_but_readable(folder: Path, reason: str) -> int:
     return len(frame)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("way", [("--in-process",), ()], ids=["in process", "networked"])
+SOON_ON_DISK = """
+import sys, rig.file_sinks
+rig.file_sinks.GROUP_TICKS = rig.file_sinks.HELD_BACK_TICKS = 512
+from rig.__main__ import main
+sys.exit(main())
+"""
+"""The program `coldloop`, which writes ticks in small groups: the first ones are in the file after two minutes."""
+
+
+INTERRUPTED = [
+    pytest.param((), signal.SIGINT, id="networked, SIGINT"),
+    pytest.param(("--in-process",), signal.SIGTERM, id="in process, SIGTERM"),
+    pytest.param((), signal.SIGTERM, id="networked, SIGTERM", marks=pytest.mark.exhaustive),
+    pytest.param(("--in-process",), signal.SIGINT, id="in process, SIGINT", marks=pytest.mark.exhaustive),
+]
+
+
+@pytest.mark.parametrize(("way", "number"), INTERRUPTED)
 def test_a_signal_in_the_middle_leaves_what_was_recorded(
-    number: signal.Signals, way: tuple[str, ...], tmp_path: Path
+    way: tuple[str, ...], number: signal.Signals, tmp_path: Path, processes: Processes
 ) -> None:
     out = tmp_path / "run"
-    command = [sys.executable, "-m", "rig", "run", *way, "--load", "6h", "--figures", "png", "--out", str(out)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ, text=True)
+    words = ("run", *way, "--load", "6h", "--figures", "png", "--out", str(out))
+    run = processes.python("-c", SOON_ON_DISK, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     deadline = time.monotonic() + PATIENCE_S
-    while not (out / "trace.parquet").exists() or (out / "trace.parquet").stat().st_size < 100_000:
-        assert process.poll() is None, process.communicate()
+    while not (out / "trace.parquet").exists() or (out / "trace.parquet").stat().st_size < 20_000:
+        assert run.alive, run.ended()
         assert time.monotonic() < deadline
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(0.05)
-    process.send_signal(number)
-    _, complaints = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 128 + number
-    assert "Traceback" not in complaints
-    assert f"interrupted by {number.name}" in complaints.splitlines()[-1]
-    assert assert_incomplete_but_readable(out, f"interrupted by {number.name}") > 10_000
+        time.sleep(0.05)
+    run.popen.send_signal(number)
+    ended = run.ended(PATIENCE_S)
+    assert ended.code == 128 + number
+    assert "Traceback" not in ended.err
+    assert f"interrupted by {number.name}" in ended.err.splitlines()[-1]
+    assert assert_incomplete_but_readable(out, f"interrupted by {number.name}") >= 512
 
 
 @pytest.mark.parametrize("delay_s", [0.05, 0.3, 0.8])
-def test_ctrl_c_before_there_is_anything_to_record_leaves_nothing(delay_s: float, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "rig", "run", "--in-process", "--load", "6h", "--out", str(tmp_path / "run")]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ, text=True)
-    with pytest.raises(subprocess.TimeoutExpired):
-        process.wait(delay_s)
-    process.send_signal(signal.SIGINT)
-    _, complaints = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode in (130, -signal.SIGINT), "the interpreter itself may not be up yet"
-    if process.returncode == 130:
-        assert "Traceback" not in complaints
+def test_ctrl_c_before_there_is_anything_to_record_leaves_nothing(
+    delay_s: float, tmp_path: Path, processes: Processes
+) -> None:
+    words = ("run", "--in-process", "--load", "6h", "--out", tmp_path / "run")
+    run = processes.coldloop(*words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    time.sleep(delay_s)
+    run.popen.send_signal(signal.SIGINT)
+    ended = run.ended(PATIENCE_S)
+    assert ended.code in (130, -signal.SIGINT), "the interpreter itself may not be up yet"
+    if ended.code == 130:
+        assert "Traceback" not in ended.err
 
 
 def fail_after(ticks: int, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,7 +187,7 @@ def test_a_sink_that_fails_does_not_keep_blocks_from_the_others() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_while_modules_are_imported_is_no_traceback(number: signal.Signals) -> None:
+def test_an_interrupt_while_modules_are_imported_is_no_traceback(number: signal.Signals, processes: Processes) -> None:
     program = (
         "import os, sys\n"
         "from importlib.abc import MetaPathFinder\n"
@@ -184,5 +198,5 @@ def test_an_interrupt_while_modules_are_imported_is_no_traceback(number: signal.
         "from rig.__main__ import main\n"
         "main()\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
-    assert (done.returncode, done.stderr) == (128 + number, "coldloop: interrupted\n")
+    ended = processes.python("-c", program, stderr=subprocess.PIPE).ended()
+    assert (ended.code, ended.err) == (128 + number, "coldloop: interrupted\n")

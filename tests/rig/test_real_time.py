@@ -17,31 +17,39 @@ from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Mode, Pl
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import PLANT_MAP, LoadStep, PlantSession
+from control_plc.settings import ControlSection, LadderSettings
 from plant.program import LoadProfile
 from rig.scenario import Scenario
+from rig.session_reader import SampleReader
+from rig.settings import Settings
+from tests.harness import processes as harness
 
 if TYPE_CHECKING:
     from rig.recording import Recording
-    from tests.rig.conftest import Bus, OnTheBus, Simulate, Start
+    from tests.rig.conftest import Bus, OnTheBus, Simulate
+
+pytestmark = pytest.mark.usefixtures("realtime")
 
 T = TypeVar("T")
 
 LIMITS = InputLimits()
-PROMPT_S = 5.0
-"""Long for something that takes milliseconds."""
+ENDLESS_HOLD = Settings(control_plc=ControlSection(ladder=LadderSettings(hold_s=10_000, optimizer_timeout_s=0)))
+"""The classical loops take over only after longer than anybody needs to look at the hold."""
+PATIENCE_S = 90.0
+"""A machine that is busy with something else takes longer."""
 
 
 @asynccontextmanager
 async def client(register_map: RegisterMap, port: int) -> AsyncIterator[RegisterClient]:
-    one = RegisterClient(register_map, host="127.0.0.1", port=port, timeout_s=PROMPT_S)
-    await one.connect(60)
+    one = RegisterClient(register_map, host="127.0.0.1", port=port, timeout_s=PATIENCE_S)
+    await one.connect(PATIENCE_S)
     try:
         yield one
     finally:
         one.close()
 
 
-async def until(read: Callable[[], Awaitable[T]], wanted: Callable[[T], bool], within_s: float = PROMPT_S) -> T:
+async def until(read: Callable[[], Awaitable[T]], wanted: Callable[[T], bool], within_s: float = PATIENCE_S) -> T:
     """Return the first value read that is as wanted."""
     deadline = time.monotonic() + within_s
     while not wanted(value := await read()):
@@ -106,19 +114,21 @@ async def start_real_time(bus: "Bus", factor: float, *, session: int = 1, optimi
 
 
 async def test_a_killed_optimiser_leaves_the_plant_held_and_a_new_one_takes_over_again(
-    on_the_bus: "OnTheBus", start_service: "Start"
+    on_the_bus: "OnTheBus", processes: harness.Processes
 ) -> None:
-    async with on_the_bus(services=("plant", "control_plc")) as bus:
-        optimiser = start_service("optimizer_plc", bus.settings)
+    def start_optimiser() -> harness.Process:
+        return processes.service("optimizer_plc", port=bus.endpoints.optimizer_plc.port, settings=bus.settings)
+
+    async with on_the_bus(ENDLESS_HOLD, services=("plant", "control_plc")) as bus:
+        optimiser = start_optimiser()
         await start_real_time(bus, factor=5.0)
         async with client(CONTROL_MAP, bus.endpoints.control_plc.port) as plc:
 
             def status() -> Awaitable[Status]:
                 return plc.read(Status)
 
-            await until(lambda: plc.read(Plan), lambda now: now.update >= 4, 60)
+            await until(lambda: plc.read(Plan), lambda now: now.update >= 4)
             optimiser.kill()  # it has said when its sequence is due, and is at work on it
-            optimiser.wait()
 
             held = await until(status, lambda now: now.mode == Mode.HOLD and now.remaining == 0)
             assert held.deadline_misses > 0
@@ -128,14 +138,14 @@ async def test_a_killed_optimiser_leaves_the_plant_held_and_a_new_one_takes_over
             assert in_bounds(later.u)
             assert later.y != first.y
 
-            start_service("optimizer_plc", bus.settings)
-            back = await until(status, lambda now: now.mode == Mode.MPC and now.accepted >= held.accepted + 5, 60)
+            start_optimiser()
+            back = await until(status, lambda now: now.mode == Mode.MPC and now.accepted >= held.accepted + 5)
             assert back.update > held.update
             assert in_bounds((await plc.read(Process)).u)
 
 
 async def test_without_an_optimiser_the_operating_inputs_hold_from_the_start(on_the_bus: "OnTheBus") -> None:
-    async with on_the_bus(services=("plant", "control_plc")) as bus:
+    async with on_the_bus(ENDLESS_HOLD, services=("plant", "control_plc")) as bus:
         await start_real_time(bus, factor=100.0, optimizer=False)
         async with client(CONTROL_MAP, bus.endpoints.control_plc.port) as plc:
             process = await until(lambda: plc.read(Process), lambda now: now.tick >= 40)
@@ -169,14 +179,34 @@ async def test_a_plan_that_comes_too_late_costs_an_update_and_not_the_session(
             assert status.rejected >= 1
 
 
+class ClockOfTicks:
+    """A clock for the client of a session, on which each tick of the plant takes most of what a quiet rig is given."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._tick = 0
+        read = SampleReader.read
+
+        async def noted(reader: SampleReader) -> int:
+            self._tick = await read(reader)
+            return self._tick
+
+        monkeypatch.setattr(SampleReader, "read", noted)
+        monkeypatch.setattr(rig.session_client, "time", self)
+
+    def monotonic(self) -> float:
+        return 0.9 * rig.session_client.QUIET_S * self._tick
+
+
 async def test_a_slow_run_is_not_given_up_while_it_moves(
     load_a: LoadProfile, on_the_bus: "OnTheBus", monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rig.session_client, "QUIET_S", 1.0)  # factor 10 and 1 s for factor 0.5 and 20 s
+    clock = ClockOfTicks(monkeypatch)
+    monkeypatch.setattr(rig.session_client, "LONGEST_PAUSE_S", 0.002)  # most looks find nothing new
     async with on_the_bus() as bus:
         recording = await bus.record(Scenario(ticks=80, load=load_a, updating_period_s=0.0, seed=1, realtime=True,
-                                              factor=10.0))  # fmt: skip
+                                              factor=40.0))  # fmt: skip
     assert len(recording.load) == 80
+    assert clock.monotonic() > 10 * rig.session_client.QUIET_S
 
 
 async def test_a_run_in_real_time_takes_over_from_another_one(

@@ -15,6 +15,7 @@ from scipy.io import loadmat
 
 from rig import cli
 from rig.run_folder import RunFolder
+from tests.conftest import draw_nothing
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -28,8 +29,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     (folder / "my_load.csv").write_text(LOAD)
     common = ["run", "--in-process", "--load", str(folder / "my_load.csv"), "--duration", "90s", "--figures", "png"]
-    assert cli.main([*common, "--out", str(folder / "mpc")]) == 0
-    assert cli.main([*common, "--set", "control_plc.driver=classical", "--out", str(folder / "classical")]) == 0
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        draw_nothing(monkeypatch)
+        assert cli.main([*common, "--out", str(folder / "mpc")]) == 0
+        assert cli.main([*common, "--set", "control_plc.driver=classical", "--out", str(folder / "classical")]) == 0
     return folder
 
 
@@ -165,6 +168,7 @@ def test_a_run_is_repeated_from_its_folder_alone(
     assert outcome.out.split()[-1] == RunFolder(moved).summary["trace_sha256"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_repetition_can_be_kept(coldloop: "Coldloop", mpc: Path, results: Path) -> None:
     assert coldloop("rerun", mpc, "--out", results).code == 0
     assert RunFolder(results).summary["trace_sha256"] == RunFolder(mpc).summary["trace_sha256"]

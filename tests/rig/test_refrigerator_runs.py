@@ -30,12 +30,13 @@ def configured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@pytest.mark.usefixtures("undrawn", "processes")
 def test_a_trip_leaves_one_trace_in_one_process_and_over_the_link(
     configured: Path, tmp_path: Path, coldloop: "Coldloop"
 ) -> None:
     common = ("--config", str(configured), "--duration", "60s", "--figures", "png")
-    coldloop("run", *common, "--in-process", "--out", str(tmp_path / "alone"))
-    coldloop("run", *common, "--out", str(tmp_path / "networked"))
+    for way, name in ((("--in-process",), "alone"), ((), "networked")):
+        assert coldloop("run", *common, *way, "--out", tmp_path / name).code == 0
     alone, networked = (tmp_path / name for name in ("alone", "networked"))
     assert trace_of(alone) == trace_of(networked)
     table = pq.read_table(networked / "station.parquet").to_pydict()
@@ -52,8 +53,9 @@ def trace_of(folder: Path) -> str:
     return str(summary["trace_sha256"])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_cold_box_leaves_no_station(tmp_path: Path, coldloop: "Coldloop") -> None:
-    coldloop("run", "--in-process", "--load", "a", "--duration", "15s", "--out", str(tmp_path / "run"))
+    assert coldloop("run", "--in-process", "--load", "a", "--duration", "15s", "--out", tmp_path / "run").code == 0
     assert not (tmp_path / "run" / "station.parquet").exists()
 
 

@@ -163,6 +163,7 @@ def test_duckdb_and_pandas_read_the_trace(folder: Path, minute: Recording) -> No
     assert frame["L1"].tolist() == minute.y[:, 0].tolist()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_manifest_holds_what_is_needed_to_repeat_the_run(
     folder: Path, minute: Recording, coldloop: "Coldloop", tmp_path: Path
 ) -> None:
@@ -189,6 +190,7 @@ def test_a_run_shorter_than_its_first_update_has_results_too(coldloop: "Coldloop
     assert pq.read_table(results / "updates.parquet").num_rows == 0
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_an_existing_run_is_replaced_only_when_forced(coldloop: "Coldloop", results: Path) -> None:
     run = ("run", "--in-process", "--duration", "2s", "--figures", "png", "--out", results)
     assert coldloop(*run).code == 0

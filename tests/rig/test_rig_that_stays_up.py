@@ -1,12 +1,11 @@
 """`coldloop up`, `down`, `status`, `set` and `run --attach`: a rig that stays up, and what is done with it."""
 
 import asyncio
+import contextlib
 import json
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,21 +16,24 @@ from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
 from rig import cli
-from rig.started_rigs import running_rig
+from rig.started_rigs import running_rig, state_folder
 from tests.conftest import Coldloop, first_of_three_ports
+from tests.harness.processes import Processes
+
+pytestmark = pytest.mark.usefixtures("realtime", "undrawn")
 
 FACTOR = "5"
+PATIENCE_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def up(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) -> Iterator[str]:
     """The first port of a rig that is up."""
     os.environ["XDG_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
     base = str(first_of_three_ports())
-    command = [sys.executable, "-m", "rig", "up", "--port-base", base, "--load", "e", "--factor", FACTOR]
-    command += ["--set", "plant.sensors.level=0.01"]
+    words = ("up", "--port-base", base, "--load", "e", "--factor", FACTOR, "--set", "plant.sensors.level=0.01")
     try:
-        subprocess.run([*command, "--detach"], check=True, timeout=120, stdout=subprocess.DEVNULL)
+        assert shared_processes.coldloop(*words, "--detach").popen.wait(PATIENCE_S) == 0
         yield base
         assert cli.main(["down", "--port-base", base]) == 0
         assert running_rig(int(base)) is None
@@ -47,10 +49,16 @@ def shown(coldloop: Coldloop, base: str) -> dict[str, str]:
 
 
 def until(coldloop: Coldloop, base: str, row: str, part: str) -> str:
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE_S
     while part not in (text := shown(coldloop, base)[row]):
         assert time.monotonic() < deadline, f"{row} is {text}, not {part}"
     return text
+
+
+def until_plant_time_passes(coldloop: Coldloop, base: str) -> None:
+    before, deadline = shown(coldloop, base)["session"], time.monotonic() + PATIENCE_S
+    while shown(coldloop, base)["session"] == before:
+        assert time.monotonic() < deadline, "plant time stands still"
 
 
 def test_status_shows_session_mode_load_outputs_and_alarms(coldloop: Coldloop, up: str) -> None:
@@ -58,6 +66,13 @@ def test_status_shows_session_mode_load_outputs_and_alarms(coldloop: Coldloop, u
     assert set(rows) == {"session", "mode", "operator", "load", "L1", "T5", "tau_u", "alarms"}
     assert f"{FACTOR} x real time" in rows["session"]
     assert rows["L1"].endswith("%")
+
+
+def test_commands_find_the_one_rig_that_is_up(coldloop: Coldloop, up: str) -> None:
+    for words in (("status",), ("events",), ("events", "--service", "plant"), ("set", "resume")):
+        outcome = coldloop(*words)
+        assert outcome.code == 0, outcome.complaints
+        assert outcome.out.split()[0] == coldloop(*words, "--port-base", up).out.split()[0]
 
 
 def test_a_rig_that_was_started_has_not_lost_anything_yet(coldloop: Coldloop, up: str) -> None:
@@ -105,7 +120,7 @@ def test_what_cannot_be_done_is_one_line(coldloop: Coldloop, up: str, words: tup
 @pytest.mark.parametrize("mode", list(OperatorMode))
 def test_a_setpoint_beyond_the_bounds_is_refused_by_the_control_plc_itself(up: str, mode: OperatorMode) -> None:
     async def write() -> None:
-        control = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=int(up) + 1, timeout_s=10.0)
+        control = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=int(up) + 1, timeout_s=PATIENCE_S)
         before = await control.read(Operator)
         with pytest.raises(RequestRefusedError) as refusal:
             await control.write(Operator(mode, 80.0, before.ncr22, before.cv156))
@@ -124,6 +139,26 @@ def test_a_load_file_begins_now(coldloop: Coldloop, up: str, tmp_path: Path) -> 
     assert "load of 3000 steps from 90000 s to 92999 s" in outcome.out
     assert "400 W from 90000 s" in shown(coldloop, up)["load"]
     assert coldloop("set", "--port-base", up, "load", "385").code == 0
+
+
+def test_a_load_that_begins_later_is_told_as_it_was_written(coldloop: Coldloop, up: str) -> None:
+    assert coldloop("set", "--port-base", up, "load", "385").code == 0  # nothing else is to come
+    assert coldloop("set", "--port-base", up, "load", "444", "--at", "80000").out.startswith(
+        "load 444 W from 80000 s on ("
+    )
+    outcome = coldloop("set", "--port-base", up, "load", "400", "--at", "90000.25")
+    assert outcome.out.startswith("load 400 W from 90000.2 s on, before it 444 W from 80000 s on (was ")
+    assert coldloop("set", "--port-base", up, "load", "385").code == 0
+    outcome = coldloop("set", "--port-base", up, "load", "400", "--at", "0.25")
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+    assert "plant time is" in outcome.complaints[0]
+
+
+@pytest.mark.parametrize("time", ["-1", "0.1", "nan", "inf", "1e300", "9" * 5000, "soon", str(2**32)])
+def test_a_time_that_no_session_has_is_one_line(coldloop: Coldloop, time: str) -> None:
+    outcome = coldloop("set", "load", "400", "--at", time)
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+    assert "not a number of seconds" in outcome.complaints[0]
 
 
 def test_a_second_rig_on_the_same_ports_is_refused_and_the_holder_named(coldloop: Coldloop, up: str) -> None:
@@ -149,9 +184,7 @@ def test_a_rig_that_was_attached_to_runs_on_in_real_time(coldloop: Coldloop, up:
     outcome = coldloop(*run, tmp_path / "run")
     assert outcome.code == 0, outcome.complaints
     until(coldloop, up, "session", f"{FACTOR} x real time")
-    before, deadline = shown(coldloop, up)["session"], time.monotonic() + 30
-    while shown(coldloop, up)["session"] == before:
-        assert time.monotonic() < deadline, "plant time goes on"
+    until_plant_time_passes(coldloop, up)
 
 
 def attach(up: str) -> tuple[str, ...]:
@@ -194,13 +227,42 @@ def test_what_a_rig_runs_may_be_named_again(coldloop: Coldloop, up: str, results
     assert coldloop(*run).code == 0
 
 
-def test_ctrl_c_gives_an_attached_rig_back_too(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
-    ends = [f"127.0.0.1:{int(up) + place}" for place in range(3)]
-    command = [sys.executable, "-m", "rig", "run", "--attach", *ends, "--load", "e", "--duration", "100h"]
-    with subprocess.Popen(
-        [*command, "--figures", "png", "--out", str(tmp_path / "run")], stderr=subprocess.DEVNULL
-    ) as run:
-        until(coldloop, up, "session", "lock-step")
-        run.send_signal(signal.SIGINT)
-        assert run.wait(60) == 130
+@pytest.mark.parametrize("service", ["optimizer_plc", "plant", "control_plc"])
+def test_a_service_that_is_killed_is_started_again_and_the_session_goes_on(
+    coldloop: Coldloop, up: str, service: str
+) -> None:
+    session = shown(coldloop, up)["session"].partition(",")[0]
+    rig = running_rig(int(up))
+    assert rig is not None
+    log = state_folder(int(up)) / "up.log"
+    before = log.read_text().count("started again")
+    os.kill(child_of(rig.pid, service), signal.SIGKILL)
+    deadline = time.monotonic() + PATIENCE_S
+    while coldloop("status", "--port-base", up).code or log.read_text().count("started again") == before:
+        assert time.monotonic() < deadline, log.read_text()
+    assert f"the {service} service was ended by SIGKILL" in log.read_text().splitlines()[-1]
+    assert "(1 of 5)" in log.read_text().splitlines()[-1]
+    until(coldloop, up, "mode", "mpc")
+    assert shown(coldloop, up)["session"].partition(",")[0] == session
+    assert running_rig(int(up)) == rig
+
+
+def child_of(parent: int, service: str) -> int:
+    """The process of a service that another one has started."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            words = (folder / "cmdline").read_bytes().split(b"\0")
+            started_by = int((folder / "stat").read_bytes().rpartition(b")")[2].split()[1])
+            if started_by == parent and service.encode() in words:
+                return int(folder.name)
+    raise AssertionError(f"no process of {service}")
+
+
+def test_ctrl_c_gives_an_attached_rig_back_too(
+    coldloop: Coldloop, up: str, tmp_path: Path, processes: Processes
+) -> None:
+    run = processes.coldloop(*attach(up), "--load", "e", "--duration", "100h", "--out", tmp_path / "run")
+    until(coldloop, up, "session", "lock-step")
+    until_plant_time_passes(coldloop, up)
+    assert run.interrupt() == 130
     until(coldloop, up, "session", f"{FACTOR} x real time")

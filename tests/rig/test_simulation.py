@@ -14,6 +14,7 @@ def minute() -> Simulation:
     return simulate(load="e", solver="ode", updating_period="adaptive", duration_s=60)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_simulation_has_the_trace_of_the_command(minute: Simulation, tmp_path: Path) -> None:
     from rig import cli  # noqa: PLC0415
     from rig.run_folder import RunFolder  # noqa: PLC0415

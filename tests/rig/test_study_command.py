@@ -33,10 +33,11 @@ def test_every_study_is_listed_with_its_title(coldloop: "Coldloop") -> None:
         assert study.title in outcome.out
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_study_on_a_load_of_ones_own_leaves_table_figure_and_section(
     coldloop: "Coldloop", own_load: Path, tmp_path: Path
 ) -> None:
-    asked = ("study", "limited", "--load", own_load, "--duration", "1min", "--seeds", "2", "--workers", "2")
+    asked = ("study", "limited", "--load", own_load, "--duration", "1min", "--seeds", "2", "--workers", "1")
     outcome = coldloop(*asked, "--out", tmp_path / "studies")
     assert outcome.code == 0, outcome.complaints
     folder = tmp_path / "studies" / "limited"

@@ -36,8 +36,8 @@ async def test_a_run_that_takes_over_a_running_rig_gets_its_own_trace(
 async def plant_under_way(bus: "Bus") -> AsyncIterator[RegisterClient]:
     """Wait until the plant is in the middle of a session."""
     end = bus.endpoints.plant
-    rack = RegisterClient(PLANT_MAP, host=end.host, port=end.port, timeout_s=5)
-    await rack.connect(60)
+    rack = RegisterClient(PLANT_MAP, host=end.host, port=end.port, timeout_s=60)
+    await rack.connect(90)
     try:
         while True:
             if (await rack.read(Identity)).tick >= 100:

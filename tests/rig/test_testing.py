@@ -1,23 +1,28 @@
 """`rig.testing` and the fixture `coldloop_rigs`: rigs for test suites, ours and others'."""
 
-import asyncio
 import importlib.metadata
-import subprocess
-import sys
-from collections.abc import Iterator
+import socket
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from coldloop.errors import LinkError, RequestRefusedError, UsageError
 from coldloop.registers.control_plc import Mode, OperatorMode, PlantLinkState
 from rig.testing import LiveRig, Rigs, up
+from tests.harness.processes import Processes
 
 
 @pytest.fixture(scope="module")
-def rig() -> Iterator[LiveRig]:
+def live_rig() -> Iterator[LiveRig]:
     with up(load="e") as one:
         yield one
+
+
+@pytest.fixture
+def rig(live_rig: LiveRig) -> LiveRig:
+    return live_rig
 
 
 def mode(rig: LiveRig) -> Mode:
@@ -29,10 +34,9 @@ def test_pytest_finds_the_plugin_of_the_installed_package() -> None:
     assert found["coldloop"] == "rig.pytest_plugin"
 
 
-def test_a_run_of_pytest_that_wants_no_rig_does_not_import_it() -> None:
-    program = "import sys, rig.pytest_plugin; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert not {"numpy", "numba", "pyarrow", "pymodbus", "rig.testing"} & set(done.stdout.split())
+def test_a_run_of_pytest_that_wants_no_rig_does_not_import_it(processes: Processes) -> None:
+    out, _ = processes.run_python("import sys, rig.pytest_plugin; print(*sys.modules)")
+    assert not {"numpy", "numba", "pyarrow", "pymodbus", "rig.testing"} & set(out.split())
 
 
 def test_lock_step_moves_as_far_as_it_is_let_and_no_further(rig: LiveRig) -> None:
@@ -100,23 +104,34 @@ def test_a_killed_service_comes_back_and_the_session_goes_on(rig: LiveRig, proce
     rig.wait_until(lambda: mode(rig) is Mode.MPC)
 
 
-def test_the_links_of_a_rig_in_real_time_can_be_disturbed(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("processes", "realtime")
+def test_the_links_of_a_rig_in_real_time_can_be_disturbed_and_its_ports_closed_by_stopping_it(
+    tmp_path: Path,
+) -> None:
     with Rigs(tmp_path) as rigs:
         rig = rigs.up(load="e", mode="realtime", factor=10)
-        rig.wait_until(lambda: rig.control_plc.read("plant link.state") == PlantLinkState.IN_STEP)
+
+        def until(name: str, condition: Callable[[Any], bool]) -> None:
+            rig.wait_until(lambda: condition(rig.control_plc.read(name)), within_s=900)
+
+        until("plant link.state", lambda state: state == PlantLinkState.IN_STEP)
         with rig.fault("freeze", link="plant"):
-            rig.wait_until(lambda: rig.control_plc.read("plant link.state") == PlantLinkState.SEARCHING)
-        rig.wait_until(lambda: rig.control_plc.read("plant link.state") == PlantLinkState.IN_STEP)
+            until("plant link.state", lambda state: state == PlantLinkState.SEARCHING)
+        until("plant link.state", lambda state: state == PlantLinkState.IN_STEP)
         with rig.fault("sensor", output="T5", shows="nan"):
-            rig.wait_until(lambda: rig.control_plc.read("ladder.bad_sensors") != 0)
+            until("ladder.bad_sensors", lambda sensors: sensors != 0)
         assert rig.log("plant").is_file()
         assert rig.log("plant").is_relative_to(tmp_path)
+    for endpoint in rig.endpoints:
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection((endpoint.host, endpoint.port))
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_service_that_ends_by_itself_is_named_with_its_log(tmp_path: Path) -> None:
     with up(load="e", folder=tmp_path) as rig:
         rig._proxied.services.processes["plant"].kill()  # noqa: SLF001 nobody ends a service by itself otherwise
-        with pytest.raises(LinkError, match=r"the plant service has ended: .*plant\.log"):
+        with pytest.raises(LinkError, match=r"the plant service was ended by SIGKILL .*plant\.log"):
             rig.advance(60)
 
 
@@ -125,16 +140,6 @@ def test_waiting_for_what_does_not_come_ends_after_plant_time(rig: LiveRig) -> N
     with pytest.raises(TimeoutError, match="within 2 s of plant time"):
         rig.wait_until(lambda: False, within_s=2)
     assert rig.time_s == before + 2
-
-
-async def test_the_ports_of_a_stopped_rig_are_closed() -> None:
-    def started_and_stopped() -> int:
-        with up(load="e") as rig:
-            return rig.endpoints.plant.port
-
-    port = await asyncio.to_thread(started_and_stopped)
-    with pytest.raises(ConnectionRefusedError):
-        await asyncio.open_connection("127.0.0.1", port)
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,7 @@ import json
 import os
 import shutil
 import struct
-import subprocess
-import sys
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,61 +14,24 @@ from typing import Any, Protocol
 import aiomqtt
 import pytest
 
-from coldloop.config import PREFIX
-from rig.ports import ReservedPorts
+from tests.harness.processes import Process, Processes
 
 # -- processes ---------------------------------------------------------------------------------------------------------
 
-Start = Callable[..., "subprocess.Popen[str]"]
+Start = Callable[..., Process]
 
 
 @pytest.fixture
-def start() -> Iterator[Start]:
-    """Start a service with `--set` assignments; what is still running at the end of the test is killed.
+def start(processes: Processes) -> Start:
+    """Start a service with `--set` assignments; its peer is where nobody listens, unless they say otherwise."""
+    nobody = processes.free_port()
 
-    It listens on any free port, and looks for its peer where nobody listens, unless the assignments say otherwise.
-    """
-    started: list[subprocess.Popen[str]] = []
-    nobody = ReservedPorts(1)
-
-    def one(
-        service: str, *assignments: str, level: str = "error", stderr: int = subprocess.PIPE
-    ) -> subprocess.Popen[str]:
+    def one(service: str, *assignments: str, level: str = "error", **how: Any) -> Process:  # noqa: ANN401 - of `service`
         ports = {"plant": [], "control_plc": ["plant"], "optimizer_plc": ["control_plc"]}[service]
-        peers = [f"{service}.{peer}.port={nobody.numbers[0]}" for peer in ports]
-        chosen = [f"--set={text}" for text in (f"{service}.server.port=0", *peers, *assignments)]
-        started.append(
-            subprocess.Popen(
-                [sys.executable, "-m", service, "--log-level", level, *chosen],
-                env={name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
-                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stderr, text=True,
-            )
-        )  # fmt: skip
-        return started[-1]
+        peers = [f"{service}.{peer}.port={nobody}" for peer in ports]
+        return processes.service(service, *peers, *assignments, level=level, **how)
 
-    yield one
-    for process in started:
-        process.kill()
-        process.communicate()
-    nobody.release()
-
-
-ServingPort = Callable[["subprocess.Popen[str]"], int]
-
-
-@pytest.fixture
-def serving_port() -> ServingPort:
-    """Wait until a service that was started with `level="info"` serves; return the port that it got."""
-
-    def read(process: "subprocess.Popen[str]") -> int:
-        assert process.stderr is not None
-        for line in process.stderr:
-            said = json.loads(line)
-            if said["event"] == "serving":
-                return int(said["port"])
-        raise AssertionError(f"ended with {process.wait()} before it served")
-
-    return read
+    return one
 
 
 # -- brokers -----------------------------------------------------------------------------------------------------------

@@ -1,9 +1,7 @@
 """A service whose standard error is a pipe that nobody reads: it goes on answering, and ends when it is told to."""
 
-import asyncio
 import contextlib
 import os
-import signal
 from collections.abc import AsyncIterator, Iterator
 from typing import TYPE_CHECKING
 
@@ -46,7 +44,7 @@ async def test_a_plant_whose_logs_nobody_reads_goes_on_answering_and_ends_in_goo
     start: "Start", free_port: int, unread_pipe: tuple[int, int]
 ) -> None:
     reader, writer = unread_pipe
-    process = start("plant", f"plant.server.port={free_port}", level="info", stderr=writer)
+    process = start("plant", port=free_port, level="info", stderr=writer)
     async with client_of_plant(free_port) as client:
         await client.write_rows([LoadStep(0, 385.0)])
         for session in range(1, 41):
@@ -54,7 +52,6 @@ async def test_a_plant_whose_logs_nobody_reads_goes_on_answering_and_ends_in_goo
             with pytest.raises(RequestRefusedError):
                 await client.write(Identity(0, 0, 0, 0, 0, 0, 0))
         assert (await client.read(Identity)).session == 40
-    process.send_signal(signal.SIGTERM)
-    assert await asyncio.to_thread(process.wait, 20) == 0
+    assert await process.terminated() == 0
     os.set_blocking(reader, False)
     assert b'"event": "session started"' not in os.read(reader, 1 << 20)

@@ -8,8 +8,9 @@ from distributed import Client
 
 from rig.indicators import Indicators
 from rig.studies.execution import Store, Workers
-from rig.studies.request import UPDATE_COLUMNS, Outcome, RunRequest
-from rig.studies.study import Load, StudyOptions, draw_of
+from rig.studies.request import UPDATE_COLUMNS, Outcome, RunRequest, perform
+from rig.studies.results import conduct
+from rig.studies.study import RUNS, Load, Study, StudyOptions, StudyResult, draw_of
 
 Requests = Callable[[int], list[RunRequest]]
 
@@ -33,17 +34,36 @@ def store(tmp_path: Path) -> Store:
     return Store(tmp_path / "runs")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def client() -> Iterator[Client]:
-    """Two workers."""
+    """Two workers, in processes of their own; they are the same ones for all tests."""
     with Workers(2).connected() as client:
         yield client
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def running(client: Client) -> Workers:
     """The same two workers, for whoever names their scheduler."""
     return Workers(1, scheduler=client.scheduler.address)
+
+
+NOBODY = Workers(1, scheduler="tcp://127.0.0.1:1")
+"""No run is left for them."""
+Conducted = Callable[[Study, StudyOptions], StudyResult]
+
+
+@pytest.fixture
+def conducted(tmp_path: Path) -> Conducted:
+    """Conduct a study whose runs were done in this process; its files are in `tmp_path`."""
+
+    def conduct_here(study: Study, options: StudyOptions) -> StudyResult:
+        (tmp_path / RUNS).mkdir()
+        store = Store(tmp_path / RUNS)
+        for request in study.requests(options):
+            store.keep(request, perform(request))
+        return conduct(study, options, NOBODY, tmp_path)
+
+    return conduct_here
 
 
 # -- outcomes that no run has given, to judge by hand ----------------------------------------------------------------

@@ -126,7 +126,9 @@ def test_an_exact_solver_needs_one_iteration_and_a_truncated_one_more() -> None:
     assert needs[SolverName.ODE].worst > 1
 
 
-def test_the_command_prints_a_row_for_each_solver(coldloop: "Coldloop") -> None:
+def test_the_command_prints_a_row_for_each_solver(coldloop: "Coldloop", monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of scenarios of three minutes."""
+    monkeypatch.setattr("rig.certification.SCENARIO_TICKS", 720)
     outcome = coldloop("budget", "--certify", "2", "--confidence", "90")
     assert outcome.code == 0, outcome.complaints
     rows = {line.split()[0]: line for line in outcome.out.splitlines() if line and line.split()[0] in set(SolverName)}

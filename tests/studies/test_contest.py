@@ -1,15 +1,17 @@
 """What the study of solvers in the closed loop makes of its runs, against a case done by hand."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from rig.indicators import Indicators
 from rig.studies.contest import REFERENCE, SOLVERS, WAYS, ContestStudy
-from rig.studies.execution import Workers
 from rig.studies.request import Outcome, RunRequest, settings_of
-from rig.studies.results import conduct
 from rig.studies.study import StudyOptions
+
+if TYPE_CHECKING:
+    from tests.studies.conftest import Conducted
 
 STUDY = ContestStudy()
 
@@ -50,9 +52,7 @@ def test_the_reference_is_among_the_ways() -> None:
     assert REFERENCE[1] in {way.label for way in WAYS}
 
 
-@pytest.mark.slow
-def test_the_study_is_conducted(running: Workers, tmp_path: Path) -> None:
-    options = StudyOptions(ticks=240, loads=("e",), seeds=1)
-    result = conduct(STUDY, options, running, tmp_path)
+def test_the_study_is_conducted(conducted: "Conducted", tmp_path: Path) -> None:
+    result = conducted(STUDY, StudyOptions(ticks=240, loads=("e",), seeds=1))
     assert len(result.rows) == len(SOLVERS) * len(WAYS)
     assert (tmp_path / "contest" / "section.md").is_file()

@@ -2,12 +2,12 @@
 
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from rig.indicators import Indicators
-from rig.studies.execution import Workers
 from rig.studies.hindsight import Objective
 from rig.studies.oracles import (
     BEST,
@@ -24,9 +24,11 @@ from rig.studies.oracles import (
     worst,
 )
 from rig.studies.request import Outcome
-from rig.studies.results import conduct
 from rig.studies.robustness import CONDITIONS, POLICIES, REFERENCE, RobustnessStudy, ratio_table
 from rig.studies.study import StudyOptions
+
+if TYPE_CHECKING:
+    from tests.studies.conftest import Conducted
 
 
 def outcome(closed: float, opened: float) -> Outcome:
@@ -86,13 +88,12 @@ def test_robustness_compares_under_the_same_condition() -> None:
         assert row["Algorithm 1"][:3] == pytest.approx((4.0, 2.0, 8.0))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("study", [OraclesStudy(), RobustnessStudy()])
 def test_the_whole_study_of_half_a_minute_has_a_row_for_each_run(
-    study: OraclesStudy | RobustnessStudy, running: Workers, tmp_path: Path
+    study: OraclesStudy | RobustnessStudy, conducted: "Conducted", tmp_path: Path
 ) -> None:
     options = StudyOptions(seeds=1, ticks=120, loads=("e",))
-    result = conduct(study, options, running, tmp_path)
+    result = conducted(study, options)
     assert len(result.rows) == len(study.requests(options))
     assert len({row[-1] for row in result.rows}) > len(FAST), "runs differ"
     section = (tmp_path / study.name / "section.md").read_text()

@@ -313,7 +313,6 @@ def test_harsh_problems_of_all_loads_are_counted_together(short: StudyOptions, m
     }
 
 
-@pytest.mark.slow
 def test_a_short_study_from_requests_to_report() -> None:
     study, options = STUDIES["solver-comparison"], StudyOptions(loads=("e",), ticks=600, quick=True)
     outcomes = {request: Outcome.from_json(perform(request)) for request in study.requests(options)}
@@ -325,7 +324,6 @@ def test_a_short_study_from_requests_to_report() -> None:
     assert [remark.splitlines()[0][:9] for remark in result.remarks] == ["**Paired,", "**Harsh p"]
 
 
-@pytest.mark.slow
 def test_under_a_load_that_never_steps_nothing_is_compared_and_nothing_fails(tmp_path: "Path") -> None:
     (tmp_path / "quiet.csv").write_text("time_s,load_w\n0,384.74\n")
     study, options = STUDIES["solver-comparison"], StudyOptions(loads=(f"{tmp_path}/quiet.csv",), ticks=240, quick=True)

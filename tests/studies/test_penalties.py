@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -11,15 +12,16 @@ from optimizer_plc.penalties import Preset
 from plant.program import LoadProfile
 from rig.indicators import Indicators
 from rig.studies.best_periods import end_over_best, groups, share_inside
-from rig.studies.execution import Workers
 from rig.studies.open_loop import paired_loads
 from rig.studies.penalties import PenaltiesStudy, misfit
 from rig.studies.penalty_sums import Paired
 from rig.studies.penalty_variants import OWN, PRESETS, VARIANTS, Variant, paired, powers_of
 from rig.studies.request import Outcome, RunRequest, settings_of
-from rig.studies.results import conduct
 from rig.studies.study import Load, StudyOptions
 from rig.studies.updating_period import is_inside
+
+if TYPE_CHECKING:
+    from tests.studies.conftest import Conducted
 
 QUICK = StudyOptions(quick=True)
 TUNED, AS_PRINTED = PRESETS[Preset.TUNED], PRESETS[Preset.AS_PRINTED]
@@ -88,14 +90,13 @@ def test_hours_that_rules_were_tuned_on_are_not_fresh() -> None:
     }
 
 
-@pytest.mark.slow
 def test_the_whole_study_of_half_a_minute_has_a_row_for_each_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    conducted: "Conducted", tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLDLOOP__PLANT__SEED", "7")  # the environment does not count
     options = StudyOptions(quick=True, ticks=120)
     study = PenaltiesStudy()
-    result = conduct(study, options, Workers(1), tmp_path)
+    result = conducted(study, options)
     assert len(result.rows) == len(study.requests(options))
     text = (tmp_path / "penalties" / "section.md").read_text()
     for expected in (

@@ -88,6 +88,7 @@ def test_shards_may_share_a_folder_and_be_done_at_once(whole: Path, client: "Cli
     assert results(tmp_path) == results(whole)
 
 
+@pytest.mark.exhaustive  # what a dead worker costs is shown for single runs in test_execution.py
 def test_a_third_of_the_workers_killed_changes_no_byte(whole: Path, tmp_path: Path) -> None:
     with Workers(3).connected() as client:
         victim = next(iter(client.run(os.getpid).values()))
@@ -162,9 +163,11 @@ def test_what_cannot_be_merged_is_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_the_command_does_shards_and_merges_them(whole: Path, coldloop: "Coldloop", tmp_path: Path) -> None:
+def test_the_command_does_shards_and_merges_them(
+    whole: Path, coldloop: "Coldloop", running: Workers, tmp_path: Path
+) -> None:
     for number in (1, 2):
-        outcome = coldloop("study", *ARGUMENTS, "--shard", f"{number}/2", "--workers", "2", "--out",
+        outcome = coldloop("study", *ARGUMENTS, "--shard", f"{number}/2", "--scheduler", running.scheduler, "--out",
                            tmp_path / str(number))  # fmt: skip
         assert outcome.code == 0, outcome.complaints
         assert outcome.out == f"shard {number}/2 of trade-off: 6 runs in {tmp_path / str(number) / RUNS}\n"

@@ -7,7 +7,14 @@ from collections.abc import Sequence
 from typing import Any, Final, Self, TypeVar, cast
 
 from coldloop.endpoints import Endpoint
-from coldloop.errors import DamagedAnswerError, PeerUnreachableError, RequestRefusedError, UntrustedPeerError
+from coldloop.errors import (
+    DamagedAnswerError,
+    ImplausibleAnswerError,
+    PeerUnreachableError,
+    RequestRefusedError,
+    UnfitValueError,
+    UntrustedPeerError,
+)
 from coldloop.modbus.peer_check import check_peer
 from coldloop.modbus.requests import (
     MAX_READ_WORDS,
@@ -21,6 +28,7 @@ from coldloop.modbus.transport import REQUESTS_AT_ONCE, NoAnswerError, Transport
 from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
+from coldloop.registers.domain import DomainError
 from coldloop.seal import Seal, seal_of, sealed_bytes
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -55,10 +63,13 @@ class RegisterClient:
 
     Requests of several tasks are sent one after the other. After a lost connection the next request connects again.
 
-    Records of sealed blocks are sealed when they are written, and their seals are checked when they are read.
+    Records of sealed blocks are sealed when they are written, and their seals are checked when they are read. Values
+    that are read are checked by the declarations of their registers.
 
     All requests raise `PeerUnreachableError` when there is no answer in time, `RequestRefusedError` when the answer is
-    a Modbus exception, and `DamagedAnswerError` when a record that should be sealed is not, or its seal is broken.
+    a Modbus exception, `DamagedAnswerError` when a record that should be sealed is not, or its seal is broken,
+    `ImplausibleAnswerError` when a value is out of its range, and `UnfitValueError` when one that is to be written does
+    not fit.
     """
 
     def __init__(
@@ -158,11 +169,7 @@ class RegisterClient:
                 for first, here in parts[place : place + REQUESTS_AT_ONCE]
             ]
             for raw in await self._read_words(block, words):
-                places = range(0, len(raw), codec.size)
-                if block.sealed:
-                    for offset in places:
-                        self._check_seal(block, codec, raw, offset)
-                rows += [cast("R", codec.decode(raw, offset)) for offset in places]
+                rows += [self._decoded(block, codec, raw, offset) for offset in range(0, len(raw), codec.size)]
         return rows
 
     async def write(self, record: tuple[Any, ...]) -> None:
@@ -202,14 +209,12 @@ class RegisterClient:
         """
         block, codec = self._places[type(record)]
         answer_block, answer_codec = self._places[answer]
-        data = _encoded(block, codec, record) + b"".join([self._places[type(row)][1].encode(row) for row in rows])
+        data = _encoded(block, codec, record) + b"".join([_encoded(*self._places[type(row)], row) for row in rows])
         head = _READ_WRITE.pack(
             READ_WRITE_REGISTERS, answer_block.address, answer_codec.size // 2, block.address, len(data) // 2, len(data)
         )
         words = self._checked(await self._transact(head + data, block, patience_s), answer_codec.size, answer_block)
-        if answer_block.sealed:
-            self._check_seal(answer_block, answer_codec, words, 0)
-        return cast("R", answer_codec.decode(words))
+        return cast("R", self._decoded(answer_block, answer_codec, words))
 
     async def query(self, record: tuple[Any, ...], answer: type[R], rows: type[S], count: int) -> tuple[R, list[S]]:
         """Write `record`, then read `answer` and the first `count` rows of the block that adjoins it, in one request.
@@ -218,7 +223,7 @@ class RegisterClient:
         """
         written, own_codec = self._places[type(record)]
         block, codec = self._places[answer]
-        row_codec = self._places[rows][1]
+        row_block, row_codec = self._places[rows]
         size = codec.size + count * row_codec.size
         data = _encoded(written, own_codec, record)
         head = _READ_WRITE.pack(
@@ -226,7 +231,8 @@ class RegisterClient:
         )
         raw = self._checked(await self._transact(head + data, written), size, block)
         places = range(codec.size, size, row_codec.size)
-        return cast("R", codec.decode(raw)), [cast("S", row_codec.decode(raw, place)) for place in places]
+        found = [cast("S", self._decoded(row_block, row_codec, raw, place)) for place in places]
+        return cast("R", self._decoded(block, codec, raw)), found
 
     def close(self) -> None:
         """Close the connection."""
@@ -244,9 +250,14 @@ class RegisterClient:
             raise self._nonsense(block)
         return raw[1:]
 
-    def _check_seal(self, block: Block, codec: RecordCodec, raw: bytes, offset: int) -> None:
-        if seal_of(codec, raw, offset) is not Seal.INTACT:
+    def _decoded(self, block: Block, codec: RecordCodec, raw: bytes, offset: int = 0) -> Any:  # noqa: ANN401 - a record
+        """Return a record of an answer, its seal and its values checked."""
+        if block.sealed and seal_of(codec, raw, offset) is not Seal.INTACT:
             raise DamagedAnswerError(f"{self.peer}: block '{block.name}' arrived damaged, or is not sealed there")
+        try:
+            return codec.decode_checked(raw, offset)
+        except DomainError as error:
+            raise ImplausibleAnswerError(f"{self.peer}: block '{block.name}' is not plausible: {error}") from None
 
     async def _transact(self, request: bytes, block: Block, patience_s: float | None = None) -> bytes:
         """Send a PDU; return the bytes behind the answer's function code."""
@@ -299,4 +310,7 @@ def _secured(tls: TlsSettings, name: str) -> ssl.SSLContext:
 
 
 def _encoded(block: Block, codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
-    return sealed_bytes(codec, record) if block.sealed else codec.encode(record)
+    try:
+        return sealed_bytes(codec, record) if block.sealed else codec.encode(record)
+    except (struct.error, OverflowError) as error:
+        raise UnfitValueError(f"block '{block.name}' cannot hold what was to be written: {error}") from None

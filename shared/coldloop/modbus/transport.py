@@ -80,6 +80,8 @@ class Transport:
             raise UntrustedPeerError(
                 f"{self.peer} cannot be trusted: {error.verify_message}: check the host name, and tls.ca here"
             ) from None
+        except UnicodeError:
+            raise PeerUnreachableError(f"{self.peer}: the host name is none") from None
         except OSError as error:
             if self._tls is not None and isinstance(
                 error, ssl.SSLError | ConnectionResetError | ConnectionAbortedError

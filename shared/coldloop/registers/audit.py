@@ -28,7 +28,7 @@ class EventKind(IntEnum):
     ALARM_OUT_OF_SERVICE = 7
     ALARM_IN_SERVICE = 8
     BOOT = 9
-    """The service started: subject 1 when it goes on with a retained state."""
+    """The service started: subject 1 when it goes on with a retained state, cause 1 when one was set aside."""
     SESSION = 10
     """A session was started: subject 0 lock-step, 1 real time; value the factor."""
     OPERATOR_MODE = 11

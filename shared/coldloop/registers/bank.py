@@ -1,14 +1,12 @@
 """The registers of one server, held in memory, with every check that a write must pass."""
 
-import math
-import struct
 from bisect import bisect_left
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar, cast
 
 from coldloop.registers.codec import RecordCodec, ValueCodec, WordOrder, codec_of
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, Role, fields_of
+from coldloop.registers.domain import Domain, DomainError
 from coldloop.seal import Seal, seal_of, sealed_bytes
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -109,7 +107,7 @@ class RegisterBank:
             self._writable[block.address : block.end] = b"\1" * size
         if block.sealed and block.writer is None:  # no seal is damage to those who read, also before there is anything
             self.put_sealed(codec_of(block, self.order).decode(bytes(2 * size)))
-        fields = {name: _with_stored_bounds(field) for name, field in fields_of(block.record).items()}
+        fields = fields_of(block.record)
         for row in range(block.rows):
             for register in block.registers(row):
                 if register.kind.words == 2:
@@ -203,10 +201,10 @@ class RegisterBank:
         return span.blocks
 
     def _check(self, span: "_Span", image: bytes) -> None:
-        values = span.codec.unpack(image)
-        if not span.plain or not math.isfinite(sum(values)):
-            for value, (field, name) in zip(values, span.fields, strict=True):
-                _check_value(value, field, name)
+        try:
+            span.domain.check(span.codec.unpack(image))
+        except DomainError as error:
+            raise IllegalValueError(str(error)) from None
         for codec, offset, name in span.sealed:
             if seal_of(codec, image, offset) is Seal.BROKEN:
                 raise IllegalValueError(f"the CRC of block '{name}' is not that of its registers: write all of them")
@@ -242,8 +240,7 @@ class RegisterBank:
             first=first,
             end=end,
             codec=ValueCodec("".join(kind.letter for _, kind, _, _ in checks), self.order),
-            fields=[(field, name) for *_, field, name in checks],
-            plain=all(field.low is None and field.high is None for *_, field, _ in checks),
+            domain=Domain([field for *_, field, _ in checks], [name for *_, name in checks]),
             blocks=blocks,
             writers=writers,
             sealed=[
@@ -271,9 +268,7 @@ class _Span(NamedTuple):
     end: int
     """Behind the last one."""
     codec: ValueCodec
-    fields: list[tuple[Field, str]]
-    plain: bool
-    """No value has a range of its own: it is enough that all are finite."""
+    domain: Domain
     blocks: list[Block]
     writers: frozenset[Role]
     sealed: list[tuple[RecordCodec, int, str]]
@@ -292,22 +287,3 @@ def _forbidden(blocks: list[Block], roles: frozenset[Role]) -> ForbiddenWriteErr
     block = next(block for block in blocks if block.writer not in roles)
     own = ", ".join(sorted(roles)) or "none"
     return ForbiddenWriteError(f"block '{block.name}' is written by the {block.writer}; roles of this client: {own}")
-
-
-def _check_value(value: float, field: Field, name: str) -> None:
-    if not math.isfinite(value):
-        raise IllegalValueError(f"{name} is not a finite number")
-    if field.low is not None and value < field.low:
-        raise IllegalValueError(f"{name} = {value:g} is below {field.low:g} {field.unit}".rstrip())
-    if field.high is not None and value > field.high:
-        raise IllegalValueError(f"{name} = {value:g} is above {field.high:g} {field.unit}".rstrip())
-
-
-def _with_stored_bounds(field: Field) -> Field:
-    """Round the bounds as values are rounded: 0.01 is stored as a little less, and is still in a range from 0.01."""
-    if field.kind is not Kind.F32:
-        return field
-    low, high = (
-        None if bound is None else struct.unpack("f", struct.pack("f", bound))[0] for bound in (field.low, field.high)
-    )
-    return replace(field, low=low, high=high)

@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any, TypeVar, cast
 
 from coldloop.registers.declaration import Block, fields_of
+from coldloop.registers.domain import DomainError, domain_of
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -57,6 +58,7 @@ class RecordCodec:
     def __init__(self, block: Block, order: WordOrder) -> None:
         self._values = ValueCodec(block.letters, order)
         self._record = block.record
+        self._domain = domain_of(block.record)
         self._arrays = [len(field.elements) for field in fields_of(block.record).values()]
         self._flat = not any(self._arrays)
         self.size = self._values.size
@@ -71,7 +73,37 @@ class RecordCodec:
 
     def decode(self, data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[Any, ...]:
         """Return the record in `data` at `offset` (bytes)."""
+        return self._made_of(self._values.unpack(data, offset))
+
+    def decode_checked(self, data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[Any, ...]:
+        """Return the record in `data` at `offset` (bytes), which somebody else has made.
+
+        Registers that nobody has written yet are all 0, whatever their ranges.
+
+        Raises:
+            DomainError: A value is not one that its register can have.
+        """
         values = self._values.unpack(data, offset)
+        try:
+            self._domain.check(values)
+        except DomainError:
+            if any(values):
+                raise
+        return self._made_of(values)
+
+    def check(self, record: tuple[Any, ...]) -> None:
+        """Check a record that has not come by the bus.
+
+        Raises:
+            DomainError: A value is not one that its register can have.
+        """
+        try:
+            values = self._values.unpack(self.encode(record))
+        except (struct.error, OverflowError) as error:
+            raise DomainError(f"a value does not fit its register: {error}") from None
+        self._domain.check(values)
+
+    def _made_of(self, values: tuple[Any, ...]) -> tuple[Any, ...]:
         return self._record(*(values if self._flat else self._nested(values)))
 
     def canonical(self, data: bytes | bytearray | memoryview, offset: int = 0) -> bytes | bytearray | memoryview:
@@ -113,6 +145,15 @@ def codec_of(block: Block, order: WordOrder = WordOrder.HIGH_FIRST) -> RecordCod
 @cache
 def _wire_codec(record: type[tuple[Any, ...]]) -> RecordCodec:
     return RecordCodec(Block("wire", 0, record, ""), WordOrder.HIGH_FIRST)
+
+
+def check_record(record: tuple[Any, ...]) -> None:
+    """Check a record that has not come by the bus, but from a file.
+
+    Raises:
+        DomainError: A value is not one that its register can have.
+    """
+    _wire_codec(type(record)).check(record)
 
 
 def as_transmitted(record: R) -> R:

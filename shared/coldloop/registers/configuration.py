@@ -56,13 +56,18 @@ def configuration_of(digest: ConfigurationDigest, lines: Sequence[ConfigurationL
     """Return the values by dotted key.
 
     Raises:
-        ValueError: The text is not the one of the digest: it was cut off, or has arrived damaged.
+        ValueError: The text is not the one of the digest: it was cut off, or has arrived damaged; or it is no object of
+            values.
     """
     document = "".join(from_words(line.text) for line in lines)
     if _digest(document) != from_words(digest.sha256):
         raise ValueError("the text is not the one of its digest")
-    values: dict[str, Any] = json.loads(document)
-    return values
+    try:
+        return {**json.loads(document)}
+    except RecursionError:
+        raise ValueError("the text is nested too deeply") from None
+    except TypeError:
+        raise ValueError("the text is not an object") from None
 
 
 def _lines(document: str) -> Iterator[str]:

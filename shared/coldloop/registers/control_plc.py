@@ -3,11 +3,21 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, STATE_NAMES, STATE_UNITS
+from coldloop.process import (
+    INPUT_NAMES,
+    INPUT_UNITS,
+    LAST_NUMBER,
+    LAST_TICK,
+    OUTPUT_NAMES,
+    OUTPUT_UNITS,
+    STATE_NAMES,
+    STATE_UNITS,
+)
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
+from coldloop.registers.plant import MAX_INPUT, MAX_LOAD_W, MAX_STATE
 from coldloop.registers.safety import Alarm, AlarmCommand, AlarmKind, LeaseStatus, WatchdogStatus, WatchdogTime
 
 SEQUENCE_ROWS: Final = 240
@@ -97,8 +107,8 @@ class LinkCause(IntEnum):
     NO_ANSWER = 1
     DAMAGED = 2
     """An answer whose seal is broken or absent."""
-    NOT_FINITE = 3
-    """What it says that it applies is no number."""
+    IMPLAUSIBLE = 3
+    """It says what cannot be: a value out of its range, or no number."""
     WRONG_SESSION = 4
     UNTIMELY = 5
     CHANGED = 6
@@ -116,13 +126,15 @@ class LinkCause(IntEnum):
     STARTED = 12
     PACE = 13
     """The time base of the session was changed."""
+    LIMITED = 14
+    """The rack moved its outputs by no more than it lets anybody move them in one of its ticks."""
 
 
 class Process(NamedTuple):
     """The process at the last scan."""
 
     tick: Annotated[int, u32("Tick of the scan")]
-    load: Annotated[float, f32("Heat load NCR22_HL", unit="W")]
+    load: Annotated[float, f32("Heat load NCR22_HL", unit="W", finite=False)]
     u: Annotated[tuple[float, ...], f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS)]
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
 
@@ -167,14 +179,28 @@ class Update(NamedTuple):
     """What is latched at an updating instant for the optimiser."""
 
     session: Annotated[int, u32("Session")]
-    update: Annotated[int, u32("Number of the update; 0 is the one at tick 0")]
-    tick: Annotated[int, u32("Tick of the updating instant t_i")]
-    playing: Annotated[int, u32("Number of the sequence being played from this instant on; 0 is none")]
-    load: Annotated[float, f32("Heat load NCR22_HL", unit="W")]
-    u_before: Annotated[tuple[float, ...], f32_array("Input applied until this instant", INPUT_NAMES, INPUT_UNITS)]
-    u: Annotated[tuple[float, ...], f32_array("Input applied from this instant on", INPUT_NAMES, INPUT_UNITS)]
-    y: Annotated[tuple[float, ...], f32_array("Output measured at this instant", OUTPUT_NAMES, OUTPUT_UNITS)]
-    x: Annotated[tuple[float, ...], f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS)]
+    update: Annotated[int, u32("Number of the update; 0 is the one at tick 0", high=LAST_NUMBER)]
+    tick: Annotated[int, u32("Tick of the updating instant t_i", high=LAST_TICK)]
+    playing: Annotated[
+        int, u32("Number of the sequence being played from this instant on; 0 is none", high=LAST_NUMBER)
+    ]
+    load: Annotated[float, f32("Heat load NCR22_HL", unit="W", low=0, high=MAX_LOAD_W)]
+    u_before: Annotated[
+        tuple[float, ...],
+        f32_array("Input applied until this instant", INPUT_NAMES, INPUT_UNITS, low=0, high=MAX_INPUT),
+    ]
+    u: Annotated[
+        tuple[float, ...],
+        f32_array("Input applied from this instant on", INPUT_NAMES, INPUT_UNITS, low=0, high=MAX_INPUT),
+    ]
+    y: Annotated[
+        tuple[float, ...],
+        f32_array("Output measured at this instant", OUTPUT_NAMES, OUTPUT_UNITS, low=-MAX_STATE, high=MAX_STATE),
+    ]
+    x: Annotated[
+        tuple[float, ...],
+        f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS, low=-MAX_STATE, high=MAX_STATE),
+    ]
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none")] = 0
 
 
@@ -226,8 +252,8 @@ class LatchedUpdate(NamedTuple):
     """Which update is the newest: what an optimiser that computes looks at."""
 
     session: Annotated[int, u32("Session")] = 0
-    update: Annotated[int, u32("Number of the newest update")] = 0
-    tick: Annotated[int, u32("Tick of its updating instant")] = 0
+    update: Annotated[int, u32("Number of the newest update", high=LAST_NUMBER)] = 0
+    tick: Annotated[int, u32("Tick of its updating instant", high=LAST_TICK)] = 0
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
@@ -246,7 +272,7 @@ class SequenceHeader(NamedTuple):
     It is right before the buffer: header and rows of a short sequence fit into one request.
     """
 
-    number: Annotated[int, u32("Number of the sequence, rising")]
+    number: Annotated[int, u32("Number of the sequence, rising", high=LAST_NUMBER)]
     update: Annotated[int, u32("Update that the sequence answers")]
     first_tick: Annotated[int, u32("First tick at which it is valid, t_{i+1}")]
     length: Annotated[int, u16("Rows in use", high=SEQUENCE_ROWS)]
@@ -277,8 +303,8 @@ class PlantLinkStatus(NamedTuple):
     cause: Annotated[
         int,
         u16(
-            "0 none, 1 no answer, 2 damaged, 3 not finite, 4 wrong session, 5 untimely, 6 changed, 7 second master, "
-            "8 refused, 9 overslept, 10 leapt, 11 stopped, 12 started, 13 pace",
+            "0 none, 1 no answer, 2 damaged, 3 implausible, 4 wrong session, 5 untimely, 6 changed, 7 second master, "
+            "8 refused, 9 overslept, 10 leapt, 11 stopped, 12 started, 13 pace, 14 limited",
             values=LinkCause,
         ),
     ] = LinkCause.NONE
@@ -290,7 +316,7 @@ class PlantLinkStatus(NamedTuple):
     plant_tick: Annotated[int, u32("Tick of the rack when it last answered")] = 0
     offset: Annotated[float, f32("Phase of the rack's clock against ours, less what it should be", unit="ms")] = 0.0
     skew: Annotated[float, f32("How much faster the rack's clock is than ours", unit="ppm")] = 0.0
-    skew_error: Annotated[float, f32("Standard error of that", unit="ppm")] = 0.0
+    skew_error: Annotated[float, f32("Standard error of that", unit="ppm", finite=False)] = 0.0
 
 
 class ControlSession(NamedTuple):

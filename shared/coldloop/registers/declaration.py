@@ -55,6 +55,8 @@ class Field:
     """Meaning of the numbers of an enumeration."""
     is_text: bool = False
     """The elements are the words of a text (`registers.text`)."""
+    finite: bool = True
+    """No NaN and no infinity; where they may be, whoever uses the value judges it."""
 
     @property
     def words(self) -> int:
@@ -63,15 +65,16 @@ class Field:
 
 
 def u16(
-    description: str, *, unit: str = "", low: int = 0, high: int = 0xFFFF, values: type[IntEnum] | None = None
+    description: str, *, unit: str = "", low: int = 0, high: int | None = None, values: type[IntEnum] | None = None
 ) -> Field:
-    """Declare an unsigned 16-bit register; `values` gives the numbers of an enumeration their meaning."""
-    return Field(Kind.U16, description, unit, low, high, values=values)
+    """Declare an unsigned 16-bit register; `values` gives an enumeration's numbers their meaning, and their end."""
+    end = 0xFFFF if values is None else max(values)
+    return Field(Kind.U16, description, unit, low, end if high is None else high, values=values)
 
 
-def u32(description: str, *, unit: str = "", low: int | None = None) -> Field:
+def u32(description: str, *, unit: str = "", low: int | None = None, high: int | None = None) -> Field:
     """Declare an unsigned 32-bit register pair."""
-    return Field(Kind.U32, description, unit, low)
+    return Field(Kind.U32, description, unit, low, high)
 
 
 def u16_array(description: str, elements: tuple[str, ...], *, unit: str = "") -> Field:
@@ -84,14 +87,24 @@ def text(description: str, words: int) -> Field:
     return Field(Kind.U16, description, elements=tuple(f"{word}" for word in range(words)), is_text=True)
 
 
-def f32(description: str, *, unit: str = "", low: float | None = None, high: float | None = None) -> Field:
+def f32(
+    description: str, *, unit: str = "", low: float | None = None, high: float | None = None, finite: bool = True
+) -> Field:
     """Declare an IEEE-754 single-precision register pair."""
-    return Field(Kind.F32, description, unit, low, high)
+    return Field(Kind.F32, description, unit, low, high, finite=finite)
 
 
-def f32_array(description: str, elements: tuple[str, ...], units: tuple[str, ...]) -> Field:
-    """Declare one single-precision register pair for each element."""
-    return Field(Kind.F32, description, elements=elements, units=units)
+def f32_array(
+    description: str,
+    elements: tuple[str, ...],
+    units: tuple[str, ...],
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    finite: bool = True,
+) -> Field:
+    """Declare one single-precision register pair for each element, all with the same range."""
+    return Field(Kind.F32, description, "", low, high, elements, units, finite=finite)
 
 
 @cache

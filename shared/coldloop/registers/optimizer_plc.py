@@ -69,24 +69,29 @@ class ControlLinkStatus(NamedTuple):
 
 
 class Optimization(NamedTuple):
-    """What the optimiser did between two updating instants. Costs are those of the augmented cost function J."""
+    """What the optimiser did between two updating instants. Costs are those of the augmented cost function J.
+
+    A cost may be infinite, and a rate no number, where nothing was iterated.
+    """
 
     update: Annotated[int, u32("Update")]
     tick: Annotated[int, u32("Tick of the updating instant t_i")]
     tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i", unit="0.25 s")]
     iterations: Annotated[int, u16("Iterations done: q(t_i), or fewer if more would have changed nothing")]
     verdict: Annotated[int, u16("Verdict of the control PLC on the sequence", values=Verdict)]
-    j_effective: Annotated[float, f32("J_i: the profile being played, at the state reached")]
-    j_hot_start: Annotated[float, f32("J+_i: the shifted profile, at the predicted state")]
-    j_delivered: Annotated[float, f32("Ĵ_{i+1}: the delivered profile, at the predicted state")]
-    j_dev: Annotated[float, f32("Predicted deviation cost of the delivered profile")]
-    j_cst: Annotated[float, f32("Predicted constraint violation cost of the delivered profile")]
-    violation: Annotated[float, f32("Largest violated row, max(Gamma p - gamma, 0), of the delivered profile")]
-    efficiency: Annotated[float, f32("E^r of Algorithm 1")]
-    mismatch: Annotated[float, f32("D^r of Algorithm 1")]
-    contraction: Annotated[float, f32("K^r of Algorithm 1")]
-    gamma: Annotated[float, f32("Γ of Algorithm 1, the gradient that decides the next step in q")]
-    load_mismatch: Annotated[float, f32("Estimated load mismatch", unit="W")]
+    j_effective: Annotated[float, f32("J_i: the profile being played, at the state reached", finite=False)]
+    j_hot_start: Annotated[float, f32("J+_i: the shifted profile, at the predicted state", finite=False)]
+    j_delivered: Annotated[float, f32("Ĵ_{i+1}: the delivered profile, at the predicted state", finite=False)]
+    j_dev: Annotated[float, f32("Predicted deviation cost of the delivered profile", finite=False)]
+    j_cst: Annotated[float, f32("Predicted constraint violation cost of the delivered profile", finite=False)]
+    violation: Annotated[
+        float, f32("Largest violated row, max(Gamma p - gamma, 0), of the delivered profile", finite=False)
+    ]
+    efficiency: Annotated[float, f32("E^r of Algorithm 1", finite=False)]
+    mismatch: Annotated[float, f32("D^r of Algorithm 1", finite=False)]
+    contraction: Annotated[float, f32("K^r of Algorithm 1", finite=False)]
+    gamma: Annotated[float, f32("Γ of Algorithm 1, the gradient that decides the next step in q", finite=False)]
+    load_mismatch: Annotated[float, f32("Estimated load mismatch", unit="W", finite=False)]
 
 
 class UpdatingRuleKind(IntEnum):

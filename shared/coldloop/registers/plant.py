@@ -8,6 +8,7 @@ from typing import Annotated, Final, NamedTuple
 from coldloop.process import (
     INPUT_NAMES,
     INPUT_UNITS,
+    LAST_TICK,
     OUTPUT_NAMES,
     OUTPUT_UNITS,
     STATE_NAMES,
@@ -26,6 +27,12 @@ HISTORY_ROWS: Final = 256
 STATION_ROWS: Final = 128
 LOAD_ROWS: Final = 2048
 MAX_LOAD_W: Final = 10_000.0
+MAX_INPUT: Final = 1000.0
+"""No input, in % or W, is larger."""
+MAX_STATE: Final = 1e9
+"""No number of a simulated state, in Pa, m3 or K, is further from 0."""
+MAX_AGE: Final = 1e5
+"""Longest time, in ticks, by which a rack that was stopped may be late."""
 AHEAD_STEPS: Final = 24
 """Steps of the load in one request."""
 LONGEST_AHEAD_TICKS: Final = 0xFFFF
@@ -43,6 +50,8 @@ class OutputVerdict(IntEnum):
     """For another tick than the present one; in real time, too old."""
     CHANGED = 4
     """What is applied has changed since it was read back: read it back, and begin from there."""
+    LIMITED = 5
+    """Applied as far as the rack lets outputs move in one of its ticks: read back how far, and begin from there."""
 
 
 class Actuators(NamedTuple):
@@ -51,7 +60,9 @@ class Actuators(NamedTuple):
     The rack judges them whole; its next measurement tells whether it has taken them.
     """
 
-    tick: Annotated[int, u32("Tick of these outputs; in lock-step writing the present one moves the plant on")]
+    tick: Annotated[
+        int, u32("Tick of these outputs; in lock-step writing the present one moves the plant on", high=LAST_TICK)
+    ]
     cv155: Annotated[float, f32("Opening of the Joule-Thomson valve", unit="%", low=0, high=100)]
     ncr22: Annotated[float, f32("Actuator part of the bath heater's power", unit="W", low=0, high=1000)]
     cv156: Annotated[float, f32("Opening of the turbine valve", unit="%", low=0, high=100)]
@@ -62,27 +73,38 @@ class Actuators(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """What the rack reads at one tick, what it applies, and who decided that."""
+    """What the rack reads at one tick, what it applies, and who decided that.
 
-    tick: Annotated[int, u32("Tick at which these values were read")]
-    load: Annotated[float, f32("Heat load NCR22_HL (the same heater, so it is known)", unit="W")]
-    y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
-    x: Annotated[tuple[float, ...], f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS)]
+    Load, outputs and states may be any number, or none: sensors fail, and the control PLC goes on without them.
+    """
+
+    tick: Annotated[int, u32("Tick at which these values were read", high=LAST_TICK)]
+    load: Annotated[float, f32("Heat load NCR22_HL (the same heater, so it is known)", unit="W", finite=False)]
+    y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS, finite=False)]
+    x: Annotated[
+        tuple[float, ...], f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS, finite=False)
+    ]
     session: Annotated[int, u32("Session")]
-    u: Annotated[tuple[float, ...], f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS)] = (0.0, 0.0, 0.0)
+    u: Annotated[
+        tuple[float, ...], f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS, low=0, high=MAX_INPUT)
+    ] = (0.0, 0.0, 0.0)
     holder: Annotated[int, u32("Whose outputs they are; 0 is a simple client's, the safe state or the beginning")] = 0
     generation: Annotated[
-        int, u32("Rises when outputs change in another way than by their writer: safe state, session, new writer")
-    ] = 0
+        int,
+        u32("Rises when outputs change in another way than by their writer: safe state, session, new writer", low=1),
+    ] = 1
     verdict: Annotated[
         int,
         u16(
-            "Outputs sent last: 0 none, 1 taken, 2 wrong session, 3 untimely, 4 changed since they were read back",
+            "Outputs sent last: 0 none, 1 taken, 2 wrong session, 3 untimely, 4 changed since they were read back, "
+            "5 limited to the rate in a tick",
             values=OutputVerdict,
         ),
     ] = OutputVerdict.NONE
     refused: Annotated[int, u16("Writes of others that were refused so far; wraps")] = 0
-    age: Annotated[float, f32("Time since this tick began, by the rack's clock, in ticks; 0 in lock-step")] = 0.0
+    age: Annotated[
+        float, f32("Time since this tick began, by the rack's clock, in ticks; 0 in lock-step", low=0, high=MAX_AGE)
+    ] = 0.0
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
@@ -118,7 +140,7 @@ class PlantSession(NamedTuple):
 class LoadStep(NamedTuple):
     """One step of the load table, held until the next one."""
 
-    tick: Annotated[int, u32("First tick of the step", unit="0.25 s")]
+    tick: Annotated[int, u32("First tick of the step", unit="0.25 s", high=LAST_TICK)]
     watts: Annotated[float, f32("Heat load", unit="W", low=0, high=MAX_LOAD_W)]
 
 
@@ -136,7 +158,9 @@ class LoadStatus(NamedTuple):
 class LiveLoad(NamedTuple):
     """Changes the heat load of the session under way; what was known of later ticks is dropped."""
 
-    tick: Annotated[int, u32("First tick of it, which is to come; 0 is the next one", unit="0.25 s")] = 0
+    tick: Annotated[
+        int, u32("First tick of it, which is to come; 0 is the next one", unit="0.25 s", high=LAST_TICK)
+    ] = 0
     watts: Annotated[float, f32("Heat load", unit="W", low=0, high=MAX_LOAD_W)] = 0.0
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
@@ -145,7 +169,7 @@ class LoadAhead(NamedTuple):
     """Steps of the heat load that are to come, for loads of any length; what was known from the first on is dropped."""
 
     session: Annotated[int, u32("Session that they are for")] = 0
-    tick: Annotated[int, u32("Tick of the first step, which is to come", unit="0.25 s")] = 0
+    tick: Annotated[int, u32("Tick of the first step, which is to come", unit="0.25 s", high=LAST_TICK)] = 0
     length: Annotated[int, u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
     watts: Annotated[
         tuple[float, ...], f32_array("Heat load of step", tuple(map(str, range(AHEAD_STEPS))), ("W",) * AHEAD_STEPS)
@@ -185,7 +209,9 @@ class LoadAhead(NamedTuple):
             raise ValueError(f"{self.length} steps are not 1 to {AHEAD_STEPS}")
         if not all(self.ticks[: self.length - 1]):
             raise ValueError("a step lasts one tick or more")
-        starts = accumulate(self.ticks[: self.length - 1], initial=self.tick)
+        starts = list(accumulate(self.ticks[: self.length - 1], initial=self.tick))
+        if starts[-1] > LAST_TICK:
+            raise ValueError(f"tick {starts[-1]} is after the last one of a session, {LAST_TICK}")
         return [LoadStep(*step) for step in zip(starts, self.watts, strict=False)]
 
 
@@ -195,8 +221,8 @@ class PlantSample(NamedTuple):
     tick: Annotated[int, u32("Tick of the row")]
     load: Annotated[float, f32("Heat load", unit="W")]
     u: Annotated[tuple[float, ...], f32_array("Input applied from this tick on", INPUT_NAMES, INPUT_UNITS)]
-    y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
-    x: Annotated[tuple[float, ...], f32_array("Simulated state", STATE_NAMES, STATE_UNITS)]
+    y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS, finite=False)]
+    x: Annotated[tuple[float, ...], f32_array("Simulated state", STATE_NAMES, STATE_UNITS, finite=False)]
 
 
 class StationMode(IntEnum):
@@ -230,7 +256,9 @@ class StationSample(NamedTuple):
     """Compression station and nitrogen pre-cooler at one tick; all 0 where the plant is a cold box alone."""
 
     tick: Annotated[int, u32("Tick of the row")]
-    signals: Annotated[tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS)]
+    signals: Annotated[
+        tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
+    ]
     mode: Annotated[
         int, u16("Pressure control: 0 automatic, 1 a valve at its end, 2 charging stopped, 3 one compressor, 4 stopped")
     ] = StationMode.AUTOMATIC
@@ -246,9 +274,9 @@ class StationStatus(NamedTuple):
     tick: Annotated[int, u32("Tick at which these values were read")] = 0
     mode: Annotated[int, u16("As in the station history")] = StationMode.AUTOMATIC
     alarms: Annotated[int, u16("As in the station history")] = 0
-    signals: Annotated[tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS)] = (
-        0.0,
-    ) * len(STATION_SIGNAL_NAMES)
+    signals: Annotated[
+        tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
+    ] = (0.0,) * len(STATION_SIGNAL_NAMES)
     commands: Annotated[tuple[float, ...], f32_array("Opening asked of valve", STATION_VALVE_NAMES, ("%",) * 4)] = (
         0.0,
     ) * len(STATION_VALVE_NAMES)

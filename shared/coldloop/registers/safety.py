@@ -78,6 +78,8 @@ class AlarmKind(IntEnum):
     CERTIFICATE = 17
     """Our certificate has expired, or will soon."""
     STATE_NOT_RETAINED = 18
+    SCANS_STOPPED = 19
+    """In real time no scan is made, and the link to the rack has no reason for it."""
 
 
 class AlarmState(IntEnum):

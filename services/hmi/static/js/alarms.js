@@ -21,7 +21,7 @@ function line() {
   const hidden = state.alarms.filter((one) => ["shelved", "out of service"].includes(one.state)).length;
   const parts = told.slice(0, 4).map((one) => element("a", { class: `alarm ${WAITING.includes(one.state) ? "unacknowledged" : ""}`, href: "#alarms" }, badge(one), element("span", { text: `${one.name}${one.cause ? ` (${one.cause})` : ""}, ${STATES[one.state]}` })));
   for (const name of state.plant.alarms || []) parts.push(element("a", { class: "alarm", href: "#alarms" }, badge({ state: "acknowledged", priority: 3 }), element("span", { text: `station: ${name}` })));
-  if (!parts.length) parts.push(element("span", { class: "minor", text: state.catalog.replay ? "A recorded run: its alarms are in the history" : "No alarms" }));
+  if (!parts.length) parts.push(element("span", { class: "minor", text: "No alarms" }));
   const station = (state.plant.alarms || []).length;
   const counts = `${told.length} alarm${told.length === 1 ? "" : "s"}, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}${station ? `, ${station} of the station` : ""}`;
   holder.replaceChildren(element("span", { class: "told" }, ...parts), element("span", { class: "count", text: counts }));

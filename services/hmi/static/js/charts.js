@@ -4,11 +4,13 @@ import { timeText } from "./store.js";
 
 export function colour(name) { return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim(); }
 
-const MODE_SHADE = { mpc: null, rest: "medium-ground", hold: "high-ground", classical: "low-ground", manual: "ahead" };
+export const MODE_SHADE = { mpc: null, rest: "medium-ground", hold: "high-ground", classical: "low-ground", manual: "ahead" };
+
+const TITLE_HEIGHT = 16; // above the curves, never over them
 
 // lines: [{label, stroke, stepped, width}], options: {title, unit, decimals, log, band, sync, axis, small}
 export function makeChart(holder, lines, options) {
-  const extra = { substituted: {}, replaced: [], replacedEnds: [], band: null, predictions: [], marks: [], modes: [], now: null };
+  const extra = { substituted: {}, replaced: [], replacedEnds: [], band: null, predictions: [], planned: false, marks: [], modes: [], gaps: [], now: null };
   const axis = (side) => ({
     stroke: colour("muted"), grid: { stroke: colour("line"), width: 0.5 }, ticks: { stroke: colour("line"), width: 0.5, size: 4 },
     font: "11px system-ui, sans-serif", ...side,
@@ -20,13 +22,13 @@ export function makeChart(holder, lines, options) {
   const size = () => ({ width: Math.max(80, holder.clientWidth), height: Math.max(40, holder.clientHeight) });
   const chart = new uPlot({
     ...size(),
-    padding: [4, options.small ? 8 : 28, options.axis ? 0 : 4, 0], // room for half of the last time
+    padding: [TITLE_HEIGHT, options.small ? 14 : 28, options.axis ? 0 : 4, 0], // room for half of the last time
     legend: { show: false },
     cursor: { sync: options.sync ? { key: options.sync, setSeries: false } : undefined, drag: { x: Boolean(options.onZoom), y: false, setScale: false }, points: { size: 5 }, y: false },
     scales: { x: { time: false, range: (_u, low, high) => options.range ? options.range(low, high) : [low, high] },
       y: options.log ? { distr: 3 } : { range: (_u, low, high) => spread(low, high, [...(extra.band || []), ...extra.replacedEnds], options.spread) } },
     axes: [
-      axis({ show: Boolean(options.axis), size: 24, values: (_u, ticks) => ticks.map((tick) => (tick < 0 ? "" : timeText(tick))), space: 90 }),
+      axis({ show: Boolean(options.axis), size: options.small ? 20 : 24, values: (_u, ticks) => ticks.map((tick) => (tick < 0 ? "" : timeText(tick))), space: 90 }),
       axis({ size: options.small ? 42 : 58, space: 22, ...(options.log ? { filter: decades, grid: { stroke: colour("line"), width: 0.5, filter: decades } } : {}), values: (_u, ticks) => ticks.map((tick) => (tick === null ? "" : short(tick))) }),
     ],
     series: [{}, ...lines.map((line) => ({
@@ -42,7 +44,7 @@ export function makeChart(holder, lines, options) {
   }, [[], ...lines.map(() => [])], holder);
   if (options.onPick) chart.over.addEventListener("click", () => { if (chart.cursor.left >= 0) options.onPick(chart.posToVal(chart.cursor.left, "x")); });
   new ResizeObserver(() => chart.setSize(size())).observe(holder);
-  return { chart, extra, show(data, more = {}) { Object.assign(extra, more); chart.setData(withoutReplaced(data, lines, extra)); holder.dataset.substituted = extra.replaced.length; } };
+  return { chart, extra, lines, title: options.title, show(data, more = {}) { Object.assign(extra, more); chart.setData(withoutReplaced(data, lines, extra)); Object.assign(holder.dataset, { substituted: extra.replaced.length, gaps: extra.gaps.length }); } };
 }
 
 // Where a sensor is bad another value stands in for it: what is not measured is no line like others.
@@ -93,6 +95,20 @@ function swatch(line) {
 // Of a logarithmic axis only the decades are shown.
 const decades = (_u, splits) => splits.map((value) => (value > 0 && Math.abs(Math.log10(value) - Math.round(Math.log10(value))) < 1e-6 ? value : null));
 
+// What is to be seen in a trend document, and nothing else: modes, gaps, substituted values, predictions, marks.
+const MARKS = { load: "load", alarm: "alarm", operator: "command", fault: "sensor fault" };
+export function legendOf(found, { predictions = false, names = Object.keys(found.series) } = {}) {
+  const entry = (kind, text, shade) => { const made = document.createElement("span"), sample = document.createElement("i"); made.className = "entry"; sample.className = `sample ${kind}`; if (shade) sample.style.background = `var(--${shade})`; made.append(sample, text); return made; };
+  const modes = [...new Set(found.modes.map((one) => one.mode))].filter((mode) => MODE_SHADE[mode]);
+  const entries = modes.map((mode) => entry("ground", `mode ${mode}`, MODE_SHADE[mode]));
+  if (found.gaps.length) entries.push(entry("gap", "nothing read"));
+  if (names.some((name) => (found.substituted[name] || []).length)) entries.push(entry("dotted", "sensor bad: substituted"));
+  if (predictions && found.planned && found.predictions.length) entries.push(entry("dashed", "expected from the newest sequence"));
+  if (predictions && found.predictions.length > (found.planned ? 1 : 0)) entries.push(entry("faint", "earlier predictions"));
+  for (const kind of new Set(found.marks.map((mark) => mark.kind))) entries.push(entry(`mark ${kind}`, MARKS[kind] || kind));
+  return entries;
+}
+
 function short(value) {
   const size = Math.abs(value);
   if (size >= 1e5 || (size > 0 && size < 1e-3)) return value.toExponential(0);
@@ -113,6 +129,7 @@ function spread(low, high, band, least = 0.1) {
 function drawGround(u, extra) {
   const { ctx, bbox } = u;
   ctx.save();
+  ctx.textAlign = "left"; ctx.textBaseline = "alphabetic";
   ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip();
   if (extra.band && extra.band[1] > extra.band[0] && u.scales.y.min !== null) {
     const top = u.valToPos(extra.band[1], "y", true), bottom = u.valToPos(extra.band[0], "y", true);
@@ -121,7 +138,11 @@ function drawGround(u, extra) {
     ctx.globalAlpha = 1; ctx.strokeStyle = colour("muted"); ctx.setLineDash([6, 4]); ctx.lineWidth = 1;
     for (const y of [top, bottom]) { ctx.beginPath(); ctx.moveTo(bbox.left, y); ctx.lineTo(bbox.left + bbox.width, y); ctx.stroke(); }
     ctx.setLineDash([]);
+    ctx.fillStyle = colour("muted"); ctx.font = `${10 * devicePixelRatio}px system-ui, sans-serif`; ctx.textAlign = "right";
+    if (extra.bandName) ctx.fillText(extra.bandName, bbox.left + bbox.width - 4 * devicePixelRatio, Math.max(top, bbox.top) + 11 * devicePixelRatio);
+    ctx.textAlign = "left";
   }
+  for (const [from, to] of extra.gaps) drawGap(u, from, to);
   for (const stretch of extra.modes) {
     const shade = MODE_SHADE[stretch.mode];
     if (!shade) continue;
@@ -149,13 +170,36 @@ function drawGround(u, extra) {
   ctx.restore();
 }
 
+// Hatched: nothing was read.
+function drawGap(u, start, end) {
+  const { ctx, bbox } = u;
+  const from = Math.max(bbox.left, u.valToPos(start, "x", true)), to = Math.min(bbox.left + bbox.width, u.valToPos(end, "x", true));
+  if (to <= from) return;
+  const step = 7 * devicePixelRatio, bottom = bbox.top + bbox.height;
+  ctx.save();
+  ctx.beginPath(); ctx.rect(from, bbox.top, to - from, bbox.height); ctx.clip();
+  ctx.strokeStyle = ctx.fillStyle = colour("muted"); ctx.lineWidth = 1; ctx.globalAlpha = 0.7; ctx.setLineDash([]);
+  ctx.beginPath();
+  for (let x = from - bbox.height; x < to; x += step) { ctx.moveTo(x, bottom); ctx.lineTo(x + bbox.height, bbox.top); }
+  ctx.stroke();
+  ctx.globalAlpha = 1; ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+  const text = "nothing read", width = ctx.measureText(text).width;
+  if (to - from > width + 12) {
+    ctx.fillStyle = colour("panel"); ctx.fillRect(from + 3, bottom - 17 * devicePixelRatio, width + 6, 15 * devicePixelRatio);
+    ctx.fillStyle = colour("ink"); ctx.fillText(text, from + 6, bottom - 6 * devicePixelRatio);
+  }
+  ctx.restore();
+}
+
+// A prediction that is not played, as in manual, says nothing of what is to come: it ends now.
 function drawAhead(u, extra, lines) {
   if (!extra.predictions.length || u.scales.y.min === null) return;
   const { ctx, bbox } = u;
+  const end = extra.planned || extra.now === null ? bbox.left + bbox.width : u.valToPos(extra.now, "x", true);
   ctx.save();
-  ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip();
+  ctx.beginPath(); ctx.rect(bbox.left, bbox.top, Math.max(0, end - bbox.left), bbox.height); ctx.clip();
   extra.predictions.forEach((prediction, place) => {
-    const newest = place === extra.predictions.length - 1;
+    const newest = extra.planned && place === extra.predictions.length - 1;
     ctx.lineWidth = (newest ? 1.8 : 1) * devicePixelRatio; ctx.globalAlpha = newest ? 1 : 0.4;
     ctx.setLineDash(newest ? [5, 4] : [2, 3]);
     prediction.curves.forEach((curve, line) => {
@@ -178,8 +222,16 @@ export function asPicture(charts) {
   ctx.fillStyle = colour("panel"); ctx.fillRect(0, 0, picture.width, picture.height);
   let top = 0;
   charts.forEach((one, i) => {
-    ctx.fillStyle = colour("ink"); ctx.font = `${12 * devicePixelRatio}px system-ui, sans-serif`;
-    ctx.fillText(one.title, 8, top + 13 * devicePixelRatio);
+    ctx.font = `${12 * devicePixelRatio}px system-ui, sans-serif`;
+    let left = 8;
+    for (const line of one.lines.length > 1 ? one.lines : []) {
+      ctx.strokeStyle = colour(line.stroke); ctx.lineWidth = 2 * devicePixelRatio; ctx.setLineDash(line.dash || []);
+      ctx.beginPath(); ctx.moveTo(left, top + 9 * devicePixelRatio); ctx.lineTo(left + 16 * devicePixelRatio, top + 9 * devicePixelRatio); ctx.stroke();
+      ctx.fillStyle = colour("ink"); ctx.fillText(line.name || line.label, left + 20 * devicePixelRatio, top + 13 * devicePixelRatio);
+      left += 32 * devicePixelRatio + ctx.measureText(line.name || line.label).width;
+    }
+    ctx.setLineDash([]); ctx.fillStyle = colour("ink");
+    ctx.fillText(one.title, left, top + 13 * devicePixelRatio);
     ctx.drawImage(canvases[i], 0, top + 18 * devicePixelRatio);
     top += canvases[i].height + 18 * devicePixelRatio;
   });

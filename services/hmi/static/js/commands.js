@@ -1,5 +1,5 @@
 // Commands in two steps: what would be done, then confirm; and what came of it. Login.
-import { ask, element, onChange, send, signal, state, timeText } from "./store.js";
+import { ask, element, isStale, onChange, send, signal, state, timeText } from "./store.js";
 import { bindAll } from "./values.js";
 
 const byId = (id) => document.getElementById(id);
@@ -12,6 +12,11 @@ function note(asked, what, detail) {
   const body = byId("outcome-table").querySelector("tbody");
   body.prepend(element("tr", {}, element("td", { class: "number", text: time }), element("td", { text: asked }), element("td", { class: what, text: came })));
   while (body.children.length > 50) body.lastChild.remove();
+  say(what, asked, came);
+}
+
+function say(what, asked, came) {
+  const time = timeText(state.tick * state.catalog.tick_s);
   const line = byId("outcome-line");
   line.replaceChildren(element("span", { class: "label", text: time }), ` ${asked}: `, element("span", { class: what, text: came }));
   line.className = what;
@@ -22,18 +27,32 @@ function note(asked, what, detail) {
 // Asks for the number in a field; for nothing when it has none: an empty field is not a zero.
 function numberIn(field, then) { if (field.value === "") field.focus(); else then(Number(field.value)); }
 
-// `atOnce` is for what does not touch the process, such as acknowledging an alarm. One command at a time: a click while
-// another one is under way, or the second of a double click on Confirm, is no command, and changes nothing that is asked.
-const TOO_SOON_MS = 400;
-let underWay = false, closed = -Infinity;
-export async function command(body, atOnce = false) {
-  if (underWay) return;
-  underWay = true;
-  document.body.classList.add("commanding");
-  try { await oneCommand(body, atOnce); } finally {
-    setTimeout(() => { underWay = false; document.body.classList.remove("commanding"); }, Math.max(0, closed + TOO_SOON_MS - performance.now()));
-  }
+// `atOnce` is for what does not touch the process, such as acknowledging an alarm. One command at a time: another one
+// waits until it is over. The same one again, as by a double click, and the second click of a double click on Confirm are
+// no commands.
+const TOO_SOON_MS = 400, MOST_WAITING = 8;
+let current = null, closed = -Infinity;
+const waiting = [];
+export function command(body, atOnce = false) {
+  const text = JSON.stringify(body);
+  if (performance.now() < closed + TOO_SOON_MS || text === current || waiting.some((one) => one.text === text) || waiting.length >= MOST_WAITING) return Promise.resolve();
+  return new Promise((resolve) => {
+    waiting.push({ body, atOnce, text, resolve });
+    if (current === null) takeTurns(); else say("waiting", kindOf(body), "waits until the command before it is over");
+  });
 }
+
+async function takeTurns() {
+  document.body.classList.add("commanding");
+  while (waiting.length) {
+    const { body, atOnce, text, resolve } = waiting.shift();
+    current = text;
+    try { await oneCommand(body, atOnce); } finally { current = null; resolve(); }
+  }
+  document.body.classList.remove("commanding");
+}
+
+const kindOf = (body) => body.kind.replaceAll("_", " ");
 
 async function oneCommand(body, atOnce) {
   let prepared;
@@ -105,6 +124,12 @@ function faceplates() {
   bindAll(holder);
 }
 
+// The mode that the operator asks for is the button that is pressed.
+function showMode() {
+  const about = signal("control_plc.operator.mode"), asked = about && about.words[state.values["control_plc.operator.mode"]];
+  for (const one of document.querySelectorAll("[data-mode]")) one.setAttribute("aria-pressed", String(Boolean(asked) && asked.startsWith(one.dataset.mode) && !isStale("control_plc.")));
+}
+
 export async function refreshUser() {
   state.me = await ask("api/me");
   byId("login-open").hidden = Boolean(state.me.user);
@@ -152,5 +177,6 @@ export function initCommands(userChanged) {
       await refreshUser();
     } catch (error) { byId("login-error").textContent = error.message; }
   });
+  onChange(showMode);
   setInterval(() => refreshUser().catch(() => {}), 15000);
 }

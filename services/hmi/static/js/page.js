@@ -58,11 +58,14 @@ function overview() {
       byId("tau-u-sentence").replaceChildren(...(found ? indexed(found.sentence) : ["No update yet."]));
     }
     const values = state.values, upcoming = values["plant.load status.upcoming"];
-    const rows = [["expected next", upcoming ? `${values["plant.load status.next_watts"]?.toFixed(1)} W in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now"],
-      ["estimated mismatch", state.update ? `${state.update.update.load_mismatch.toFixed(1)} W` : "–"]];
+    const note = byId("tau-u-note"), inUse = !state.stale.includes("update");
+    note.hidden = inUse;
+    if (!inUse) note.textContent = "Of the last update: MPC does not drive now.";
+    const rows = [["expected next", upcoming ? `${values["plant.load status.next_watts"]?.toFixed(1)} W in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
+      ["estimated mismatch", state.update ? `${state.update.update.load_mismatch.toFixed(1)} W` : "–", "optimizer_plc.", "update"]];
     const text = JSON.stringify(rows);
-    if (facts.dataset.text !== text) { facts.dataset.text = text; facts.replaceChildren(...rows.flatMap(([name, value]) => [element("dt", { text: name }), element("dd", { class: "value", text: value })])); }
-    facts.classList.toggle("stale", isStale("plant."));
+    if (facts.dataset.text !== text) { facts.dataset.text = text; facts.replaceChildren(...rows.flatMap(([name, value, ...sources]) => [element("dt", { text: name }), element("dd", { class: "value", text: value, "data-sources": sources.join(" ") })])); }
+    for (const one of facts.querySelectorAll("dd")) one.classList.toggle("stale", one.dataset.sources.split(" ").some(isStale));
     const mode = state.values["control_plc.ladder.mode"];
     byId("drive-chip").classList.toggle("abnormal-mode", mode !== undefined && mode !== 1);
     for (const one of document.querySelectorAll("#strips, #charts")) one.classList.toggle("stale", isStale("control_plc.process."));

@@ -1,9 +1,8 @@
 // Trends: a window of plant time, the horizon ahead, zoom, values at the cursor, export.
 import { ask, element, state, timeText } from "./store.js";
-import { asPicture, makeChart } from "./charts.js";
+import { asPicture, legendOf, makeChart } from "./charts.js";
 
 const WINDOWS = [[300, "5 min"], [900, "15 min"], [1800, "30 min"], [3600, "1 h"], [7200, "2 h"]];
-const NAMES = "L1,T5,CV155,NCR22_A,CV156,load";
 const LAYOUT = [
   { id: "L1", title: "L1 %", lines: [{ label: "L1", stroke: "trend", from: "series" }], band: "L1", spread: 1, tall: true, ahead: ["L1"], ribbon: true },
   { id: "T5", title: "T5 K", lines: [{ label: "T5", stroke: "trend", from: "series" }], band: "T5", spread: 1, tall: true, ahead: ["T5"] },
@@ -15,8 +14,13 @@ const LAYOUT = [
 // Of a whole refrigerator the pressures too, between the inputs and the updating period.
 const PRESSURES = [["P12", "HP bar"], ["P11", "LP bar"]].map(([name, title]) => ({ id: name, title, lines: [{ label: name, stroke: "trend", from: "series" }], station: name, spread: name === "P12" ? 0.4 : 0.04 }));
 const isRefrigerator = () => state.plant.kind === "refrigerator";
-const layout = () => (isRefrigerator() ? [...LAYOUT.slice(0, 4), ...PRESSURES, ...LAYOUT.slice(4)] : LAYOUT);
-const names = () => (isRefrigerator() ? `${NAMES},${PRESSURES.map((one) => one.id).join(",")}` : NAMES);
+const drawn = () => (isRefrigerator() ? [...LAYOUT.slice(0, 4), ...PRESSURES, ...LAYOUT.slice(4)] : LAYOUT);
+// Further pens: any other signal that trends are kept of, each in a chart of its own.
+const MOST_PENS = 8;
+let pens = [];
+const layout = () => [...drawn().slice(0, -2), ...pens.map((name) => ({ id: `pen-${name}`, title: `${name}${unitOf(name)}`, lines: [{ label: name, stroke: "trend", from: "series", stepped: name === "mode" }], spread: 0.01 })), ...drawn().slice(-2)];
+const names = () => layout().flatMap((one) => one.lines).filter((line) => line.from === "series").map((line) => line.label).join(",");
+const unitOf = (name) => { const about = ["process.y.", "process.u.", "process."].map((part) => state.catalog.signals[`control_plc.${part}${name}`]).concat(state.catalog.signals[`plant.station.signals.${name}`]).find(Boolean); return about && about.unit ? ` ${about.unit}` : ""; };
 const stationBand = (name) => { const [low, high] = (state.plant.bands || {})[`plant.station.signals.${name}`] || []; return Number.isFinite(low) && Number.isFinite(high) ? [low, high] : null; };
 const REFRESH_MS = 500;
 
@@ -61,7 +65,8 @@ function show(one) {
   const predictions = one.ahead ? newest.predictions.map((each) => ({ time: one.ahead[0].startsWith("CV") ? each.input_time : each.time, curves: one.ahead.map((name) => each[name]) })) : [];
   one.show([times, ...one.lines.map(source)], {
     band: one.band ? newest.bands[one.band] : one.station ? stationBand(one.station) : one.bounds ? newest.bounds[one.bounds] : null,
-    predictions, substituted: newest.substituted, marks: newest.marks, modes: newest.modes, now: newest.now_s, ribbon: one.ribbon,
+    bandName: one.band ? "band" : one.station ? "alarm limits" : one.bounds ? "bounds of both" : "",
+    predictions, planned: newest.planned, gaps: newest.gaps, substituted: newest.substituted, marks: newest.marks, modes: newest.modes, now: newest.now_s, ribbon: one.ribbon,
   });
 }
 
@@ -75,6 +80,7 @@ async function refresh() {
   if (!charts) build();
   charts.forEach(show);
   document.getElementById("charts").dataset.now = newest.now_s;
+  document.getElementById("trend-legend").replaceChildren(...legendOf(newest, { predictions: true }), element("span", { text: "Drag to zoom." }));
   document.getElementById("export-csv").href = `api/trend.csv?${query}`;
 }
 
@@ -93,7 +99,24 @@ export function initTrends(pick) {
   document.getElementById("export-png").addEventListener("click", () => {
     asPicture(charts || []).toBlob((blob) => { const link = element("a", { href: URL.createObjectURL(blob), download: "coldloop-trends.png" }); link.click(); URL.revokeObjectURL(link.href); });
   });
-  document.getElementById("trend-legend").textContent = "Band and bounds: dashed lines. Ahead of now: what the newest sequence is expected to lead to; faint: earlier predictions. Marks: load (dotted), alarms, commands, faults. Ground: modes other than MPC. Dotted between crosses: the sensor is bad, another value stands in for it. Drag to zoom.";
+  pens = (localStorage.getItem("pens") || "").split(",").filter((name) => state.catalog.trended.includes(name)).slice(0, MOST_PENS);
+  document.getElementById("pen-add").addEventListener("change", (event) => setPens([...pens, event.target.value]));
+  showPens();
+}
+
+function setPens(names_) {
+  pens = names_;
+  localStorage.setItem("pens", pens.join(","));
+  showPens();
+  recolourTrends();
+}
+
+function showPens() {
+  const choice = document.getElementById("pen-add"), shown = names().split(",");
+  choice.replaceChildren(element("option", { value: "", text: "add…" }), ...state.catalog.trended.filter((name) => !shown.includes(name)).map((name) => element("option", { value: name, text: name })));
+  choice.value = "";
+  choice.disabled = pens.length >= MOST_PENS;
+  document.getElementById("pens").replaceChildren(...pens.map((name) => element("button", { type: "button", class: "quiet", text: `${name} ×`, "aria-label": `Remove ${name}`, onclick: () => setPens(pens.filter((one) => one !== name)) })));
 }
 
 export function showTrends() { refresh(); if (!timer) timer = setInterval(refresh, REFRESH_MS); }
@@ -102,7 +125,7 @@ export function recolourTrends() { if (charts) { charts.forEach((one) => one.cha
 
 // The four small ones under the mimic.
 const STRIPS = [
-  { title: "L1 %", lines: [{ label: "L1", stroke: "trend" }], band: "L1", spread: 1 }, { title: "T5 K", lines: [{ label: "T5", stroke: "trend" }], band: "T5", spread: 1 },
+  { title: "L1 % and its band", lines: [{ label: "L1", stroke: "trend" }], band: "L1", spread: 1 }, { title: "T5 K and its band", lines: [{ label: "T5", stroke: "trend" }], band: "T5", spread: 1 },
   { title: "load W", lines: [{ label: "load", stroke: "trend", stepped: true }], spread: 20 }, { title: "τu s", lines: [{ label: "tau_u", stroke: "trend", stepped: true }], spread: 1, updates: true },
 ];
 let strips = null, stripsNow = 0;
@@ -110,15 +133,16 @@ export async function refreshStrips() {
   if (document.getElementById("overview").hidden) return;
   let found;
   try { found = await ask("api/trend?names=L1,T5,load&seconds=300&points=400"); } catch { return; }
-  const holder = document.getElementById("strips");
+  const holder = document.getElementById("strip-charts");
   stripsNow = found.now_s;
   if (!strips) {
     holder.replaceChildren();
-    strips = STRIPS.map((one) => { const box = element("div", { class: "strip" }); holder.append(box); return { ...one, ...makeChart(box, one.lines, { title: one.title, spread: one.spread, small: true, axis: false, range: () => [stripsNow - 300, stripsNow] }) }; });
+    strips = STRIPS.map((one) => { const box = element("div", { class: "strip" }); holder.append(box); return { ...one, ...makeChart(box, one.lines, { title: one.title, spread: one.spread, small: true, axis: true, range: () => [stripsNow - 300, stripsNow] }) }; });
   }
   for (const one of strips) {
     const times = one.updates ? found.updates.time : found.time;
-    one.show([times, one.updates ? found.updates.tau_u : found.series[one.lines[0].label]], { band: one.band ? found.bands[one.band] : null, substituted: found.substituted, modes: found.modes, marks: found.marks });
+    one.show([times, one.updates ? found.updates.tau_u : found.series[one.lines[0].label]], { band: one.band ? found.bands[one.band] : null, substituted: found.substituted, modes: found.modes, marks: found.marks, gaps: found.gaps });
   }
+  document.getElementById("strip-legend").replaceChildren(...legendOf(found));
 }
 export function recolourStrips() { if (strips) { strips.forEach((one) => one.chart.destroy()); strips = null; refreshStrips(); } }

@@ -31,7 +31,7 @@ export function bindText(one) {
 function scale(one, value, ends) {
   const all = [Number(one.dataset.low), Number(one.dataset.high), value, ...ends].filter(Number.isFinite);
   const low = Math.min(...all), high = Math.max(...all);
-  return (x) => (x - low) / (high - low || 1);
+  return { from: low, to: high, at: (x) => (x - low) / (high - low || 1) };
 }
 
 // Where the plant's own alarms of a signal begin; an end that there is not is the end of the scale.
@@ -45,7 +45,7 @@ function place(one, parts, width) {
   const own = ownBand(one, name), band = own || pair(one.dataset.band), bounds = pair(one.dataset.bounds);
   const ends = own || (band || bounds || []).map(number);
   const known = ends.length === 2 && ends[1] > ends[0];
-  const at = scale(one, value, known ? ends : []);
+  const { from, to, at } = scale(one, value, known ? ends : []);
   if (known) {
     parts.band.setAttribute("x", at(ends[0]) * width);
     parts.band.setAttribute("width", Math.max(0, (at(ends[1]) - at(ends[0])) * width));
@@ -55,14 +55,19 @@ function place(one, parts, width) {
   const outside = known && (value < ends[0] || value > ends[1]);
   one.classList.toggle("abnormal", Boolean(band) && outside);
   one.classList.toggle("at-limit", Boolean(bounds) && known && (value <= ends[0] || value >= ends[1]));
-  return { value, known, ends, at };
+  return { value, from, to };
 }
+
+const short = (value) => String(Number(value.toPrecision(3)));
+
+// What is not current is crossed out from corner to corner: a line along the middle would hide a sign.
+const cross = (width, height) => shape("line", { class: "cross", x1: -2, y1: height, x2: width + 2, y2: 0 });
 
 // A value without a bar, for what has no limits.
 function bindSmallTag(tag) {
   const name = tag.dataset.signal, width = Number(tag.dataset.width) || 100;
   const text = shape("text", { x: width, y: 12, "text-anchor": "end", class: "reading" });
-  tag.append(shape("rect", { class: "ground", x: -2, y: 0, width: width + 4, height: 16, rx: 2, opacity: 0.85 }), shape("text", { class: "name", x: 0, y: 12 }, tag.dataset.name), text);
+  tag.append(shape("rect", { class: "ground", x: -2, y: 0, width: width + 4, height: 16, rx: 2, opacity: 0.85 }), shape("text", { class: "name", x: 0, y: 12 }, tag.dataset.name), text, cross(width, 16));
   bind(name, () => { text.textContent = valueText(name); });
   watched.push([tag, name]);
 }
@@ -80,7 +85,7 @@ function bindTag(tag) {
     band: shape("rect", { class: "band", x: 0, y: 20, width: 0, height: 6 }),
     pointer: shape("rect", { class: "pointer", x: 0, y: 18, width: 3, height: 10 }),
   };
-  tag.append(ground, frame, label, letter, text, parts.track, parts.band, parts.pointer);
+  tag.append(ground, frame, label, letter, text, parts.track, parts.band, parts.pointer, cross(width, 30));
   const draw = () => {
     text.textContent = valueText(name);
     const { value } = place(tag, parts, width);
@@ -105,8 +110,9 @@ function bindBar(bar) {
   drawing.append(parts.track, parts.band, parts.pointer);
   const about = signal(name);
   const text = element("span", { class: "value reading", "data-reading": name });
-  bar.append(element("span", { class: "name", text: bar.dataset.name, title: about ? about.description : "" }), drawing, text);
-  const draw = () => { text.textContent = valueText(name); place(bar, parts, width); };
+  const low = element("span"), high = element("span");
+  bar.append(element("span", { class: "name", text: bar.dataset.name, title: about ? about.description : "" }), drawing, text, element("span", { class: "ends", "aria-hidden": "true" }, low, high));
+  const draw = () => { text.textContent = valueText(name); const { from, to } = place(bar, parts, width); low.textContent = short(from); high.textContent = short(to); };
   for (const one of [name, ...(pair(bar.dataset.band) || []), ...(pair(bar.dataset.bounds) || [])]) bind(one, draw);
   watched.push([text, name], [drawing, name]);
 }

@@ -1,0 +1,65 @@
+"""Tells the user that numerical kernels are being compiled, which takes long and happens once.
+
+Whoever needs kernels says whose they are, in `kernels_of`; the cache of kernels reports each one that it does not have
+to `needs_compiling`. Without one that is missing nothing is said.
+"""
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+
+@dataclass
+class Kernels:
+    """Kernels that may have to be compiled."""
+
+    owner: str
+    """Whose they are, such as "the refrigerator"."""
+    about_s: int
+    """Seconds that compiling all of them takes."""
+
+
+Announce = Callable[[Kernels], None]
+
+
+def write_line(*kernels: Kernels) -> None:
+    """Announce on standard error; kernels of several owners are compiled at the same time, where there are cores."""
+    owners = " and of ".join(each.owner for each in kernels)
+    seconds = [each.about_s for each in kernels]
+    about_s = max(seconds) if (os.cpu_count() or 1) > 1 else sum(seconds)
+    with contextlib.suppress(OSError):
+        sys.stderr.write(
+            f"coldloop: compiling the kernels of {owners}; this takes about {about_s} s and happens once\n"
+        )
+        sys.stderr.flush()
+
+
+_needed: list[Kernels] = []
+"""The kernels that are needed at present; the first are what the user has asked for, the others are parts of it."""
+_announced: set[str] = set()
+_announce: Announce = write_line
+
+
+def announce_with(announce: Announce) -> None:
+    """Let `announce` tell the user from now on."""
+    global _announce  # noqa: PLW0603 one user a process
+    _announce = announce
+
+
+@contextlib.contextmanager
+def kernels_of(owner: str, about_s: int) -> Iterator[None]:
+    """Announce what is compiled in this context as the kernels of `owner`."""
+    _needed.append(Kernels(owner, about_s))
+    try:
+        yield
+    finally:
+        _needed.pop()
+
+
+def needs_compiling() -> None:
+    """Announce the kernels that are needed at present, unless they have been announced."""
+    if _needed and _needed[0].owner not in _announced:
+        _announced.add(_needed[0].owner)
+        _announce(_needed[0])

@@ -1,0 +1,38 @@
+"""Words and numbers of the pages that are those of the programs."""
+
+import re
+import struct
+from pathlib import Path
+
+from coldloop.event_text import word
+from coldloop.registers.common import MAGIC
+from coldloop.registers.safety import AlarmKind
+from control_plc.alarm_settings import PASSING, AlarmSettings
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def test_alarms_are_called_what_they_are_called_with_their_priorities() -> None:
+    page = (DOCS / "fail-safe.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d) \w+ \|.*\| ([^|]+) \|$", page, re.MULTILINE)
+    told = {(int(priority), name) for priority, names in rows for name in re.findall(r"`([^`]+)`", names)}
+    settings = AlarmSettings()
+    assert told == {(int(settings.rule(kind).priority), word(kind)) for kind in AlarmKind}
+    passing = re.search(r"happens at an instant \(([^)]+)\)", page)
+    assert passing is not None
+    assert set(re.findall(r"`([^`]+)`", passing[1])) == {word(kind) for kind in PASSING}
+
+
+def test_what_a_wrong_word_order_shows_is_what_it_shows() -> None:
+    page = (DOCS / "scada.md").read_text(encoding="utf-8")
+    high, low = struct.unpack(">HH", struct.pack(">f", MAGIC))
+    (swapped,) = struct.unpack(">f", struct.pack(">HH", low, high))
+    assert f"| {swapped:g}, from all three servers | the word order |" in page
+    ends = (struct.unpack(">f", struct.pack(">HH", low, second))[0] for second in (0, 0xFFFF))
+    least, largest = (f"{end:.5g}" for end in ends)
+    assert f"between {least} and {largest}" in page
+
+
+def test_requests_for_trends_are_written_as_they_can_be_sent() -> None:
+    page = (DOCS / "operator-page.md").read_text(encoding="utf-8")
+    assert not re.findall(r"GET /\S*=(?:&|`)", page), "an empty value is no number"

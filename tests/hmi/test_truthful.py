@@ -1,0 +1,117 @@
+"""What the page draws is what was read and what is so: gaps, other modes, replays, and commands that wait."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+
+from hmi.trends import NAMES
+from tests.hmi.conftest import RECORDED_S, Served, Site, eventually, opened
+from tests.hmi.test_operating import MANUAL, MPC, confirm, mode, view
+from tests.hmi.test_sceptical_operator import operated, outcome
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page, Route
+
+__all__ = ["operated"]  # a fixture
+
+
+def test_a_time_in_which_nothing_was_read_is_a_gap_and_no_line(page: "Page", site: Site) -> None:
+    view(page, "trends")
+    before = len(site.ask("/api/trend?names=L1").document["gaps"])
+    site.freeze("control_plc")
+    try:
+        eventually(lambda: not site.is_live(), "the page notices")
+    finally:
+        site.thaw("control_plc")
+    trend = eventually(
+        lambda: found if len((found := site.ask("/api/trend?names=L1").document)["gaps"]) > before else None, "a gap"
+    )
+    start, end = trend["gaps"][-1]
+    inside = [value for time, value in zip(trend["time"], trend["series"]["L1"], strict=True) if start < time < end]
+    assert inside == [None], "the line is interrupted once"
+    eventually(lambda: page.evaluate("document.querySelector('#chart-L1').dataset.gaps > 0"), "it is drawn")
+    assert "nothing read" in page.inner_text("#trend-legend")
+    eventually(lambda: mode(site) == MPC, "MPC drives again", 90)
+
+
+def test_in_manual_nothing_of_mpc_looks_current_and_the_button_says_who_drives(operated: "Page", site: Site) -> None:
+    pressed = "[...document.querySelectorAll('[data-mode][aria-pressed=true]')].map((one) => one.dataset.mode)"
+    eventually(lambda: operated.evaluate(pressed) == ["auto"], "automatic is pressed")
+    operated.click("[data-mode=manual]")
+    confirm(operated)
+    eventually(lambda: mode(site) == MANUAL, "manual")
+    try:
+        eventually(lambda: operated.evaluate(pressed) == ["manual"], "manual is pressed")
+        eventually(lambda: operated.locator("#tau-u.stale").count() == 1, "the updating period is crossed out")
+        assert not site.ask("/api/trend?names=L1").document["planned"]
+        view(operated, "trends")
+        eventually(lambda: "mode manual" in operated.inner_text("#trend-legend"), "its colour has a name")
+        assert "expected" not in operated.inner_text("#trend-legend")
+    finally:
+        view(operated, "commands")
+        operated.click("[data-mode=auto]")
+        confirm(operated)
+    eventually(lambda: mode(site) == MPC, "MPC drives again", 90)
+    eventually(lambda: operated.locator("#tau-u.stale").count() == 0, "it is current again", 60)
+
+
+@pytest.fixture
+def held(operated: "Page") -> "Iterator[list[Route]]":
+    """Requests to prepare a command, held until somebody lets them go."""
+    routes: list[Route] = []
+    operated.route("**/api/commands", lambda route: routes.append(route))  # noqa: PLW0108 no builtin
+    yield routes
+    operated.unroute("**/api/commands")
+
+
+def test_a_second_command_waits_with_a_word_until_the_first_is_over(operated: "Page", held: "list[Route]") -> None:
+    operated.click("button:has-text('Pause')")
+    operated.fill("#load-number", "444")
+    operated.click("#load-set")
+    operated.click("#load-set")
+    eventually(lambda: "load: waits until the command before it is over" in outcome(operated), "it says so")
+    for text in ("stand still", "444"):
+        eventually(lambda: operated.evaluate("1") and held, "it is prepared")
+        held.pop().continue_()
+        operated.wait_for_selector("#confirm[open]")
+        assert text in operated.inner_text("#confirm-text")
+        operated.click("#confirm-no")
+        operated.wait_for_selector("#confirm[open]", state="detached")
+    operated.wait_for_selector("body:not(.commanding)")
+    assert not held, "the same one again is none"
+
+
+def test_every_signal_of_the_trends_can_be_a_pen(page: "Page") -> None:
+    view(page, "trends")
+    page.wait_for_selector("#chart-L1")
+    offered = set(page.eval_on_selector_all("#pen-add option", "all => all.map((one) => one.value)")) - {""}
+    assert offered | {"L1", "T5", "load", "CV155", "CV156", "NCR22_A"} == set(NAMES)
+    page.select_option("#pen-add", "T4")
+    page.wait_for_selector("#chart-pen-T4")
+    assert "T4 K" in page.inner_text("#chart-pen-T4 .title")
+    page.click("button[aria-label='Remove T4']")
+    page.wait_for_selector("#chart-pen-T4", state="detached")
+
+
+def test_a_small_screen_shows_the_whole_drawing(browser: "Browser", site: Site) -> None:
+    with opened(browser, site.address, viewport={"width": 1024, "height": 600}) as page:
+        view(page, "overview")
+        box = page.locator("#mimic svg").bounding_box()
+        assert box is not None
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 1024
+        lines = page.locator("#alarm-line").bounding_box()
+        assert lines is not None
+        assert box["y"] + box["height"] <= lines["y"]
+
+
+def test_a_replay_begins_at_its_beginning_and_knows_since_when_and_which_alarms(served: Served) -> None:
+    assert served.ask("/api/replay")["tick"] == 0
+    served.ask("/api/replay", {"tick": 4 * RECORDED_S - 1})
+    state = served.ask("/api/state")
+    events = served.ask("/api/events?service=control_plc")["events"]
+    changes = [event["tick"] for event in events if event["kind"] == "mode"]
+    assert state["values"]["control_plc.ladder.since"] == max(changes, default=0)
+    raised = {event["subject"] for event in events if event["kind"] == "alarm raised"}
+    assert {alarm["name"] for alarm in state["alarms"] if alarm["times"]} == raised

@@ -1,0 +1,64 @@
+"""Answers and requests that say nonsense, their seals intact: what a confused peer sends."""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+from coldloop.registers.codec import RecordCodec, codec_of
+from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, fields_of
+from coldloop.seal import Seal, seal_of, sealed_bytes
+
+READS: Final = (3, 23)
+HEAD: Final = 9
+"""Bytes of an answer before the words that were read: MBAP header, function code, byte count."""
+FLOATS: Final = (math.nan, math.inf, -math.inf, 3.4e38, -3.4e38, 1e-45, -0.0, -1e9, 1e9, 0.0)
+INTEGERS: Final = {Kind.U16: (0, 1, 0x7FFF, 0xFFFF), Kind.U32: (0, 1, 2**31 - 1, 2**31, 2**32 - 2**16, 2**32 - 1)}
+
+Change = Callable[[tuple[Any, ...]], tuple[Any, ...]]
+"""Takes a record; returns another one."""
+
+
+def record_in(answer: bytes, block: Block) -> tuple[Any, ...] | None:
+    """Return the record of a sealed block that an answer carries, if it is that."""
+    codec = codec_of(block)
+    if len(answer) != HEAD + codec.size or answer[7] not in READS or seal_of(codec, answer, HEAD) is not Seal.INTACT:
+        return None
+    return codec.decode(answer, HEAD)
+
+
+def with_record(answer: bytes, codec: RecordCodec, record: tuple[Any, ...]) -> bytes:
+    """Return an answer with another record, sealed."""
+    return answer[:HEAD] + sealed_bytes(codec, record)
+
+
+def changed(answer: bytes, block: Block, change: Change) -> bytes:
+    """Return an answer whose record, if it carries one of this block, is changed."""
+    record = record_in(answer, block)
+    return answer if record is None else with_record(answer, codec_of(block), change(record))
+
+
+def values_of(field: Field) -> tuple[float, ...]:
+    """Return the values with which a field is poisoned."""
+    return FLOATS if field.kind is Kind.F32 else INTEGERS[field.kind]
+
+
+def poisons(record: type[tuple[Any, ...]]) -> Iterator[tuple[str, Change]]:
+    """Yield what each field of a record but its seal can be changed into, with words for it; of arrays one element."""
+    for place, (name, field) in enumerate(fields_of(record).items()):
+        if name == "crc":
+            continue
+        for value in values_of(field):
+            yield f"{name} = {value}", _setting(place, field, value)
+
+
+def _setting(place: int, field: Field, value: float) -> Change:
+    def change(record: tuple[Any, ...]) -> tuple[Any, ...]:
+        new = (value, *record[place][1:]) if field.elements else value
+        return type(record)(*record[:place], new, *record[place + 1 :])
+
+    return change
+
+
+def sealed_blocks(register_map: RegisterMap) -> list[Block]:
+    """Return the blocks of a map that are sealed and read."""
+    return [block for block in register_map.blocks if block.sealed and block.writer is None]

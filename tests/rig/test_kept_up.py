@@ -1,0 +1,77 @@
+"""Services of a rig that stays up: what ends is started again after a pause, and given up after five times."""
+
+import asyncio
+
+import pytest
+
+from coldloop.errors import LinkError
+from rig.kept_up import PAUSES_S, end_of, keep_up
+
+NONE = (0.0,) * len(PAUSES_S)
+
+
+class Mortal:
+    """A process that ends at once, and counts how often it was started."""
+
+    name = "the plant service"
+
+    def __init__(self, lives: int = 1_000_000) -> None:
+        self.starts = 0
+        self._lives = lives
+
+    async def ended(self) -> str:
+        if self.starts >= self._lives:
+            await asyncio.Event().wait()
+        return "was ended by SIGKILL"
+
+    async def restart(self) -> None:
+        self.starts += 1
+
+
+async def test_what_ends_again_and_again_is_given_up_after_five(capsys: pytest.CaptureFixture[str]) -> None:
+    process = Mortal()
+    with pytest.raises(LinkError, match="was ended by SIGKILL, and was started again 5 times before: it is given up"):
+        await keep_up(process, pauses_s=NONE)
+    assert process.starts == 5
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "coldloop: the plant service was ended by SIGKILL: started again in 0 s (1 of 5)"
+    assert len(lines) == 5
+
+
+async def test_what_has_run_for_long_begins_to_count_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rig.kept_up.STEADY_S", -1.0)
+    process = Mortal(lives=12)
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(keep_up(process, pauses_s=NONE), 1.0)
+    assert process.starts == 12
+
+
+async def test_each_start_is_followed_up() -> None:
+    told: list[int] = []
+    process = Mortal(lives=2)
+
+    async def restarted() -> None:
+        told.append(process.starts)
+
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(keep_up(process, restarted, NONE), 1.0)
+    assert told == [1, 2]
+
+
+def test_the_pauses_grow() -> None:
+    assert len(PAUSES_S) == 5
+    assert list(PAUSES_S) == sorted(PAUSES_S)
+    assert PAUSES_S[0] >= 1
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        (-9, "was ended by SIGKILL"),
+        (-77, "was ended by signal 77"),
+        (2, "has ended with exit code 2: plant: port 5020"),
+        (0, "has ended with exit code 0: plant: port 5020"),
+    ],
+)
+def test_how_a_process_has_ended_is_told(code: int, text: str) -> None:
+    assert end_of(code, "plant: port 5020") == text

@@ -1,0 +1,65 @@
+"""What is compiled beforehand, and when: nothing is left to be compiled in a session."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+from rig.one_process import OneProcessRig
+from rig.recording import Recorder
+from rig.running import make_scenario
+from rig.settings import Settings
+
+ROOT = Path(__file__).parents[2]
+OURS = ("coldloop", "plant", "optimizer_plc", "control_plc", "rig")
+
+
+def compiled_kernels() -> int:
+    """Return how many kernels this process has, for all types."""
+    found = {
+        id(value): value
+        for name, module in tuple(sys.modules.items())
+        if name.partition(".")[0] in OURS
+        for value in vars(module).values()
+        if isinstance(value, Dispatcher)
+    }
+    return sum(len(kernel.overloads) for kernel in found.values())
+
+
+class FirstTick(Recorder):
+    """Counts the kernels when the programs have been made, before the first tick."""
+
+    before = 0
+
+    def begin(self) -> None:
+        self.before = compiled_kernels()
+        super().begin()
+
+
+@pytest.mark.parametrize("plant", ["cold-box", "refrigerator"])
+def test_making_the_programs_compiles_all_that_a_session_of_them_needs(plant: str) -> None:
+    settings = Settings.model_validate({"plant": {"kind": plant, "load": "a"}})
+    scenario = make_scenario(settings, 120)
+    recorder = FirstTick(scenario.ticks, [])
+    OneProcessRig(settings, compiled=False).run(scenario, recorder)
+    assert recorder.before == compiled_kernels() > 0
+
+
+@pytest.mark.parametrize(("numba", "code"), [("", 0), ("raise ImportError('broken')", 1)])
+def test_the_failure_of_one_part_is_that_of_all(tmp_path: Path, numba: str, code: int) -> None:
+    (tmp_path / "plant").mkdir()
+    (tmp_path / "plant" / "__init__.py").touch()
+    (tmp_path / "plant" / "settings.py").write_text(f"PlantKind = ()\n{numba}\n")
+    done = subprocess.run(
+        [sys.executable, ROOT / "docker" / "precompile.py", "hmi", "plant", "control_plc"],
+        check=False, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )  # fmt: skip
+    assert (done.returncode, "broken" in done.stdout, done.stderr) == (code, bool(code), "")
+
+
+def test_setup_refuses_a_name_that_it_does_not_know() -> None:
+    done = subprocess.run([ROOT / "scripts" / "setup", "build"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (2, "usage: scripts/setup run|study|dev|all\n")

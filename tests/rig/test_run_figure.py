@@ -1,0 +1,64 @@
+"""What the figure of a run shows, and that its legends name what can be seen and nothing else."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from coldloop.process import INPUT_NAMES
+from rig.plot import DRAWN, Bounds, RunCurves, draw_run
+from rig.run_folder import RunFolder
+from rig.run_plot import curves_of
+from tests.conftest import Coldloop
+
+TICKS = 4000
+
+
+def curves(level: float = 60.0, **pressures: tuple[float, float]) -> RunCurves:
+    series = {name: np.ones(TICKS) for name in (*DRAWN, *pressures)}
+    series |= {"time_s": np.arange(TICKS) * 0.25, "L1": np.full(TICKS, level), "T5": np.full(TICKS, 10.0)}
+    bounds = Bounds({"L1": (59.0, 61.0), "T5": (9.0, 16.0)}, dict.fromkeys(INPUT_NAMES, (0.0, 100.0)))
+    events = [
+        {"time_s": 0.0, "kind": "mode", "subject": "hold"},
+        {"time_s": 0.25, "kind": "mode", "subject": "mpc"},
+        {"time_s": 500.0, "kind": "mode", "subject": "classical"},
+    ]
+    return RunCurves(series, events, bounds, "", "", pressures)
+
+
+def legends(figure: Figure) -> list[list[str]]:
+    found = []
+    for axes in figure.axes:
+        legend = axes.get_legend()
+        found.append([text.get_text() for text in legend.get_texts()] if legend else [])
+    return found
+
+
+def test_a_mode_that_is_too_short_to_be_seen_has_no_entry() -> None:
+    assert legends(draw_run(curves()))[-1] == ["mpc", "classical"]
+
+
+@pytest.mark.parametrize(("level", "is_seen"), [(60.0, True), (59.05, True), (20.0, False), (90.0, False)])
+def test_a_band_has_an_entry_where_it_can_be_seen(level: float, *, is_seen: bool) -> None:
+    entries = legends(draw_run(curves(level)))[1]
+    assert any(entry.startswith("band 59 to 61 %") for entry in entries) is is_seen
+
+
+def test_a_refrigerator_has_its_pressures_between_inputs_and_updating_period() -> None:
+    figure = draw_run(curves(P12=(14.5, 16.8), P11=(0.97, 1.15)))
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels[6:9] == ["P12 (bar)", "P11 (bar)", "tau_u (s)"]
+
+
+def test_the_run_of_a_refrigerator_is_drawn_with_what_its_station_recorded(tmp_path: Path, coldloop: Coldloop) -> None:
+    folder = tmp_path / "run"
+    outcome = coldloop(
+        "run", "--in-process", "--load", "a", "--duration", "15s", "--set", "plant.kind=refrigerator",
+        "--figures", "png", "--out", str(folder),
+    )  # fmt: skip
+    assert outcome.code == 0
+    found = curves_of(RunFolder(folder))
+    assert found.pressures == {"P12": (14.5, 16.8), "P11": (0.97, 1.15)}
+    assert found.series["P12"] == pytest.approx(np.full(60, 16.0), abs=0.1)
+    assert (folder / "run.png").is_file()
