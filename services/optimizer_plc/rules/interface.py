@@ -72,7 +72,7 @@ def assess(observation: Observation) -> Assessment:
     dE = (o.delivered - o.last_but_one) / o.hot_start
     dK = E * dD + D * dE
     log_K = real(math.log(K))
-    dt_r = (-log_K + q / K * dK) / (log_K * log_K) if log_K != zero else real(math.copysign(math.inf, dK))
+    dt_r = (-log_K + q / K * dK) / (log_K * log_K) if log_K != zero else real(math.copysign(real(math.inf), dK))
     return Assessment(E, D, K, dD, dE, dK, dt_r, dK if one <= K else dt_r)
 
 
