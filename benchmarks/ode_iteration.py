@@ -14,7 +14,7 @@ from qp_solvers import Recorded, record
 from scipy.linalg import lapack
 
 from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.solvers.ode import OdeSolver
+from optimizer_plc.solvers.ode import ode_solver
 
 ITERATIONS = 10
 """Of each problem."""
@@ -24,12 +24,8 @@ FLOOR_US = 1.0
 
 def lively(problems: list[Recorded]) -> list[Recorded]:
     """Return the problems that do not stall."""
-    solver, found = OdeSolver(OdeSettings()), []
-    for one in problems:
-        solver.start(*one)
-        if solver.iterate(ITERATIONS + 1) > ITERATIONS:
-            found.append(one)
-    return found
+    solver = ode_solver(OdeSettings())
+    return [one for one in problems if solver.solve(*one, (ITERATIONS + 1,)).iterations[-1] > ITERATIONS]
 
 
 def microseconds(work: Callable[[], object], times: int) -> float:
@@ -42,10 +38,10 @@ def microseconds(work: Callable[[], object], times: int) -> float:
 
 def iteration_us(problems: list[Recorded]) -> float:
     """Return the mean time of an iteration."""
-    solver, total = OdeSolver(OdeSettings()), 0.0
+    solver, total = ode_solver(OdeSettings()), 0.0
     for one in problems:
-        solver.start(*one)
-        total += microseconds(lambda: solver.iterate(ITERATIONS), 1)
+        start, whole = (microseconds(lambda q=q: solver.solve(*one, (q,)), 1) for q in (0, ITERATIONS))  # noqa: B023
+        total += whole - start
     return total / ITERATIONS / len(problems)
 
 

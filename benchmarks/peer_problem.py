@@ -35,10 +35,9 @@ def solved(prediction: PredictionModel, design: ControlDesign, limits: InputLimi
     for _ in range(6):
         start = time.perf_counter()
         qp = problem.at(Situation(np.zeros(prediction.n_states), LOAD_STEP_W, at_rest))
-        solver.start(qp, problem.hold(at_rest))
-        solver.iterate(ITERATIONS)
+        answer = solver.solve(qp, problem.hold(at_rest), (ITERATIONS,))
         times.append(time.perf_counter() - start)
-    return statistics.median(times[1:]), solver.cost + float(qp.constant)
+    return statistics.median(times[1:]), answer.cost + float(qp.constant)
 
 
 def described(prediction: PredictionModel, design: ControlDesign, limits: InputLimits) -> dict[str, Any]:

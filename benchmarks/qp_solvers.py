@@ -8,6 +8,7 @@ many iterations before (paper, Remark to Definition 1), or above what it was at 
 
 import argparse
 import time
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import daqp
@@ -20,8 +21,7 @@ from coldloop.lti_model import load
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import QuadraticProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
-from optimizer_plc.solution import Solution
-from optimizer_plc.solvers import Solver, make_solver
+from optimizer_plc.solvers import Answer, Solver, judged, make_solver
 from plant.load import find_load
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder
@@ -57,28 +57,10 @@ class Listener:
         """Pass on."""
         self._solver.reset()
 
-    def start(self, problem: QuadraticProblem, guess: Array) -> None:
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
         """Remember, and pass on."""
         self.heard.append(Recorded(problem, guess.copy()))
-        self._solver.start(problem, guess)
-
-    def iterate(self, count: int) -> int:
-        """Pass on."""
-        return self._solver.iterate(count)
-
-    @property
-    def solution(self) -> Array:
-        """Of the solver listened to."""
-        return self._solver.solution
-
-    @property
-    def cost(self) -> float:
-        """Of the solver listened to."""
-        return self._solver.cost
-
-    def judged(self) -> Solution:
-        """Of the solver listened to."""
-        return self._solver.judged()
+        return self._solver.solve(problem, guess, counts)
 
 
 def record(hours: str, minutes: float, period_s: float) -> list[Recorded]:
@@ -119,11 +101,8 @@ def paths(solver: Solver, problems: list[Recorded], iterations: int) -> Array:
     """Return J after 0, 1, ... iterations, a row for each problem."""
     costs = np.empty((len(problems), iterations + 1))
     for row, (problem, guess) in zip(costs, problems, strict=True):
-        solver.start(problem, guess)
-        row[0] = solver.cost + problem.constant
-        for q in range(iterations):
-            solver.iterate(1)
-            row[q + 1] = solver.cost + problem.constant
+        answer = solver.solve(problem, guess, range(iterations + 1))
+        row[:] = answer.costs + problem.constant
     return costs
 
 
@@ -141,11 +120,11 @@ def times(solver: Solver, problems: list[Recorded], count: int) -> tuple[float, 
     starts, iterations = [], []
     for problem, guess in problems:
         before = time.perf_counter()
-        solver.start(problem, guess)
+        solver.solve(problem, guess, (0,))
         between = time.perf_counter()
-        solver.iterate(count)
+        solver.solve(problem, guess, (count,))
         starts.append(between - before)
-        iterations.append(time.perf_counter() - between)
+        iterations.append(time.perf_counter() - between - starts[-1])
     return float(np.median(starts)) * 1e6, float(np.median(iterations)) * 1e6
 
 
@@ -154,16 +133,15 @@ def report_cuts(name: str, problems: list[Recorded], best: Array, harsh: NDArray
     cells = []
     for count in COUNTS:
         solver = make_solver(ProgramSettings(solver=SolverName(name)))
-        ratios, judged = [], []
+        ratios, solutions = [], []
         for (problem, guess), lowest in zip(problems, best, strict=True):
-            solver.start(problem, guess)
-            solver.iterate(count)
-            ratios.append((solver.cost + problem.constant) / lowest)
-            judged.append(solver.judged())
+            answer = solver.solve(problem, guess, (count,))
+            ratios.append((answer.cost + problem.constant) / lowest)
+            solutions.append(judged(problem, answer, solver.alpha))
         of_harsh = np.array(ratios)[harsh]
         cells.append(f"{np.median(of_harsh):9.3g} / {of_harsh.max():9.3g}")
-    primal = np.median([solution.primal_residual for solution, hard in zip(judged, harsh, strict=True) if hard])
-    dual = np.median([solution.dual_residual for solution, hard in zip(judged, harsh, strict=True) if hard])
+    primal = np.median([solution.primal_residual for solution, hard in zip(solutions, harsh, strict=True) if hard])
+    dual = np.median([solution.dual_residual for solution, hard in zip(solutions, harsh, strict=True) if hard])
     print(f"{name:14}", *cells, f"{primal:8.1e} {dual:8.1e}")
 
 
@@ -237,9 +215,7 @@ def report_interior_points(problems: list[Recorded], best: Array, alpha: float) 
 def cost_after(name: SolverName, qp: QuadraticProblem, guess: Array, count: int) -> float:
     """Return J after `count` iterations of one of our solvers."""
     solver = make_solver(ProgramSettings(solver=name))
-    solver.start(qp, guess)
-    solver.iterate(count)
-    return solver.cost + qp.constant
+    return solver.solve(qp, guess, (count,)).cost + qp.constant
 
 
 def is_there(name: SolverName) -> bool:

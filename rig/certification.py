@@ -100,14 +100,9 @@ def iterations_needed(solver: Solver, problem: Problem, tolerance: float, floor:
     qp = problem.qp
     rest = qp.constant + floor
     enough = (1.0 + tolerance) * (float(augmented_cost(qp, problem.optimum, solver.alpha)) + rest)
-    solver.start(qp, problem.guess)
-    needed, done = 0, 0
-    while True:
-        if solver.cost + rest > enough:
-            needed = done + 1
-        if done == LONGEST or not solver.iterate(1):
-            return needed if needed <= done else LONGEST + 1
-        done += 1
+    answer = solver.solve(qp, problem.guess, range(1, LONGEST + 1))
+    above = np.flatnonzero(np.array([answer.guessed, *answer.costs]) + rest > enough)
+    return int(above[-1]) + 1 if len(above) else 0
 
 
 def scenario_problems(settings: Settings, number: int) -> list[Problem]:

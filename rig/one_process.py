@@ -112,7 +112,7 @@ class OneProcessRig:
         self.control.restart(session=1)
         stretches = None
         if self._compiled:
-            stretches = CompiledStretches(plant, self.control, self.optimizer, load, self._settings.limits)
+            stretches = CompiledStretches(plant, self.control, self.optimizer, load)
         recorder.begin()
         while self.control.tick < scenario.ticks:
             stretch = stretches.ahead(scenario.ticks) if stretches else None

@@ -9,7 +9,7 @@ from coldloop.registers.safety import AlarmKind
 from coldloop.sequence import InputSequence, with_checksum
 from control_plc.output_limits import GuardState
 from control_plc.program import ControlProgram
-from rig.compiled.records import GUARD, NOT, SCAN, Alarms, Array, Trace, record
+from rig.compiled.records import GUARD, NOT, SCAN, Alarms, Array, Trace, empty_rows, record
 
 BANDS = (AlarmKind.LEVEL_BAND, AlarmKind.T5_BAND)
 LONGEST_SILENCE = 22
@@ -112,7 +112,8 @@ def played_sequence(s: Any, update: int, rows: Array, model_digest: int) -> Inpu
     return with_checksum(header, [SequenceRow(*row) for row in rows[:length].tolist()])
 
 
-def sequence_rows(sequence: InputSequence, room: Array) -> Array:
-    """Return the rows of a sequence as an array of the size of `room`."""
-    room[: len(sequence.rows)] = np.array(sequence.rows)
-    return room
+def sequence_rows(sequence: InputSequence) -> Array:
+    """Return the rows of a sequence, and room for those of the next one, shape (2, 240, 3)."""
+    rows = empty_rows()
+    rows[0, : len(sequence.rows)] = sequence.rows
+    return rows

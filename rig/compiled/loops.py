@@ -5,7 +5,7 @@ finds out whether it is one; when not, the loop ends with nothing of that tick d
 would cross the link are rounded as the link rounds them, through the rows of the trace.
 """
 
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,9 +15,10 @@ from coldloop.process import L1, T5
 from control_plc.output_limits import admit, admits, copy_state, in_range
 from control_plc.sensors import CONTROLLED, are_inside, watch_standing
 from optimizer_plc import scheme
-from optimizer_plc.scheme import Constants, Memory
+from optimizer_plc.scheme import BY_THE_RULE
+from optimizer_plc.session_state import Memory
 from rig.compiled.plants import advance_plant
-from rig.compiled.records import NOT, Alarms, Array, PlantState, Reports, Trace, World
+from rig.compiled.records import NOT, Alarms, Array, Optimizer, PlantState, Reports, Trace, World
 
 DONE: Final = 0
 UNUSUAL: Final = 1
@@ -102,10 +103,10 @@ def play(
 def go_on(
     w: World,
     alarms: Alarms,
-    c: Constants,
+    o: Optimizer,
     scans: Any,  # noqa: ANN401
     guards: Any,  # noqa: ANN401
-    m: Memory,
+    rows: Array,
     plant: PlantState,
     trace: Trace,
     reports: Reports,
@@ -114,109 +115,94 @@ def go_on(
     """Do ticks and updates; return DONE at the tick `until`, or UNUSUAL.
 
     An answer is computed when the programs would deliver it: at its instant, or at once where a load step may cut it
-    off. One that has not begun when something unusual happens is forgotten, as if it had never been computed.
+    off. One that has not begun when something unusual happens is not reported: it is computed again, with the same
+    bits. `rows` (2, 240, 3) are those of the sequence being played, and of the one that was offered.
     """
     s, guard, twin = scans[0], guards[0], guards[1]
-    u_before, kept, length = np.empty(3), before_solving(m), 0
+    u_before, answered = np.empty(3), False
     outcome = DONE
     while s.tick < until:
         tick, instant = s.tick, s.tick == s.next_update
         outcome = UNUSUAL
         if not look(w, alarms, s, plant, trace):
             break
-        if length == 0 and (instant or s.load_step > 0.0):
-            if s.next_update <= until:
-                length = answer(w, c, s, guard, twin, m, kept, reports)
-            if length == 0:
+        if not answered and (instant or s.load_step > 0.0):
+            answered = s.next_update <= until and answer(w, o, s, guard, twin, rows, reports)
+            if not answered:
                 break
         if instant:
-            begin_sequence(s, m, length)
-            length = 0
+            begin_sequence(s, rows, o.memory)
+            answered = False
         if tick - s.first_tick >= s.length:
             break
         u_before[:] = guard.applied
-        scan(w, alarms, s, guard, m.rows, plant, trace)
+        scan(w, alarms, s, guard, rows[0], plant, trace)
         if instant:
-            latch(w, c, s, m, trace, reports, tick, u_before)
+            latch(w, o, s, trace, tick, u_before)
         outcome = DONE
-    if length > 0:
-        forget_answer(m, kept)
+    if answered:
         s.solved -= 1
     return outcome
 
 
-class BeforeSolving(NamedTuple):
-    """What a solve changes in an optimiser's memory, as it was before."""
-
-    numbers: Any
-    u_before: Array
-    predicted: Array
-    x_solved: Array
-
-
-@kernel
-def before_solving(m: Memory) -> BeforeSolving:
-    """Return a copy of what a solve changes."""
-    return BeforeSolving(m.numbers.copy(), m.u_before.copy(), m.predicted.copy(), m.x_solved.copy())
-
-
-@kernel
-def forget_answer(m: Memory, kept: BeforeSolving) -> None:
-    """Undo a solve."""
-    m.numbers[0] = kept.numbers[0]
-    m.u_before[:], m.predicted[:], m.x_solved[:] = kept.u_before, kept.predicted, kept.x_solved
-
-
 @kernel
 def answer(
-    w: World, c: Constants, s: Any, guard: Any, twin: Any, m: Memory, kept: BeforeSolving, reports: Reports  # noqa: ANN401
-) -> int:  # fmt: skip
-    """Solve the problem of the update under way, and judge the sequence as the control PLC would; return its length.
-
-    What is refused has the length 0, and is forgotten, as if it had never been solved.
-    """
-    kept.numbers[0] = m.numbers[0]
-    kept.u_before[:], kept.predicted[:], kept.x_solved[:] = m.u_before, m.predicted, m.x_solved
-    length = scheme.solve(c, m)
+    w: World, o: Optimizer, s: Any, guard: Any, twin: Any, rows: Array, reports: Reports  # noqa: ANN401
+) -> bool:  # fmt: skip
+    """Solve the problem of the update under way; tell whether the control PLC would accept the sequence."""
+    m = o.memory
+    scheme.solve(o.constants, o.method, m)
+    offered, length = rows[1], m.sent.numbers[0].length
+    offered[:length] = m.sent.rows[:length]
     accepted = s.next_update - s.first_tick <= s.length
     for tick in range(length):
-        accepted = accepted and in_range(w.limits, m.answer_rows[tick])
+        accepted = accepted and in_range(w.limits, offered[tick])
     copy_state(guard, twin, w.limits)
     if accepted:
         for tick in range(s.tick, s.next_update):
-            admit(twin, w.limits, tick, m.rows[tick - s.first_tick], tick == s.first_tick)
-    if not (accepted and admits(twin, w.limits, s.next_update, m.answer_rows, length)):
-        forget_answer(m, kept)
-        return 0
+            admit(twin, w.limits, tick, rows[0, tick - s.first_tick], tick == s.first_tick)
+    if not (accepted and admits(twin, w.limits, s.next_update, offered, length)):
+        return False
     report(s, m, reports)
     trigger(w, s, s.tick)
-    return length
+    return True
 
 
 @kernel
-def begin_sequence(s: Any, m: Memory, length: int) -> None:  # noqa: ANN401
+def begin_sequence(s: Any, rows: Array, m: Memory) -> None:  # noqa: ANN401
     """Let the answer be what is played."""
-    scheme.take_answer(m)
-    s.number, s.first_tick = m.numbers[0].sequences, s.tick
-    s.length, s.tau_u = length, m.numbers[0].ticks
+    scheme.begin_sent(m)
+    playing = m.playing.numbers[0]
+    rows[0, : playing.length] = rows[1, : playing.length]
+    s.number, s.first_tick, s.length, s.tau_u = playing.number, s.tick, playing.length, playing.ticks
     s.accepted += 1
 
 
 @kernel
 def latch(
-    w: World, c: Constants, s: Any, m: Memory, trace: Trace, reports: Reports, tick: int, u_before: Array  # noqa: ANN401
+    w: World, o: Optimizer, s: Any, trace: Trace, tick: int, u_before: Array  # noqa: ANN401
 ) -> None:  # fmt: skip
     """Latch an update at `tick`, whose scan has been done, and plan the updating period that begins there."""
-    row = tick - s.first
-    s.updates += 1
+    m, row = o.memory, tick - s.first
+    real = m.u.dtype.type
     s.update_tick, s.update_load = tick, trace.load[row]
     s.u_before[:] = u_before
-    y, x = trace.y[row].astype(np.float64), trace.x[row].astype(np.float64)
-    a = scheme.plan(c, m, tick, u_before, np.float64(trace.load[row]), y, x)
-    of_update = reports.assessment
-    of_update[0], of_update[1], of_update[2], of_update[3] = a.efficiency, a.mismatch, a.contraction, a.gamma
-    s.next_update, s.load_step = tick + m.numbers[0].ticks, c.load_step
+    for i in range(m.u.shape[0]):
+        m.u[i] = real(trace.u[row, i]) - o.constants.estimator.u0[i]
+    before, y, x = measured(u_before, m), measured(trace.y[row], m), measured(trace.x[row], m)
+    scheme.plan(o.constants, o.rule, m, BY_THE_RULE, s.updates, tick, before, real(trace.load[row]), y, x)
+    s.updates += 1
+    s.next_update, s.load_step = tick + m.numbers[0].ticks, w.load_step
     trigger(w, s, tick + 1)
+
+
+@kernel
+def measured(values: Array, m: Memory) -> Array:
+    """Return values in the optimiser's floating-point type."""
+    result = np.empty(values.shape[0], m.u.dtype)
+    for i in range(values.shape[0]):
+        result[i] = values[i]
+    return result
 
 
 @kernel
@@ -229,11 +215,11 @@ def trigger(w: World, s: Any, tick: int) -> None:  # noqa: ANN401
 @kernel
 def report(s: Any, m: Memory, reports: Reports) -> None:  # noqa: ANN401
     """Write what was done with the update under way."""
-    o, a = m.numbers[0], reports.assessment
+    now, sent = m.numbers[0], m.sent.numbers[0]
     counts, values = reports.counts[s.solved], reports.values[s.solved]
-    counts[0], counts[1], counts[2], counts[3] = s.updates - 1, o.update_tick, o.ticks, o.done
-    values[0], values[1], values[2], values[3] = o.effective, o.hot_start, o.delivered, o.j_dev
-    values[4], values[5] = o.j_cst, o.violation
-    values[6], values[7], values[8], values[9] = a[0], a[1], a[2], a[3]
-    values[10] = o.mismatch
+    counts[0], counts[1], counts[2], counts[3] = now.update, now.tick, now.ticks, sent.iterations
+    values[0], values[1], values[2], values[3] = now.effective, sent.hot_start, sent.delivered, sent.j_dev
+    values[4], values[5] = sent.j_cst, sent.violation
+    values[6], values[7], values[8], values[9] = now.efficiency, now.mismatch, now.contraction, now.gamma
+    values[10] = m.belief.numbers[0].mismatch
     s.solved += 1

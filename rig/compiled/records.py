@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from control_plc.output_limits import Limits
+from optimizer_plc.rules import UpdatingRule
+from optimizer_plc.scheme import Constants
+from optimizer_plc.session_state import Memory
 from plant.cold_box import ColdBox
 from plant.helium.properties import Helium
 from plant.refrigerator import Refrigerator
@@ -115,6 +118,19 @@ class World(NamedTuple):
     largest_load: float
     watchdog: int
     """Time-out, ticks; 0 is off."""
+    load_step: float
+    """Change of the load that interrupts an updating period, W, or 0."""
+
+
+class Optimizer(NamedTuple):
+    """The optimiser's program, as kernels take it."""
+
+    constants: Constants
+    method: Any
+    """Of a solver of our own."""
+    rule: UpdatingRule
+    memory: Memory
+    """Its state, which is overwritten."""
 
 
 class Alarms(NamedTuple):
@@ -147,8 +163,6 @@ class Reports(NamedTuple):
     """Update, tick, tau_u, iterations."""
     values: NDArray[np.float32]
     """The numbers of `Optimization` from `j_effective` on."""
-    assessment: Array
-    """Of the update under way: E, D, K, Gamma."""
 
 
 def empty_trace(station: int) -> Trace:
@@ -159,12 +173,12 @@ def empty_trace(station: int) -> Trace:
 
 def empty_reports() -> Reports:
     """Return room for the updates of a block."""
-    return Reports(np.empty((BLOCK_TICKS, 4), np.int64), np.empty((BLOCK_TICKS, 11), np.float32), np.zeros(4))
+    return Reports(np.empty((BLOCK_TICKS, 4), np.int64), np.empty((BLOCK_TICKS, 11), np.float32))
 
 
 def empty_rows() -> Array:
-    """Return room for the longest sequence."""
-    return np.zeros((SEQUENCE_ROWS, len(INPUT_NAMES)))
+    """Return room for two of the longest sequences."""
+    return np.zeros((2, SEQUENCE_ROWS, len(INPUT_NAMES)))
 
 
 def record(kind: Any) -> Any:  # noqa: ANN401 numpy's types of records

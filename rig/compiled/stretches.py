@@ -4,14 +4,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.limits import InputLimits
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import MAX_LOAD_W
 from control_plc.program import ControlProgram
 from optimizer_plc.program import OptimizerProgram
 from plant.program import LoadProfile, PlantProgram
 from rig.compiled import control, loops, optimizer, plants
-from rig.compiled.records import BLOCK_TICKS, PlantState, World, empty_reports, empty_rows, empty_trace
+from rig.compiled.records import BLOCK_TICKS, PlantState, World, empty_reports, empty_trace
 from rig.recorded import NO_STATION, STATION_COLUMNS, SampleBlock
 
 SHORTEST: Final = 6
@@ -33,24 +32,20 @@ class CompiledStretches:
         control: The control PLC.
         optimizer: The optimiser, in its session.
         load: What the plant's load follows.
-        limits: Of the inputs.
     """
 
     def __init__(
-        self, plant: PlantProgram, control_plc: ControlProgram, optimizer_plc: OptimizerProgram, load: LoadProfile,
-        limits: InputLimits,
+        self, plant: PlantProgram, control_plc: ControlProgram, optimizer_plc: OptimizerProgram, load: LoadProfile
     ) -> None:  # fmt: skip
         self._plant, self._control, self._optimizer = plant, control_plc, optimizer_plc
-        self._constants = (
-            optimizer.constants_of(optimizer_plc, limits) if optimizer.is_compiled(optimizer_plc) else None
-        )
+        self._is_compiled = optimizer.is_compiled(optimizer_plc)
         self._trace, self._reports = empty_trace(STATION_COLUMNS if plant.station else 0), empty_reports()
         self._pause_until = 0
         sensors = control_plc.sensors
         self._world = World(
             plants.constants_of(plant), plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
             control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), sensors.frozen_ticks, MAX_LOAD_W,
-            control_plc.watchdog.time,
+            control_plc.watchdog.time, optimizer_plc.settings.interrupting_load_step_w,
         )  # fmt: skip
 
     def ahead(self, until: int) -> Stretch | None:
@@ -58,7 +53,7 @@ class CompiledStretches:
         if self._control.tick < self._pause_until or not control.is_ordinary(self._control):
             return None
         answered = self._control.player.has_answer
-        whole = self._constants is not None and not answered and optimizer.is_ordinary(self._optimizer)
+        whole = self._is_compiled and not answered and optimizer.is_ordinary(self._optimizer)
         if not whole and not answered and self._control.player.load_step:
             return None  # the programs deliver at once what a load step may cut off
         until = min(until, (self._control.tick // BLOCK_TICKS + 1) * BLOCK_TICKS)
@@ -76,22 +71,22 @@ class CompiledStretches:
         if sequence is None or program.player.next_update_tick - program.tick < SHORTEST:
             return None
         scans, guards = control.scan_record(program), control.guard_records(program.guard.state)
-        rows = control.sequence_rows(sequence, empty_rows())
-        loops.play(self._world, control.alarms_of(program), scans, guards, rows, plant, self._trace, until)
+        rows = control.sequence_rows(sequence)
+        loops.play(self._world, control.alarms_of(program), scans, guards, rows[0], plant, self._trace, until)
         s = scans[0]
         if s["tick"] == s["first"]:
             return None
         return Stretch(self._give_back(plant, s, guards[0]), [])
 
     def _updates_too(self, plant: PlantState, until: int) -> Stretch | None:
-        program, constants = self._control, self._constants
-        if constants is None:
-            raise RuntimeError("these updates have no compiled form")
+        program, optimizer_plc, playing = self._control, self._optimizer, self._control.player.sequence
+        if playing is None:
+            raise RuntimeError("an ordinary update plays a sequence")
         scans, guards = control.scan_record(program), control.guard_records(program.guard.state)
-        memory, self._reports.assessment[:] = optimizer.memory_of(self._optimizer)
+        rows = control.sequence_rows(playing)
         loops.go_on(
-            self._world, control.alarms_of(program), constants, scans, guards, memory, plant, self._trace,
-            self._reports, until,
+            self._world, control.alarms_of(program), optimizer.parts_of(optimizer_plc), scans, guards, rows, plant,
+            self._trace, self._reports, until,
         )  # fmt: skip
         s = scans[0]
         if s["tick"] == s["first"]:
@@ -99,9 +94,8 @@ class CompiledStretches:
         block, solved = self._give_back(plant, s, guards[0]), int(s["solved"])
         if solved:
             update = control.latched_update(program, s, self._trace)
-            sequence = control.played_sequence(s, update.update - 1, memory.rows, self._optimizer.model_digest)
+            sequence = control.played_sequence(s, update.update - 1, rows[0], optimizer_plc.model_digest)
             program.player.take_over(sequence, update, int(s["next_update"]), int(s["accepted"]))
-            optimizer.give_back(self._optimizer, memory, update, sequence, self._reports.assessment)
         return Stretch(block, optimizer.optimizations(self._reports, solved))
 
     def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:

@@ -19,7 +19,7 @@ from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample
 from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.updating_period import FixedPeriod
+from optimizer_plc.rules import make_rule
 from plant.kinds import plant_maker
 from plant.own_model import own_header
 from plant.program import LoadProfile
@@ -116,12 +116,13 @@ class LoopBranch:
             OptimizerProgram(model, program, settings.limits),
         )
         optimizer = self._programs.optimizer
-        self._rules = [FixedPeriod(optimizer.budget.iterations(round(period / TICK_S))) for period in PERIODS_S]
+        iterations = (optimizer.budget.iterations(round(period / TICK_S)) for period in PERIODS_S)
+        self._rules = [make_rule(program, optimizer.budget, 0).fixed(q) for q in iterations]
         optimizer.restart(0.0, self._rules[0])
         self._programs.control.restart(session=1)
         self._sums = CostSums(StageCost(model, program.design), recorder)
         self._objective = objective
-        self._load, self._limits = load_table(scenario.load), settings.limits
+        self._load = load_table(scenario.load)
         self._compiled = compiled
         if recorder is not None:
             recorder.begin()
@@ -139,7 +140,7 @@ class LoopBranch:
         """Go on to `until`; periods that begin from now on are of the choice."""
         plant, control, optimizer = programs = self._programs
         optimizer.rule = self._rules[choice]
-        stretches = CompiledStretches(plant, control, optimizer, self._load, self._limits) if self._compiled else None
+        stretches = CompiledStretches(plant, control, optimizer, self._load) if self._compiled else None
         while control.tick < until:
             stretch = stretches.ahead(until) if stretches else None
             if stretch is not None:

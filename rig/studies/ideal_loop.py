@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from coldloop.lti_model import load
 from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import SequenceRow, Update
+from coldloop.registers.control_plc import SequenceRow
 from coldloop.registers.plant import PlantSample
 from control_plc.guard import OutputGuard
-from optimizer_plc.estimator import KalmanFilter
+from optimizer_plc.computing_settings import EstimatorKind
+from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.solvers.daqp import DaqpSolver
@@ -52,7 +53,9 @@ def run_ideal_loop(
     header, model = own_header(settings.model.file), load(settings.model.file)
     prediction, program = PredictionModel(model), settings.optimizer_plc.program
     problem = PredictiveProblem(prediction, program.design, settings.limits)
-    estimator, solver = KalmanFilter(prediction, program.estimator), DaqpSolver(program.daqp)
+    kalman = program.estimator.model_copy(update={"kind": EstimatorKind.KALMAN})
+    estimator, belief = estimator_of(prediction, kalman), no_belief(prediction.n_states)
+    solver = DaqpSolver(program.daqp)
     plant = plant_maker(header, settings.plant)(scenario.load, scenario.seed)
     applied = as_transmitted(SequenceRow(*model.u0.tolist()))
     guard = OutputGuard(settings.limits, applied)
@@ -63,18 +66,18 @@ def run_ideal_loop(
         wanted = applied
         instant = tick % ticks == 0
         if instant:
-            estimate = estimator.correct(Update(1, tick, tick, 0, watts, tuple(applied), tuple(applied), y, x))
-            situation = Situation(estimate.x, estimate.w, np.array(applied) - model.u0, ticks)
+            correct(estimator, belief, np.array(applied), watts, np.array(y), np.array(x))
+            u = np.array(applied) - model.u0
+            situation = Situation(belief.x.copy(), float(belief.numbers[0]["w"]), u, ticks)
             qp, guess = problem.at(situation), problem.shifted(z, ticks)
-            solver.start(qp, guess)
-            solver.iterate(1)
-            z = solver.solution
+            z = solver.solve(qp, guess, (1,)).z
             if solved is not None:
                 solved(qp, guess, z)
             wanted = SequenceRow(*problem.inputs(z, 1)[0].tolist())
         applied = guard.admit(tick, wanted, update=instant)
         if instant:
-            estimator.predict([(np.array(applied) - model.u0, ticks)])
+            begin_prediction(belief)
+            predict(estimator, belief, np.array(applied) - model.u0, ticks)
         plant.apply(applied)
         recorder.sample(PlantSample(tick, watts, tuple(applied), y, x))
         plant.advance()

@@ -33,12 +33,12 @@ def paired_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
     columns: Columns = {name: [] for name in ("iterations", "j_dev", "j_cst", "violation", "lowest")}
     for (situation, _), lowest in zip(sequence.recorded, sequence.lowest.tolist(), strict=True):
         qp, ticks = problem.at(situation), situation.elapsed_ticks
-        solver.start(penalised.at(situation), problem.shifted(z, ticks))
-        done = solver.iterate(PlcBudget(program.budget, solver.tau_1_s).iterations(ticks))
-        z = penalised.within_first_rate(solver.solution, situation)
+        iterations = PlcBudget(program.budget, solver.tau_1_s).iterations(ticks)
+        answer = solver.solve(penalised.at(situation), problem.shifted(z, ticks), (iterations,))
+        z = penalised.within_first_rate(answer.z, situation)
         cost = sequence.profiles.cost(qp, z, situation)
         violation = float(indicators(problem, qp, z, situation).violation)
-        for name, value in zip(columns, (done, *cost, violation, lowest), strict=True):
+        for name, value in zip(columns, (answer.iterations[-1], *cost, violation, lowest), strict=True):
             columns[name].append(float(value))
     return columns
 
@@ -62,17 +62,15 @@ def harsh_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
         harsh = at_guess + FLOOR > HARSH * (lowest + FLOOR)
         if not harsh and not settling:
             continue
-        solver.start(penalised.at(situation), guess)
+        looked_at = tuple(counts.values()) if harsh else ()
+        last = looked_at[-1] if harsh else 0
+        answer = solver.solve(penalised.at(situation), guess, (*looked_at, last + settling))
         if harsh:
             row = [lowest, at_guess]
-            done = 0
-            for count in counts.values():
-                solver.iterate(count - done)
-                done = count
-                row += [count, sequence.profiles.cost(qp, solver.solution, situation).total]
+            for count, point in zip(looked_at, answer.points, strict=False):
+                row += [count, sequence.profiles.cost(qp, point, situation).total]
             for name, value in zip(columns, row, strict=True):
                 columns[name].append(float(value))
-        solver.iterate(settling)
     return columns
 
 

@@ -14,8 +14,8 @@ from coldloop.sequence import InputSequence
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, Situation
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.rules import UpdatingRule
 from optimizer_plc.settings import ProgramSettings, SolverName
-from optimizer_plc.updating_period import UpdatingRule
 from rig.one_process import OneProcessRig
 from rig.recording import Recorder
 from rig.scenario import Scenario
@@ -69,8 +69,9 @@ class _ListeningOptimizer(OptimizerProgram):
     def solve(self) -> InputSequence:
         """Solve, and keep what was solved."""
         sequence = super().solve()
-        if self.state.sent is not None:
-            self.heard.append(Recorded(self.state.sent.situation, self.state.sent.z))
+        sent = self.state.sent
+        w, ticks = float(sent.numbers[0]["w"]), int(sent.numbers[0]["ticks"])
+        self.heard.append(Recorded(Situation(sent.x.copy(), w, sent.u_before.copy(), ticks), sent.z.copy()))
         return sequence
 
 

@@ -1,7 +1,7 @@
 """Why an updating period is as long as it is: from what was recorded of an update to the branch that decided, in words.
 
 A pure function of registers: it works on a running rig and on a recorded run alike. Symbols are those of Algorithm 1
-(`optimizer_plc/updating_period.py`): the quantities of update i were found at t_i, of the period that ended there.
+(`optimizer_plc/rules/`): the quantities of update i were found at t_i, of the period that ended there.
 """
 
 import math

@@ -1,6 +1,6 @@
 """What the optimiser believes of the plant's state at an updating instant."""
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from coldloop.compiled import kept, kernel
 from coldloop.errors import ConfigurationError
 from coldloop.process import SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
-from coldloop.registers.control_plc import Update
 from optimizer_plc.arithmetic import DOUBLE, Real
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
 from optimizer_plc.linear_algebra import add_transposed_product, multiply, respond
@@ -17,102 +16,107 @@ from optimizer_plc.prediction import PredictionModel, Transition
 Array = NDArray[np.float64]
 
 
-class Estimate(NamedTuple):
-    """State and load as deviations from the operating point."""
+class Estimator(NamedTuple):
+    """What an estimator computes with that does not change in a session, in the on-line floating-point type.
 
+    The Kalman filter is stationary, on the LTI model with one slow load-mismatch state; a load that is known is fed in.
+    State feedback believes the simulated state; it is not free of offset, for it does not know why the model is wrong.
+    """
+
+    steps: Transition
+    """Transitions over 1, 2, ... ticks, stacked."""
+    outputs: Transition
+    """C, D, G."""
+    x0: Array
+    u0: Array
+    y0: Array
+    w0: float
+    kalman: bool
+    """Kalman filter, or else state feedback."""
+    load_known: bool
+    gains: Array
+    """Of the Kalman filter for periods of 1, 2, ... ticks, shape (ticks, n_y, n + 1)."""
+
+
+class Belief(NamedTuple):
+    """What an estimator believes, as deviations from the operating point; kernels overwrite it."""
+
+    numbers: Any
+    """A record, shape (1,): `w`, the load (W); `mismatch`, the share of it that no sensor saw; `since`, the ticks
+    predicted over since the last measurement."""
     x: Array
-    w: float
-    mismatch: float
-    """Share of w that no sensor saw, W."""
+    """State at the last measurement, shape (n,)."""
+    predicted: Array
+    """State predicted since, shape (n,)."""
 
-
-class Estimator(Protocol):
-    """Turns measurements at updating instants into states."""
-
-    def reset(self) -> None:
+    def forget(self) -> None:
         """Begin at the operating point."""
-
-    def correct(self, update: Update) -> Estimate:
-        """Take the measurement at an updating instant."""
-
-    def predict(self, segments: list[tuple[Array, int]]) -> Array:
-        """Move to the next updating instant under (input deviation, ticks) segments; return the state there."""
+        self.x[:] = self.predicted[:] = 0.0
+        self.numbers[0] = (0.0, 0.0, 1)
 
 
-class StateFeedback:
-    """Believes the simulated state; not free of offset, for it does not know why the model is wrong."""
-
-    def __init__(self, prediction: PredictionModel, real: Real = DOUBLE) -> None:
-        self._model = prediction.rounded(real)
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin at the operating point."""
-        real = self._model.real
-        self.estimate = Estimate(np.zeros(self._model.n_states, real), real(0.0), real(0.0))
-
-    def correct(self, update: Update) -> Estimate:
-        """Take the simulated state."""
-        m = self._model
-        self.estimate = Estimate(np.asarray(update.x, m.real) - m.x0, m.real(update.load) - m.w0, m.real(0.0))
-        return self.estimate
-
-    def predict(self, segments: list[tuple[Array, int]]) -> Array:
-        """Predict with the model."""
-        return _through(self._model, self.estimate.x, self.estimate.w, segments)
-
-
-class KalmanFilter:
-    """Stationary Kalman filter on the LTI model with one slow load-mismatch state; a load that is known is fed in."""
-
-    def __init__(self, prediction: PredictionModel, settings: EstimatorSettings, real: Real = DOUBLE) -> None:
-        self._model = prediction.rounded(real)
-        self.load_known = settings.load_known
-        gains = stationary_gains(prediction, settings)
-        self.gains = {ticks: gain.astype(real, copy=False) for ticks, gain in gains.items()}
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin at the operating point."""
-        real = self._model.real
-        self.x = np.zeros(self._model.n_states, real)
-        self.mismatch = real(0.0)
-        self.estimate = Estimate(self.x, real(0.0), real(0.0))
-        self.since = 1
-
-    def correct(self, update: Update) -> Estimate:
-        """Correct the predicted state by the measurement, with the gain of the period that just ended."""
-        m = self._model
-        u = np.asarray(update.u_before, m.real) - m.u0
-        known = m.real(update.load) - m.w0 if self.load_known else m.real(0.0)
-        y = np.asarray(update.y, m.real) - m.y0
-        gain = self.gains[min(self.since, len(self.gains))]
-        self.x, mismatch = corrected(gain, m.outputs, self.x, self.mismatch, u, known, y)
-        self.mismatch = m.real(mismatch)
-        self.estimate = Estimate(self.x, known + self.mismatch, self.mismatch)
-        return self.estimate
-
-    def predict(self, segments: list[tuple[Array, int]]) -> Array:
-        """Predict with the model and the mismatch."""
-        self.x = _through(self._model, self.estimate.x, self.estimate.w, segments)
-        self.since = sum(ticks for _, ticks in segments)
-        return self.x
-
-
-def make_estimator(prediction: PredictionModel, settings: EstimatorSettings, real: Real) -> Estimator:
+def estimator_of(prediction: PredictionModel, settings: EstimatorSettings, real: Real = DOUBLE) -> Estimator:
     """Return the estimator that the settings name.
 
     Raises:
         ConfigurationError: The simulated state is to be believed, and is not that of the model.
     """
-    if settings.kind is EstimatorKind.KALMAN:
-        return KalmanFilter(prediction, settings, real)
-    if prediction.n_states > len(STATE_NAMES):
+    kalman = settings.kind is EstimatorKind.KALMAN
+    if not kalman and prediction.n_states > len(STATE_NAMES):
         raise ConfigurationError(
             "optimizer_plc.program.estimator.kind=state-feedback: the model has states that the plant does not"
             " tell; use kalman"
         )
-    return StateFeedback(prediction, real)
+    m = prediction.rounded(real)
+    gains = np.array(list(stationary_gains(prediction, settings).values())) if kalman else np.zeros((1, 1, 1))
+    return Estimator(
+        Transition(*(np.array(M) for M in zip(*m.transitions.values(), strict=True))),
+        m.outputs, np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, kalman, settings.load_known,
+        gains.astype(real, copy=False),
+    )  # fmt: skip
+
+
+def no_belief(n_states: int, real: Real = DOUBLE) -> Belief:
+    """Return the belief of an estimator that begins at the operating point."""
+    numbers = np.zeros(1, [("w", real), ("mismatch", real), ("since", "i8")])
+    belief = Belief(numbers, np.zeros(n_states, real), np.zeros(n_states, real))
+    belief.forget()
+    return belief
+
+
+@kernel
+def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array, x: Array) -> None:
+    """Take a measurement (u_before (3,), load, y (22,), x (28,), in physical units and the on-line type)."""
+    b = belief.numbers[0]
+    known = load - c.w0 if c.load_known else belief.x.dtype.type(0.0)
+    if not c.kalman:
+        belief.x[:] = x - c.x0
+        b.w, b.mismatch = known, belief.x.dtype.type(0.0)
+        return
+    gain = c.gains[min(b.since, c.gains.shape[0]) - 1]
+    belief.x[:], b.mismatch = corrected(gain, c.outputs, belief.predicted, b.mismatch, u_before - c.u0, known, y - c.y0)
+    belief.predicted[:] = belief.x
+    b.w = known + b.mismatch
+
+
+@kernel
+def begin_prediction(belief: Belief) -> None:
+    """Predict from the last measurement on."""
+    belief.predicted[:] = belief.x
+    belief.numbers[0].since = 0
+
+
+@kernel
+def predict(c: Estimator, belief: Belief, u: Array, ticks: int) -> None:
+    """Predict so many ticks further under the input deviation u (3,)."""
+    b = belief.numbers[0]
+    b.since += ticks
+    longest = c.steps.A.shape[0]
+    while ticks > 0:
+        step = min(ticks, longest)
+        A, B, F = c.steps.A[step - 1], c.steps.B[step - 1], c.steps.F[step - 1]
+        belief.predicted[:] = respond(A, B, F, belief.predicted, u, b.w)
+        ticks -= step
 
 
 def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> dict[int, Array]:
@@ -158,12 +162,6 @@ def corrected(
     correction = np.zeros(gain.shape[1], gain.dtype)
     add_transposed_product(gain, innovation, correction)
     return x + correction[:-1], mismatch + correction[-1]
-
-
-def _through(model: PredictionModel, x: Array, w: float, segments: list[tuple[Array, int]]) -> Array:
-    for u, ticks in segments:
-        x = model.advance(x, u, w, ticks)
-    return x
 
 
 @kernel

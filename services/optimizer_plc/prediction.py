@@ -15,7 +15,7 @@ from coldloop.lti_model import LtiModel
 from coldloop.process import L1, STATE_NAMES, T5, TICKS_PER_SAMPLE
 from optimizer_plc.arithmetic import DOUBLE, Real
 from optimizer_plc.design import ControlDesign
-from optimizer_plc.linear_algebra import multiply, respond
+from optimizer_plc.linear_algebra import multiply
 
 Array = NDArray[np.float64]
 
@@ -78,23 +78,10 @@ class PredictionModel:
         """The transition over one sampling period of 5 s."""
         return self.transitions[TICKS_PER_SAMPLE]
 
-    def advance(self, x: Array, u: Array, w: float, ticks: int) -> Array:
-        """Return the state after `ticks` ticks under constant deviations u and w."""
-        while ticks > 0:
-            step = min(ticks, TICKS_PER_SAMPLE)
-            A, B, F = self.transitions[step]
-            x = respond(A, B, F, x, u, w)
-            ticks -= step
-        return x
-
     @property
     def outputs(self) -> Transition:
         """C, D and G, which give outputs as a transition gives states."""
         return Transition(self.C, self.D, self.G)
-
-    def output(self, x: Array, u: Array, w: float) -> Array:
-        """Return the deviation of the measured output, shape (22,)."""
-        return respond(*self.outputs, x, u, w)
 
 
 def state_weights(model: LtiModel, design: ControlDesign) -> Array:

@@ -1,10 +1,11 @@
 """The optimiser PLC's program: the implementation scheme of the paper's section II, steps (1) to (5).
 
 For each update the control PLC latches, `plan` decides the updating period and `solve` computes the sequence that is
-played from its end on. Pure: no sockets, no clock, no sleeping.
+played from its end on. Here are the decisions; the arithmetic is that of `scheme.py`, on the one state of the session.
+Pure: no sockets, no clock, no sleeping.
 """
 
-from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,6 @@ from coldloop.first_use import kernels_of
 from coldloop.limits import InputLimits
 from coldloop.lti_model import LtiModel
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
-from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import (
     INPUT_SAMPLES,
@@ -24,22 +24,21 @@ from coldloop.registers.optimizer_plc import (
     UpdatingRuleStatus,
 )
 from coldloop.sequence import InputSequence, with_checksum
+from optimizer_plc import scheme
 from optimizer_plc.arithmetic import real_of
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
-from optimizer_plc.costs import augmented_cost, indicators
-from optimizer_plc.estimator import make_estimator
+from optimizer_plc.estimator import estimator_of
 from optimizer_plc.prediction import PredictionModel
-from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
-from optimizer_plc.rules import make_rule
-from optimizer_plc.session_state import UNDECIDED, Delivery, Period, SessionState
+from optimizer_plc.problem import PredictiveProblem, Situation
+from optimizer_plc.rules import UpdatingRule, make_rule
+from optimizer_plc.session_state import empty_memory
 from optimizer_plc.settings import ProgramSettings
-from optimizer_plc.solvers import make_solver
-from optimizer_plc.updating_period import Assessment, Observation, UpdatingRule
+from optimizer_plc.solvers import KernelSolver, make_solver
 
 Array = NDArray[np.float64]
 
-LONGEST_GAP_TICKS = 4 * SEQUENCE_ROWS
+LONGEST_GAP_TICKS: Final = 4 * SEQUENCE_ROWS
 """After a longer time without an update nothing is predicted from the last one."""
 
 
@@ -55,22 +54,27 @@ class OptimizerProgram:
             self.settings = settings
             self.model_digest = model.short_digest
             self._real = real_of(settings.arithmetic)
-            self.model = PredictionModel(model)
-            self.problem = PredictiveProblem(self.model, settings.design, limits, self._real, settings.penalties)
+            prediction = PredictionModel(model)
+            self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
             self.solver = make_solver(settings)
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
-            self.estimator = make_estimator(self.model, settings.estimator, self._real)
-            self.model = self.model.rounded(self._real)
+            self.state = empty_memory(prediction.n_states, self.problem.size, self._real)
+            estimator = estimator_of(prediction, settings.estimator, self._real)
+            at_rest = self.problem.at(Situation(self.state.belief.x, self._real(0.0), self.state.u))
+            self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
+            self.constants = scheme.constants_of(estimator, self.problem, self.solver.alpha, settings, self.budget)
             self._compile_kernels(model)
         self.restart(settings.updating_period_s)
 
     def _compile_kernels(self, model: LtiModel) -> None:
-        """Go once through an update at the operating point, so that no session waits for the compiler."""
-        self.restart(0.0)
+        """Go through two updates at the operating point, so that no session waits for the compiler."""
         u, y, x = (tuple(values.tolist()) for values in (model.u0, model.y0, model.x0))
-        self.plan(Update(0, 0, 0, 0, load=model.w0, u_before=u, u=u, y=y, x=x))
-        self.solve()
-        self.report(Verdict.NONE)
+        first = Update(0, 0, 0, 0, load=model.w0, u_before=u, u=u, y=y, x=x)
+        self.restart(0.0)
+        planned = self.plan(first)
+        sequence = self.solve()
+        self.prediction()
+        self.plan(first._replace(update=1, tick=planned.next_update_tick, playing=sequence.header.number))
 
     def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
         """Forget everything and begin a session at the operating point.
@@ -79,173 +83,142 @@ class OptimizerProgram:
             updating_period_s: Fixed updating period; 0 is adaptive.
             rule: Decides adaptive periods instead of the rule that the settings name.
         """
-        self.fixed_ticks = round(updating_period_s / TICK_S)
-        self.rule = rule or make_rule(self.settings, self.budget, self.fixed_ticks)
-        self.estimator.reset()
+        fixed_ticks = round(updating_period_s / TICK_S)
+        self.constants = self.constants._replace(fixed_ticks=fixed_ticks)
+        self.rule = rule or make_rule(self.settings, self.budget, fixed_ticks, self._real)
         self.solver.reset()
-        at_rest = np.zeros(3, self._real)
-        nothing = Situation(np.zeros(self.model.n_states, self._real), self._real(0.0), at_rest)
-        self.state = SessionState(Delivery(self.problem.hold(at_rest), nothing, 0, None))
+        for part in (self.state.numbers, self.state.playing.numbers, self.state.sent.numbers):
+            part[:] = np.zeros(1, part.dtype)
+        for array in (*self.state.playing[1:], *self.state.sent[1:], self.state.u, self.state.rule):
+            array[:] = 0
+        self.state.belief.forget()
+        self._now["guessed_before"] = self._now["delivered_before"] = np.inf
+        self._playing["ticks"], self._playing["share"] = TICKS_PER_SAMPLE, self.constants.rate_shares[TICKS_PER_SAMPLE]
+
+    @property
+    def _now(self) -> np.void:
+        """Numbers of the period under way."""
+        record: np.void = self.state.numbers[0]
+        return record
+
+    @property
+    def _playing(self) -> np.void:
+        """Numbers of what is played."""
+        record: np.void = self.state.playing.numbers[0]
+        return record
+
+    @property
+    def _sent(self) -> np.void:
+        """Numbers of the last answer."""
+        record: np.void = self.state.sent.numbers[0]
+        return record
 
     # -- steps (4), (5) and (2): at an updating instant ---------------------------------------------------------------
 
     def plan(self, update: Update) -> Plan:
         """Take the update latched at t_i and decide the updating period that begins there."""
-        elapsed = update.tick - self.state.last.update.tick if self.state.last else 0
+        now, state, estimator = self._now, self.state, self.constants.estimator
+        u = np.asarray(update.u, self._real) - estimator.u0
+        elapsed = update.tick - int(now["tick"]) if now["planned"] else 0
         if not 0 <= elapsed <= LONGEST_GAP_TICKS or not self._knows_what_is_played(update):
-            self._begin_again(update)
-        self._predict_to(update)
+            self._begin_again(update, u)
+        elif 0 < elapsed != now["ticks"]:
+            scheme.predict_played(self.constants, state, elapsed)
         interrupted = self._is_interrupted(update)
-        estimate = self.estimator.correct(update)
-        self._follow(update)
-        self.state.sequences = max(self.state.sequences, update.playing)
-        played = self.state.playing
-        here = played.situation._replace(x=estimate.x, w=estimate.w)
-        effective = self._cost(self.problem.at(here), played.z)
-        wanted, assessment = self._decide(effective, update, interrupted=interrupted)
-        iterations = min(wanted, self.budget.iterations(MAX_PERIOD_TICKS))
-        ticks = self.fixed_ticks or min(self.budget.period(iterations) + self.state.allowance, MAX_PERIOD_TICKS)
-        self.state.last = Period(update, estimate, iterations, ticks, effective, assessment)
+        in_time = self._follow(update)
+        now["sequences"] = max(int(now["sequences"]), update.playing)
+        state.u[:] = u
+        scheme.plan(
+            self.constants, self.rule, state, self._wanted(interrupted=interrupted, in_time=in_time),
+            update.update, update.tick,
+            np.array(update.u_before, self._real), self._real(update.load), np.array(update.y, self._real),
+            np.array(update.x, self._real),
+        )  # fmt: skip
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
-        return Plan(update.update, update.tick + ticks, load_step)
+        return Plan(update.update, update.tick + int(now["ticks"]), load_step)
 
     def _knows_what_is_played(self, update: Update) -> bool:
         """Tell whether the control PLC plays something of ours, or has not begun to."""
-        if self.state.playing.sequence is None:
-            return True
-        ours = (delivery.sequence for delivery in (self.state.playing, self.state.sent) if delivery is not None)
-        return any(sequence is not None and sequence.header.number == update.playing for sequence in ours)
+        ours = [one["number"] for one in (self._playing, self._sent) if one["length"]]
+        return not self._playing["length"] or update.playing in ours
 
-    def _begin_again(self, update: Update) -> None:
+    def _begin_again(self, update: Update, u: Array) -> None:
         """Forget what was sent: others have moved the inputs since, from which the next profile sets out."""
-        self.estimator.reset()
-        u = np.asarray(update.u, self._real) - self.model.u0
-        situation = self.state.playing.situation._replace(u_before=u)
-        self.state.playing = Delivery(self.problem.hold(u), situation, update.tick, None)
-        self.state.sent = self.state.last = None
-
-    def _predict_to(self, update: Update) -> None:
-        """Predict to this instant if another one was planned."""
-        last = self.state.last
-        if last is not None and 0 < (elapsed := update.tick - last.update.tick) != last.ticks:
-            self.estimator.predict(self._segments(last.update, elapsed))
+        self.state.belief.forget()
+        playing = self.state.playing
+        playing.z[:], playing.u_before[:] = self.problem.hold(u), u
+        self._playing["first_tick"], self._playing["length"] = update.tick, 0
+        self._sent["length"] = 0
+        self._now["planned"] = False
 
     def _is_interrupted(self, update: Update) -> bool:
         """Tell whether a load step has cut the last period off."""
-        last = self.state.last
-        if last is None:
+        now = self._now
+        if not now["planned"]:
             return False
-        elapsed = update.tick - last.update.tick
-        stepped = abs(update.load - last.update.load) > self.settings.interrupting_load_step_w > 0
-        return stepped and 0 < elapsed < last.ticks
+        elapsed = update.tick - int(now["tick"])
+        stepped = abs(update.load - float(now["load"])) > self.settings.interrupting_load_step_w > 0
+        return stepped and 0 < elapsed < int(now["ticks"])
 
-    def _follow(self, update: Update) -> None:
-        """Find out which profile the control PLC plays from this instant on."""
-        sent = self.state.sent
-        if sent is not None and sent.sequence is not None and sent.sequence.header.number == update.playing:
-            late = update.tick - sent.first_tick  # scans were missed: it began before this instant
-            self.state.playing = replace(sent, z=self.problem.shifted(sent.z, late)) if late > 0 else sent
-        elif self.state.last is not None:
-            late, played = update.tick - self.state.last.update.tick, self.state.playing
-            self.state.playing = Delivery(
-                self.problem.shifted(played.z, late), played.situation, played.first_tick, played.sequence
-            )
+    def _follow(self, update: Update) -> bool:
+        """Find out which profile is played from this instant on; tell whether it is the last answer, in time."""
+        sent, playing = self._sent, self.state.playing
+        late = 0
+        if begun := bool(sent["length"] and sent["number"] == update.playing):
+            scheme.begin_sent(self.state)
+            late = update.tick - int(sent["first_tick"])  # scans were missed: it began before this instant
+        elif self._now["planned"]:
+            late = update.tick - int(self._now["tick"])
+        if late > 0:
+            playing.z[:] = self.problem.shifted(playing.z, late)
+        return begun and late == 0
 
-    def _decide(self, effective: float, update: Update, *, interrupted: bool) -> tuple[int, Assessment]:
-        """Step (4): the rule decides, unless the last sequence never took effect."""
-        last, played = self.state.last, self.state.playing
-        if last is None:
-            return self.rule.first, UNDECIDED
+    def _wanted(self, *, interrupted: bool, in_time: bool) -> int:
+        """Return the iterations of the period, which the rule decides unless the last sequence never took effect."""
+        if not self._now["planned"]:
+            return self.rule.first
         if interrupted:
-            return self.rule.after_interruption(), UNDECIDED
-        if played is not self.state.sent or played.first_tick != update.tick:
-            return last.iterations, UNDECIDED
-        observation = Observation(
-            last.iterations,
-            last.ticks * TICK_S,
-            last.effective,
-            played.hot_start,
-            played.last_but_one,
-            played.delivered,
-            effective,
-        )
-        return self.rule.next(observation)
+            return self.rule.after_interruption(self.state.rule)
+        return scheme.BY_THE_RULE if in_time else int(self._now["iterations"])
 
     # -- step (3): during the updating period -------------------------------------------------------------------------
 
     def answer_after_s(self) -> float:
         """Return the plant time from the instant of the last `plan` until the PLC has computed its answer."""
-        return self.budget.answer_after_s(self._period.iterations)
+        return self.budget.answer_after_s(self._iterations)
 
     @property
-    def _period(self) -> Period:
-        if self.state.last is None:
+    def _iterations(self) -> int:
+        if not self._now["planned"]:
             raise RuntimeError("solve and answer_after_s follow plan")
-        return self.state.last
+        return int(self._now["iterations"])
 
     def solve(self) -> InputSequence:
         """Predict the state at t_{i+1}, shift the profile, do q iterations; return the sequence to play from there."""
-        period = self._period
-        segments = self._segments(period.update, period.ticks)
-        x = self.estimator.predict(segments)
-        situation = Situation(x, period.estimate.w, segments[-1][0], period.ticks)
-        qp = self.problem.at(situation)
-        self.solver.start(qp, self.problem.shifted(self.state.playing.z, period.ticks))
-        hot_start = self.solver.cost
-        done = self.solver.iterate(period.iterations - 1)
-        last_but_one = self.solver.cost
-        done += self.solver.iterate(1)
-        z = self.problem.within_first_rate(self.solver.solution, situation)
-        sequence = self._sequence(period, z)
-        self.state.sent = Delivery(
-            z, situation, sequence.header.first_tick, sequence, qp,
-            self._with_floor(hot_start, qp), self._with_floor(last_but_one, qp), self._with_floor(self.solver.cost, qp),
-            done,
-        )  # fmt: skip
-        return sequence
+        q = self._iterations
+        if isinstance(self.solver, KernelSolver):
+            scheme.solve(self.constants, self.method, self.state)
+        else:
+            qp, guess = scheme.pose(self.constants, self.state)
+            scheme.deliver(self.constants, self.state, qp, self.solver.solve(qp, guess, (q - 1, q)))
+        return self._sequence()
 
-    def _segments(self, update: Update, ticks: int) -> list[tuple[Array, int]]:
-        """Return the inputs played from an update on as (deviation, ticks), runs of equal inputs joined."""
-        u0 = self.model.u0
-        sequence = self.state.playing.sequence
-        if sequence is None:
-            return [(np.asarray(update.u, self._real) - u0, ticks)]
-        segments: list[tuple[Array, int]] = []
-        previous: SequenceRow | None = None
-        for tick in range(update.tick, update.tick + ticks):
-            row = sequence.rows[min(tick - self.state.playing.first_tick, len(sequence.rows) - 1)]
-            if row == previous:
-                segments[-1] = (segments[-1][0], segments[-1][1] + 1)
-            else:
-                segments.append((np.asarray(row, self._real) - u0, 1))
-            previous = row
-        return segments
-
-    def _sequence(self, period: Period, z: Array) -> InputSequence:
-        length = max(self.settings.sequence_ticks, 2 * period.ticks)
-        samples = -(-length // TICKS_PER_SAMPLE)
-        inputs = [as_transmitted(SequenceRow(*row)) for row in self.problem.inputs(z, samples).tolist()]
-        rows = [inputs[tick // TICKS_PER_SAMPLE] for tick in range(length)]
-        self.state.sequences += 1
+    def _sequence(self) -> InputSequence:
+        """Return the last answer as the control PLC takes it."""
+        now, sent, rows = self._now, self._sent, self.state.sent.rows
+        length = int(sent["length"])
+        inputs = [SequenceRow(*row) for row in rows[:length:TICKS_PER_SAMPLE].tolist()]
         header = SequenceHeader(
-            number=self.state.sequences,
-            update=period.update.update,
-            first_tick=period.update.tick + period.ticks,
+            number=int(sent["number"]),
+            update=int(now["update"]),
+            first_tick=int(sent["first_tick"]),
             length=length,
-            tau_u=period.ticks,
+            tau_u=int(now["ticks"]),
             model_digest=self.model_digest,
             crc=0,
         )
-        return with_checksum(header, rows)
-
-    def _cost(self, qp: QuadraticProblem, z: Array) -> float:
-        return self._with_floor(augmented_cost(qp, z, self._real(self.solver.alpha)), qp)
-
-    def _with_floor(self, cost: float, qp: QuadraticProblem) -> float:
-        """Return J with its constant and its floor; rounding, in single precision, must not take it below the floor."""
-        floor = self._real(self.settings.adaptive.cost_floor)
-        return max(self._real(cost) + (qp.constant + floor), floor)
+        return with_checksum(header, [inputs[tick // TICKS_PER_SAMPLE] for tick in range(length)])
 
     def answered(self, *, late: bool) -> None:
         """Note how an answer came: after a late one adaptive periods get longer, after one in time shorter again.
@@ -253,27 +226,24 @@ class OptimizerProgram:
         The budget is what the PLC should need; this is what machine and link really take. Each late answer doubles
         what is allowed for them, each one in time takes a tick off.
         """
-        if late:
-            self.state.allowance = min(max(1, 2 * self.state.allowance), MAX_PERIOD_TICKS)
-        else:
-            self.state.allowance = max(0, self.state.allowance - 1)
+        allowance = int(self._now["allowance"])
+        self._now["allowance"] = min(max(1, 2 * allowance), MAX_PERIOD_TICKS) if late else max(0, allowance - 1)
 
     # -- diagnostics --------------------------------------------------------------------------------------------------
 
     def prediction(self) -> Prediction:
         """Return what the last profile is expected to lead to."""
-        sent = self.state.sent
-        if sent is None or sent.sequence is None:
+        header, sent = self._sent, self.state.sent
+        if not header["length"]:
             raise RuntimeError("prediction follows solve")
         horizon = self.problem.design.horizon
-        outputs = self.problem.outputs(sent.z, sent.situation)
+        outputs = self.problem.outputs(sent.z, Situation(sent.x, header["w"], sent.u_before))
         inputs = self.problem.inputs(sent.z, horizon)
         shown = outputs[[min(sample, horizon) - 1 for sample in PREDICTED_SAMPLES]]
         planned = inputs[[min(sample, horizon) - 1 for sample in INPUT_SAMPLES]]
-        header = sent.sequence.header
         return Prediction(
-            header.update, header.first_tick, tuple(shown[:, 0].tolist()), tuple(shown[:, 1].tolist()),
-            tuple(planned.ravel().tolist()),
+            int(self._now["update"]), int(header["first_tick"]), tuple(shown[:, 0].tolist()),
+            tuple(shown[:, 1].tolist()), tuple(planned.ravel().tolist()),
         )  # fmt: skip
 
     @property
@@ -288,15 +258,14 @@ class OptimizerProgram:
 
     def report(self, verdict: Verdict) -> Optimization:
         """Return what was done with the last update, once the control PLC has answered."""
-        period, sent = self._period, self.state.sent
-        if sent is None or sent.qp is None:
+        if not self._sent["length"]:
             raise RuntimeError("report follows solve")
-        predicted = indicators(self.problem, sent.qp, sent.z, sent.situation)
-        a = period.assessment
+        now, sent = self._now, self._sent
         return Optimization(
-            update=period.update.update, tick=period.update.tick, tau_u=period.ticks, iterations=sent.iterations,
-            verdict=verdict, j_effective=float(period.effective), j_hot_start=float(sent.hot_start),
-            j_delivered=float(sent.delivered), j_dev=predicted.j_dev, j_cst=predicted.j_cst,
-            violation=predicted.violation, efficiency=float(a.efficiency), mismatch=float(a.mismatch),
-            contraction=float(a.contraction), gamma=float(a.gamma), load_mismatch=float(period.estimate.mismatch),
+            update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]),
+            iterations=int(sent["iterations"]), verdict=verdict, j_effective=float(now["effective"]),
+            j_hot_start=float(sent["hot_start"]), j_delivered=float(sent["delivered"]), j_dev=float(sent["j_dev"]),
+            j_cst=float(sent["j_cst"]), violation=float(sent["violation"]), efficiency=float(now["efficiency"]),
+            mismatch=float(now["mismatch"]), contraction=float(now["contraction"]), gamma=float(now["gamma"]),
+            load_mismatch=float(self.state.belief.numbers[0]["mismatch"]),
         )  # fmt: skip

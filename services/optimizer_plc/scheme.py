@@ -1,88 +1,38 @@
-"""The implementation scheme as kernels: what the program does in an ordinary update.
+"""The implementation scheme as kernels: steps (2) to (5) of the paper's section II on the state of a session.
 
-`solve` is step (3) of the paper's section II, `plan` are steps (4), (5) and (2). They compute with what the program
-computes with, in its order, so that whoever calls them instead has the same bits. Double precision only.
+`plan` are steps (4), (5) and (2); `solve`, which is `pose`, a solver and `deliver`, is step (3). They take single and
+double precision alike. What is decided beside the arithmetic is in `program.py`.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.compiled import kernel
 from coldloop.process import TICK_S, TICKS_PER_SAMPLE
-from optimizer_plc.costs import OutputMaps, augmented_cost, predicted_indicators
-from optimizer_plc.estimator import corrected
+from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
+from optimizer_plc.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
+from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
 from optimizer_plc.instance import Maps, instance, keep_first_rate
-from optimizer_plc.linear_algebra import respond
-from optimizer_plc.prediction import Transition
-from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.profile import inputs_of, shifted
-from optimizer_plc.solvers import compiled
-from optimizer_plc.solvers.compiled import Costs, SolverConstants
-from optimizer_plc.updating_period import (
-    Assessment,
-    ContractionParameters,
-    Observation,
-    assess,
-    by_contraction,
-    one_step,
-    recent_contraction,
-)
+from optimizer_plc.rules.interface import Observation, UpdatingRule, assessed, decide_by
+from optimizer_plc.session_state import Delivery, Memory
+from optimizer_plc.settings import ProgramSettings
+from optimizer_plc.solvers.interface import Answer, Costs
+from optimizer_plc.solvers.kernel_solver import solve_by
 
 Array = NDArray[np.float64]
 
-FIXED, ALGORITHM_1, CONTRACTION = 0, 1, 2
-
-OPTIMIZER_STATE = np.dtype([
-    ("update_tick", "i8"), ("iterations", "i8"), ("ticks", "i8"), ("since", "i8"), ("done", "i8"),
-    ("sequences", "i8"), ("mismatch", "f8"), ("w", "f8"), ("effective", "f8"), ("hot_start", "f8"),
-    ("last_but_one", "f8"), ("delivered", "f8"), ("j_dev", "f8"), ("j_cst", "f8"), ("violation", "f8"),
-    ("contraction", "f8"), ("contraction_delivered", "f8"), ("played_w", "f8"), ("played_share", "f8"),
-    ("played_ticks", "i8"),
-])  # fmt: skip
-"""Numbers of the optimiser between two updates.
-
-update_tick, iterations, ticks, effective: t_k, q(t_k), tau_u in ticks and J_k of the update under way. w, mismatch:
-estimated load, and its share that no sensor saw. since: ticks predicted over. sequences: number of the last one.
-done, hot_start, last_but_one, delivered, j_dev, j_cst, violation, played_w, played_share, played_ticks: of the last
-solve. contraction, contraction_delivered: of the contraction rule."""
-
-
-class Rule(NamedTuple):
-    """The rule of the updating period, and what follows from its decision."""
-
-    kind: int
-    """FIXED, ALGORITHM_1 or CONTRACTION."""
-    fixed_ticks: int
-    q_min: int
-    """That of a fixed period is q_max, too."""
-    q_max: int
-    delta: int
-    contraction: ContractionParameters
-    most: int
-    """Iterations that fit into the longest period."""
-    periods: NDArray[np.int64]
-    """Updating period in ticks for each number of iterations, shape (most + 1,)."""
+BY_THE_RULE: Final = 0
+"""Iterations that `plan` is given when the rule is to decide them."""
 
 
 class Constants(NamedTuple):
-    """What an optimiser computes with that never changes in a session."""
+    """What an optimiser computes with that does not change in a session, in the on-line floating-point type."""
 
-    steps: Transition
-    """Transitions over 1, 2, ... ticks, stacked."""
-    outputs: Transition
-    """C, D, G."""
-    x0: Array
-    u0: Array
-    y0: Array
-    w0: float
-    kalman: bool
-    """Kalman filter, or else state feedback."""
-    load_known: bool
-    """The filter is fed the measured load."""
-    gains: Array
-    """Of the Kalman filter for periods of 1, 2, ... ticks, shape (ticks, 22, n + 1)."""
+    estimator: Estimator
     Phi: Array
     Gamma: Array
     maps: Maps
@@ -98,41 +48,47 @@ class Constants(NamedTuple):
     rate_shares: Array
     """Share of the rate limit after 0, 1, ... ticks, shape (ticks + 1,)."""
     n_inputs: int
-    solver: SolverConstants
+    alpha: float
+    """Penalty weight."""
     floor: float
     """Constant added to J."""
     sequence_ticks: int
-    load_step: float
-    """Change of the load that interrupts an updating period, W, or 0."""
-    rule: Rule
+    fixed_ticks: int
+    """Fixed updating period; 0 is adaptive."""
+    most: int
+    """Iterations that fit into the longest period."""
+    periods: NDArray[np.int64]
+    """Updating period in ticks for each number of iterations, shape (most + 1,)."""
 
 
-class Memory(NamedTuple):
-    """State of an optimiser between two updates, overwritten as it goes on."""
-
-    numbers: Any
-    """`OPTIMIZER_STATE`, shape (1,)."""
-    x: Array
-    """Estimated state at the last update, as a deviation, shape (n_x,)."""
-    predicted: Array
-    """State predicted for the next one, or estimated at the last one, shape (n_x,)."""
-    x_solved: Array
-    """State of the last problem solved, shape (n_x,)."""
-    z: Array
-    """The profile being played, shape (n,)."""
-    answer: Array
-    """The profile that `solve` has found, shape (n,)."""
-    u_before: Array
-    """Input before the first knot of the last problem solved, as a deviation, shape (3,)."""
-    rows: Array
-    """Inputs of the sequence being played, a row a tick, shape (240, 3)."""
-    answer_rows: Array
-    """Those of the sequence that `solve` has made."""
+def constants_of(
+    estimator: Estimator,
+    problem: PredictiveProblem,
+    alpha: float,
+    settings: ProgramSettings,
+    budget: PlcBudget,
+) -> Constants:  # fmt: skip
+    """Return the constants of a session with adaptive periods."""
+    real = problem.Phi.dtype.type
+    most = budget.iterations(MAX_PERIOD_TICKS)
+    return Constants(
+        estimator=estimator,
+        Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps, shifts=problem.shifts,
+        predicted=output_maps(problem),
+        weights=problem.knots_to_samples, input_scale=problem.input_scale, rate=problem.rate,
+        scaled_rate=problem.scaled_rate,
+        rate_shares=np.array([problem.limits.rate_share(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)], real),
+        n_inputs=problem.n_inputs,
+        alpha=real(alpha), floor=real(settings.adaptive.cost_floor),
+        sequence_ticks=settings.sequence_ticks,
+        fixed_ticks=0, most=most,
+        periods=np.array([budget.period(iterations) for iterations in range(most + 1)]),
+    )  # fmt: skip
 
 
 @kernel
 def with_floor(cost: float, constant: float, floor: float) -> float:
-    """Return J with its constant and its floor."""
+    """Return J with its constant and its floor; rounding, in single precision, must not take it below the floor."""
     return max(cost + (constant + floor), floor)
 
 
@@ -143,94 +99,144 @@ def problem_at(c: Constants, x: Array, w: float, u_before: Array, share: float) 
     return QuadraticProblem(c.Phi, phi, c.Gamma, gamma, low, high, constant)
 
 
-@kernel
-def solve(c: Constants, m: Memory) -> int:
-    """Predict the state at t_{k+1}, shift the profile, do q iterations, make the sequence; return its length in ticks.
+# -- step (3): during the updating period ------------------------------------------------------------------------------
 
-    What is played until then is the first row of the present sequence. The answer is in `answer` and `answer_rows`.
-    """
-    s = m.numbers[0]
-    ticks = s.ticks
-    u = np.empty(3)
-    for i in range(3):
-        u[i] = m.rows[0, i] - c.u0[i]
-    m.predicted[:] = respond(c.steps.A[ticks - 1], c.steps.B[ticks - 1], c.steps.F[ticks - 1], m.x, u, s.w)
-    m.x_solved[:] = m.predicted
-    s.since = ticks
-    s.played_w, s.played_share, s.played_ticks = s.w, c.rate_shares[ticks], ticks
-    m.u_before[:] = u
-    qp = problem_at(c, m.predicted, s.w, u, c.rate_shares[ticks])
-    before = Costs(s.hot_start, s.delivered)
-    answer = compiled.solve(c.solver, qp, shifted(c.shifts[ticks], m.z), s.iterations, before)
+
+@kernel
+def predict_played(c: Constants, m: Memory, ticks: int) -> Array:
+    """Predict so many ticks on from the update under way under what is played; return the last input, (3,)."""
+    begin_prediction(m.belief)
+    p, rows = m.playing.numbers[0], m.playing.rows
+    u = m.u.copy()
+    if p.length == 0:
+        predict(c.estimator, m.belief, u, ticks)
+        return u
+    tick, end = m.numbers[0].tick, m.numbers[0].tick + ticks
+    while tick < end:
+        row = rows[row_at(tick, p.first_tick, p.length)]
+        until = tick + 1
+        while until < end and same_inputs(row, rows[row_at(until, p.first_tick, p.length)]):
+            until += 1
+        for i in range(u.shape[0]):
+            u[i] = u.dtype.type(row[i]) - c.estimator.u0[i]
+        predict(c.estimator, m.belief, u, until - tick)
+        tick = until
+    return u
+
+
+@kernel
+def row_at(tick: int, first_tick: int, length: int) -> int:
+    """Return the row that is played at a tick; after the last one it holds."""
+    return max(0, min(tick - first_tick, length - 1))
+
+
+@kernel
+def same_inputs(one: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
+    """Tell whether two rows (3) are the same."""
+    return bool(one[0] == other[0] and one[1] == other[1] and one[2] == other[2])
+
+
+@kernel
+def pose(c: Constants, m: Memory) -> tuple[QuadraticProblem, Array]:
+    """Predict the state at t_{k+1}; return the problem there and the guess, the shifted profile."""
+    ticks, sent = m.numbers[0].ticks, m.sent
+    sent.u_before[:] = predict_played(c, m, ticks)
+    sent.x[:] = m.belief.predicted
+    s = sent.numbers[0]
+    s.w, s.share, s.ticks = m.belief.numbers[0].w, c.rate_shares[ticks], ticks
+    return problem_at(c, sent.x, s.w, sent.u_before, s.share), shifted(c.shifts[ticks], m.playing.z)
+
+
+@kernel
+def deliver(c: Constants, m: Memory, qp: QuadraticProblem, answer: Answer) -> None:
+    """Make the sequence of an answer after q - 1 and q iterations, and judge its profile."""
+    now, sent = m.numbers[0], m.sent
+    s = sent.numbers[0]
     s.hot_start = with_floor(answer.guessed, qp.constant, c.floor)
-    s.last_but_one = with_floor(answer.last_but_one, qp.constant, c.floor)
-    s.delivered = with_floor(answer.delivered, qp.constant, c.floor)
-    s.done = answer.slots
-    keep_first_rate(c.maps, c.scaled_rate, u, c.rate_shares[ticks], answer.z)
-    s.j_dev, s.j_cst, s.violation = predicted_indicators(c.predicted, qp, answer.z, m.predicted, s.w, c.n_inputs)
-    m.answer[:] = answer.z
-    return write_rows(c, answer.z, ticks, m.answer_rows)
+    s.last_but_one = with_floor(answer.costs[0], qp.constant, c.floor)
+    s.delivered = with_floor(answer.costs[1], qp.constant, c.floor)
+    s.iterations = answer.iterations[1]
+    sent.z[:] = answer.points[1]
+    keep_first_rate(c.maps, c.scaled_rate, sent.u_before, s.share, sent.z)
+    s.j_dev, s.j_cst, s.violation = predicted_indicators(c.predicted, qp, sent.z, sent.x, s.w, c.n_inputs)
+    s.number, s.first_tick = now.sequences + 1, now.tick + now.ticks
+    s.length = write_rows(c, sent.z, now.ticks, sent.rows)
+    now.solved = True
 
 
 @kernel
-def write_rows(c: Constants, z: Array, ticks: int, rows: Array) -> int:
+def solve(c: Constants, method: Any, m: Memory) -> None:  # noqa: ANN401 of any solver of our own
+    """Pose the problem, do q iterations by the method of a solver of our own, deliver the answer."""
+    now = m.numbers[0]
+    qp, guess = pose(c, m)
+    counts = np.array([now.iterations - 1, now.iterations])
+    deliver(c, m, qp, solve_by(method, qp, guess, counts, Costs(now.guessed_before, now.delivered_before)))
+
+
+@kernel
+def write_rows(c: Constants, z: Array, ticks: int, rows: NDArray[np.float32]) -> int:
     """Write the sequence of a profile, in single precision and a row a tick, into `rows`; return its length."""
     length = max(c.sequence_ticks, 2 * ticks)
     samples = (length + TICKS_PER_SAMPLE - 1) // TICKS_PER_SAMPLE
-    inputs = inputs_of(c.weights[:samples], z, c.input_scale, c.u0, c.rate)
+    inputs = inputs_of(c.weights[:samples], z, c.input_scale, c.estimator.u0, c.rate)
     for tick in range(length):
-        for i in range(3):
-            rows[tick, i] = np.float64(np.float32(inputs[tick // TICKS_PER_SAMPLE, i]))
+        for i in range(inputs.shape[1]):
+            rows[tick, i] = inputs[tick // TICKS_PER_SAMPLE, i]
     return length
 
 
-@kernel
-def take_answer(m: Memory) -> None:
-    """Let what `solve` has found be what is played: its sequence begins."""
-    m.z[:] = m.answer
-    m.rows[:] = m.answer_rows
-    m.numbers[0].sequences += 1
+# -- steps (4), (5) and (2): at an updating instant --------------------------------------------------------------------
 
 
 @kernel
-def estimate(c: Constants, m: Memory, u_before: Array, load: float, y: Array, x: Array) -> None:
-    """Take the measurement at an updating instant, all in physical units."""
-    s = m.numbers[0]
-    known = load - c.w0 if c.load_known else 0.0
-    if not c.kalman:
-        m.x[:] = x - c.x0
-        s.w, s.mismatch = known, 0.0
-        return
-    gain = c.gains[min(s.since, c.gains.shape[0]) - 1]
-    m.x[:], s.mismatch = corrected(gain, c.outputs, m.predicted, s.mismatch, u_before - c.u0, known, y - c.y0)
-    m.predicted[:] = m.x
-    s.w = known + s.mismatch
+def begin_sent(m: Memory) -> None:
+    """Let the last answer be what is played: its sequence begins."""
+    copy_delivery(m.sent, m.playing)
 
 
 @kernel
-def plan(c: Constants, m: Memory, tick: int, u_before: Array, load: float, y: Array, x: Array) -> Assessment:
-    """Take the update latched at `tick`, where the sequence of the last `solve` begins; decide the updating period.
+def copy_delivery(source: Delivery, target: Delivery) -> None:
+    """Make `target` the same as `source`."""
+    target.numbers[0] = source.numbers[0]
+    target.x[:], target.u_before[:], target.z[:] = source.x, source.u_before, source.z
+    target.rows[:] = source.rows
 
-    The decision is in `iterations` and `ticks`; what it was decided by is returned.
+
+@kernel
+def plan(
+    c: Constants,
+    rule: UpdatingRule,
+    m: Memory,
+    wanted: int,
+    update: int,
+    tick: int,
+    u_before: Array,
+    load: float,
+    y: Array,
+    x: Array,
+) -> None:
+    """Take the update latched at `tick`, in physical units and the on-line type; decide the updating period.
+
+    `wanted` are its iterations, or BY_THE_RULE where what is played is the answer to the update before, in time.
     """
-    s, rule = m.numbers[0], c.rule
-    estimate(c, m, u_before, load, y, x)
-    qp = problem_at(c, m.x, s.w, m.u_before, s.played_share)
-    effective = with_floor(augmented_cost(qp, m.z, c.solver.alpha), qp.constant, c.floor)
-    o = Observation(s.iterations, s.ticks * TICK_S, s.effective, s.hot_start, s.last_but_one, s.delivered, effective)
-    assessment = _assess(o)
-    wanted = rule.q_min
-    if rule.kind == ALGORITHM_1:
-        wanted = _one_step(rule.q_min, rule.q_max, rule.delta, s.iterations, assessment.gamma)
-    elif rule.kind == CONTRACTION:
-        s.contraction = _recent_contraction(rule.contraction, s.contraction, s.contraction_delivered, o)
-        s.contraction_delivered = s.delivered
-        wanted = _by_contraction(rule.contraction, s.contraction, o)
-    s.iterations = min(wanted, rule.most)
-    s.ticks = rule.fixed_ticks or rule.periods[s.iterations]
-    s.effective, s.update_tick = effective, tick
-    return assessment
-
-
-_assess, _one_step = kernel(assess), kernel(one_step)
-_recent_contraction, _by_contraction = kernel(recent_contraction), kernel(by_contraction)
+    now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
+    if now.solved:
+        now.sequences = max(now.sequences, m.sent.numbers[0].number)
+        now.guessed_before, now.delivered_before = m.sent.numbers[0].hot_start, m.sent.numbers[0].delivered
+        now.solved = False
+    correct(c.estimator, m.belief, u_before, load, y, x)
+    qp = problem_at(c, m.belief.x, m.belief.numbers[0].w, m.playing.u_before, played.share)
+    effective = with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
+    now.efficiency = now.mismatch = now.contraction = real(1.0)
+    now.gamma = real(0.0)
+    if wanted == BY_THE_RULE:
+        o = Observation(
+            now.iterations, real(now.ticks) * real(TICK_S), now.effective, played.hot_start, played.last_but_one,
+            played.delivered, effective,
+        )  # fmt: skip
+        a = assessed(o)
+        wanted = decide_by(rule, m.rule, o, a)
+        now.efficiency, now.mismatch, now.contraction, now.gamma = a.efficiency, a.mismatch, a.contraction, a.gamma
+    now.iterations = min(wanted, c.most)
+    now.ticks = c.fixed_ticks or min(c.periods[now.iterations] + now.allowance, MAX_PERIOD_TICKS)
+    now.update, now.tick, now.load, now.effective, now.planned = update, tick, load, effective, True

@@ -1,58 +1,82 @@
-"""What the optimiser's program remembers of a session, as plain records."""
+"""The one state of the optimiser in a session, as records and arrays that kernels overwrite."""
 
-from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.registers.control_plc import Update
-from coldloop.sequence import InputSequence
-from optimizer_plc.estimator import Estimate
-from optimizer_plc.problem import QuadraticProblem, Situation
-from optimizer_plc.updating_period import Assessment
+from coldloop.registers.control_plc import SEQUENCE_ROWS
+from optimizer_plc.arithmetic import Real
+from optimizer_plc.design import N_INPUTS
+from optimizer_plc.estimator import Belief, no_belief
+from optimizer_plc.rules.interface import MEMORY
 
 Array = NDArray[np.float64]
 
-UNDECIDED = Assessment(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+DELIVERY: Final = (
+    ("number", "i8"), ("first_tick", "i8"), ("length", "i8"), ("ticks", "i8"), ("iterations", "i8"), ("w", "real"),
+    ("share", "real"), ("hot_start", "real"), ("last_but_one", "real"), ("delivered", "real"), ("j_dev", "real"),
+    ("j_cst", "real"), ("violation", "real"),
+)  # fmt: skip
+"""number, first_tick, length: of the sequence; length 0 where there is none. ticks, w, share: updating period before
+the first tick, load (W, a deviation), share of the rate limit. iterations: done. hot_start, last_but_one, delivered:
+costs of the guess, after q - 1 and after q iterations. j_dev, j_cst, violation: indicators of the profile."""
+
+PERIOD: Final = (
+    ("update", "i8"), ("tick", "i8"), ("iterations", "i8"), ("ticks", "i8"), ("sequences", "i8"), ("allowance", "i8"),
+    ("planned", "?"), ("solved", "?"), ("load", "real"), ("effective", "real"), ("efficiency", "real"),
+    ("mismatch", "real"), ("contraction", "real"), ("gamma", "real"), ("guessed_before", "real"),
+    ("delivered_before", "real"),
+)  # fmt: skip
+"""update, tick, load: of the update under way. iterations, ticks, effective: q(t_k), tau_u and J_k. efficiency,
+mismatch, contraction, gamma: what they were decided by. sequences: number of the last sequence. allowance: ticks that
+adaptive periods are longer than the budget says. planned, solved: whether there is a period, and an answer to it.
+guessed_before, delivered_before: J+ and Jhat of the problem before, infinite where there was none."""
 
 
-@dataclass(frozen=True, slots=True)
-class Delivery:
-    """A profile, the situation it was computed for, and the sequence that tells it to the control PLC."""
+class Delivery(NamedTuple):
+    """A profile, the situation that it was computed for, and the rows that tell it to the control PLC."""
 
+    numbers: Any
+    """`DELIVERY`, shape (1,)."""
+    x: Array
+    """State of the problem, as a deviation, shape (n_x,)."""
+    u_before: Array
+    """Input before the first knot, as a deviation, shape (3,)."""
     z: Array
-    situation: Situation
-    first_tick: int
-    sequence: InputSequence | None
-    qp: QuadraticProblem | None = None
-    hot_start: float = 0.0
-    last_but_one: float = 0.0
-    delivered: float = 0.0
-    iterations: int = 0
+    """Shape (n,)."""
+    rows: NDArray[np.float32]
+    """Inputs as the link carries them, a row a tick, shape (240, 3)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Period:
-    """An updating period, and what was known when it began."""
+class Memory(NamedTuple):
+    """State of the optimiser between two updates, and between a plan and its answer."""
 
-    update: Update
-    estimate: Estimate
-    iterations: int
-    ticks: int
-    effective: float
-    assessment: Assessment
-
-
-@dataclass(slots=True)
-class SessionState:
-    """What the program remembers of a session."""
-
+    numbers: Any
+    """`PERIOD`, shape (1,)."""
+    belief: Belief
     playing: Delivery
     """What the control PLC plays."""
-    sent: Delivery | None = None
-    last: Period | None = None
-    """The period under way."""
-    sequences: int = 0
-    """Number of the last sequence."""
-    allowance: int = 0
-    """Ticks that adaptive periods are longer than the budget says: answers have been late by the clock."""
+    sent: Delivery
+    """The last answer. An answer may be computed again from the same state, with the same bits."""
+    u: Array
+    """Input applied at the update under way, as a deviation, shape (3,): played on where no sequence is."""
+    rule: Array
+    """What the rule of the updating period remembers, shape (2,)."""
+
+
+def empty_memory(n_states: int, size: int, real: Real) -> Memory:
+    """Return room for the state, for so many states of the model and variables of the problem."""
+
+    def numbers(fields: tuple[tuple[str, str], ...]) -> Any:  # noqa: ANN401 a record
+        return np.zeros(1, [(name, real if kind == "real" else kind) for name, kind in fields])
+
+    def delivery() -> Delivery:
+        rows = np.zeros((SEQUENCE_ROWS, N_INPUTS), np.float32)
+        x, u, z = (np.zeros(n, real) for n in (n_states, N_INPUTS, size))
+        return Delivery(numbers(DELIVERY), x, u, z, rows)
+
+    return Memory(
+        numbers(PERIOD), no_belief(n_states, real), delivery(), delivery(), np.zeros(N_INPUTS, real),
+        np.zeros(MEMORY, real),
+    )  # fmt: skip

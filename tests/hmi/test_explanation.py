@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from decimal import Decimal, getcontext
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 
 from coldloop.registers.codec import as_transmitted
@@ -17,7 +18,7 @@ from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
 from hmi.explanation import Branch, Explanation, explain, increments_of, period_ticks
 from hmi.sentences import sentence
-from optimizer_plc.updating_period import Algorithm1, Observation, assess
+from optimizer_plc.rules import Algorithm1, Observation, algorithm_1, assess
 
 getcontext().prec = 40
 
@@ -91,7 +92,8 @@ def decided_cases(wanted: int) -> list[Case]:
             continue
         observed = Observation(q, 0.25 * (1 + q), J_k, J_hot, J_last, J_hat, J_next)
         a = assess(observed)
-        assert Algorithm1(9, 2, 19, 2).next(observed)[0] == reference.q, "the program agrees with the reference"
+        decided = algorithm_1.decide(Algorithm1(9, 2, 19, 2), np.zeros(2), observed, a)
+        assert decided == reference.q, "the program agrees with the reference"
         before = optimization(7, 100, q, j_effective=J_k, j_hot_start=J_hot, j_delivered=J_hat)
         update = optimization(
             8, 101 + q, reference.q, j_effective=J_next, efficiency=a.efficiency, mismatch=a.mismatch,

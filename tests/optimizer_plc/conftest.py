@@ -1,6 +1,6 @@
 """The controller's problem, random situations to solve, exact optima, and jumps recorded from the closed loop."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import NamedTuple
 
@@ -25,9 +25,7 @@ from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.settings import ProgramSettings
-from optimizer_plc.solution import Solution
-from optimizer_plc.solvers import make_solver
-from optimizer_plc.solvers.interface import Solver
+from optimizer_plc.solvers import Answer, Solver, make_solver
 from plant.cold_box import REFERENCE
 from plant.load import find_load
 from plant.program import PlantProgram
@@ -121,26 +119,12 @@ class Recorder:
         self.alpha, self.tau_1_s = solver.alpha, solver.tau_1_s
         self.started: Jump | None = None
 
-    def start(self, problem: QuadraticProblem, guess: Array) -> None:
-        self.started = Jump(deepcopy(problem), guess.copy())
-        self._solver.start(problem, guess)
-
     def reset(self) -> None:
         self._solver.reset()
 
-    def iterate(self, count: int) -> int:
-        return self._solver.iterate(count)
-
-    @property
-    def solution(self) -> Array:
-        return self._solver.solution
-
-    @property
-    def cost(self) -> float:
-        return self._solver.cost
-
-    def judged(self) -> Solution:
-        return self._solver.judged()
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
+        self.started = Jump(deepcopy(problem), guess.copy())
+        return self._solver.solve(problem, guess, counts)
 
 
 def recorded_jumps(model: LtiModel, hour: str, minutes: float) -> list[Jump]:

@@ -18,7 +18,7 @@ from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings, SolverName
-from optimizer_plc.solvers.ode import OdeSolver
+from optimizer_plc.solvers.ode import ode_solver
 from tests.harness.processes import Processes
 from tests.optimizer_plc.single_precision import code, has_double
 
@@ -29,17 +29,8 @@ Array = NDArray[np.float64]
 
 SINGLE = real_of(Arithmetic.FLOAT32)
 
-ON_LINE = {
-    "costs.augmented_cost", "costs.predicted_indicators", "estimator.corrected", "instance.instance",
-    "linear_algebra.respond", "profile.inputs_of", "profile.shifted",
-}  # fmt: skip
-"""Kernels that each update calls, whatever solves it; those that they call are part of their code."""
-OF_SOLVERS = {
-    SolverName.ODE: {"ode.warm_start", "ode.descend"},
-    SolverName.FAST_GRADIENT: {"fast_gradient.descend"},
-    SolverName.INTERIOR_POINT: {"interior_point.begin", "interior_point.descend"},
-    SolverName.HYBRID: {"interior_point.descend", "ode.descend"},
-}
+ON_LINE = {"instance.instance", "profile.inputs_of", "scheme.plan", "scheme.solve"}
+"""Kernels that the program calls; those that they call, solvers and rules among them, are part of their code."""
 
 
 def test_no_kernel_of_the_default_solver_computes_with_a_double_in_single_precision(processes: Processes) -> None:
@@ -57,8 +48,8 @@ def check(cases: list[tuple[SolverName, EstimatorKind]], processes: Processes) -
     program = f"from tests.optimizer_plc.single_precision import main; main({names})"
     called, faults = json.loads(processes.run_python(program)[0])
     assert not faults
-    own = {f"solvers.{name}" for solver, _ in cases for name in OF_SOLVERS[solver]}
-    assert set(called) >= {f"optimizer_plc.{name}" for name in ON_LINE | own}
+    assert set(called) >= {f"optimizer_plc.{name}" for name in ON_LINE}
+    assert called.count("optimizer_plc.scheme.solve") == len({solver for solver, _ in cases}), "one method a solver"
 
 
 @numba.njit
@@ -115,10 +106,7 @@ def loss(qp: QuadraticProblem, guess: Array, iterations: int, best: float) -> tu
     alpha = OdeSettings().alpha
     ends = []
     for one, start in ((qp, guess), (rounded(qp), guess.astype(SINGLE))):
-        solver = OdeSolver(OdeSettings())
-        solver.start(one, start)
-        solver.iterate(iterations)
-        z = solver.solution
+        z = ode_solver(OdeSettings()).solve(one, start, (iterations,)).z
         assert z.dtype == one.phi.dtype
         whole = np.clip(z.astype(np.float64), qp.low, qp.high)
         ends.append(augmented_cost(qp, whole, alpha) + qp.constant)
@@ -143,13 +131,7 @@ def test_after_harsh_load_jumps_single_precision_loses_little(
 def test_in_single_precision_the_cost_never_rises_however_long_one_iterates(harsh_jumps: "list[Jump]") -> None:
     for qp, guess in harsh_jumps[:10]:
         single = rounded(qp)
-        solver = OdeSolver(OdeSettings())
-        solver.start(single, guess.astype(SINGLE))
-        before = solver.cost
-        for _ in range(600):
-            solver.iterate(1)
-            assert solver.cost <= before
-            before = solver.cost
-        z = solver.solution
-        assert np.isfinite(z).all()
-        assert ((single.low <= z) & (z <= single.high)).all()
+        answer = ode_solver(OdeSettings()).solve(single, guess.astype(SINGLE), range(601))
+        assert (np.diff(answer.costs) <= 0.0).all()
+        assert np.isfinite(answer.z).all()
+        assert ((single.low <= answer.z) & (answer.z <= single.high)).all()

@@ -1,3 +1,5 @@
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -6,13 +8,43 @@ from numpy.typing import NDArray
 from coldloop.lti_model import LtiModel
 from coldloop.registers.control_plc import Update
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
-from optimizer_plc.estimator import KalmanFilter, StateFeedback
+from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
+from optimizer_plc.linear_algebra import respond
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.settings import ProgramSettings
 
 Array = NDArray[np.float64]
 
 SETTINGS = EstimatorSettings()
+FEEDBACK = EstimatorSettings(kind=EstimatorKind.STATE_FEEDBACK)
+
+
+class Estimate(NamedTuple):
+    """State and load as deviations from the operating point, and the share of the load that no sensor saw."""
+
+    x: Array
+    w: float
+    mismatch: float
+
+
+class Estimating:
+    """An estimator with its belief."""
+
+    def __init__(self, prediction: PredictionModel, settings: EstimatorSettings) -> None:
+        self._constants = estimator_of(prediction, settings)
+        self._belief = no_belief(prediction.n_states)
+
+    def correct(self, update: Update) -> Estimate:
+        u_before, y, x = (np.array(values) for values in (update.u_before, update.y, update.x))
+        correct(self._constants, self._belief, u_before, update.load, y, x)
+        w, mismatch, _ = self._belief.numbers[0].tolist()
+        return Estimate(self._belief.x.copy(), w, mismatch)
+
+    def predict(self, segments: list[tuple[Array, int]]) -> Array:
+        begin_prediction(self._belief)
+        for u, ticks in segments:
+            predict(self._constants, self._belief, u, ticks)
+        return self._belief.predicted.copy()
 
 
 def noise(settings: EstimatorSettings, ticks: int) -> tuple[Array, Array]:
@@ -63,11 +95,11 @@ def test_the_stationary_gain_is_that_of_the_riccati_equation(
     expected = P @ C.T @ np.linalg.inv(C @ P @ C.T + np.diag(sensors))
     nothing = np.zeros(3)
     gain = np.zeros_like(expected)
-    estimator = KalmanFilter(prediction, SETTINGS)
+    estimator = Estimating(prediction, SETTINGS)
     mismatch = 0.0
     for output, seen in enumerate(np.eye(22)):
         x = estimator.predict([(nothing, ticks)])
-        y = prediction.output(x, nothing, mismatch) + seen
+        y = respond(*prediction.outputs, x, nothing, mismatch) + seen
         estimate = estimator.correct(told(model, np.zeros(28), nothing, y, 0.0))
         gain[:, output] = np.append(estimate.x - x, estimate.mismatch - mismatch)
         mismatch = estimate.mismatch
@@ -105,10 +137,10 @@ def test_noise_per_time_weighs_a_measurement_by_the_time_since_the_last(predicti
     sensors = ("level_sensor", "speed_sensor", "temperature_sensor", "pressure_sensor")
     doubled = SETTINGS.model_copy(update={name: 2.0 * getattr(SETTINGS, name) for name in sensors})
     by_time = SETTINGS.model_copy(update={"noise_reference": NoiseReference.TIME})
-    usual, twice, found = (KalmanFilter(prediction, one).gains for one in (SETTINGS, doubled, by_time))
-    assert found[20] == pytest.approx(usual[20], rel=1e-5, abs=1e-9 * np.abs(usual[20]).max())
-    assert found[5] == pytest.approx(twice[5], rel=1e-5, abs=1e-9 * np.abs(twice[5]).max())
-    assert np.abs(found[5] - usual[5]).max() > 1e-3 * np.abs(usual[5]).max()
+    usual, twice, found = (estimator_of(prediction, one).gains for one in (SETTINGS, doubled, by_time))
+    assert found[19] == pytest.approx(usual[19], rel=1e-5, abs=1e-9 * np.abs(usual[19]).max())
+    assert found[4] == pytest.approx(twice[4], rel=1e-5, abs=1e-9 * np.abs(twice[4]).max())
+    assert np.abs(found[4] - usual[4]).max() > 1e-3 * np.abs(usual[4]).max()
 
 
 @pytest.mark.parametrize("ticks", [5, 20])
@@ -117,7 +149,7 @@ def test_a_load_that_no_sensor_sees_is_found_and_leaves_no_offset(
     model: LtiModel, prediction: PredictionModel, ticks: int, unseen: float
 ) -> None:
     rng = np.random.default_rng(21)
-    world, estimator = World(model, ticks, unseen), KalmanFilter(prediction, SETTINGS)
+    world, estimator = World(model, ticks, unseen), Estimating(prediction, SETTINGS)
     u_before = np.zeros(3)
     known = 0.0
     for step in range(8000 // ticks):
@@ -135,7 +167,7 @@ def test_a_load_that_no_sensor_sees_is_found_and_leaves_no_offset(
 def test_without_noise_and_mismatch_the_estimate_is_the_truth_from_the_first_instant(
     model: LtiModel, prediction: PredictionModel
 ) -> None:
-    world, estimator = World(model, 20, 0.0), KalmanFilter(prediction, SETTINGS)
+    world, estimator = World(model, 20, 0.0), Estimating(prediction, SETTINGS)
     u = np.array([1.0, 5.0, -1.0])
     before = np.zeros(3)
     for _ in range(50):
@@ -150,7 +182,7 @@ def test_without_noise_and_mismatch_the_estimate_is_the_truth_from_the_first_ins
 def test_state_feedback_returns_the_state_and_believes_the_known_load(
     model: LtiModel, prediction: PredictionModel
 ) -> None:
-    world, estimator = World(model, 10, 30.0), StateFeedback(prediction)
+    world, estimator = World(model, 10, 30.0), Estimating(prediction, FEEDBACK)
     u = np.array([0.5, 0.0, -0.5])
     for _ in range(5):
         estimate = estimator.correct(world.measured(u, 15.0, u))
@@ -158,7 +190,7 @@ def test_state_feedback_returns_the_state_and_believes_the_known_load(
         assert estimate.w == pytest.approx(15.0)
         assert estimate.mismatch == 0.0
         world.move(u, 15.0)
-    assert np.allclose(estimator.predict([(u, 10)]), prediction.advance(estimate.x, u, estimate.w, 10))
+    assert np.allclose(estimator.predict([(u, 10)]), respond(*prediction.transitions[10], estimate.x, u, estimate.w))
 
 
 def test_a_prediction_may_be_cut_into_segments_of_any_length(model: LtiModel, prediction: PredictionModel) -> None:
@@ -167,7 +199,7 @@ def test_a_prediction_may_be_cut_into_segments_of_any_length(model: LtiModel, pr
     whole = model.discretised(7.75)
     expected = whole.A @ x + whole.B @ u + whole.F * w
     for cut in ([31], [20, 11], [1] * 31, [3, 25, 3]):
-        estimator = StateFeedback(prediction)
+        estimator = Estimating(prediction, FEEDBACK)
         estimator.correct(World(model, 1, 0.0).measured(u, w, u)._replace(x=tuple((x + model.x0).tolist())))
         reached = estimator.predict([(u, ticks) for ticks in cut])
         assert np.allclose(reached, expected, rtol=1e-9, atol=1e-9)
@@ -176,16 +208,16 @@ def test_a_prediction_may_be_cut_into_segments_of_any_length(model: LtiModel, pr
 def test_a_load_that_is_not_measured_is_estimated(model: LtiModel, prediction: PredictionModel) -> None:
     """A plant as its model, with 100 W more that nobody tells: all of it becomes mismatch."""
     settings = EstimatorSettings(load_known=False, load_walk_w=30.0)
-    kalman, deaf = KalmanFilter(prediction, settings), KalmanFilter(prediction, settings)
+    kalman, deaf = Estimating(prediction, settings), Estimating(prediction, settings)
     x, u = np.zeros(28), np.zeros(3)
     for number in range(60):
-        y = prediction.output(x, u, 100.0)
+        y = respond(*prediction.outputs, x, u, 100.0)
         estimate = kalman.correct(told(model, x, u, y, 100.0, number))
         again = deaf.correct(told(model, x, u, y, -55.0, number))
         assert estimate.w == estimate.mismatch == again.w
         for one in (kalman, deaf):
             one.predict([(u, 20)])
-        x = prediction.advance(x, u, 100.0, 20)
+        x = respond(*prediction.transitions[20], x, u, 100.0)
     assert estimate.w == pytest.approx(100.0, rel=0.02)
 
 

@@ -1,6 +1,7 @@
 """The hybrid solver: who gets a problem, and what its slots hold."""
 
 import math
+import types
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,12 +9,20 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
-from optimizer_plc.computing_settings import HybridSettings
-from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
+from optimizer_plc.problem import PredictiveProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
-from optimizer_plc.solution import Solution
-from optimizer_plc.solvers import make_solver
-from optimizer_plc.solvers.hybrid import HybridSolver, is_far, iterations_in, slots_passed
+from optimizer_plc.solvers import Answer, hybrid, make_solver
+from optimizer_plc.solvers.hybrid import (
+    HybridMethod,
+    allowed_in,
+    in_slots,
+    is_far,
+    iterations_in,
+    picoseconds,
+    slots_begun,
+)
+from optimizer_plc.solvers.interface import Costs
+from optimizer_plc.solvers.kernel_solver import KERNELS
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Jump, Situations
@@ -21,102 +30,111 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-class Scripted:
-    """A solver whose costs are written down: that of the guess, then one an iteration; it ends with the last one."""
-
-    alpha = 1.0
-
-    def __init__(self, tau_1_s: float, costs: dict[float, tuple[float, ...]]) -> None:
-        self.tau_1_s = tau_1_s
-        self._costs = costs
-        self.done: list[int] = []
-
-    def reset(self) -> None:
-        self.done = []
-
-    def start(self, _: QuadraticProblem, guess: Array) -> None:
-        self._present = self._costs[float(guess[0])]
-        self.solution = guess
-        self._at = 0
-
-    def iterate(self, count: int) -> int:
-        before = self._at
-        self._at = min(self._at + count, len(self._present) - 1)
-        self.done.append(self._at - before)
-        return self._at - before
-
-    @property
-    def cost(self) -> float:
-        return self._present[self._at]
-
-    def judged(self) -> Solution:
-        raise NotImplementedError
-
-
 @pytest.fixture
-def anything() -> QuadraticProblem:
-    one = np.ones(1)
-    return QuadraticProblem(np.eye(1), one, np.eye(1), one, -one, one, constant=4.0)
+def choices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, Costs]]:
+    """What the choice of each problem was made by; the kernel itself is run as plain Python."""
+    made: list[tuple[float, Costs]] = []
+
+    def noted(switch: float, guessed: float, before: Costs) -> bool:
+        made.append((float(guessed), Costs(*map(float, before))))
+        return bool(hybrid.is_far(switch, guessed, before))
+
+    plain = types.FunctionType(
+        hybrid.solve.py_func.__code__,  # type: ignore[attr-defined] # of a kernel
+        hybrid.solve.py_func.__globals__ | {"is_far": noted},  # type: ignore[attr-defined]
+    )
+    monkeypatch.setitem(KERNELS, HybridMethod, plain)
+    return made
 
 
-def test_a_load_step_goes_to_the_interior_point_until_it_has_little_to_win(anything: QuadraticProblem) -> None:
-    """With constant and floor 5: J+ and Jhat are 10 and 7, 15 and 9, 10 and 9, 10 and 8."""
-    far = Scripted(0.2, {1.0: (10.0, 4.0), 2.0: (5.0, 4.0), 3.0: (5.0, 3.0)})
-    quiet = Scripted(0.2, {0.0: (5.0, 2.0), 1.0: (10.0, 9.0), 2.0: (5.0, 4.5), 3.0: (5.0, 3.0)})
-    solver = HybridSolver(HybridSettings(switch=1.5), far, quiet, floor=1.0)
-    taken = []
-    for problem in (0.0, 1.0, 2.0, 3.0):
-        solver.start(anything, np.array([problem]))
-        solver.iterate(1)
-        taken.append(solver.is_far)
+def test_a_problem_is_chosen_for_by_the_costs_of_the_one_before(
+    choices: list[tuple[float, Costs]], harsh_jumps: "list[Jump]"
+) -> None:
+    """J+ and Jhat, both with constant and floor, are those of the problem before, whoever solved it."""
+    solver = make_solver(ProgramSettings(solver=SolverName.HYBRID))
+    answers = [solver.solve(qp, guess, (4, 5)) for qp, guess in harsh_jumps[:6]]
+    rest = [qp.constant + 1.0 for qp, _ in harsh_jumps[:6]]
+    whole = [Costs(a.guessed + more, a.cost + more) for a, more in zip(answers, rest, strict=True)]
+    assert choices[0][1] == (math.inf, math.inf)
+    for (guessed, before), own, last in zip(choices[1:], whole[1:], whole, strict=False):
+        assert guessed == pytest.approx(own.guessed)
+        assert before == pytest.approx(last)
+    solver.reset()
+    solver.solve(*harsh_jumps[0], (1,))
+    assert choices[-1][1] == (math.inf, math.inf)
+
+
+def test_a_load_step_goes_to_the_interior_point_until_it_has_little_to_win() -> None:
+    """With constant and floor: J+ and Jhat are 10 and 7, 15 and 9, 10 and 9, 10 and 8."""
+    costs = [Costs(10.0, 7.0), Costs(15.0, 9.0), Costs(10.0, 9.0), Costs(10.0, 8.0)]
+    before = [Costs(math.inf, math.inf), *costs]
     # 10 > 1.5 inf: no; 15 > 1.5 * 7: yes; max(10, 15) > 1.5 * 9: yes; max(10, 10) > 1.5 * 9: no
+    taken = [is_far(1.5, own.guessed, last) for own, last in zip(costs, before, strict=False)]
     assert taken == [False, True, True, False]
 
 
 def test_the_first_problem_is_a_quiet_one_whatever_it_costs() -> None:
-    assert not is_far(2.0, 1e9, math.inf, math.inf)
-    assert is_far(2.0, 21.0, 5.0, 10.0)
-    assert is_far(2.0, 5.0, 21.0, 10.0)
-    assert not is_far(2.0, 20.0, 20.0, 10.0)
+    assert not is_far(2.0, 1e9, Costs(math.inf, math.inf))
+    assert is_far(2.0, 21.0, Costs(5.0, 10.0))
+    assert is_far(2.0, 5.0, Costs(21.0, 10.0))
+    assert not is_far(2.0, 20.0, Costs(20.0, 10.0))
+
+
+SLOT, INTERIOR = picoseconds(0.25), picoseconds(0.17)
 
 
 def test_iterations_never_take_longer_than_their_slots() -> None:
-    assert [iterations_in(slots, 0.25, 0.17) for slots in (0, 1, 2, 3, 4, 9, 19)] == [0, 1, 2, 4, 5, 13, 27]
-    assert [iterations_in(slots, 0.25, 0.25) for slots in range(25)] == list(range(25))
-    assert all(iterations_in(slots, 0.25, 0.17) * 0.17 <= slots * 0.25 + 1e-9 for slots in range(200))
+    assert [iterations_in(slots, SLOT, INTERIOR) for slots in (0, 1, 2, 3, 4, 9, 19)] == [0, 1, 2, 4, 5, 13, 27]
+    assert [iterations_in(slots, SLOT, SLOT) for slots in range(25)] == list(range(25))
+    assert all(iterations_in(slots, SLOT, INTERIOR) * 0.17 <= slots * 0.25 + 1e-9 for slots in range(200))
+
+
+def test_a_time_that_is_no_decimal_fits_as_often_as_it_should() -> None:
+    assert iterations_in(1, picoseconds(1 / 3), picoseconds(1 / 6)) == 2
+    assert iterations_in(3, picoseconds(0.7), picoseconds(2.1)) == 1
+    assert slots_begun(3, picoseconds(2.1), picoseconds(0.7)) == 1
+
+
+def passed(iterations: list[int], slots: list[int], tau_1_ps: int = INTERIOR) -> list[int]:
+    """Return how many of the slots pass when a solver does so many iterations in them."""
+    allowed = allowed_in(np.array(slots), SLOT, tau_1_ps)
+    nothing = np.empty(0)
+    answer = Answer(0.0, nothing, nothing, np.minimum(iterations, allowed), nothing)
+    return in_slots(answer, np.array(slots), allowed, SLOT, tau_1_ps).iterations.tolist()
 
 
 def test_slots_pass_as_long_as_there_is_something_to_do() -> None:
-    assert slots_passed(13, 13, 4, 5, 0.25, 0.17) == 5
-    assert slots_passed(6, 13, 4, 5, 0.25, 0.17) == 1, "six iterations take 1.02 s: the fifth slot has begun"
-    assert slots_passed(2, 13, 4, 5, 0.25, 0.17) == 0
+    assert passed([5, 13], [4, 9]) == [4, 9], "all that fit were done"
+    assert passed([5, 6], [4, 9]) == [4, 5], "six iterations take 1.02 s: the fifth slot has begun"
+    assert passed([2, 2], [4, 9]) == [2, 2], "it has ended within the second slot"
+    assert passed([0, 0], [4, 9]) == [0, 0]
 
 
-def test_what_is_left_of_a_slot_counts_for_the_next_one(harsh_jumps: "list[Jump]") -> None:
-    qp, guess = harsh_jumps[0]
-    far = Scripted(0.17, {float(guess[0]): tuple(range(100, 60, -1))})
-    solver = HybridSolver(HybridSettings(), far, Scripted(0.25, {float(guess[0]): (1e6,)}), floor=1.0)
-    solver.go_on_after(1.0, 1.0)
-    solver.start(qp, guess)
-    assert solver.is_far
-    assert [solver.iterate(1) for _ in range(4)] == [1] * 4
-    assert far.done == [1, 1, 2, 1]
+def test_what_is_left_of_a_slot_counts_for_the_next_one() -> None:
+    allowed = allowed_in(np.arange(5), SLOT, INTERIOR)
+    assert np.diff(allowed).tolist() == [1, 1, 2, 1]
+    assert passed([99] * 5, [0, 1, 2, 3, 4]) == [0, 1, 2, 3, 4]
 
 
 def test_on_harsh_problems_it_is_the_interior_point_in_the_time_of_its_slots(
     problem: PredictiveProblem, situations: "Situations", harsh_jumps: "list[Jump]"
 ) -> None:
     solver, interior = (make_solver(ProgramSettings(solver=name)) for name in (SolverName.HYBRID, "interior-point"))
-    solver.start(problem.at(situations(np.random.default_rng(30))), np.zeros(49))
-    solver.iterate(19)
+    solver.solve(problem.at(situations(np.random.default_rng(30))), np.zeros(49), (19,))
     qp, guess = harsh_jumps[0]
-    solver.start(qp, guess)
-    assert solver.iterate(3) == 3
-    interior.start(qp, guess)
-    interior.iterate(4)
-    assert isinstance(solver, HybridSolver)
-    assert solver.is_far
-    assert (solver.solution == interior.solution).all()
+    slots = solver.solve(qp, guess, (3,))
+    assert slots.iterations[-1] == 3
+    assert (slots.z == interior.solve(qp, guess, (4,)).z).all()
+
+
+def test_in_quiet_it_is_the_ode_based_solver(problem: PredictiveProblem, situations: "Situations") -> None:
+    solver, ode = (make_solver(ProgramSettings(solver=name)) for name in (SolverName.HYBRID, SolverName.ODE))
+    qp = problem.at(situations(np.random.default_rng(31)))
+    first = solver.solve(qp, np.zeros(49), (5, 400))
+    solver.solve(qp, first.z, (40,))  # the guess before was bad: the interior point has it
+    again = solver.solve(qp, first.z, (1, 2))
+    assert (first.points == ode.solve(qp, np.zeros(49), (5, 400)).points).all(), "the first problem is a quiet one"
+    assert (again.points == ode.solve(qp, first.z, (1, 2)).points).all(), "there is little to win"
 
 
 def test_both_judge_by_one_cost() -> None:

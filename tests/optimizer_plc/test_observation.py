@@ -4,8 +4,11 @@ The optimiser's solver is one whose answers are known, its estimator believes th
 what it is told. Every update shows another state than the model predicts, so that no two costs are equal by chance.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -17,12 +20,13 @@ from coldloop.process import TICK_S
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
 from coldloop.sequence import InputSequence
+from optimizer_plc import solvers
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
-from optimizer_plc.program import UNDECIDED, OptimizerProgram
+from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.rules import Assessment, Observation
+from optimizer_plc.rules.interface import decides_by
 from optimizer_plc.settings import ProgramSettings
-from optimizer_plc.solution import Solution
-from optimizer_plc.updating_period import Assessment, Observation
 
 Array = NDArray[np.float64]
 
@@ -47,51 +51,55 @@ class KnownSolver:
     def reset(self) -> None:
         pass
 
-    def start(self, problem: QuadraticProblem, guess: Array) -> None:
-        self._problem = problem
-        self._z = np.clip(guess, problem.low, problem.high)
-
-    def iterate(self, count: int) -> int:
-        for _ in range(count):
-            self._z = np.clip(self._z + self.move, self._problem.low, self._problem.high)
-        return count
-
-    @property
-    def solution(self) -> Array:
-        return self._z.copy()
-
-    @property
-    def cost(self) -> float:
-        return cost(self._problem, self._z) - self._problem.constant - FLOOR
-
-    def judged(self) -> Solution:
-        raise NotImplementedError
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> solvers.Answer:
+        path = [np.clip(guess, problem.low, problem.high)]
+        for _ in range(counts[-1]):
+            path.append(np.clip(path[-1] + self.move, problem.low, problem.high))
+        costs = [cost(problem, z) - problem.constant - FLOOR for z in path]
+        chosen = list(counts)
+        return solvers.Answer(costs[0], np.array(path)[chosen], np.array(costs)[chosen], np.array(chosen), np.zeros(94))
 
 
-@dataclass
-class NotingRule:
+class NotingRule(NamedTuple):
     """Notes what it is told."""
 
-    told: list[Observation] = field(default_factory=list)
-    first: int = FIRST
+    count: NDArray[np.int64]
+    notes: Array
+
+    @property
+    def told(self) -> list[Observation]:
+        rows = self.notes[: self.count[0]].tolist()
+        return [Observation(int(iterations), *others) for iterations, *others in rows]
+
+    @property
+    def first(self) -> int:
+        return FIRST
 
     @property
     def status(self) -> UpdatingRuleStatus:
         return UpdatingRuleStatus(UpdatingRuleKind.FIXED)
 
-    def after_interruption(self) -> int:
+    def after_interruption(self, memory: Array) -> int:
+        memory[0] += 1.0
         return INTERRUPTED
 
-    def next(self, observation: Observation) -> tuple[int, Assessment]:
-        self.told.append(observation)
-        return NEXT, UNDECIDED
+
+@decides_by(NotingRule)
+@numba.njit
+def decide(rule: NotingRule, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001 a kernel
+    note = rule.notes[rule.count[0]]
+    note[0], note[1], note[2], note[3] = o.iterations, o.period_s, o.effective_before, o.hot_start
+    note[4], note[5], note[6] = o.last_but_one, o.delivered, o.effective
+    rule.count[0] += 1
+    return NEXT
 
 
 class Bench:
     """The program, and beside it all that it should know."""
 
     def __init__(self, model: LtiModel, problem: PredictiveProblem, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.rule, self.model, self.problem = NotingRule(), model, problem
+        self.rule = NotingRule(np.zeros(1, np.int64), np.zeros((20, 7)))
+        self.model, self.problem = model, problem
         monkeypatch.setattr(optimizer_plc.program, "make_rule", lambda *_: self.rule)
         monkeypatch.setattr(optimizer_plc.program, "make_solver", lambda _: KnownSolver())
         settings = ProgramSettings(
@@ -99,7 +107,7 @@ class Bench:
         )
         self.program = OptimizerProgram(model, settings, InputLimits())
         self.program.restart(0.0)
-        self.rule.told.clear()
+        self.rule.count[0] = 0
         self._updates = 0
 
     def update(self, tick: int, playing: int, x: Array, watts: float = 0.0) -> Plan:

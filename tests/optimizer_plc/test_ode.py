@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from optimizer_plc.computing_settings import OdeSettings
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
-from optimizer_plc.solvers.ode import OdeSolver
+from optimizer_plc.solvers import KernelSolver
+from optimizer_plc.solvers.ode import ode_solver
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Jump, PenalisedOptimum, Situations
@@ -56,18 +57,12 @@ def settings_for(rng: np.random.Generator) -> OdeSettings:
 
 def descend(qp: QuadraticProblem, guess: Array, chosen: OdeSettings, iterations: int) -> None:
     """Iterate; fail if J rises once, if the box is left once, or if the cost told is not that of the solution told."""
-    solver = OdeSolver(chosen)
-    solver.start(qp, guess)
-    before = solver.cost
-    size = abs(before) + 1.0
-    for _ in range(iterations):
-        solver.iterate(1)
-        z = solver.solution
-        assert solver.cost <= before
-        assert ((qp.low <= z) & (z <= qp.high)).all()
-        before = solver.cost
-        size = max(size, abs(before))
-    assert before == pytest.approx(augmented(qp, solver.solution, chosen.alpha), rel=1e-8, abs=1e-8 * size)
+    answer = ode_solver(chosen).solve(qp, guess, range(1, iterations + 1))
+    costs = np.array([answer.guessed, *answer.costs])
+    assert (np.diff(costs) <= 0.0).all()
+    assert ((qp.low <= answer.points) & (answer.points <= qp.high)).all()
+    size = np.abs(costs).max() + 1.0
+    assert answer.cost == pytest.approx(augmented(qp, answer.z, chosen.alpha), rel=1e-8, abs=1e-8 * size)
 
 
 @pytest.mark.parametrize("block", range(10))
@@ -103,9 +98,7 @@ def test_an_iteration_is_a_step_of_tr_bdf2_with_the_papers_first_step_size() -> 
             factor @ factor.T, rng.normal(size=n), np.zeros((1, n)), np.ones(1), -free, free, constant=0.0
         )
         z = rng.normal(size=n)
-        solver = OdeSolver(chosen)
-        solver.start(qp, z)
-        solver.iterate(1)
+        solution = ode_solver(chosen).solve(qp, z, (1,)).z
         A, b = -0.1 * 2 * qp.Phi, -0.1 * qp.phi
         h = 1 / np.sqrt(np.linalg.norm(A @ z + b))
         g = 2 - np.sqrt(2)
@@ -113,31 +106,26 @@ def test_an_iteration_is_a_step_of_tr_bdf2_with_the_papers_first_step_size() -> 
         half_way = np.linalg.solve(one - g / 2 * h * A, z + g / 2 * h * (A @ z + 2 * b))
         share = (1 - g) / (2 - g)
         backward = half_way / (g * (2 - g)) - (1 - g) ** 2 / (g * (2 - g)) * z + share * h * b
-        assert solver.solution == pytest.approx(np.linalg.solve(one - share * h * A, backward), rel=1e-10, abs=1e-12)
+        assert solution == pytest.approx(np.linalg.solve(one - share * h * A, backward), rel=1e-10, abs=1e-12)
 
 
 def test_it_stays_put_at_an_optimum(
     problem: PredictiveProblem, situations: "Situations", penalised_optimum: "PenalisedOptimum"
 ) -> None:
     rng = np.random.default_rng(12)
-    solver = OdeSolver(OdeSettings())
+    solver = ode_solver(OdeSettings())
     for _ in range(20):
         qp = problem.at(situations(rng))
         best = penalised_optimum(qp, solver.alpha)
-        solver.start(qp, best)
-        at_first = solver.cost
-        for _ in range(30):
-            solver.iterate(1)
-        assert solver.solution == pytest.approx(best, abs=1e-5)
-        assert solver.cost == pytest.approx(at_first, rel=1e-9, abs=1e-6)
+        answer = solver.solve(qp, best, (30,))
+        assert answer.z == pytest.approx(best, abs=1e-5)
+        assert answer.cost == pytest.approx(answer.guessed, rel=1e-9, abs=1e-6)
 
 
 def test_a_guess_outside_the_box_is_projected_into_it(problem: PredictiveProblem, situations: "Situations") -> None:
     qp = problem.at(situations(np.random.default_rng(13)))
     guess = np.full(49, -1e3)
-    solver = OdeSolver(OdeSettings())
-    solver.start(qp, guess)
-    assert (solver.solution == qp.low).all()
+    assert (ode_solver(OdeSettings()).solve(qp, guess, (0,)).z == qp.low).all()
     assert (guess == -1e3).all(), "the caller's guess is not touched"
 
 
@@ -148,49 +136,36 @@ def test_the_same_start_gives_the_same_bits_whatever_was_solved_before(
     qp, other = problem.at(situations(rng)), problem.at(situations(rng))
     guess = np.concatenate([rng.normal(size=21), np.zeros(28)])
 
-    def path(solver: OdeSolver) -> list[bytes]:
-        solver.start(qp, guess)
-        visited = []
-        for _ in range(30):
-            solver.iterate(1)
-            visited.append(solver.solution.tobytes() + np.float64(solver.cost).tobytes())
-        return visited
+    def path(solver: KernelSolver) -> bytes:
+        answer = solver.solve(qp, guess, range(1, 31))
+        return answer.points.tobytes() + answer.costs.tobytes()
 
-    fresh, used = OdeSolver(OdeSettings()), OdeSolver(OdeSettings())
-    used.start(other, np.zeros(49))
-    for _ in range(7):
-        used.iterate(1)
+    fresh, used = ode_solver(OdeSettings()), ode_solver(OdeSettings())
+    used.solve(other, np.zeros(49), (7,))
     assert path(fresh) == path(used) == path(fresh)
 
 
 def test_a_solution_that_was_handed_out_does_not_change_any_more(
     problem: PredictiveProblem, situations: "Situations"
 ) -> None:
-    solver = OdeSolver(OdeSettings())
-    solver.start(problem.at(situations(np.random.default_rng(15))), np.zeros(49))
-    solution = solver.solution
-    copied = solution.copy()
-    for _ in range(5):
-        solver.iterate(1)
-    assert (solution == copied).all()
-    assert (solver.solution != copied).any()
+    solver, qp = ode_solver(OdeSettings()), problem.at(situations(np.random.default_rng(15)))
+    answer = solver.solve(qp, np.zeros(49), (0, 5))
+    copied = answer.points.copy()
+    solver.solve(qp, answer.z, (5,))
+    assert (answer.points == copied).all()
+    assert (answer.points[0] != answer.points[1]).any()
 
 
 def test_after_harsh_load_jumps_few_iterations_come_near_the_optimum(
     harsh_jumps: "list[Jump]", penalised_optimum: "PenalisedOptimum"
 ) -> None:
     assert len(harsh_jumps) >= 50
-    solver = OdeSolver(OdeSettings())
+    solver = ode_solver(OdeSettings())
     ratios = []
     for qp, guess in harsh_jumps:
         best = augmented(qp, penalised_optimum(qp, solver.alpha), solver.alpha) + qp.constant
         assert best > 0
-        solver.start(qp, guess)
-        costs = [solver.cost]
-        for _ in range(40):
-            solver.iterate(1)
-            costs.append(solver.cost)
-        ratios.append((np.array(costs) + qp.constant) / best)
+        ratios.append((solver.solve(qp, guess, range(41)).costs + qp.constant) / best)
     median = np.median(ratios, axis=0)
     assert np.min(ratios) > 1 - 1e-9, "nothing is below the optimum"
     assert median[0] > 100, "the jumps are harsh"

@@ -14,7 +14,7 @@ from optimizer_plc.penalties import PRESETS, PenaltySettings, Preset
 from optimizer_plc.prediction import PredictionModel
 from optimizer_plc.problem import PredictiveProblem, Situation
 from optimizer_plc.settings import ProgramSettings
-from optimizer_plc.solvers.ode import OdeSolver
+from optimizer_plc.solvers.ode import ode_solver
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Optimum, PenalisedOptimum, Situations
@@ -135,14 +135,11 @@ def test_the_cost_never_rises_whatever_the_preset(
     rng = np.random.default_rng(5)
     for _ in range(5):
         qp = problem.at(situations(rng))
-        solver = OdeSolver(chosen.ode, chosen.penalties)
-        solver.start(qp, np.zeros(49))
-        costs = [solver.cost]
-        for _ in range(60):
-            solver.iterate(1)
-            costs.append(solver.cost)
-            assert (solver.solution >= qp.low).all()
-            assert (solver.solution <= qp.high).all()
+        solver = ode_solver(chosen.ode, chosen.penalties)
+        answer = solver.solve(qp, np.zeros(49), range(61))
+        costs = answer.costs.tolist()
+        assert (answer.points >= qp.low).all()
+        assert (answer.points <= qp.high).all()
         assert costs == sorted(costs, reverse=True)
         best = float(augmented_cost(qp, penalised_optimum(qp, solver.alpha), solver.alpha)) + qp.constant
         assert best * (1 - 1e-9) <= costs[-1] + qp.constant <= 1.5 * best + 1.0
@@ -155,12 +152,10 @@ def test_each_device_changes_what_a_few_iterations_reach(
     change: dict[str, bool], problem: PredictiveProblem, situations: "Situations"
 ) -> None:
     qp = problem.at(situations(np.random.default_rng(6)))
-    reached = []
-    for settings in (OdeSettings(), OdeSettings(**change)):  # type: ignore[arg-type]
-        solver = OdeSolver(settings)
-        solver.start(qp, np.zeros(49))
-        solver.iterate(6)
-        reached.append(solver.cost)
+    reached = [
+        ode_solver(settings).solve(qp, np.zeros(49), (6,)).cost
+        for settings in (OdeSettings(), OdeSettings(**change))  # type: ignore[arg-type]
+    ]
     assert reached[0] != reached[1]
 
 
@@ -186,8 +181,6 @@ def test_the_box_is_penalised_as_it_is_printed(problem: PredictiveProblem, situa
     qp = problem.at(situations(np.random.default_rng(8)))
     reached = []
     for box in (0.0, 1.0):
-        solver = OdeSolver(OdeSettings(hold_at_bounds=False), PenaltySettings(box=box))
-        solver.start(qp, np.zeros(49))
-        solver.iterate(8)
-        reached.append(solver.solution)
+        solver = ode_solver(OdeSettings(hold_at_bounds=False), PenaltySettings(box=box))
+        reached.append(solver.solve(qp, np.zeros(49), (8,)).z)
     assert not np.array_equal(*reached)

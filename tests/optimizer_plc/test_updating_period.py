@@ -1,19 +1,29 @@
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optimizer_plc.updating_period import (
-    Algorithm1,
-    ContractionParameters,
-    ContractionRule,
-    FixedPeriod,
-    Observation,
-    assess,
-)
+from optimizer_plc.rules import Algorithm1, Assessment, ContractionRule, FixedPeriod, Observation, UpdatingRule, assess
+from optimizer_plc.rules.interface import MEMORY, assessed, decide_by
 
 RULE = Algorithm1(q_first=9, q_min=2, q_max=19, delta=2)
+
+
+class Deciding:
+    """A rule with its memory."""
+
+    def __init__(self, rule: UpdatingRule) -> None:
+        self.rule, self.memory = rule, np.zeros(MEMORY)
+
+    def next(self, observation: Observation) -> tuple[int, Assessment]:
+        a = assess(observation)
+        return decide_by(self.rule, self.memory, observation, a), a
+
+    def after_interruption(self) -> int:
+        return self.rule.after_interruption(self.memory)
+
 
 costs = st.floats(1.0, 1e8)
 rules = st.builds(
@@ -61,13 +71,13 @@ def test_the_quantities_are_those_that_the_paper_defines() -> None:
 
 
 def test_a_contraction_that_the_last_iteration_hardly_helped_makes_the_period_shorter() -> None:
-    q, a = RULE.next(contracting(effective_before=160.0))
+    q, a = Deciding(RULE).next(contracting(effective_before=160.0))
     assert a.gamma > 0
     assert q == 2
 
 
 def test_a_contraction_that_still_gains_with_the_last_iteration_makes_the_period_longer() -> None:
-    q, a = RULE.next(contracting(last_but_one=180.0))
+    q, a = Deciding(RULE).next(contracting(last_but_one=180.0))
     assert a.contraction < 1
     assert a.gamma < 0
     assert q == 6
@@ -75,32 +85,33 @@ def test_a_contraction_that_still_gains_with_the_last_iteration_makes_the_period
 
 def test_without_contraction_the_sign_of_the_contractions_increment_decides() -> None:
     # K = 260 / 200; D = 2.6: dK = 0.5 * 1.6 / 4 + 2.6 * dE is 0.2 - 0.052 with 104 before, 0.2 - 1.04 with 180
-    shorter, better = RULE.next(contracting(effective=260.0)), RULE.next(contracting(effective=260.0, last_but_one=180))
+    observed = contracting(effective=260.0)
+    shorter, better = (Deciding(RULE).next(one) for one in (observed, observed._replace(last_but_one=180.0)))
     assert (shorter[1].gamma, better[1].gamma) == pytest.approx((0.148, -0.84))
     assert (shorter[0], better[0]) == (2, 6)
 
 
 def test_a_contraction_of_exactly_1_counts_as_none() -> None:
     at_one = contracting(effective=200.0)
-    q, a = RULE.next(at_one)
+    q, a = Deciding(RULE).next(at_one)
     assert a.contraction == 1.0
     assert math.isinf(a.response_increment)
     assert a.gamma == a.contraction_increment == pytest.approx(0.5 * 1.0 / 4 - 2.0 * 0.02)
     assert q == 2
-    assert RULE.next(at_one._replace(last_but_one=180.0))[0] == 6
+    assert Deciding(RULE).next(at_one._replace(last_but_one=180.0))[0] == 6
 
 
 def test_a_zero_gradient_changes_nothing() -> None:
     still = Observation(
         iterations=7, period_s=2.0, effective_before=5.0, hot_start=5.0, last_but_one=5.0, delivered=5.0, effective=5.0
     )
-    q, a = RULE.next(still)
+    q, a = Deciding(RULE).next(still)
     assert (q, a.gamma) == (7, 0.0)
 
 
 @given(rule=rules, observation=observations)
 def test_q_moves_by_delta_against_the_gradient_or_is_clipped(rule: Algorithm1, observation: Observation) -> None:
-    q, a = rule.next(observation)
+    q, a = Deciding(rule).next(observation)
     assert rule.q_min <= q <= rule.q_max
     sign = (a.gamma > 0) - (a.gamma < 0)
     wanted = observation.iterations - rule.delta * sign
@@ -127,7 +138,7 @@ def test_multiplying_all_costs_by_a_constant_changes_nothing(observation: Observ
         delivered=observation.delivered * factor,
         effective=observation.effective * factor,
     )
-    assert RULE.next(scaled) == RULE.next(observation)
+    assert Deciding(RULE).next(scaled) == Deciding(RULE).next(observation)
 
 
 @given(observation=observations)
@@ -152,15 +163,15 @@ def test_a_fixed_period_is_fixed_but_tells_the_quantities_all_the_same(
 ) -> None:
     rule = FixedPeriod(iterations)
     assert rule.first == iterations
-    assert rule.next(observation) == (iterations, assess(observation))
+    assert Deciding(rule).next(observation) == (iterations, assess(observation))
 
 
 def test_the_first_period_is_the_one_configured() -> None:
     assert RULE.first == 9
 
 
-def own_rule() -> ContractionRule:
-    return ContractionRule(ContractionParameters(q_busy=2, q_quiet=9, q_step=13, rate=0.05, memory=0.9, surprise=2.0))
+def own_rule() -> Deciding:
+    return Deciding(ContractionRule(q_busy=2, q_quiet=9, q_step=13, rate=0.05, memory=0.9, surprise=2.0))
 
 
 def delivered(cost: float, *, surprise: float = 1.0) -> Observation:
@@ -192,3 +203,22 @@ def test_the_own_rule_stays_between_its_numbers(observed: list[Observation]) -> 
     rule = own_rule()
     assert all(2 <= rule.next(one)[0] <= 13 for one in observed)
     assert rule.after_interruption() == 13
+
+
+def test_after_a_load_step_nothing_contracts_at_first() -> None:
+    """Another load is another problem: a cost that is lower than before says nothing."""
+    rule = own_rule()
+    rule.next(delivered(1000.0))
+    rule.after_interruption()
+    assert rule.next(delivered(10.0))[0] == 9
+    assert rule.next(delivered(5.0))[0] == 2
+
+
+@given(rule=rules, observation=observations)
+def test_compiled_and_plain_a_rule_is_assessed_the_same(rule: Algorithm1, observation: Observation) -> None:
+    """To the bit, and in single precision to its rounding."""
+    assert assessed(observation) == assess(observation)
+    single = Observation(observation.iterations, *map(np.float32, observation[1:]))
+    rough, exact = assessed(single), assess(Observation(single.iterations, *map(float, single[1:])))
+    assert rough.contraction == pytest.approx(exact.contraction, rel=1e-6)
+    assert rule.q_min <= decide_by(rule, np.zeros(MEMORY, np.float32), single, rough) <= rule.q_max

@@ -26,6 +26,7 @@ from rig.settings import Settings
 PROGRAM = "optimizer_plc.program."
 NOISE = ("plant.sensors.level=0.02", "plant.sensors.speed=0.5", "plant.sensors.temperature=0.02")
 REFRIGERATOR = "plant.kind=refrigerator"
+SINGLE = f'{PROGRAM}arithmetic="float32"'
 TRIP = (
     'plant.refrigerator.events=[{at_s=90, target="nc1", value=0}, {at_s=120, target="nc1", value=1}, '
     '{at_s=150.25, target="leak", value=2.0}]'
@@ -65,10 +66,16 @@ COMPILED = {
     "first knot as rows": (f"{PROGRAM}penalties.first_knot_in_box=false",),
     "no look-ahead rows": (f"{PROGRAM}ode.look_ahead_rows=false",),
     "not held at bounds": (f"{PROGRAM}ode.hold_at_bounds=false",),
+    "single precision": (SINGLE,),
+    "single precision, fixed": (SINGLE, f"{PROGRAM}updating_period_s=2.5", *NOISE),
+    "single precision, load steps that interrupt a rule": (
+        SINGLE,
+        f'{PROGRAM}adaptive.rule="contraction"',
+        f"{PROGRAM}interrupting_load_step_w=10",
+    ),
 }
 """Whose updates are compiled too."""
 LEFT_TO_PROGRAMS = {
-    "single precision": (f'{PROGRAM}arithmetic="float32"',),
     "osqp": (f'{PROGRAM}solver="osqp"', f"{PROGRAM}updating_period_s=5"),
     "daqp": (f'{PROGRAM}solver="daqp"', *NOISE),
     "qpoases": (f'{PROGRAM}solver="qpoases"',),

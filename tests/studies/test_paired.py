@@ -178,9 +178,9 @@ def test_a_solver_starts_each_problem_from_its_own_last_profile(sequence: Proble
     solver, z = make_solver(program), np.zeros(49)
     for row, (where, _) in enumerate(sequence.recorded[:20]):
         qp = sequence.problem.at(where)
-        solver.start(qp, sequence.problem.shifted(z, 20))
-        assert columns["iterations"][row] == solver.iterate(5), "5 s at P = 0.2 over 0.17 s"
-        z = solver.solution
+        answer = solver.solve(qp, sequence.problem.shifted(z, 20), (5,))
+        assert columns["iterations"][row] == answer.iterations[-1], "5 s at P = 0.2 over 0.17 s"
+        z = answer.z
         cost = sequence.profiles.cost(qp, z, where)
         assert (columns["j_dev"][row], columns["j_cst"][row]) == (cost.j_dev, cost.j_cst)
 

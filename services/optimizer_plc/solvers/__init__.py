@@ -4,30 +4,28 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from optimizer_plc.solvers.daqp import DaqpSolver
-from optimizer_plc.solvers.fast_gradient import FastGradientSolver
-from optimizer_plc.solvers.hybrid import HybridSolver
-from optimizer_plc.solvers.interface import Solver
-from optimizer_plc.solvers.interior_point import InteriorPointSolver
-from optimizer_plc.solvers.ode import OdeSolver
+from optimizer_plc.solvers.fast_gradient import fast_gradient_solver
+from optimizer_plc.solvers.hybrid import hybrid_solver
+from optimizer_plc.solvers.interface import Answer, Solver, judged
+from optimizer_plc.solvers.interior_point import interior_point_solver
+from optimizer_plc.solvers.kernel_solver import KernelSolver
+from optimizer_plc.solvers.ode import ode_solver
 from optimizer_plc.solvers.osqp import OsqpSolver
 from optimizer_plc.solvers.qpoases import QpoasesSolver
 
 if TYPE_CHECKING:
     from optimizer_plc.settings import ProgramSettings
 
-__all__ = ["Solver", "make_solver"]
+__all__ = ["Answer", "KernelSolver", "Solver", "judged", "make_solver"]
 
 _MAKERS: "dict[str, Callable[[ProgramSettings], Solver]]" = {
-    "ode": lambda settings: OdeSolver(settings.ode, settings.penalties),
+    "ode": lambda settings: ode_solver(settings.ode, settings.penalties),
     "qpoases": lambda settings: QpoasesSolver(settings.qpoases),
     "osqp": lambda settings: OsqpSolver(settings.osqp),
-    "fast-gradient": lambda settings: FastGradientSolver(settings.fast_gradient),
-    "interior-point": lambda settings: InteriorPointSolver(settings.interior_point),
-    "hybrid": lambda settings: HybridSolver(
-        settings.hybrid,
-        InteriorPointSolver(settings.interior_point),
-        OdeSolver(settings.ode, settings.penalties),
-        settings.adaptive.cost_floor,
+    "fast-gradient": lambda settings: fast_gradient_solver(settings.fast_gradient),
+    "interior-point": lambda settings: interior_point_solver(settings.interior_point),
+    "hybrid": lambda settings: hybrid_solver(
+        settings.hybrid, settings.interior_point, settings.ode, settings.adaptive.cost_floor, settings.penalties
     ),
     "daqp": lambda settings: DaqpSolver(settings.daqp),
 }

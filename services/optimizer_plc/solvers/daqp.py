@@ -6,14 +6,15 @@
   little to its advantage, J may rise (Definition 1 of the paper does not hold to the letter).
 """
 
+from collections.abc import Sequence
+
 import daqp
 import numpy as np
 from numpy.typing import NDArray
 
 from optimizer_plc.computing_settings import DaqpSettings
-from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import QuadraticProblem
-from optimizer_plc.solution import Solution, judge
+from optimizer_plc.solvers.interface import Answer, collected
 
 Array = NDArray[np.float64]
 
@@ -31,19 +32,19 @@ class DaqpSolver:
     def reset(self) -> None:
         """Nothing is kept from one problem to the next."""
 
-    def start(self, problem: QuadraticProblem, guess: Array) -> None:
-        """Take the problem; `guess` is the answer until the first iteration, and if there is no optimum."""
-        self._problem = problem
-        self._z = np.clip(guess, problem.low, problem.high)
-        self._multipliers = np.zeros_like(problem.gamma)
-        self._done = not (np.isfinite(problem.phi).all() and np.isfinite(problem.gamma).all())
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
+        """Solve the problem, once; the guess is the answer until then, and if there is no optimum."""
+        guess = np.clip(guess, problem.low, problem.high)
+        z, multipliers = guess, np.zeros_like(problem.gamma)
+        solvable = bool(np.isfinite(problem.phi).all() and np.isfinite(problem.gamma).all())
+        if solvable and max(counts) > 0:
+            z, multipliers = self._optimum(problem, guess)
+        points, done = [z if count else guess for count in counts], [int(solvable and count > 0) for count in counts]
+        return collected(problem, self.alpha, guess, points, done, multipliers)
 
-    def iterate(self, count: int) -> int:
-        """Solve the problem, once."""
-        if count < 1 or self._done:
-            return 0
-        self._done = True
-        qp, n = self._problem, len(self._z)
+    def _optimum(self, qp: QuadraticProblem, guess: Array) -> tuple[Array, Array]:
+        """Return the optimum and the multipliers of its rows; the guess and zeros if there is none."""
+        n = len(guess)
         lower = np.full(n + len(qp.gamma), -UNBOUNDED)
         lower[:n] = np.maximum(qp.low, -UNBOUNDED)
         upper = np.minimum(np.concatenate([qp.high, qp.gamma]), UNBOUNDED)
@@ -51,21 +52,6 @@ class DaqpSolver:
             2.0 * qp.Phi, qp.phi.copy(), qp.Gamma, upper, lower, np.zeros(len(upper), np.int32),
             primal_tol=self._tolerance,
         )  # fmt: skip
-        if flag == 1:
-            self._z = np.clip(z, qp.low, qp.high)
-            self._multipliers = np.maximum(info["lam"][n:], 0.0)
-        return 1
-
-    @property
-    def solution(self) -> Array:
-        """The optimum, or the guess before it is known, shape (n,)."""
-        return self._z.copy()
-
-    @property
-    def cost(self) -> float:
-        """Augmented cost of `solution`."""
-        return float(augmented_cost(self._problem, self._z, self.alpha))
-
-    def judged(self) -> Solution:
-        """Return `solution` with its residuals."""
-        return judge(self._problem, self.solution, self.alpha, self._multipliers.copy())
+        if flag != 1:
+            return guess, np.zeros_like(qp.gamma)
+        return np.clip(z, qp.low, qp.high), np.maximum(info["lam"][n:], 0.0)

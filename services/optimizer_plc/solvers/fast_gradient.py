@@ -19,7 +19,8 @@ from coldloop.compiled import kernel
 from optimizer_plc.computing_settings import FastGradientSettings
 from optimizer_plc.costs import Matrices, augmented_cost, gradient, matrices_of
 from optimizer_plc.problem import QuadraticProblem
-from optimizer_plc.solution import Solution, judge, penalty_multipliers
+from optimizer_plc.solvers.interface import Answer, Costs
+from optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
 
 Array = NDArray[np.float64]
 
@@ -37,50 +38,25 @@ class Momentum(NamedTuple):
     """Nesterov's sequence t_k, shape (1,)."""
 
 
-class FastGradientSolver:
-    """Projected gradient steps with momentum."""
+class FastGradientMethod(NamedTuple):
+    """What the solver computes with that does not change from problem to problem."""
 
-    def __init__(self, settings: FastGradientSettings) -> None:
-        self.alpha = settings.alpha
-        self.tau_1_s = settings.tau_1_s
-        self._adaptive_restart = settings.adaptive_restart
-        self._source: tuple[Array, Array] | None = None
+    matrices: Matrices
+    steps: Array
+    """Step sizes, shape (n,)."""
+    alpha: float
+    adaptive_restart: bool
 
-    def reset(self) -> None:
-        """Only the step sizes are kept, which depend on the matrices alone."""
 
-    def start(self, problem: QuadraticProblem, guess: Array) -> None:
-        """Begin with `guess` projected into the box, without momentum."""
-        self._problem = problem
-        self._alpha = problem.phi.dtype.type(self.alpha)
-        if self._source is None or problem.Phi is not self._source[0] or problem.Gamma is not self._source[1]:
-            self._source, self._matrices = (problem.Phi, problem.Gamma), matrices_of(problem)
-            self._steps = step_sizes(problem.Phi, problem.Gamma, self._alpha)
-        self._z = np.clip(guess, problem.low, problem.high)
-        self._momentum = Momentum(self._z.copy(), np.ones_like(self._z[:1]))
+def fast_gradient_solver(settings: FastGradientSettings) -> KernelSolver:
+    """Return the solver, which keeps nothing from one problem to the next."""
 
-    def iterate(self, count: int) -> int:
-        """Take `count` steps."""
-        descend(
-            self._matrices, self._problem, self._z, self._momentum, self._steps, self._alpha, self._adaptive_restart,
-            count,
-        )  # fmt: skip
-        return count
+    def method(problem: QuadraticProblem) -> FastGradientMethod:
+        alpha = problem.phi.dtype.type(settings.alpha)
+        steps = step_sizes(problem.Phi, problem.Gamma, alpha)
+        return FastGradientMethod(matrices_of(problem), steps, alpha, settings.adaptive_restart)
 
-    @property
-    def solution(self) -> Array:
-        """The present point, shape (n,)."""
-        return self._z.copy()
-
-    @property
-    def cost(self) -> float:
-        """Augmented cost at the present point."""
-        return float(augmented_cost(self._problem, self._z, self._alpha))
-
-    def judged(self) -> Solution:
-        """Return `solution` with its residuals; its multipliers are the slopes of the penalties."""
-        z = self.solution
-        return judge(self._problem, z, self.alpha, penalty_multipliers(self._problem, z, self.alpha))
+    return KernelSolver(method, settings.alpha, settings.tau_1_s)
 
 
 @kernel
@@ -154,3 +130,22 @@ def descend(
         t[0] = t_next
         for i in range(n):
             point[i] = z[i] + weight * moved[i]
+
+
+@solves_by(FastGradientMethod)
+@kernel
+def solve(
+    c: FastGradientMethod, qp: QuadraticProblem, guess: Array, counts: NDArray[np.int64], before: Costs  # noqa: ARG001
+) -> Answer:  # fmt: skip
+    """Return the answer after each count of steps, which begin without momentum."""
+    z = np.empty_like(guess)
+    for i in range(z.shape[0]):
+        z[i] = min(max(guess[i], qp.low[i]), qp.high[i])
+    guessed, momentum = augmented_cost(qp, z, c.alpha), Momentum(z.copy(), np.ones_like(z[:1]))
+    points, costs = np.empty((counts.shape[0], z.shape[0]), z.dtype), np.empty(counts.shape[0], z.dtype)
+    done = 0
+    for k in range(counts.shape[0]):
+        descend(c.matrices, qp, z, momentum, c.steps, c.alpha, c.adaptive_restart, counts[k] - done)
+        done = counts[k]
+        points[k], costs[k] = z, augmented_cost(qp, z, c.alpha)
+    return Answer(guessed, points, costs, counts.copy(), np.empty(0, z.dtype))

@@ -13,109 +13,125 @@ The PLC's time is counted in slots, each as long as the longer of both iteration
 solver does as many of its own iterations as fit, never more; what is left of a slot counts for the next one.
 """
 
-import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from optimizer_plc.computing_settings import HybridSettings
+from coldloop.compiled import kernel
+from optimizer_plc.computing_settings import HybridSettings, InteriorPointSettings, OdeSettings
+from optimizer_plc.costs import matrices_of
+from optimizer_plc.penalties import DEFAULT_PENALTIES, PenaltySettings
 from optimizer_plc.problem import QuadraticProblem
-from optimizer_plc.solution import Solution
-from optimizer_plc.solvers.interface import Solver
+from optimizer_plc.solvers import interior_point, ode
+from optimizer_plc.solvers.interface import Answer, Costs
+from optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
 
 Array = NDArray[np.float64]
+Counts = NDArray[np.int64]
+
+PICOSECONDS = 1_000_000_000_000
+ROUNDING = 1_000_000_000
+"""A time that misses a whole number of slots or iterations by less than this part of one counts as that number."""
 
 
-class HybridSolver:
-    """Chooses between two solvers for each problem.
+class HybridMethod(NamedTuple):
+    """What the solver computes with that does not change from problem to problem."""
+
+    ode: ode.OdeMethod
+    interior_point: interior_point.InteriorPointMethod
+    switch: float
+    floor: float
+    """Constant that J has besides that of the problem."""
+    slot_ps: int
+    ode_ps: int
+    """tau_1 of the ODE-based solver."""
+    interior_point_ps: int
+    """tau_1 of the interior-point solver."""
+
+
+def hybrid_solver(
+    settings: HybridSettings,
+    far: InteriorPointSettings,
+    quiet: OdeSettings,
+    floor: float,
+    penalties: PenaltySettings = DEFAULT_PENALTIES,
+) -> KernelSolver:
+    """Return the solver, which keeps the costs of guess and answer from one problem to the next.
 
     Args:
         settings: When to switch.
-        far: Solver of problems that are far from their optimum.
-        quiet: Solver of the others; both have the same alpha.
+        far: Of the solver of problems that are far from their optimum.
+        quiet: Of the solver of the others; both have the same alpha.
         floor: Constant that J has besides that of the problem.
+        penalties: Of the ODE-based solver.
     """
+    slot_s = max(far.tau_1_s, quiet.tau_1_s)
 
-    def __init__(self, settings: HybridSettings, far: Solver, quiet: Solver, floor: float) -> None:
-        self.alpha = quiet.alpha
-        self.tau_1_s = max(far.tau_1_s, quiet.tau_1_s)
-        self._switch, self._floor = settings.switch, floor
-        self._far, self._quiet = far, quiet
-        self.reset()
+    def method(problem: QuadraticProblem) -> HybridMethod:
+        real = problem.phi.dtype.type
+        return HybridMethod(
+            ode.OdeMethod(matrices_of(problem), ode.flow_in(quiet, penalties, real)),
+            interior_point.method_of(far, problem),
+            real(settings.switch), real(floor), picoseconds(slot_s), picoseconds(quiet.tau_1_s),
+            picoseconds(far.tau_1_s),
+        )  # fmt: skip
 
-    def reset(self) -> None:
-        """Forget earlier problems; the first one is taken for a quiet one."""
-        self._far.reset()
-        self._quiet.reset()
-        self._chosen: Solver | None = None
-        self.guessed = self.delivered = math.inf
-
-    def start(self, problem: QuadraticProblem, guess: Array) -> None:
-        """Choose a solver, and begin with `guess` projected into the box."""
-        if self._chosen is not None:
-            self.delivered = self._whole(self._chosen.cost)
-        self._rest = float(problem.constant) + self._floor
-        self._quiet.start(problem, guess)
-        before, self.guessed = self.guessed, self._whole(self._quiet.cost)
-        self._chosen = self._quiet
-        if is_far(self._switch, self.guessed, before, self.delivered):
-            self._far.start(problem, guess)
-            self._chosen = self._far
-        self._slots = self._done = 0
-
-    def iterate(self, count: int) -> int:
-        """Let this many slots pass, or fewer when more iterations would change nothing; return how many passed."""
-        before, chosen = self._slots, self._present
-        self._slots += count
-        allowed = iterations_in(self._slots, self.tau_1_s, chosen.tau_1_s)
-        self._done += chosen.iterate(allowed - self._done)
-        return slots_passed(self._done, allowed, before, count, self.tau_1_s, chosen.tau_1_s)
-
-    @property
-    def _present(self) -> Solver:
-        if self._chosen is None:
-            raise RuntimeError("no problem was started")
-        return self._chosen
-
-    @property
-    def is_far(self) -> bool:
-        """Whether the present problem was taken for one far from its optimum."""
-        return self._chosen is self._far
-
-    def go_on_after(self, guessed: float, delivered: float) -> None:
-        """Go on as after a problem with these costs of guess and answer, constant and floor included."""
-        self._chosen, self.guessed, self.delivered = None, guessed, delivered
-
-    @property
-    def solution(self) -> Array:
-        """The answer of the chosen solver, shape (n,)."""
-        return self._present.solution
-
-    @property
-    def cost(self) -> float:
-        """Augmented cost of `solution`."""
-        return self._present.cost
-
-    def judged(self) -> Solution:
-        """Return `solution` with its residuals."""
-        return self._present.judged()
-
-    def _whole(self, cost: float) -> float:
-        return max(cost + self._rest, self._floor)
+    return KernelSolver(method, quiet.alpha, slot_s, floor)
 
 
-def is_far(switch: float, guessed: float, guessed_before: float, delivered_before: float) -> bool:
+def picoseconds(seconds: float) -> int:
+    """Return a time as a whole number: what fits into what is then decided without rounding, in any precision."""
+    return round(seconds * PICOSECONDS)
+
+
+@kernel
+def is_far(switch: float, guessed: float, before: Costs) -> bool:
     """Tell whether a problem is far from its optimum, from J+_k, J+_{k-1} and Jhat_{k-1}."""
-    return max(guessed, guessed_before) > switch * delivered_before
+    return max(guessed, before.guessed) > switch * before.delivered
 
 
-def iterations_in(slots: int, slot_s: float, tau_1_s: float) -> int:
-    """Return the iterations of `tau_1_s` that fit into the time of some slots."""
-    return math.floor(slots * slot_s / tau_1_s + 1e-9)
+@kernel
+def iterations_in(slots: int, slot_ps: int, tau_1_ps: int) -> int:
+    """Return the iterations of `tau_1_ps` that fit into the time of some slots."""
+    return (slots * slot_ps + tau_1_ps // ROUNDING) // tau_1_ps
 
 
-def slots_passed(done: int, allowed: int, before: int, count: int, slot_s: float, tau_1_s: float) -> int:
-    """Return how many of `count` slots passed after the first `before`: fewer when the solver ended by itself."""
-    if done == allowed:
-        return count
-    return max(0, math.ceil(done * tau_1_s / slot_s - 1e-9) - before)
+@kernel
+def slots_begun(iterations: int, slot_ps: int, tau_1_ps: int) -> int:
+    """Return the slots that so many iterations need, the last one begun."""
+    return -((slot_ps // ROUNDING - iterations * tau_1_ps) // slot_ps)
+
+
+@kernel
+def allowed_in(slots: Counts, slot_ps: int, tau_1_ps: int) -> Counts:
+    """Return the iterations that fit into each number of slots, shape (k,)."""
+    allowed = np.empty_like(slots)
+    for k in range(slots.shape[0]):
+        allowed[k] = iterations_in(slots[k], slot_ps, tau_1_ps)
+    return allowed
+
+
+@kernel
+def in_slots(answer: Answer, slots: Counts, allowed: Counts, slot_ps: int, tau_1_ps: int) -> Answer:
+    """Return an answer with its iterations counted in slots: fewer passed when the solver ended by itself."""
+    passed, latest = np.empty_like(slots), 0
+    for k in range(slots.shape[0]):
+        ended = answer.iterations[k] < allowed[k]
+        latest = max(latest, slots_begun(answer.iterations[k], slot_ps, tau_1_ps)) if ended else slots[k]
+        passed[k] = latest
+    return Answer(answer.guessed, answer.points, answer.costs, passed, answer.multipliers)
+
+
+@solves_by(HybridMethod)
+@kernel
+def solve(c: HybridMethod, qp: QuadraticProblem, guess: Array, counts: Counts, before: Costs) -> Answer:
+    """Return the answer of the chosen solver after each number of slots."""
+    z, guessed, dt = ode.warm_start(c.ode.matrices, qp, guess, c.ode.flow)
+    if is_far(c.switch, max(guessed + (qp.constant + c.floor), c.floor), before):
+        allowed = allowed_in(counts, c.slot_ps, c.interior_point_ps)
+        answer = interior_point.solve(c.interior_point, qp, guess, allowed, before)
+        return in_slots(answer, counts, allowed, c.slot_ps, c.interior_point_ps)
+    allowed = allowed_in(counts, c.slot_ps, c.ode_ps)
+    answer = ode.follow(c.ode, qp, z, guessed, dt, allowed)
+    return in_slots(answer, counts, allowed, c.slot_ps, c.ode_ps)

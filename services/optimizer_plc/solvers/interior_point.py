@@ -27,7 +27,8 @@ from optimizer_plc.computing_settings import InteriorPointSettings
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.linear_algebra import cholesky, cholesky_solve
 from optimizer_plc.problem import QuadraticProblem
-from optimizer_plc.solution import Solution, judge
+from optimizer_plc.solvers.interface import Answer, Costs
+from optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -92,50 +93,22 @@ def path_in(settings: InteriorPointSettings, size: int, real: Real) -> Path:
     )
 
 
-class InteriorPointSolver:
-    """Predictor and corrector, one factorisation an iteration."""
+class InteriorPointMethod(NamedTuple):
+    """What the solver computes with that does not change from problem to problem."""
 
-    def __init__(self, settings: InteriorPointSettings) -> None:
-        self.alpha = settings.alpha
-        self.tau_1_s = settings.tau_1_s
-        self._settings = settings
-        self._matrices: tuple[Array, Array] | None = None
+    structure: Structure
+    path: Path
 
-    def reset(self) -> None:
-        """Only the structure of the matrices is kept from one problem to the next."""
 
-    def start(self, problem: QuadraticProblem, guess: Array) -> None:
-        """Begin near `guess`, on the central path as far as its rows are concerned."""
-        self._problem = problem
-        if self._matrices is None or problem.Phi is not self._matrices[0] or problem.Gamma is not self._matrices[1]:
-            self._matrices = problem.Phi, problem.Gamma
-            self._structure = structure_of(problem)
-            self._path = path_in(self._settings, len(problem.phi) + len(problem.gamma), problem.phi.dtype.type)
-        self._best = np.empty_like(problem.phi)
-        self._rows = np.empty_like(problem.gamma)
-        self._cost, self._point = begin(self._structure, problem, guess, self._path, self._best, self._rows)
+def method_of(settings: InteriorPointSettings, problem: QuadraticProblem) -> InteriorPointMethod:
+    """Return the method for problems with these matrices."""
+    size = len(problem.phi) + len(problem.gamma)
+    return InteriorPointMethod(structure_of(problem), path_in(settings, size, problem.phi.dtype.type))
 
-    def iterate(self, count: int) -> int:
-        """Take `count` steps, or fewer once the products are as small as rounding."""
-        real = self._problem.phi.dtype.type
-        done, self._cost, self._point = descend(
-            self._structure, self._problem, self._path, self._point, self._best, self._rows, real(self._cost), count
-        )
-        return done
 
-    @property
-    def solution(self) -> Array:
-        """The best point so far, shape (n,)."""
-        return self._best.copy()
-
-    @property
-    def cost(self) -> float:
-        """Augmented cost of `solution`."""
-        return self._cost
-
-    def judged(self) -> Solution:
-        """Return `solution` with its residuals and the multipliers that belong to it."""
-        return judge(self._problem, self.solution, self.alpha, self._rows.copy())
+def interior_point_solver(settings: InteriorPointSettings) -> KernelSolver:
+    """Return the solver, which keeps nothing from one problem to the next."""
+    return KernelSolver(lambda problem: method_of(settings, problem), settings.alpha, settings.tau_1_s)
 
 
 def structure_of(problem: QuadraticProblem) -> Structure:
@@ -334,7 +307,7 @@ def after(point: Point, change: Point, share: float) -> Point:
 
 
 @kernel
-def solve(
+def newton_step(
     constant: Structure,
     U: Array,
     skyline: NDArray[np.uint64],
@@ -426,11 +399,29 @@ def step(
     U = newton_matrix(constant, point, away, softness)
     skyline = cholesky(U)
     products = towards_zero(point, away)
-    change, moved = solve(constant, U, skyline, slope, point, away, products, softness)
+    change, moved = newton_step(constant, U, skyline, slope, point, away, products, softness)
     share = longest(point, away, change, moved, one)
     predicted = after(point, change, share)
     centring = mean_product(predicted, distances(constant, gamma, low, high, predicted, softness)) / mu
     correct(products, mu * centring * centring * centring, point, change, moved)
-    change, moved = solve(constant, U, skyline, slope, point, away, products, softness)
+    change, moved = newton_step(constant, U, skyline, slope, point, away, products, softness)
     share = min(one, real(SHORT_OF) * longest(point, away, change, moved, one / real(SHORT_OF)))
     return after(point, change, share), True
+
+
+@solves_by(InteriorPointMethod)
+@kernel
+def solve(
+    c: InteriorPointMethod, qp: QuadraticProblem, guess: Array, counts: NDArray[np.int64], before: Costs  # noqa: ARG001
+) -> Answer:  # fmt: skip
+    """Return the best point after each count of steps, fewer once the products are as small as rounding."""
+    best, rows = np.empty_like(qp.phi), np.empty_like(qp.gamma)
+    guessed, point = begin(c.structure, qp, guess, c.path, best, rows)
+    points, costs = np.empty((counts.shape[0], best.shape[0]), best.dtype), np.empty(counts.shape[0], best.dtype)
+    iterations = np.empty_like(counts)
+    cost, done = guessed, 0
+    for k in range(counts.shape[0]):
+        more, cost, point = descend(c.structure, qp, c.path, point, best, rows, cost, counts[k] - done)
+        done += more
+        points[k], costs[k], iterations[k] = best, cost, done
+    return Answer(guessed, points, costs, iterations, rows)

@@ -18,7 +18,8 @@ from optimizer_plc.costs import Matrices, cost_with_excess, excess_by_columns, g
 from optimizer_plc.linear_algebra import cholesky, cholesky_solve
 from optimizer_plc.penalties import DEFAULT_PENALTIES, PenaltySettings
 from optimizer_plc.problem import QuadraticProblem
-from optimizer_plc.solution import Solution, judge, penalty_multipliers
+from optimizer_plc.solvers.interface import Answer, Costs
+from optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
 
 Array = NDArray[np.float64]
 
@@ -66,52 +67,20 @@ def flow_in(settings: OdeSettings, penalties: PenaltySettings, real: Real) -> Fl
     )
 
 
-class OdeSolver:
-    """TR-BDF2 on the gradient flow, one step an iteration, in the floating-point type of the problem."""
+class OdeMethod(NamedTuple):
+    """What the solver computes with that does not change from problem to problem."""
 
-    def __init__(self, settings: OdeSettings, penalties: PenaltySettings = DEFAULT_PENALTIES) -> None:
-        self.alpha = settings.alpha
-        self.tau_1_s = settings.tau_1_s
-        self._settings, self._penalties = settings, penalties
-        self._source: tuple[Array, Array] | None = None
+    matrices: Matrices
+    flow: Flow
 
-    def reset(self) -> None:
-        """Only the matrices are kept from one problem to the next."""
 
-    def start(self, problem: QuadraticProblem, guess: Array) -> None:
-        """Begin with `guess` projected into the box, and with the paper's first step size sqrt(1 / |dz/dt|)."""
-        self._problem = problem
-        if self._source is None or problem.Phi is not self._source[0] or problem.Gamma is not self._source[1]:
-            self._source, self._matrices = (problem.Phi, problem.Gamma), matrices_of(problem)
-            self._real = problem.phi.dtype.type
-            self._flow = flow_in(self._settings, self._penalties, self._real)
-        self._look_ahead_rows = np.zeros_like(problem.gamma)
-        self._z, self._cost, self._dt = warm_start(self._matrices, problem, guess, self._flow)
-        self._stalled = 0
+def ode_solver(settings: OdeSettings, penalties: PenaltySettings = DEFAULT_PENALTIES) -> KernelSolver:
+    """Return the solver, which keeps nothing from one problem to the next."""
 
-    def iterate(self, count: int) -> int:
-        """Take `count` steps, or fewer once z is stationary."""
-        real = self._real
-        done, self._stalled, self._cost, self._dt = descend(
-            self._matrices, self._problem, self._z, self._look_ahead_rows, real(self._cost), real(self._dt),
-            self._stalled, count, self._flow,
-        )  # fmt: skip
-        return done
+    def method(problem: QuadraticProblem) -> OdeMethod:
+        return OdeMethod(matrices_of(problem), flow_in(settings, penalties, problem.phi.dtype.type))
 
-    @property
-    def solution(self) -> Array:
-        """The present point, shape (n,)."""
-        return self._z.copy()
-
-    @property
-    def cost(self) -> float:
-        """Augmented cost at the present point."""
-        return self._cost
-
-    def judged(self) -> Solution:
-        """Return `solution` with its residuals; its multipliers are the slopes of the penalties."""
-        z = self.solution
-        return judge(self._problem, z, self.alpha, penalty_multipliers(self._problem, z, self.alpha))
+    return KernelSolver(method, settings.alpha, settings.tau_1_s)
 
 
 @kernel
@@ -287,3 +256,29 @@ def step(
         active[r] = active_ahead[r]
     wanted = (flow.tolerance / max(error, real(1e-12))) ** real(1.0 / 3.0)
     return min(dt * min(flow.growth, max(flow.rejection, wanted)), flow.longest), reached
+
+
+@kernel
+def follow(
+    c: OdeMethod, qp: QuadraticProblem, z: Array, guessed: float, dt: float, counts: NDArray[np.int64]
+) -> Answer:
+    """Return the answer after each count of steps from z, whose cost and first step size are `guessed` and `dt`."""
+    points, costs = np.empty((counts.shape[0], z.shape[0]), z.dtype), np.empty(counts.shape[0], z.dtype)
+    iterations = np.empty_like(counts)
+    look_ahead_rows, cost, stalled, done = np.zeros_like(qp.gamma), guessed, 0, 0
+    for k in range(counts.shape[0]):
+        if counts[k] > done:
+            more, stalled, cost, dt = descend(
+                c.matrices, qp, z, look_ahead_rows, cost, dt, stalled, counts[k] - done, c.flow
+            )
+            done += more
+        points[k], costs[k], iterations[k] = z, cost, done
+    return Answer(guessed, points, costs, iterations, np.empty(0, z.dtype))
+
+
+@solves_by(OdeMethod)
+@kernel
+def solve(c: OdeMethod, qp: QuadraticProblem, guess: Array, counts: NDArray[np.int64], before: Costs) -> Answer:  # noqa: ARG001
+    """Return the answer after each count of steps, fewer once z is stationary."""
+    z, guessed, dt = warm_start(c.matrices, qp, guess, c.flow)
+    return follow(c, qp, z, guessed, dt, counts)

@@ -8,15 +8,15 @@ The matrices are scaled and factorised once, with a fixed rho; from problem to p
   J is not monotonic (Definition 1 of the paper): see `docs/solvers.md`.
 """
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from optimizer_plc.computing_settings import OsqpSettings
-from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import QuadraticProblem
-from optimizer_plc.solution import Solution, judge
+from optimizer_plc.solvers.interface import Answer, collected
 
 if TYPE_CHECKING:
     from osqp import OSQP
@@ -40,21 +40,34 @@ class OsqpSolver:
         """Drop the object with its factors and multipliers."""
         self._osqp = None
 
-    def start(self, problem: QuadraticProblem, guess: Array) -> None:
-        """Take the next problem, and begin at `guess` with the last multipliers."""
-        self._problem = problem
-        self._z = np.clip(guess, problem.low, problem.high)
-        self._multipliers = np.zeros_like(problem.gamma)
-        self._finite = bool(np.isfinite(problem.phi).all() and np.isfinite(problem.gamma).all())
-        if not self._finite:  # OSQP would never forget them
-            return
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
+        """Iterate from the guess and the last multipliers."""
+        guess = np.clip(guess, problem.low, problem.high)
+        z, multipliers, done = guess, np.zeros_like(problem.gamma), 0
+        osqp = self._prepared(problem, guess)
+        points, iterations = [], []
+        for count in counts:
+            if osqp is not None and count > done:
+                osqp.update_settings(max_iter=count - done)
+                result = osqp.solve(raise_error=False)
+                z, done = np.clip(result.x, problem.low, problem.high), count
+                multipliers = np.maximum(result.y[len(z) :], 0.0)
+            points.append(z)
+            iterations.append(done)
+        return collected(problem, self.alpha, guess, points, iterations, multipliers)
+
+    def _prepared(self, problem: QuadraticProblem, guess: Array) -> "OSQP | None":
+        """Return the object with the next problem; None if its data are no numbers, which it would never forget."""
+        if not (np.isfinite(problem.phi).all() and np.isfinite(problem.gamma).all()):
+            return None
         lower = np.concatenate([problem.low, np.full(len(problem.gamma), -np.inf)])
         upper = np.concatenate([problem.high, problem.gamma])
         if self._osqp is None:
             self._osqp = self._set_up(problem, lower, upper)
         else:
             self._osqp.update(q=problem.phi, l=lower, u=upper)
-        self._osqp.warm_start(x=self._z)
+        self._osqp.warm_start(x=guess)
+        return self._osqp
 
     def _set_up(self, problem: QuadraticProblem, lower: Array, upper: Array) -> "OSQP":
         from osqp import OSQP  # noqa: PLC0415 with scipy.sparse, a fifth of what the optimiser loads at its start
@@ -69,28 +82,3 @@ class OsqpSolver:
             eps_abs=NEVER, eps_rel=0.0, eps_prim_inf=NEVER, eps_dual_inf=NEVER, verbose=False,
         )  # fmt: skip
         return solver
-
-    def iterate(self, count: int) -> int:
-        """Do `count` iterations."""
-        if count < 1 or self._osqp is None or not self._finite:
-            return 0
-        self._osqp.update_settings(max_iter=count)
-        result = self._osqp.solve(raise_error=False)
-        n = len(self._z)
-        self._z = np.clip(result.x, self._problem.low, self._problem.high)
-        self._multipliers = np.maximum(result.y[n:], 0.0)
-        return count
-
-    @property
-    def solution(self) -> Array:
-        """The present point, projected into the box, shape (n,)."""
-        return self._z.copy()
-
-    @property
-    def cost(self) -> float:
-        """Augmented cost of `solution`."""
-        return float(augmented_cost(self._problem, self._z, self.alpha))
-
-    def judged(self) -> Solution:
-        """Return `solution` with its residuals."""
-        return judge(self._problem, self.solution, self.alpha, self._multipliers.copy())

@@ -4,8 +4,8 @@ qpOASES moves along the line from the previous problem to the present one and st
 It is the qpOASES inside CasADi; its CPU-time limit is not used, since it would make runs irreproducible.
 
 - An iteration is one step of that homotopy. The limit nWSR of a CasADi object is fixed when it is made, so ours is 1
-  and an iteration is a call: going on with the same data goes on along the same line, and `iterate(a)`, `iterate(b)`
-  is `iterate(a + b)` to the bit. One object with nWSR = q gives the same points to rounding until, at some
+  and an iteration is a call: going on with the same data goes on along the same line, and a steps and then b are a + b
+  steps to the bit. One object with nWSR = q gives the same points to rounding until, at some
   harsh load jumps, it takes another path (ramping begins anew at each call); neither is better on average.
 - A truncated answer is the optimum of an intermediate problem. It may violate the box and the rows of the present one;
   it is projected into the box. J is not monotonic (Definition 1 of the paper): see `docs/solvers.md`.
@@ -16,6 +16,7 @@ It is the qpOASES inside CasADi; its CPU-time limit is not used, since it would 
 
 import importlib
 import io
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from functools import cache
 from types import ModuleType
@@ -26,9 +27,8 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from optimizer_plc.computing_settings import QpoasesSettings
-from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import QuadraticProblem
-from optimizer_plc.solution import Solution, judge
+from optimizer_plc.solvers.interface import Answer, collected
 
 Array = NDArray[np.float64]
 
@@ -50,16 +50,30 @@ class QpoasesSolver:
         """Drop the chain: the next problem begins a new one."""
         self._chain = None
 
-    def start(self, problem: QuadraticProblem, guess: Array) -> None:
-        """Take the next problem of the chain; `guess` is the answer until the first iteration."""
-        self._problem = problem
-        self._z = np.clip(guess, problem.low, problem.high)
-        self._multipliers = np.zeros_like(problem.gamma)
-        self._status = ON_THE_WAY if _well_posed(problem) else "ill-posed data"
-        if self._status == ON_THE_WAY:  # other data never reach the chain, which they would end
-            self._begin_or_go_on(problem)
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
+        """Go along the homotopy to this problem, or up to its end; the guess is the answer until the first step."""
+        guess = np.clip(guess, problem.low, problem.high)
+        z, multipliers, done = guess, np.zeros_like(problem.gamma), 0
+        status = ON_THE_WAY if _well_posed(problem) else "ill-posed data"
+        if status == ON_THE_WAY:  # other data never reach the chain, which they would end
+            self._begin_or_continue(problem)
+        points, iterations = [], []
+        for count in counts:
+            before = done
+            while done < count and self._chain is not None and status == ON_THE_WAY:
+                status = self._chain.step()
+                done += 1
+            if self._chain is not None and done > before:
+                if status in (SOLVED, ON_THE_WAY):
+                    z = np.clip(self._chain.z, problem.low, problem.high)
+                    multipliers = np.maximum(self._chain.multipliers, 0.0)
+                else:  # a chain that broke stays broken; the answer is the last one that was good
+                    self._chain = None
+            points.append(z)
+            iterations.append(done)
+        return collected(problem, self.alpha, guess, points, iterations, multipliers)
 
-    def _begin_or_go_on(self, problem: QuadraticProblem) -> None:
+    def _begin_or_continue(self, problem: QuadraticProblem) -> None:
         fresh = self._chain is None
         if self._chain is None:
             self._chain = _Chain(self._casadi, problem)
@@ -68,35 +82,6 @@ class QpoasesSolver:
             for _ in range(FIRST_SOLVE_LIMIT):
                 if self._chain.step() != ON_THE_WAY:
                     break
-
-    def iterate(self, count: int) -> int:
-        """Go `count` steps along the homotopy, or up to its end."""
-        done = 0
-        while done < count and self._chain is not None and self._status == ON_THE_WAY:
-            self._status = self._chain.step()
-            done += 1
-        if self._chain is None or not done:
-            return done
-        if self._status in (SOLVED, ON_THE_WAY):
-            self._z = np.clip(self._chain.z, self._problem.low, self._problem.high)
-            self._multipliers = np.maximum(self._chain.multipliers, 0.0)
-        else:  # a chain that broke stays broken; the answer is the last one that was good
-            self._chain = None
-        return done
-
-    @property
-    def solution(self) -> Array:
-        """The present point, projected into the box, shape (n,)."""
-        return self._z.copy()
-
-    @property
-    def cost(self) -> float:
-        """Augmented cost of `solution`."""
-        return float(augmented_cost(self._problem, self._z, self.alpha))
-
-    def judged(self) -> Solution:
-        """Return `solution` with its residuals; its multipliers are those of the intermediate problem."""
-        return judge(self._problem, self.solution, self.alpha, self._multipliers.copy())
 
 
 def _well_posed(problem: QuadraticProblem) -> bool:

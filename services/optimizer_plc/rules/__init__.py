@@ -1,0 +1,91 @@
+"""Rules of the updating period: one file each, one interface, joined here by name."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.compiled import kernel
+from coldloop.registers.optimizer_plc import UpdatingRuleStatus
+from optimizer_plc.arithmetic import DOUBLE, Real
+from optimizer_plc.budget import PlcBudget
+from optimizer_plc.rules import algorithm_1, contraction
+from optimizer_plc.rules.algorithm_1 import Algorithm1
+from optimizer_plc.rules.contraction import ContractionRule
+from optimizer_plc.rules.fixed_period import FixedPeriod
+from optimizer_plc.rules.interface import Assessment, Observation, UpdatingRule, assess, decides_by
+from optimizer_plc.settings import ProgramSettings, RuleName
+
+__all__ = [
+    "Algorithm1", "Assessment", "ContractionRule", "FixedPeriod", "Observation", "Rule", "UpdatingRule", "assess",
+    "make_rule",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+
+FIXED_PERIOD: Final = 0
+ALGORITHM_1: Final = 1
+CONTRACTION: Final = 2
+_BY_NAME: Final = {RuleName.ALGORITHM_1: ALGORITHM_1, RuleName.CONTRACTION: CONTRACTION}
+
+
+class Rule(NamedTuple):
+    """The rules side by side, of which one decides: what is compiled for one of them serves all."""
+
+    kind: int
+    """FIXED_PERIOD, ALGORITHM_1 or CONTRACTION."""
+    fixed_period: FixedPeriod
+    algorithm_1: Algorithm1
+    contraction: ContractionRule
+
+    @property
+    def chosen(self) -> UpdatingRule:
+        """The rule that decides."""
+        return (self.fixed_period, self.algorithm_1, self.contraction)[self.kind]
+
+    @property
+    def first(self) -> int:
+        """Iterations of the first period, q(t_0)."""
+        return self.chosen.first
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """The rule and its parameters, as registers show them."""
+        return self.chosen.status
+
+    def after_interruption(self, memory: Array) -> int:
+        """Return the iterations of the period that begins with a load step."""
+        return self.chosen.after_interruption(memory)
+
+    def fixed(self, iterations: int) -> "Rule":
+        """Return the rule that always decides for so many iterations."""
+        return self._replace(kind=FIXED_PERIOD, fixed_period=FixedPeriod(iterations))
+
+
+@decides_by(Rule)
+@kernel
+def decide(rule: Rule, memory: Array, o: Observation, a: Assessment) -> int:
+    """Return q(t_{k+1})."""
+    if rule.kind == ALGORITHM_1:
+        return algorithm_1.decide(rule.algorithm_1, memory, o, a)
+    if rule.kind == CONTRACTION:
+        return contraction.decide(rule.contraction, memory, o, a)
+    return rule.fixed_period.iterations
+
+
+def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, real: Real = DOUBLE) -> Rule:
+    """Return the rule that the settings name.
+
+    Args:
+        settings: Of the program.
+        budget: Says how many iterations fit into a fixed period.
+        fixed_ticks: Fixed updating period; 0 is adaptive.
+        real: Floating-point type of the costs.
+    """
+    adaptive, own = settings.adaptive, settings.adaptive.contraction
+    return Rule(
+        FIXED_PERIOD if fixed_ticks else _BY_NAME[adaptive.rule],
+        FixedPeriod(budget.iterations(fixed_ticks)),
+        Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta),
+        ContractionRule(own.q_busy, own.q_quiet, own.q_step, real(own.rate), real(own.memory), real(own.surprise)),
+    )
