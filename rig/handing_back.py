@@ -13,7 +13,6 @@ from plant.program import LoadProfile
 from rig.load_stream import LoadStream
 from rig.operator_client import LEAD_TICKS, write_pace
 from rig.session_client import SessionClient
-from rig.told_records import told
 
 log = logging.getLogger("coldloop.rig")
 
@@ -33,15 +32,15 @@ async def look_around(rig: SessionClient) -> Found | None:
     Raises:
         LinkError: A service does not answer.
     """
-    identity, pace = await told(rig.plant, Identity), await told(rig.plant, SessionPace)
+    identity, pace = await rig.plant.read(Identity), await rig.plant.read(SessionPace)
     if not identity.session or not pace.realtime:
         return None
-    return Found(pace, await told(rig.control, Operator), await _load_from(rig, identity.tick))
+    return Found(pace, await rig.control.read(Operator), await _load_from(rig, identity.tick))
 
 
 async def _load_from(rig: SessionClient, now: int) -> LoadProfile:
     """Return the load from now on: of the session's table, unless somebody has written another one since."""
-    status, asked = await told(rig.plant, LoadStatus), await told(rig.plant, PlantSession)
+    status, asked = await rig.plant.read(LoadStatus), await rig.plant.read(PlantSession)
     steps: list[LoadStep] = []
     if status.upcoming:
         steps = await rig.plant.read_rows(LoadStep, 0, min(asked.load_steps, LOAD_ROWS))

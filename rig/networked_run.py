@@ -8,6 +8,7 @@ from typing import Any, Final
 from coldloop.config import Configuration
 from coldloop.endpoints import Endpoint
 from coldloop.service import run_event_loop
+from rig.answer_time import answered_in_time
 from rig.handing_back import give_back, look_around
 from rig.job import Job, StopRequest, Way
 from rig.local_services import run_on_localhost
@@ -17,7 +18,6 @@ from rig.rig_endpoints import RigEndpoints
 from rig.scenario import Scenario
 from rig.session_client import SessionClient
 from rig.settings import Settings
-from rig.told_records import answered_in_time
 
 ATTACH_PATIENCE_S: Final = 5.0
 

@@ -18,7 +18,6 @@ from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmComma
 from coldloop.seal import sealed
 from rig.load_stream import LoadStream
 from rig.rig_endpoints import RigEndpoints
-from rig.told_records import told
 
 if TYPE_CHECKING:
     from plant.program import LoadProfile
@@ -79,14 +78,14 @@ class OperatorClient:
         """Change the load from a tick on; return what came back."""
         if not 0.0 <= watts <= MAX_LOAD_W:
             raise UsageError(f"load {watts:g} W: not from 0 to {MAX_LOAD_W:g} W")
-        before = await told(self.plant, LoadStatus)
+        before = await self.plant.read(LoadStatus)
         tick = 0 if at_s is None else await self._tick_to_come(at_s)
         await _asked(self.plant.write(sealed(LiveLoad(tick, watts))))
         return f"{await self._load_text(tick, watts)} (was {before.watts:g} W)"
 
     async def _tick_to_come(self, at_s: float) -> int:
         """Return the tick of a time that is to come."""
-        tick, now = round(at_s / TICK_S), (await told(self.plant, Identity)).tick
+        tick, now = round(at_s / TICK_S), (await self.plant.read(Identity)).tick
         if tick <= now:
             raise UsageError(
                 f"--at {at_s:g}: plant time is {now * TICK_S:g} s already; give a later one, or leave it out"
@@ -95,7 +94,7 @@ class OperatorClient:
 
     async def _load_text(self, tick: int, watts: float) -> str:
         """Return what the plant knows of a load that was written from a tick on; 0 is the next one."""
-        status = await told(self.plant, LoadStatus)
+        status = await self.plant.read(LoadStatus)
         if not status.upcoming:
             return f"load {status.watts:g} W now"
         if tick and status.last_tick != tick:
@@ -109,15 +108,15 @@ class OperatorClient:
 
     async def stream_load(self, load: "LoadProfile", at_s: float | None, say: Callable[[str], None]) -> str:
         """Write a load of any length, as fast as the plant can store it; return what came back."""
-        identity = await told(self.plant, Identity)
+        identity = await self.plant.read(Identity)
         if not identity.session:
             raise UsageError(f"{self.plant.peer} has no session")
         begin = identity.tick + LEAD_TICKS if at_s is None else await self._tick_to_come(at_s)
-        free = (await told(self.plant, LoadStatus)).free
+        free = (await self.plant.read(LoadStatus)).free
         stream = LoadStream(self.plant, identity.session, load, begin=begin, ahead=max(0, free - AHEAD_STEPS))
         said = False
         while True:
-            await stream.feed((await told(self.plant, Identity)).tick)
+            await stream.feed((await self.plant.read(Identity)).tick)
             if stream.done:
                 break
             if await stream.was_replaced():
@@ -126,7 +125,7 @@ class OperatorClient:
                 said = True
                 say(f"the plant keeps {free} steps of {stream.steps}: this goes on until it has all of them")
             await asyncio.sleep(LOOK_S)
-        status = await told(self.plant, LoadStatus)
+        status = await self.plant.read(LoadStatus)
         times = f"{begin * TICK_S:g} s to {status.last_tick * TICK_S:g} s"
         return f"load of {stream.steps} steps from {times}; its last value is held"
 
@@ -135,7 +134,7 @@ class OperatorClient:
     async def set_mode(self, name: str) -> str:
         """Let an operator decide who drives; return what came of it."""
         mode = OperatorMode[name.upper()]
-        operator = await told(self.control, Operator)
+        operator = await self.control.read(Operator)
         await _asked(self.control.write(operator._replace(mode=mode)))
         ladder = await self._effect(mode)
         return (
@@ -148,17 +147,17 @@ class OperatorClient:
         expected = {OperatorMode.MANUAL: {Mode.MANUAL}, OperatorMode.CLASSICAL: {Mode.CLASSICAL}}.get(
             wanted, {Mode.MPC, Mode.REST}
         )
-        ladder = await told(self.control, LadderStatus)
+        ladder = await self.control.read(LadderStatus)
         for _ in range(round(EFFECT_S / LOOK_S)):
             if ladder.mode in expected:
                 break
             await asyncio.sleep(LOOK_S)
-            ladder = await told(self.control, LadderStatus)
+            ladder = await self.control.read(LadderStatus)
         return ladder
 
     async def set_setpoint(self, name: str, value: float) -> str:
         """Write a setpoint of manual mode; return what came back."""
-        operator = await told(self.control, Operator)
+        operator = await self.control.read(Operator)
         place = FIELDS[name]
         low, high = self._limits.low[place], self._limits.high[place]
         unit = INPUT_UNITS[place]
@@ -171,19 +170,19 @@ class OperatorClient:
             )
         values = [value if i == place else present for i, present in enumerate(operator[1:])]
         await _asked(self.control.write(Operator(operator.mode, *values)))
-        back = await told(self.control, Operator)
+        back = await self.control.read(Operator)
         return f"setpoint of {INPUT_NAMES[place]} {back[1 + place]:g} {unit} (was {operator[1 + place]:g} {unit})"
 
     # -- time ----------------------------------------------------------------------------------------------------------
 
     async def set_factor(self, factor: float) -> str:
         """Change how fast plant time goes; a session in lock-step changes over to real time."""
-        pace = await told(self.plant, SessionPace)
+        pace = await self.plant.read(SessionPace)
         return await self._set_pace(pace._replace(realtime=1, factor=factor))
 
     async def set_paused(self, *, paused: bool) -> str:
         """Pause or resume plant time."""
-        pace = await told(self.plant, SessionPace)
+        pace = await self.plant.read(SessionPace)
         if not pace.realtime:
             raise UsageError("the session is in lock-step: it goes as far as it is granted")
         return await self._set_pace(pace._replace(paused=int(paused)))
@@ -192,7 +191,7 @@ class OperatorClient:
         if not 0.01 <= pace.factor <= 10_000:
             raise UsageError(f"factor {pace.factor:g}: not from 0.01 to 10000")
         await write_pace((self.plant, self.control, self.optimizer), pace)
-        back, tick = await told(self.plant, SessionPace), (await told(self.plant, Identity)).tick
+        back, tick = await self.plant.read(SessionPace), (await self.plant.read(Identity)).tick
         state = "paused" if back.paused else "real time"
         return f"{state} at {tick * TICK_S:g} s, factor {back.factor:g}"
 

@@ -39,7 +39,18 @@ USES: Final = {
 }
 """The mark of a test that requests, itself or through other fixtures, one of these."""
 
-SHARED: Final = ("site", "served", "rack", "three_processes", "live_rig", "page_rig", "up", "client", "_engine")
+SHARED: Final = (
+    "site",
+    "start_site",
+    "served",
+    "rack",
+    "three_processes",
+    "live_rig",
+    "page_rig",
+    "up",
+    "client",
+    "_engine",
+)
 """Fixtures that start processes for many tests: these tests run in one worker, which starts them once."""
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # whoever started the tests ignores it; what they start must not

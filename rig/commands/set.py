@@ -73,8 +73,8 @@ def execute(options: argparse.Namespace) -> int:
 
 
 async def _do(options: argparse.Namespace) -> None:
+    from rig.answer_time import answered_in_time
     from rig.operator_client import OperatorClient
-    from rig.told_records import answered_in_time
 
     settings = operator_settings(options)
     command: Callable[[OperatorClient, argparse.Namespace], Done] = options.command

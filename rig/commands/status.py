@@ -29,9 +29,9 @@ def execute(options: argparse.Namespace) -> int:
 
 
 async def _show(options: argparse.Namespace) -> None:
+    from rig.answer_time import answered_in_time
     from rig.operator_client import OperatorClient
     from rig.rig_status import line, page, read_status
-    from rig.told_records import answered_in_time
 
     settings = operator_settings(options)
     client = OperatorClient(rig_endpoints(options, settings), settings.limits)

@@ -1,12 +1,11 @@
 """Registers of a server by their names in docs/registers.md."""
 
-import struct
 from collections.abc import Callable, Coroutine, Iterator
 from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 from coldloop.endpoints import Endpoint
-from coldloop.errors import UsageError
+from coldloop.errors import UnfitValueError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.declaration import Block, RegisterMap, fields_of
 
@@ -73,9 +72,10 @@ class NamedRegisters:
             record = self._record(where, row)._replace(**values)
         try:
             self._call(self._client.write_rows([record], row))
-        except (struct.error, OverflowError, TypeError) as error:
+        except (UnfitValueError, TypeError) as error:
             given = ", ".join(f"{name}={value!r}" for name, value in values.items())
-            raise UsageError(f"block '{block}' cannot hold {given}: {error}") from None
+            reason = str(error).rpartition(": ")[2]
+            raise UsageError(f"block '{block}' cannot hold {given}: {reason}") from None
 
     def _record(self, block: Block, row: int) -> Any:  # noqa: ANN401 the record of that block
         if not 0 <= row < block.rows:

@@ -151,32 +151,46 @@ def _answer(status: int, raw: bytes, headers: Message) -> Answer:
     return Answer(status, json.loads(raw) if is_json else raw.decode(), headers)
 
 
-@pytest.fixture(scope="session")
-def start_site(
-    shared_processes: Processes,
-    tmp_path_factory: pytest.TempPathFactory,
-    realtime: None,  # noqa: ARG001 a mark
-) -> Iterator[Callable[..., Site]]:
-    """Start sites with settings of the page that differ; they end with the tests."""
+@contextlib.contextmanager
+def sites(processes: Processes, folders: pytest.TempPathFactory) -> Iterator[Callable[..., Site]]:
+    """Start sites with settings of the page that differ; they end with the context."""
     started: list[Site] = []
 
     def start(*, kind: str = "cold-box", **overrides: object) -> Site:
-        one = Site(shared_processes, tmp_path_factory.mktemp("site"), overrides, kind)
+        one = Site(processes, folders.mktemp("site"), overrides, kind)
         started.append(one)
         for service in SERVICES:
             one.start(service)
         eventually(one.is_live, "all services answer the page")
         return one
 
-    yield start
-    for one in started:
-        one.end()
+    try:
+        yield start
+    finally:
+        for one in started:
+            one.end()
+
+
+@pytest.fixture(scope="module")
+def start_site(
+    shared_processes: Processes,
+    tmp_path_factory: pytest.TempPathFactory,
+    realtime: None,  # noqa: ARG001 a mark
+) -> Iterator[Callable[..., Site]]:
+    """Start sites of one's own, which end with the tests of a file: in real time they never rest."""
+    with sites(shared_processes, tmp_path_factory) as start:
+        yield start
 
 
 @pytest.fixture(scope="session")
-def site(start_site: Callable[..., Site]) -> Site:
+def site(
+    shared_processes: Processes,
+    tmp_path_factory: pytest.TempPathFactory,
+    realtime: None,  # noqa: ARG001 a mark
+) -> Iterator[Site]:
     """One site for all tests; they leave it as they found it."""
-    return start_site()
+    with sites(shared_processes, tmp_path_factory) as start:
+        yield start()
 
 
 # -- registers, read without anything of ours --------------------------------------------------------------------------

@@ -1,11 +1,13 @@
 """What the page draws is what was read and what is so: gaps, other modes, replays, and commands that wait."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from hmi.trends import NAMES
+from tests.harness.processes import Processes
 from tests.hmi.conftest import RECORDED_S, Served, Site, eventually, opened
 from tests.hmi.test_operating import MANUAL, MPC, confirm, mode, view
 from tests.hmi.test_sceptical_operator import operated, outcome
@@ -32,7 +34,7 @@ def test_a_time_in_which_nothing_was_read_is_a_gap_and_no_line(page: "Page", sit
     assert inside == [None], "the line is interrupted once"
     eventually(lambda: page.evaluate("document.querySelector('#chart-L1').dataset.gaps > 0"), "it is drawn")
     assert "nothing read" in page.inner_text("#trend-legend")
-    eventually(lambda: mode(site) == MPC, "MPC drives again", 90)
+    eventually(lambda: mode(site) == MPC, "MPC drives again")
 
 
 def test_in_manual_nothing_of_mpc_looks_current_and_the_button_says_who_drives(operated: "Page", site: Site) -> None:
@@ -52,12 +54,12 @@ def test_in_manual_nothing_of_mpc_looks_current_and_the_button_says_who_drives(o
         view(operated, "commands")
         operated.click("[data-mode=auto]")
         confirm(operated)
-    eventually(lambda: mode(site) == MPC, "MPC drives again", 90)
-    eventually(lambda: operated.locator("#tau-u.stale").count() == 0, "it is current again", 60)
+    eventually(lambda: mode(site) == MPC, "MPC drives again")
+    eventually(lambda: operated.locator("#tau-u.stale").count() == 0, "it is current again")
 
 
 def test_why_shows_the_trajectory_that_was_predicted_for_the_update(page: "Page", site: Site) -> None:
-    eventually(lambda: mode(site) == MPC, "MPC drives", 90)
+    eventually(lambda: mode(site) == MPC, "MPC drives")
     view(page, "why")
     eventually(lambda: page.locator("#why-charts .chart[data-ahead=true]").count() == 2, "both outputs")
 
@@ -112,7 +114,10 @@ def test_a_small_screen_shows_the_whole_drawing(browser: "Browser", site: Site) 
         assert box["y"] + box["height"] <= lines["y"]
 
 
-def test_a_replay_begins_at_its_beginning_and_knows_since_when_and_which_alarms(served: Served) -> None:
+def test_a_replay_begins_at_its_beginning_and_knows_since_when_and_which_alarms(
+    processes: Processes, recorded_run: Path
+) -> None:
+    served = Served(processes, recorded_run)
     assert served.ask("/api/replay")["tick"] == 0
     served.ask("/api/replay", {"tick": 4 * RECORDED_S - 1})
     state = served.ask("/api/state")
