@@ -100,6 +100,10 @@ class Lesson(NamedTuple):
             first.language != "python" and bool(NEEDS_A_RIG.search(first.text)) and not STARTS_A_RIG.search(first.text)
         )
 
+    def leaves(self) -> set[str]:
+        """Return the names of the runs that the blocks make themselves."""
+        return {name for each in self.blocks for name in re.findall(r"--out runs/(\w+)", each.text)}
+
     def says(self, pattern: str | re.Pattern[str]) -> bool:
         return any(re.search(pattern, each.text) for each in self.blocks)
 
@@ -304,6 +308,8 @@ def test_what_a_page_says_can_be_done(
         request.getfixturevalue("mbpoll")
     if lesson.says("runs/[ab]"):
         shutil.copytree(recorded, tmp_path / "runs")
+        for name in lesson.leaves():
+            shutil.rmtree(tmp_path / "runs" / name, ignore_errors=True)
     reader.follow(lesson)
 
 
