@@ -231,9 +231,11 @@ async def test_one_flipped_bit_in_the_model_that_is_read_ends_nothing(
 async def test_a_control_plc_that_comes_back_with_another_model_is_waited_for_without_taking_its_lease(
     connect: "Connect", control: "PlayedControlPlc", model: LtiModel
 ) -> None:
+    control.latches_on = False
     control.latch()
     async with connect(control) as link:
         await link.answers(1)
+        await link.reaches(S.WAITING)  # a write that the cut interrupts would leave the lease with a dead connection
         control.runs(model.short_digest ^ 1)
         link.wire.cut()
         await link.reaches(S.WRONG_MODEL)
