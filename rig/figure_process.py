@@ -4,6 +4,7 @@ python -m rig.figure_process <folder and formats as JSON on standard input> the 
 """
 
 import contextlib
+import gc
 import json
 import pickle
 import subprocess
@@ -83,6 +84,7 @@ def main() -> None:
     except (OSError, ColdloopError) as error:
         with contextlib.suppress(BrokenPipeError):
             sys.stdout.buffer.write(pickle.dumps(error))
+    gc.freeze()  # whoever waits for the end need not wait until all modules have been searched for cycles
 
 
 if __name__ == "__main__":

@@ -1,12 +1,15 @@
 """Folders and files of results. A file appears whole or not at all, and only a regular file is replaced."""
 
+import contextlib
 import json
 import os
 import socket
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
+from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,23 @@ def claim_folder(folder: Path, *, force: bool) -> None:
     if taken:
         raise UsageError(f"{folder}: the folder is not empty; name another one with --out, or overwrite with --force")
     prepare_folder(folder)
+
+
+def claim_folder_of_now(parent: Path, name: str) -> Path:
+    """Make and return a new folder named after what is run and when; of two that begin in one second each has its own.
+
+    Raises:
+        UsageError: It cannot be written to.
+    """
+    prepare_folder(parent)
+    of_now = f"{name}-{datetime.now():%Y%m%d-%H%M%S}"  # noqa: DTZ005 the user's clock
+    folder = parent / of_now
+    for number in count(2):
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            break
+        folder = parent / f"{of_now}-{number}"
+    return folder
 
 
 def prepare_folder(folder: Path) -> None:

@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,12 +56,12 @@ def execute(options: argparse.Namespace) -> int:
     from rig.chaos.plan import find_plan
     from rig.chaos.progress import ChaosProgress
     from rig.manifest import plain_arguments
-    from rig.results import claim_folder
+    from rig.results import claim_folder, claim_folder_of_now
 
     plan = find_plan(options.plan, _changes(options))
     effective = configuration(options)
     _refuse_what_has_no_effect(effective)
-    out = options.out or Path("chaos") / f"{plan.name}-{datetime.now():%Y%m%d-%H%M%S}"  # noqa: DTZ005
+    out = options.out or claim_folder_of_now(Path("chaos"), plan.name)
     claim_folder(out, force=options.force)
     with ChaosProgress(plan.ticks) as progress:
         experiment = perform(

@@ -3,7 +3,6 @@
 import argparse
 import sys
 from contextlib import contextmanager
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -75,12 +74,12 @@ def execute(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace, figure: "FigureProcess") -> int:
     from rig.manifest import plain_arguments
-    from rig.results import claim_folder
+    from rig.results import claim_folder, claim_folder_of_now
     from rig.running import run_into
 
     job = _job(options)
     load = Path(job.effective.settings.plant.load).stem
-    out = options.out or Path("runs") / f"{load}-{datetime.now():%Y%m%d-%H%M%S}"  # noqa: DTZ005
+    out = options.out or claim_folder_of_now(Path("runs"), load)
     claim_folder(out, force=options.force)
     with _progress(job) as sinks:
         summary = run_into(out, job, plain_arguments(options), figure, sinks)

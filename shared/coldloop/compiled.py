@@ -18,7 +18,7 @@ import zlib
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import IO, Any, ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
@@ -163,11 +163,11 @@ def _cache_directory() -> Path:
     return Path(tempfile.mkdtemp(prefix="coldloop-kernels-"))
 
 
-def _file_of_locks(folder: Path) -> IO[bytes] | None:
+def _file_of_locks(folder: Path) -> int | None:
     if fcntl is None:
         return None
     try:
-        return (folder / "locks").open("ab")
+        return os.open(folder / "locks", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     except OSError:  # another user's, who shares the folder
         return None
 

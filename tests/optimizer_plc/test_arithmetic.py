@@ -17,7 +17,7 @@ from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, OdeSetti
 from optimizer_plc.costs import augmented_cost
 from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings, SolverName
+from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings
 from optimizer_plc.solvers.ode import ode_solver
 from tests.harness.processes import Processes
 from tests.optimizer_plc.single_precision import code, has_double
@@ -33,17 +33,10 @@ ON_LINE = {"instance.instance", "profile.inputs_of", "scheme.plan", "scheme.solv
 """Kernels that the program calls; those that they call, solvers and rules among them, are part of their code."""
 
 
-def test_no_kernel_of_the_default_solver_computes_with_a_double_in_single_precision(processes: Processes) -> None:
-    check([(SolverName.ODE, EstimatorKind.KALMAN)], processes)
-
-
 @pytest.mark.exhaustive
 def test_no_kernel_computes_with_a_double_in_single_precision(processes: Processes) -> None:
-    check(list(product(SINGLE_PRECISION_SOLVERS, EstimatorKind)), processes)
-
-
-def check(cases: list[tuple[SolverName, EstimatorKind]], processes: Processes) -> None:
-    """Let these pairs compute in an interpreter of their own, which has compiled nothing for other tests."""
+    """In an interpreter of its own, which has compiled nothing for other tests: all kernels are compiled there."""
+    cases = list(product(SINGLE_PRECISION_SOLVERS, EstimatorKind))
     names = [(solver.value, estimator.value) for solver, estimator in cases]
     program = f"from tests.optimizer_plc.single_precision import main; main({names})"
     called, faults = json.loads(processes.run_python(program)[0])

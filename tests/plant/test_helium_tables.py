@@ -6,9 +6,6 @@ from hypothesis import strategies as st
 
 from plant.helium import properties as helium_at
 from plant.helium.properties import Helium, load_helium
-from plant.helium.tabulate import aluminium_heat_capacity
-
-PropsSI = pytest.importorskip("CoolProp.CoolProp").PropsSI
 
 HELIUM: Helium = load_helium()
 bath_pressures = st.floats(0.9e5, 1.9e5)
@@ -16,11 +13,15 @@ superheats = st.floats(0.02, 100.0)
 
 
 def coolprop(name: str, first: str, x: float, second: str, y: float) -> float:
-    return float(PropsSI(name, first, x, second, y, "Helium"))
+    library = pytest.importorskip("CoolProp.CoolProp")  # only here: to load it takes longer than the tests
+    return float(library.PropsSI(name, first, x, second, y, "Helium"))
 
 
 @given(T=st.floats(4.0, 300.0))
 def test_the_16_bar_isobar_agrees(T: float) -> None:
+    pytest.importorskip("CoolProp.CoolProp")
+    from plant.helium.tabulate import aluminium_heat_capacity  # noqa: PLC0415 loads CoolProp
+
     h, rho = helium_at.supply_enthalpy_and_density(16e5, T, HELIUM)
     h_cell, rho_cp, c_wall = helium_at.supply_cell(16e5, T, HELIUM)
     density, cp = coolprop("D", "P", 16e5, "T", T), coolprop("C", "P", 16e5, "T", T)

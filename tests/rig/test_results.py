@@ -31,7 +31,7 @@ from rig.columns import FILES
 from rig.commands.options import PLACES
 from rig.indicators import evaluate
 from rig.recording import LinkStatistics, Recorder, Recording
-from rig.results import whole_file, write_json
+from rig.results import claim_folder_of_now, whole_file, write_json
 from rig.scenario import Scenario
 from rig.settings import Settings
 
@@ -268,3 +268,10 @@ def test_a_run_without_updates_leaves_all_files_too(coldloop: "Coldloop", result
     assert pq.read_table(results / "updates.parquet").num_rows == 0
     assert pq.read_table(results / "trace.parquet").num_rows == TICKS
     assert (results / "run.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_runs_that_begin_in_one_second_have_a_folder_each(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        folders = list(pool.map(lambda _: claim_folder_of_now(tmp_path / "runs", "a"), range(40)))
+    assert len(set(folders)) == 40
+    assert all(folder.is_dir() and folder.name.startswith("a-20") for folder in folders)
