@@ -15,13 +15,15 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from optimizer_plc.settings import ProgramSettings
     from plant.settings import PlantKind
 
 LOOK_S: Final = 0.2
+WAITING: Final = 2
+"""Processes beside those that the cores have work for: some wait for kernels that others compile."""
 ROOT: Final = Path(__file__).parents[1]
 
 
@@ -83,20 +85,25 @@ def _make_optimizer(settings: "ProgramSettings") -> None:
     OptimizerProgram(load(DEFAULT_MODEL_FILE), settings, InputLimits())
 
 
-def cold_box_in_one_process() -> None:
-    """Let a minute pass in one process with a cold box: the compiled loop, and the programs for what is unusual."""
-    _simulate("cold-box")
+def in_one_process(**changes: Any) -> Callable[[], None]:  # noqa: ANN401 as of `simulate`
+    """Return what lets a minute pass in one process: the compiled loop, and the programs for what is unusual."""
+
+    def minute() -> None:
+        from rig import simulate  # noqa: PLC0415 not in the images
+
+        simulate(load="a", duration_s=60, **changes)
+
+    return minute
 
 
-def refrigerator_in_one_process() -> None:
-    """Let a minute pass in one process with a refrigerator."""
-    _simulate("refrigerator")
+def linear_models() -> None:
+    """Linearise both plants, which takes kernels of complex numbers."""
+    from coldloop.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
+    from plant.refrigerator_model import make_refrigerator_file  # noqa: PLC0415
+    from rig.model_listing import describe_model  # noqa: PLC0415 not in the images
 
-
-def _simulate(plant: str) -> None:
-    from rig import simulate  # noqa: PLC0415 not in the images
-
-    simulate(load="a", duration_s=60, plant={"kind": plant})
+    describe_model(DEFAULT_MODEL_FILE)
+    make_refrigerator_file()
 
 
 def run_modules() -> None:
@@ -130,8 +137,13 @@ PARTS: Final[dict[str, tuple[Callable[[], None], int]]] = {
     "hmi": (nothing, 1),
     "default-plant": (default_plant, 9),
     "default-optimizer": (default_optimizer, 13),
-    "cold-box-in-one-process": (cold_box_in_one_process, 55),
-    "refrigerator-in-one-process": (refrigerator_in_one_process, 27),
+    "cold-box-in-one-process": (in_one_process(), 55),
+    "refrigerator-in-one-process": (in_one_process(plant={"kind": "refrigerator"}), 27),
+    "single-precision-in-one-process": (in_one_process(optimizer_plc={"program": {"arithmetic": "float32"}}), 25),
+    "interior-point-in-one-process": (in_one_process(solver="interior-point"), 25),
+    "hybrid-in-one-process": (in_one_process(solver="hybrid"), 25),
+    "fast-gradient-in-one-process": (in_one_process(solver="fast-gradient"), 25),
+    "linear-models": (linear_models, 20),
     "run-modules": (run_modules, 4),
     "all-modules": (all_modules, 13),
     "tests": (tests, 9),
@@ -146,7 +158,7 @@ def compile_parts(parts: Sequence[str]) -> bool:
     total_s = max(sum(PARTS[part][1] for part in parts) / cores, *(PARTS[part][1] for part in parts))
     try:
         while len(done) < len(parts):
-            while waiting and len(processes) - len(done) < cores:
+            while waiting and len(processes) - len(done) < cores + WAITING:
                 part = waiting.pop(0)
                 processes[part] = subprocess.Popen((sys.executable, __file__, part), stderr=subprocess.STDOUT)  # noqa: S603 ourselves
             _show(f"compiling: {len(done)} of {len(parts)} parts, {_left(total_s - time.monotonic() + began)}")
