@@ -9,16 +9,16 @@ from typing import NamedTuple
 
 from coldloop.config import load_configuration
 from coldloop.modbus.client import RegisterClient
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.control_plc import CONTROL_MAP, PlantLinkState, PlantLinkStatus, Status
-from coldloop.service import run_event_loop
+from coldloop.service.start import run_event_loop
 from plant.load import find_load
 from plant.own_model import own_header
-from rig.local_services import LocalServices
-from rig.scenario import Scenario
-from rig.session_client import SessionClient
+from rig.cosim.local_services import LocalServices
+from rig.cosim.scenario import Scenario
+from rig.cosim.session_client import SessionClient
+from rig.cosim.wiring import START_PATIENCE_S
 from rig.settings import Settings
-from rig.wiring import START_PATIENCE_S
 
 
 class Followed(NamedTuple):

@@ -18,18 +18,18 @@ import time
 from pathlib import Path
 
 from coldloop.config import load_configuration
-from coldloop.lti_model import load as load_model
 from coldloop.modbus.client import RegisterClient
-from coldloop.process import TICK_S
+from coldloop.process.lti_model import load as load_model
+from coldloop.process.signals import TICK_S
 from coldloop.registers.common import ServerStatistics
 from coldloop.registers.control_plc import CONTROL_MAP, Process
 from coldloop.registers.plant import PLANT_MAP
 from coldloop.registers.safety import WatchdogStatus
 from plant.load import find_load
-from rig.local_services import LocalServices
-from rig.recording import LinkStatistics, Recorder
-from rig.scenario import Scenario
-from rig.session_client import SessionClient
+from rig.cosim.local_services import LocalServices
+from rig.cosim.scenario import Scenario
+from rig.cosim.session_client import SessionClient
+from rig.results.recording import LinkStatistics, Recorder
 from rig.settings import Settings
 
 OURS = 4

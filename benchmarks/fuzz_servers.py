@@ -30,12 +30,12 @@ from coldloop.modbus.tls import client_context
 from coldloop.registers.common import STATISTICS_BLOCK
 from coldloop.registers.declaration import RegisterMap
 from rig import cli
-from rig.certificate_files import CLIENTS
 from rig.chaos.resources import resident_mb
-from rig.local_services import LocalServices
-from rig.register_listing import MAPS
+from rig.cli.certificate_files import CLIENTS
+from rig.cli.register_listing import MAPS
+from rig.cosim.local_services import LocalServices
+from rig.cosim.wiring import SERVICES
 from rig.settings import Settings
-from rig.wiring import SERVICES
 
 BATCH = 64
 WARM_UP_FRAMES = 2000

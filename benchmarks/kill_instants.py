@@ -6,15 +6,15 @@ import tempfile
 from pathlib import Path
 
 from coldloop.config import Configuration, load_configuration
-from coldloop.process import TICK_S
-from coldloop.session import TimeMode
+from coldloop.process.signals import TICK_S
+from coldloop.session.settings import TimeMode
 from rig.chaos.evaluation import Evaluation
 from rig.chaos.experiment import perform
 from rig.chaos.faults import Kill, Pause
 from rig.chaos.plan import Plan
 from rig.chaos.progress import ChaosProgress
 from rig.chaos.report import summary_lines, write_report
-from rig.results import claim_folder
+from rig.results.folders import claim_folder
 from rig.settings import Settings
 
 IN_FLIGHT_MS = 20.0

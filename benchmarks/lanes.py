@@ -14,11 +14,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import kernel
-from coldloop.model_file import read_header
-from coldloop.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process import TICK_S
-from plant.cold_box import REFERENCE, ColdBox
+from coldloop.kernels.compiled import kernel
+from coldloop.process.model_file import read_header
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.signals import TICK_S
+from plant.cold_box.physics import REFERENCE, ColdBox
 from plant.helium.properties import Helium, load_helium, saturation
 from plant.integrator import advance
 

@@ -12,19 +12,19 @@ import numba
 import numpy as np
 from qp_solvers import Recorded, record
 
-from coldloop.lti_model import load
-from coldloop.process import TICK_S
+from coldloop.process.lti_model import load
+from coldloop.process.signals import TICK_S
 from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.costs import matrices_of
-from optimizer_plc.penalties import DEFAULT_PENALTIES
+from optimizer_plc.qp.costs import matrices_of
+from optimizer_plc.qp.penalties import DEFAULT_PENALTIES
 from optimizer_plc.solvers.ode import descend, flow_in, warm_start
-from plant.cold_box import REFERENCE, evaluate
+from plant.cold_box.physics import REFERENCE, evaluate
 from plant.helium.properties import load_helium
 from plant.integrator import advance_along
 from plant.load import find_load
-from rig.one_process import OneProcessRig
-from rig.recording import Recorder
-from rig.scenario import Scenario
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario
+from rig.results.recording import Recorder
 from rig.settings import Settings
 
 

@@ -6,15 +6,15 @@ import tempfile
 import time
 from pathlib import Path
 
-from coldloop.lti_model import load
 from coldloop.modbus.client import RegisterClient
+from coldloop.process.lti_model import load
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
-from coldloop.service import run_event_loop
+from coldloop.service.start import run_event_loop
 from plant.load import find_load
-from rig.local_services import LocalServices
-from rig.recording import Recorder
-from rig.scenario import Scenario
-from rig.session_client import SessionClient
+from rig.cosim.local_services import LocalServices
+from rig.cosim.scenario import Scenario
+from rig.cosim.session_client import SessionClient
+from rig.results.recording import Recorder
 from rig.settings import Settings
 
 

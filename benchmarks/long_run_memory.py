@@ -13,14 +13,14 @@ from typing import Final
 import numpy as np
 
 from coldloop.config import load_configuration
-from coldloop.lti_model import load as load_model
-from coldloop.process import TICK_S
+from coldloop.process.lti_model import load as load_model
+from coldloop.process.signals import TICK_S
 from plant.load import HOUR_TICKS, HOURS, concatenated, telegraph
-from rig.figure_process import FigureProcess
-from rig.job import Job, Way
-from rig.recording import SampleBlock, Sink
-from rig.results import claim_folder
-from rig.running import make_scenario, run_into
+from rig.cosim.job import Job, Way
+from rig.figures.process import FigureProcess
+from rig.results.folders import claim_folder
+from rig.results.recording import SampleBlock, Sink
+from rig.runs.running import make_scenario, run_into
 from rig.settings import Settings
 
 NAMES: Final = "abcdef"

@@ -17,15 +17,15 @@ from pathlib import Path
 import aiohttp
 
 from coldloop.config import load_configuration
-from coldloop.lti_model import load as load_model
-from coldloop.process import TICK_S
+from coldloop.process.lti_model import load as load_model
+from coldloop.process.signals import TICK_S
 from plant.load import find_load
-from rig.local_services import LocalServices
-from rig.page_process import PageProcess
-from rig.ports import ReservedPorts
-from rig.recording import LinkStatistics, Recorder
-from rig.scenario import Scenario
-from rig.session_client import SessionClient
+from rig.cosim.local_services import LocalServices
+from rig.cosim.ports import ReservedPorts
+from rig.cosim.scenario import Scenario
+from rig.cosim.session_client import SessionClient
+from rig.live.page_process import PageProcess
+from rig.results.recording import LinkStatistics, Recorder
 from rig.settings import Settings
 
 TREND = "api/trend?names=L1,T5,CV155,NCR22_A,CV156,load&seconds=300&points=900"

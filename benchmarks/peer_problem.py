@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from coldloop.limits import InputLimits
-from coldloop.lti_model import load
-from optimizer_plc.design import ControlDesign, trivial_design
-from optimizer_plc.prediction import PredictionModel, state_weights
-from optimizer_plc.problem import PredictiveProblem, Situation
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import load
+from optimizer_plc.qp.design import ControlDesign, trivial_design
+from optimizer_plc.qp.prediction import PredictionModel, state_weights
+from optimizer_plc.qp.problem import PredictiveProblem, Situation
 from optimizer_plc.settings import ProgramSettings, SolverName
 from optimizer_plc.solvers import make_solver
 from rig.settings import Settings

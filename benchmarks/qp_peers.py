@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.qp.problem import QuadraticProblem
 
 Array = NDArray[np.float64]
 

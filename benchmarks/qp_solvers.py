@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from qp_peers import TO_THE_END, installed_peers, peer_answer
 
 from coldloop.errors import ConfigurationError
-from coldloop.lti_model import load
-from optimizer_plc.costs import augmented_cost
-from optimizer_plc.problem import QuadraticProblem
+from coldloop.process.lti_model import load
+from optimizer_plc.qp.costs import augmented_cost
+from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
 from optimizer_plc.solvers import Answer, Solver, judged, make_solver
 from plant.load import find_load
-from rig.one_process import OneProcessRig
-from rig.recording import Recorder
-from rig.scenario import Scenario
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario
+from rig.results.recording import Recorder
 from rig.settings import Settings
 
 Array = NDArray[np.float64]

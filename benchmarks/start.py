@@ -17,9 +17,9 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from coldloop.config import PREFIX, to_environment
-from rig.ports import HOST, ReservedPorts
+from rig.cosim.ports import HOST, ReservedPorts
+from rig.cosim.wiring import SERVICES, endpoints_on, wired
 from rig.settings import Settings
-from rig.wiring import SERVICES, endpoints_on, wired
 
 READ_MAGIC: Final = bytes((0, 1, 0, 0, 0, 6, 1, 3, 0, 0, 0, 2))
 """Function 3: two registers from 0 on, which hold 123.456 in every map."""

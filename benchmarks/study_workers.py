@@ -5,7 +5,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from rig.commands.options import duration
+from rig.durations import duration
 from rig.studies import STUDIES
 from rig.studies.execution import Workers
 from rig.studies.results import conduct

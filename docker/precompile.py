@@ -44,8 +44,8 @@ def default_plant() -> None:
 
 
 def _make_plant(kind: "PlantKind") -> None:
-    from coldloop.model_file import read_header  # noqa: PLC0415
-    from coldloop.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
+    from coldloop.process.model_file import read_header  # noqa: PLC0415
+    from coldloop.process.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from plant.kinds import plant_maker  # noqa: PLC0415
     from plant.program import LoadProfile  # noqa: PLC0415
     from plant.settings import PlantSection  # noqa: PLC0415
@@ -77,9 +77,9 @@ def default_optimizer() -> None:
 
 
 def _make_optimizer(settings: "ProgramSettings") -> None:
-    from coldloop.limits import InputLimits  # noqa: PLC0415
-    from coldloop.lti_model import load  # noqa: PLC0415
-    from coldloop.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
+    from coldloop.process.limits import InputLimits  # noqa: PLC0415
+    from coldloop.process.lti_model import load  # noqa: PLC0415
+    from coldloop.process.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
 
     OptimizerProgram(load(DEFAULT_MODEL_FILE), settings, InputLimits())
@@ -98,9 +98,9 @@ def in_one_process(**changes: Any) -> Callable[[], None]:  # noqa: ANN401 as of 
 
 def linear_models() -> None:
     """Linearise both plants, which takes kernels of complex numbers."""
-    from coldloop.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
-    from plant.refrigerator_model import make_refrigerator_file  # noqa: PLC0415
-    from rig.model_listing import describe_model  # noqa: PLC0415 not in the images
+    from coldloop.process.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
+    from plant.refrigerator.model import make_refrigerator_file  # noqa: PLC0415
+    from rig.cli.model_listing import describe_model  # noqa: PLC0415 not in the images
 
     describe_model(DEFAULT_MODEL_FILE)
     make_refrigerator_file()
@@ -109,8 +109,8 @@ def linear_models() -> None:
 def run_modules() -> None:
     """Import what a run needs besides kernels, so that its bytecode is written."""
     for module in (
-        "control_plc.runtime", "rig.cli", "rig.commands.run", "rig.running", "rig.networked_run", "rig.one_process",
-        "rig.progress", "rig.figure_process", "rig.run_plot",
+        "control_plc.runtime", "rig.cli", "rig.cli.commands.run", "rig.runs.running", "rig.cosim.networked_run",
+        "rig.cosim.one_process", "rig.progress", "rig.figures.process", "rig.figures.run_plot",
     ):  # fmt: skip
         import_module(module)
 

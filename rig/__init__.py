@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rig.simulation import Simulation, simulate
+    from rig.runs.simulation import Simulation, simulate
 
 __all__ = ["Simulation", "simulate"]
 
@@ -11,7 +11,7 @@ __all__ = ["Simulation", "simulate"]
 def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever it is
     """Import what a front door names when it is used: the command line starts without it."""
     if name in __all__:
-        from rig import simulation  # noqa: PLC0415
+        from rig.runs import simulation  # noqa: PLC0415
 
         return getattr(simulation, name)
     raise AttributeError(f"module 'rig' has no attribute {name!r}")

@@ -2,8 +2,8 @@
 
 from pydantic import BaseModel, ConfigDict
 
-from coldloop.limits import InputLimits
 from coldloop.modbus.settings import TlsSettings
+from coldloop.process.limits import InputLimits
 from coldloop.registers.codec import WordOrder
 
 OTHERS = ("model", "session", "telemetry", "hmi")

@@ -14,10 +14,10 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from coldloop.process import L1, T5, TICK_S
+from coldloop.process.signals import L1, T5, TICK_S
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
-from rig.recording import Sink
+from rig.results.recording import Sink
 
 REFRESH_S: Final = 0.1
 NARROW: Final = 72

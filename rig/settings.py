@@ -2,10 +2,10 @@
 
 from pydantic import BaseModel, ConfigDict
 
-from coldloop.limits import InputLimits
-from coldloop.model_settings import ModelSettings
-from coldloop.session import SessionSettings
-from coldloop.telemetry_settings import TelemetrySettings
+from coldloop.process.limits import InputLimits
+from coldloop.process.model_settings import ModelSettings
+from coldloop.service.telemetry_settings import TelemetrySettings
+from coldloop.session.settings import SessionSettings
 from control_plc.settings import ControlSection
 from hmi.settings import HmiSection
 from optimizer_plc.settings import OptimizerSection

@@ -5,7 +5,7 @@ import signal
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from coldloop.service import run_event_loop
+from coldloop.service.start import run_event_loop
 from rig.interruption import INTERRUPTION
 
 

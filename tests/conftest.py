@@ -17,9 +17,9 @@ from hypothesis import settings
 from coldloop.config import PREFIX
 from coldloop.errors import UsageError
 from rig import cli
-from rig.figure_process import FigureProcess
-from rig.ports import ReservedPorts
-from rig.started_rigs import check_ports
+from rig.cosim.ports import ReservedPorts
+from rig.figures.process import FigureProcess
+from rig.live.started_rigs import check_ports
 from tests.harness.processes import Processes
 
 QUICK: Final = settings(deadline=None, print_blob=True, max_examples=20, derandomize="CI" in os.environ)

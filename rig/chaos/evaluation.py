@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process import L1, T5, TICK_S
+from coldloop.process.signals import L1, T5, TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind
 from rig.chaos.trace import ChaosTrace
-from rig.recording import Recording
+from rig.results.recording import Recording
 
 Triple = tuple[float, float, float]
 Pair = tuple[float, float]

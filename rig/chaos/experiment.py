@@ -6,18 +6,18 @@ from typing import Any, NamedTuple
 
 from coldloop.config import Configuration
 from coldloop.errors import LinkError
-from coldloop.lti_model import load as load_model
+from coldloop.process.lti_model import load as load_model
 from rig.chaos.evaluation import Evaluation, evaluate
 from rig.chaos.plan import Plan
 from rig.chaos.runner import conduct
 from rig.chaos.sequencer import Progress
 from rig.chaos.trace import ChaosTrace
-from rig.figure_process import FigureProcess
-from rig.job import Job, Way
-from rig.one_process import OneProcessRig
-from rig.recording import Recorder, Recording
-from rig.running import run_into
-from rig.scenario import Scenario
+from rig.cosim.job import Job, Way
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario
+from rig.figures.process import FigureProcess
+from rig.results.recording import Recorder, Recording
+from rig.runs.running import run_into
 from rig.settings import Settings
 
 

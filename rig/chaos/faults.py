@@ -5,8 +5,8 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from coldloop.process import OUTPUT_NAMES, TICK_S
-from plant.refrigerator_events import EventTarget, RefrigeratorEvent
+from coldloop.process.signals import OUTPUT_NAMES, TICK_S
+from plant.refrigerator.events import EventTarget, RefrigeratorEvent
 
 Share = Annotated[float, Field(gt=0, le=1)]
 Duration = Annotated[float, Field(gt=0, le=86_400)]

@@ -9,13 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from coldloop.process import INPUT_NAMES, L1, T5, TICK_S
+from coldloop.process.signals import INPUT_NAMES, L1, T5, TICK_S
 from coldloop.registers.control_plc import Mode
 from rig.chaos.evaluation import Bands
 from rig.chaos.trace import ChaosTrace
-from rig.plot import ACCENT, BAND, INK, THIRD, Series, legend_above, view
-from rig.recording import Recording
-from rig.results import whole_file
+from rig.figures.plot import ACCENT, BAND, INK, THIRD, Series, legend_above, view
+from rig.results.folders import whole_file
+from rig.results.recording import Recording
 
 COLOURS: Final = {
     Mode.MPC: INK, Mode.REST: "#7f9cb8", Mode.HOLD: "#d9a441", Mode.CLASSICAL: ACCENT, Mode.MANUAL: THIRD,

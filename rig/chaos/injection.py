@@ -8,7 +8,7 @@ from typing import Final, Protocol
 
 from coldloop.config import PREFIX
 from coldloop.errors import LinkError
-from coldloop.process import OUTPUT_NAMES
+from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.plant import SensorFault, SensorFaultKind
 from rig.chaos.faults import (
     SERVICE_OF,
@@ -25,8 +25,8 @@ from rig.chaos.faults import (
 )
 from rig.chaos.models import WRONG_MODEL
 from rig.chaos.proxy import LinkProxy
-from rig.local_services import LocalServices
-from rig.wiring import SERVICES
+from rig.cosim.local_services import LocalServices
+from rig.cosim.wiring import SERVICES
 
 ATTEMPTS: Final = 20
 _SHOWN: Final = {"nan": SensorFaultKind.NOT_A_NUMBER, "frozen": SensorFaultKind.FROZEN, "value": SensorFaultKind.VALUE}

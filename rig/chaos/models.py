@@ -6,13 +6,13 @@ from typing import Final
 
 import numpy as np
 
-from coldloop.lti_model import discretise, load
-from coldloop.process import TICK_S
-from plant.cold_box import REFERENCE
-from plant.equilibrium import find_equilibrium
+from coldloop.process.lti_model import discretise, load
+from coldloop.process.signals import TICK_S
+from plant.cold_box.equilibrium import find_equilibrium
+from plant.cold_box.linearisation import linearise
+from plant.cold_box.model import OPERATING_LEVEL
+from plant.cold_box.physics import REFERENCE
 from plant.helium.properties import load_helium
-from plant.linearisation import linearise
-from plant.model import OPERATING_LEVEL
 
 WRONG_MODEL: Final = "wrong_model.json"
 """Its file in the folder of a run."""

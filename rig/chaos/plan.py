@@ -9,13 +9,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from coldloop.config import Configuration, parsed_toml
 from coldloop.errors import LoadFileError, UsageError
-from coldloop.process import TICK_S
-from coldloop.session import TimeMode
+from coldloop.process.signals import TICK_S
+from coldloop.session.settings import TimeMode
 from plant.load import concatenated, find_load, named_families, telegraph
 from plant.program import LoadProfile
 from plant.settings import PlantKind
 from rig.chaos.faults import AnyFault, Given
-from rig.scenario import Scenario
+from rig.cosim.scenario import Scenario
 from rig.settings import Settings
 
 SHIPPED: Final = files("rig.chaos") / "plans"

@@ -5,7 +5,7 @@ from typing import Final
 
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.control_plc import LadderStatus, Mode
 from rig.progress import PlantTimeBar, clock, make_console
 

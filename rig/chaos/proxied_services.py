@@ -9,10 +9,10 @@ from typing import Self
 from coldloop.config import PREFIX
 from rig.chaos.faults import Link
 from rig.chaos.proxy import LinkProxy
-from rig.local_services import LocalServices
-from rig.ports import ReservedPorts
+from rig.cosim.local_services import LocalServices
+from rig.cosim.ports import ReservedPorts
+from rig.cosim.wiring import Detours
 from rig.settings import Settings
-from rig.wiring import Detours
 
 
 class ProxiedServices:

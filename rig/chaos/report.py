@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from coldloop.process import INPUT_NAMES
+from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind, AlarmState
 from rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
 from rig.chaos.plan import Plan
 from rig.chaos.trace import ChaosTrace
-from rig.results import whole_file, write_json
+from rig.results.folders import whole_file, write_json
 
 HEADINGS: Final = (
     "fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit", "L1 out s (was)", "T5 out s (was)",

@@ -4,8 +4,8 @@ import contextlib
 import re
 from pathlib import Path
 
-from rig.local_services import LocalServices
-from rig.wiring import SERVICES
+from rig.cosim.local_services import LocalServices
+from rig.cosim.wiring import SERVICES
 
 
 def resident_mb(services: LocalServices) -> dict[str, float]:

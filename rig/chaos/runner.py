@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import LinkError
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from rig.chaos.faults import WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
@@ -14,11 +14,11 @@ from rig.chaos.plan import Plan
 from rig.chaos.proxied_services import ProxiedServices
 from rig.chaos.sequencer import FaultSequencer, Progress
 from rig.chaos.trace import ChaosTrace
-from rig.recording import Recorder
-from rig.scenario import Scenario
-from rig.session_client import SessionClient
+from rig.cosim.scenario import Scenario
+from rig.cosim.session_client import SessionClient
+from rig.cosim.wiring import START_PATIENCE_S
+from rig.results.recording import Recorder
 from rig.settings import Settings
-from rig.wiring import START_PATIENCE_S
 
 SLOWEST: Final = 20.0
 """Seconds of plant time in a second that lock-step should reach with proxies and all."""

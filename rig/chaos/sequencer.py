@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Final
 
 from coldloop.errors import LinkError
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.safety import Alarm, AlarmKind
@@ -17,8 +17,8 @@ from rig.chaos.plan import Plan
 from rig.chaos.resources import log_lines, resident_mb
 from rig.chaos.timeline import Moment, Timeline
 from rig.chaos.trace import ChaosTrace, Mark, Resources
-from rig.local_services import LocalServices
-from rig.session_client import SessionClient
+from rig.cosim.local_services import LocalServices
+from rig.cosim.session_client import SessionClient
 
 Progress = Callable[[int, LadderStatus | None, list[str]], None]
 """Takes the plant's tick, the state of the control PLC (None while it does not answer), and the faults that are on."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from rig.chaos.faults import AnyFault
 
 

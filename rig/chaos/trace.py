@@ -5,14 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.plant import PlantSample
 from coldloop.registers.safety import Alarm
 from rig.chaos.faults import AnyFault
-from rig.driving import CONTROL
-from rig.recording import LinkStatistics, Recording, Sink
+from rig.results.driving import CONTROL
+from rig.results.recording import LinkStatistics, Recording, Sink
 
 
 @dataclass

@@ -11,7 +11,7 @@ from coldloop import __version__
 from coldloop.errors import ResultsError
 from rig.report.document import as_page, deviations, scorecard_table, verdict_counts
 from rig.report.scorecard import COUNTED, TOLERANCES, Judged, as_json, counted, counts, judge
-from rig.results import whole_file, write_json
+from rig.results.folders import whole_file, write_json
 from rig.studies import STUDIES
 from rig.studies.execution import Workers
 from rig.studies.results import conduct, section

@@ -9,8 +9,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
-from coldloop.process import INPUT_NAMES, INPUT_UNITS
-from rig.plot import (
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS
+from rig.figures.plot import (
     ACCENT,
     BAND,
     DRAWN,
@@ -25,8 +25,8 @@ from rig.plot import (
     view,
     view_with_limits,
 )
-from rig.run_folder import Curves, RunFolder
-from rig.run_plot import identity_of, title_of
+from rig.figures.run_plot import identity_of, title_of
+from rig.results.run_folder import Curves, RunFolder
 
 DRAWN_TICKS: Final = 20_000
 """A longer trace is reduced, so that the page stays small and quick."""

@@ -12,11 +12,11 @@ from typing import Annotated, Any, Final, NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
 
-from optimizer_plc.operations import cholesky
-from optimizer_plc.reference_plc import cholesky_times
-from rig import paper
-from rig.studies.cholesky import SLOW_DOWN, SPEED
-from rig.studies.solver_comparison import measures
+from rig.plc.operations import cholesky
+from rig.plc.reference_plc import cholesky_times
+from rig.studies import published as paper
+from rig.studies.paper.cholesky import SLOW_DOWN, SPEED
+from rig.studies.paper.solver_comparison import measures
 
 TOLERANCES: Final = Path(__file__).with_name("tolerances.toml")
 FROM_POINTS: Final = "points"

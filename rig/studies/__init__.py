@@ -2,21 +2,21 @@
 
 from typing import Final
 
-from rig.studies.cholesky import CholeskyStudy
-from rig.studies.classical import ClassicalStudy
-from rig.studies.contest import ContestStudy
-from rig.studies.coupling import CouplingStudy
-from rig.studies.disturbances import DisturbancesStudy
-from rig.studies.experiments import ADAPTIVE_2H, PLC_2H
-from rig.studies.oracles import OraclesStudy
-from rig.studies.penalties import PenaltiesStudy
-from rig.studies.robustness import RobustnessStudy
-from rig.studies.single_precision import SinglePrecision
-from rig.studies.solver_comparison import SolverComparison
+from rig.studies.beyond.classical import ClassicalStudy
+from rig.studies.beyond.contest import ContestStudy
+from rig.studies.beyond.coupling import CouplingStudy
+from rig.studies.beyond.disturbances import DisturbancesStudy
+from rig.studies.beyond.oracles import OraclesStudy
+from rig.studies.beyond.penalties import PenaltiesStudy
+from rig.studies.beyond.robustness import RobustnessStudy
+from rig.studies.beyond.single_precision import SinglePrecision
+from rig.studies.paper.cholesky import CholeskyStudy
+from rig.studies.paper.experiments import ADAPTIVE_2H, PLC_2H
+from rig.studies.paper.solver_comparison import SolverComparison
+from rig.studies.paper.trade_off import TradeOff
+from rig.studies.paper.trajectories import LIMITED_STUDY, TRAJECTORIES_STUDY, UNLIMITED_STUDY
+from rig.studies.paper.updating_period import UpdatingPeriodStudy
 from rig.studies.study import Study
-from rig.studies.trade_off import TradeOff
-from rig.studies.trajectories import LIMITED_STUDY, TRAJECTORIES_STUDY, UNLIMITED_STUDY
-from rig.studies.updating_period import UpdatingPeriodStudy
 
 _ALL: Final[tuple[Study, ...]] = (
     CholeskyStudy(),

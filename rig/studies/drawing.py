@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from coldloop.limits import InputLimits
-from coldloop.process import TICK_S
-from rig.plot import COLOURS, INK, LONGEST_TAU_U_S, STYLE, draw_tau_u, legend_above, limit
+from coldloop.process.limits import InputLimits
+from coldloop.process.signals import TICK_S
+from rig.figures.plot import COLOURS, INK, LONGEST_TAU_U_S, STYLE, draw_tau_u, legend_above, limit
 from rig.studies.request import Outcome
 
 

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from enum import StrEnum
 from typing import Any, Final, Protocol, Self, TypeVar
 
-from coldloop.lti_model import load
-from coldloop.process import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.lti_model import load
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample
 from control_plc.program import make_program as make_control_program
@@ -23,11 +23,11 @@ from optimizer_plc.rules import make_rule
 from plant.kinds import plant_maker
 from plant.own_model import own_header
 from plant.program import LoadProfile
-from rig.compiled.stretches import CompiledStretches
-from rig.indicators import StageCost
-from rig.one_process import Programs, load_table
-from rig.recording import Recorder, SampleBlock
-from rig.scenario import Scenario
+from rig.cosim.compiled.stretches import CompiledStretches
+from rig.cosim.one_process import Programs, load_table
+from rig.cosim.scenario import Scenario
+from rig.results.indicators import StageCost
+from rig.results.recording import Recorder, SampleBlock
 from rig.settings import Settings
 
 PERIODS_S: Final = (1.0, 1.5, 2.5, 5.0)
@@ -151,7 +151,7 @@ class LoopBranch:
 
 
 class CostSums:
-    """J_BF and J_open_mean of a run so far, as `rig.indicators` sums them at its end."""
+    """J_BF and J_open_mean of a run so far, as `rig.results.indicators` sums them at its end."""
 
     def __init__(self, stage_cost: StageCost, recorder: Recorder | None = None) -> None:
         self._stage_cost = stage_cost

@@ -7,7 +7,7 @@ the same in the run with another number that is large enough: from P = 7 on, qpO
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from optimizer_plc.budget import BudgetSettings, PlcBudget
 from optimizer_plc.solvers import make_solver
 from rig.studies.request import Outcome, Procedure, RunRequest, decisive_digest, settings_of

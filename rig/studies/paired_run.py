@@ -1,4 +1,4 @@
-"""A solver and the problems of a converged loop, one after the other: what `rig.studies.open_loop` compares."""
+"""A solver and the problems of a converged loop, one after the other: what `rig.studies.paper.open_loop` compares."""
 
 import math
 from typing import Final
@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optimizer_plc.budget import PlcBudget
-from optimizer_plc.costs import indicators
+from optimizer_plc.qp.costs import indicators
 from optimizer_plc.settings import ProgramSettings, SolverName
 from optimizer_plc.solvers import Solver, make_solver
-from rig.indicators import Indicators
+from rig.results.indicators import Indicators
 from rig.studies.problem_sequence import ProblemSequence
 
 Array = NDArray[np.float64]

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import StudyError
-from optimizer_plc.costs import indicators
-from optimizer_plc.design import N_INPUTS, N_SLACKS
-from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
+from optimizer_plc.qp.costs import indicators
+from optimizer_plc.qp.design import N_INPUTS, N_SLACKS
+from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem, Situation
 
 Array = NDArray[np.float64]
 

@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
-from coldloop.limits import InputLimits
-from coldloop.lti_model import load as load_model
-from coldloop.sequence import InputSequence
-from optimizer_plc.prediction import PredictionModel
-from optimizer_plc.problem import PredictiveProblem, Situation
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import load as load_model
+from coldloop.safety.sequence import InputSequence
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.problem import PredictiveProblem, Situation
 from optimizer_plc.rules import UpdatingRule
 from optimizer_plc.settings import ProgramSettings, SolverName
-from rig.one_process import OneProcessRig
-from rig.recording import Recorder
-from rig.scenario import Scenario
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario
+from rig.results.recording import Recorder
 from rig.settings import Settings
 from rig.studies.played_profiles import PlayedProfiles
 

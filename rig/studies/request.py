@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
 from coldloop.errors import UsageError
-from coldloop.lti_model import load as load_model
-from coldloop.process import L1, OUTPUT_NAMES, STATION_SIGNAL_NAMES, T5, TICK_S
+from coldloop.process.lti_model import load as load_model
+from coldloop.process.signals import L1, OUTPUT_NAMES, STATION_SIGNAL_NAMES, T5, TICK_S
 from optimizer_plc.solvers import make_solver
 from plant.program import LoadProfile
-from rig.indicators import Indicators, evaluate, instantaneous_cost
-from rig.local_services import run_on_localhost
-from rig.one_process import OneProcessRig
-from rig.recording import Recorder, Recording
-from rig.results import installed_version
-from rig.scenario import Scenario
+from rig.cosim.ideal_loop import run_ideal_loop
+from rig.cosim.local_services import run_on_localhost
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario
+from rig.results.folders import installed_version
+from rig.results.indicators import Indicators, evaluate, instantaneous_cost
+from rig.results.recording import Recorder, Recording
 from rig.settings import Settings
 from rig.studies.hindsight import Objective, run_best_in_hindsight
-from rig.studies.ideal_loop import run_ideal_loop
 from rig.studies.paired_run import harsh_run, paired_indicators, paired_run
 from rig.studies.problem_sequence import problem_sequence
 
@@ -37,21 +37,21 @@ Series = NDArray[np.float64]
 
 PROGRAM_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc")
 RIG_MODULES = (
-    "rig.compiled.control",
-    "rig.compiled.loops",
-    "rig.compiled.optimizer",
-    "rig.compiled.plants",
-    "rig.compiled.portable",
-    "rig.compiled.records",
-    "rig.compiled.stretches",
-    "rig.indicators",
-    "rig.session_client",
-    "rig.session_reader",
-    "rig.one_process",
-    "rig.recorded",
-    "rig.recording",
+    "rig.cosim.compiled.control",
+    "rig.cosim.compiled.loops",
+    "rig.cosim.compiled.optimizer",
+    "rig.cosim.compiled.plants",
+    "rig.cosim.compiled.portable",
+    "rig.cosim.compiled.records",
+    "rig.cosim.compiled.stretches",
+    "rig.results.indicators",
+    "rig.cosim.session_client",
+    "rig.cosim.session_reader",
+    "rig.cosim.one_process",
+    "rig.results.recorded",
+    "rig.results.recording",
     "rig.studies.hindsight",
-    "rig.studies.ideal_loop",
+    "rig.cosim.ideal_loop",
     "rig.studies.paired_run",
     "rig.studies.played_profiles",
     "rig.studies.problem_sequence",
@@ -77,7 +77,7 @@ class Procedure(StrEnum):
     HARSH_PROBLEMS = "harsh problems"
     """The same, and only those count whose guess is far from the optimum, each solver beginning at the same one."""
     INFINITELY_FAST = "infinitely fast"
-    """The exact optimum at once, every updating period (`rig.studies.ideal_loop`)."""
+    """The exact optimum at once, every updating period (`rig.cosim.ideal_loop`)."""
     BEST_CLOSED_LOOP = "best closed loop"
     """The sequence of updating periods that is best for J_BF (`rig.studies.hindsight`)."""
     BEST_OPEN_LOOP = "best open loop"

@@ -5,8 +5,8 @@ import io
 from pathlib import Path
 
 from coldloop.errors import ResultsError
-from rig.results import prepare_folder, whole_file
-from rig.run_plot import save_figure
+from rig.figures.run_plot import save_figure
+from rig.results.folders import prepare_folder, whole_file
 from rig.studies.execution import Workers, perform_all
 from rig.studies.request import check
 from rig.studies.store import Store

@@ -14,7 +14,7 @@ from typing import Any, Final, Self
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coldloop.errors import ResultsError, StudyError, UsageError
-from rig.results import prepare_folder, write_json
+from rig.results.folders import prepare_folder, write_json
 from rig.studies.execution import Workers, perform_all
 from rig.studies.request import RunRequest, check, programs_digest
 from rig.studies.store import Store

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import ResultsError
-from rig.results import whole_file
+from rig.results.folders import whole_file
 from rig.studies.request import Outcome, RunRequest
 
 REMEMBERED: Final = 64

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError, UsageError
 from coldloop.modbus.client import RegisterClient
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, Grant
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
@@ -22,14 +22,14 @@ from rig.chaos.faults import AnyFault, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
 from rig.chaos.proxied_services import ProxiedServices
+from rig.cosim.endpoints import RigEndpoints
+from rig.cosim.session_client import QUIET_S, SessionClient
+from rig.cosim.wiring import SERVICES, START_PATIENCE_S
 from rig.python_settings import Period, configured
-from rig.rig_endpoints import RigEndpoints
-from rig.running import check_certificates, make_scenario
-from rig.session_client import QUIET_S, SessionClient
+from rig.runs.running import check_certificates, make_scenario
 from rig.settings import Settings
 from rig.testing.event_loop import BackgroundLoop
 from rig.testing.named_registers import NamedRegisters
-from rig.wiring import SERVICES, START_PATIENCE_S
 
 T = TypeVar("T")
 

@@ -4,9 +4,9 @@ from collections.abc import Callable, Coroutine, Iterator
 from difflib import get_close_matches
 from typing import Any, NamedTuple
 
-from coldloop.endpoints import Endpoint
 from coldloop.errors import UnfitValueError, UsageError
 from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.endpoints import Endpoint
 from coldloop.registers.declaration import Block, RegisterMap, fields_of
 
 Call = Callable[[Coroutine[Any, Any, Any]], Any]

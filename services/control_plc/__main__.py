@@ -2,7 +2,7 @@
 
 import sys
 
-from coldloop.service import main
+from coldloop.service.start import main
 from control_plc.runtime import serve
 from control_plc.settings import ControlSettings
 

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.safety import AlarmKind, AlarmPriority
 
 PASSING: Final = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED, AlarmKind.SECOND_WRITER)

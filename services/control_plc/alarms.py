@@ -12,10 +12,10 @@ by ticks and not by scans: scans can be missed.
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
-from coldloop.journal import Journal
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
+from coldloop.service.journal import Journal
 from control_plc.alarm_settings import BANDS, PASSING, AlarmSettings
 
 TRANSITIONS: Final[Mapping[AlarmState, Mapping[EventKind, AlarmState]]] = {

@@ -10,8 +10,8 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 
-from coldloop.limits import InputLimits
-from coldloop.process import INPUT_NAMES, L1, SAMPLING_PERIOD_S, T5, TICK_S
+from coldloop.process.limits import InputLimits
+from coldloop.process.signals import INPUT_NAMES, L1, SAMPLING_PERIOD_S, T5, TICK_S
 from coldloop.registers.control_plc import SequenceRow
 
 NCR22 = INPUT_NAMES.index("NCR22_A")

@@ -4,9 +4,8 @@ import asyncio
 from collections.abc import Awaitable
 from typing import Final
 
-from coldloop.limits import InputLimits
-from coldloop.pace import Pace
-from coldloop.process import INPUT_NAMES, TICK_S
+from coldloop.process.limits import InputLimits
+from coldloop.process.signals import INPUT_NAMES, TICK_S
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
 from coldloop.registers.common import SessionPace, pace_subject
@@ -25,8 +24,9 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.declaration import Block, Role
 from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
-from coldloop.sequence import InputSequence
-from coldloop.writer_lease import LeaseEvent, WriterLease
+from coldloop.safety.sequence import InputSequence
+from coldloop.safety.writer_lease import LeaseEvent, WriterLease
+from coldloop.session.pace import Pace
 from control_plc.program import ControlProgram
 from control_plc.publication import Publication
 from control_plc.sessions import Sessions

@@ -3,10 +3,10 @@
 import math
 from collections.abc import Sequence
 
-from coldloop.limits import InputLimits
-from coldloop.process import TICKS_PER_SAMPLE
+from coldloop.kernels.single_precision import neighbour, single
+from coldloop.process.limits import InputLimits
+from coldloop.process.signals import TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SequenceRow, Verdict
-from coldloop.single_precision import neighbour, single
 from control_plc.output_limits import (
     NEVER,
     admit,

@@ -9,9 +9,9 @@ from collections.abc import MutableSequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from coldloop.limits import InputLimits, RateReference
-from coldloop.process import TICKS_PER_SAMPLE
-from coldloop.single_precision import neighbour, single
+from coldloop.kernels.single_precision import neighbour, single
+from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.signals import TICKS_PER_SAMPLE
 from control_plc.numbers import Numbers, Rows
 
 TOLERANCE: Final = 1e-5

@@ -18,11 +18,11 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from coldloop.journal import Journal
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import LinkCause, PlantLinkState
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind
+from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 
 FROZEN_TICKS: Final = 4

@@ -6,9 +6,9 @@ Scans can be missed and time can leap, so everything here goes by ticks, never b
 
 from enum import IntEnum
 
-from coldloop.process import LAST_NUMBER, TICKS_PER_SAMPLE
+from coldloop.process.signals import LAST_NUMBER, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Acknowledgement, Plan, SequenceRow, Update, Verdict
-from coldloop.sequence import InputSequence, checksum
+from coldloop.safety.sequence import InputSequence, checksum
 from control_plc.guard import OutputGuard
 
 

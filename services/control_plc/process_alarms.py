@@ -2,11 +2,11 @@
 
 from collections.abc import Collection, Sequence
 
-from coldloop.journal import Journal
-from coldloop.process import L1, T5
+from coldloop.process.signals import L1, T5
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.safety import AlarmKind
+from coldloop.service.journal import Journal
 from control_plc.alarm_settings import AlarmSettings
 from control_plc.alarms import AlarmPanel
 from control_plc.ladder import Ladder

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from coldloop.errors import ConfigurationError
-from coldloop.journal import Journal
-from coldloop.limits import InputLimits
-from coldloop.model_file import ModelHeader
-from coldloop.process import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.limits import InputLimits
+from coldloop.process.model_file import ModelHeader
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
     Acknowledgement,
@@ -31,8 +30,9 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.plant import MAX_LOAD_W, MAX_STATE, Actuators, Measurement
 from coldloop.registers.safety import Alarm, AlarmKind
-from coldloop.sequence import InputSequence
-from coldloop.watchdog import Watchdog
+from coldloop.safety.sequence import InputSequence
+from coldloop.safety.watchdog import Watchdog
+from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 from control_plc.classical import ClassicalLoops
 from control_plc.guard import OutputGuard

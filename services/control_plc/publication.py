@@ -4,15 +4,15 @@ import logging
 import math
 from collections.abc import Callable, Mapping
 
-from coldloop.clock import LatenessRecord
-from coldloop.event_text import log_event
-from coldloop.journal import JournalPublication
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, PlantLinkStatus, Process, Status
 from coldloop.registers.safety import AlarmKind, AlarmState
-from coldloop.writer_lease import WriterLease
+from coldloop.safety.writer_lease import WriterLease
+from coldloop.service.event_text import log_event
+from coldloop.service.journal import JournalPublication
+from coldloop.session.clock import LatenessRecord
 from control_plc.plant_link import PlantLink
 from control_plc.program import ControlProgram
 from control_plc.rack_clock import Skew

@@ -8,7 +8,7 @@ them (a second-order tracking loop, whose correction is bounded), and the skew o
 import math
 from typing import Final, NamedTuple
 
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 
 PHASE: Final = 0.5
 """Scans are half-way between two ticks of the rack: where neither side's jitter can confuse two ticks."""

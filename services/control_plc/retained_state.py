@@ -10,15 +10,15 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from coldloop.pace import Pace
-from coldloop.process import LAST_NUMBER, LAST_TICK
+from coldloop.process.signals import LAST_NUMBER, LAST_TICK
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Operator, SequenceHeader, SequenceRow
 from coldloop.registers.safety import Alarm, AlarmKind
-from coldloop.retained import RetainedFile, RetainedStateError
-from coldloop.retained_writer import RetainedStateWriter
-from coldloop.sequence import InputSequence, checksum
+from coldloop.safety.retained import RetainedFile, RetainedStateError
+from coldloop.safety.retained_writer import RetainedStateWriter
+from coldloop.safety.sequence import InputSequence, checksum
+from coldloop.session.pace import Pace
 from control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")

@@ -15,13 +15,10 @@ from typing import Final
 from coldloop import __version__
 from coldloop.config import selected
 from coldloop.errors import LinkError, PeerUnreachableError
-from coldloop.logs import dropped
-from coldloop.metrics_server import MetricsServer
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
-from coldloop.model_file import read_header
-from coldloop.pace import Pace
-from coldloop.process import TICK_S
+from coldloop.process.model_file import read_header
+from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import SessionPace
@@ -29,8 +26,11 @@ from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.registers.safety import AlarmKind, WatchdogTime
-from coldloop.service import SERVING
-from coldloop.telemetry import Telemetry
+from coldloop.service.logs import dropped
+from coldloop.service.metrics_server import MetricsServer
+from coldloop.service.start import SERVING
+from coldloop.service.telemetry import Telemetry
+from coldloop.session.pace import Pace
 from control_plc.certificate_watch import CertificateWatch
 from control_plc.clients import Clients
 from control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink

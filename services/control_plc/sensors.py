@@ -10,7 +10,7 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process import L1, T5, TICK_S
+from coldloop.process.signals import L1, T5, TICK_S
 from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]

@@ -7,10 +7,10 @@ import logging
 import time
 from typing import Final
 
-from coldloop.pace import Pace
 from coldloop.registers.control_plc import ControlSession
 from coldloop.registers.plant import Measurement
-from coldloop.session import SessionSettings, TimeMode
+from coldloop.session.pace import Pace
+from coldloop.session.settings import SessionSettings, TimeMode
 from control_plc.program import ControlProgram
 from control_plc.retained_state import RetainedState
 

@@ -5,16 +5,16 @@ from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from coldloop.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
-from coldloop.limits import InputLimits
-from coldloop.metrics_settings import MetricsSettings
+from coldloop.modbus.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
-from coldloop.model_settings import ModelSettings
-from coldloop.process import TICK_S
+from coldloop.process.limits import InputLimits
+from coldloop.process.model_settings import ModelSettings
+from coldloop.process.signals import TICK_S
 from coldloop.registers.codec import WordOrder
-from coldloop.retained import RetainSettings
-from coldloop.session import SessionSettings
-from coldloop.telemetry_settings import TelemetrySettings
+from coldloop.safety.retained import RetainSettings
+from coldloop.service.metrics_settings import MetricsSettings
+from coldloop.service.telemetry_settings import TelemetrySettings
+from coldloop.session.settings import SessionSettings
 from control_plc.alarm_settings import AlarmSettings
 from control_plc.classical import ClassicalSettings
 from control_plc.sensors import SensorCheckSettings

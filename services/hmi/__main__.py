@@ -3,7 +3,7 @@
 import sys
 from importlib.util import find_spec
 
-from coldloop.service import main
+from coldloop.service.start import main
 from hmi.settings import HmiSettings
 
 

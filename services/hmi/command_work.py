@@ -6,14 +6,14 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, Final
 
 from coldloop.errors import LinkError, RequestRefusedError, UsageError
-from coldloop.event_text import word
 from coldloop.modbus.client import RegisterClient
-from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.plant import AHEAD_STEPS, LiveLoad, LoadAhead, LoadStatus, SensorFault, SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
-from coldloop.seal import sealed
+from coldloop.registers.seal import sealed
+from coldloop.service.event_text import word
 from hmi.commands import (
     Command,
     FaultSensor,

@@ -8,10 +8,10 @@ from typing import Annotated, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
 from coldloop.errors import UsageError
-from coldloop.event_text import word
-from coldloop.process import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
 from coldloop.registers.plant import MAX_LOAD_W, SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
+from coldloop.service.event_text import word
 
 LONGEST_FILE: Final = 1_000_000
 """Characters of a load file."""

@@ -9,12 +9,12 @@ from itertools import pairwise
 from typing import Any, Final
 
 from coldloop import __version__
-from coldloop.event_text import alarm_cause, word
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode, OperatorMode
 from coldloop.registers.optimizer_plc import BANDED_OUTPUTS, INPUT_SAMPLES, PREDICTED_SAMPLES, Optimization, Prediction
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriority, AlarmState
+from coldloop.service.event_text import alarm_cause, word
 from hmi.explanation import explain
 from hmi.model import Model, Told
 from hmi.sentences import sentence

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from coldloop.process import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
 

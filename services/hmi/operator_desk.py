@@ -6,9 +6,9 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from coldloop.endpoints import Endpoint
 from coldloop.errors import BUSY, LinkError, RequestRefusedError, UsageError
-from coldloop.process import INPUT_NAMES, INPUT_UNITS, TICK_S
+from coldloop.modbus.endpoints import Endpoint
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, TICK_S
 from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import AlarmAction

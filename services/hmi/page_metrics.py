@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 
-from coldloop.event_text import word
-from coldloop.metrics import Family, Sample, block_families, build_family
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.optimizer_plc import Optimization
+from coldloop.service.event_text import word
+from coldloop.service.metrics import Family, Sample, block_families, build_family
 from hmi.model import Model
 from hmi.signals import MAPS
 

@@ -5,9 +5,9 @@ import logging
 import time
 from typing import Any, Final
 
-from coldloop.endpoints import Endpoint
 from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.endpoints import Endpoint
 from coldloop.registers.audit import EVENT_ROWS, Event, JournalPage
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of

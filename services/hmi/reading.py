@@ -12,8 +12,8 @@ from typing import Final
 
 from aiohttp import BasicAuth, hdrs, web
 
-from coldloop.metrics import CONTENT_TYPE, exposition
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
+from coldloop.service.metrics import CONTENT_TYPE, exposition
 from hmi.broadcast import Broadcast
 from hmi.documents import (
     alarms_document,

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple, Protocol
 from aiohttp import web
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from coldloop.process import STATION_VALVE_NAMES, TICK_S
+from coldloop.process.signals import STATION_VALVE_NAMES, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Process
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus

@@ -4,7 +4,7 @@ import asyncio
 import logging
 import time
 
-from coldloop.endpoints import Endpoint
+from coldloop.modbus.endpoints import Endpoint
 from hmi.model import Model
 from hmi.operator_desk import OperatorDesk
 from hmi.page_server import Exhibit, PageServer

@@ -3,10 +3,10 @@
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from coldloop.event_text import word
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import UpdatingRuleStatus
+from coldloop.service.event_text import word
 from hmi.explanation import Branch, Explanation, is_rounded_to_one
 
 AT_REST: Final = 1e-9

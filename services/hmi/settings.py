@@ -6,7 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
-from coldloop.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT, Endpoint
+from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT, Endpoint
 from coldloop.modbus.settings import TlsSettings
 
 PAGE_PORT = 8020

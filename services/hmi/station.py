@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
-from coldloop.event_text import word
 from coldloop.registers.plant import StationAlarm, StationMode, StationStatus
+from coldloop.service.event_text import word
 from hmi.model import Model
 
 KIND: Final = "plant.kind"

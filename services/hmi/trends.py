@@ -7,7 +7,7 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.control_plc import Mode, Process
 
 STATION_NAMES: Final = ("P12", "P11")

@@ -2,8 +2,8 @@
 
 import sys
 
-from coldloop.lean_numba import load_numba_alone
-from coldloop.service import main
+from coldloop.kernels.lean_numba import load_numba_alone
+from coldloop.service.start import main
 
 
 def start() -> int:

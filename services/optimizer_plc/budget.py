@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
-from coldloop.process import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 
 MAX_PERIOD_TICKS = TICKS_PER_SAMPLE
 

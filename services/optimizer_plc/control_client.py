@@ -3,9 +3,9 @@
 from collections.abc import Awaitable, Callable
 from typing import Final, TypeVar
 
-from coldloop.endpoints import Endpoint
 from coldloop.errors import BUSY, DamagedAnswerError, LinkError, ModelFileError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.endpoints import Endpoint
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import (
     CONTROL_MAP,
@@ -18,7 +18,7 @@ from coldloop.registers.control_plc import (
     Verdict,
 )
 from coldloop.registers.optimizer_plc import ControlLinkState
-from coldloop.sequence import InputSequence
+from coldloop.safety.sequence import InputSequence
 from optimizer_plc.control_link import ControlLink
 
 T = TypeVar("T")

@@ -14,10 +14,10 @@ from collections.abc import Callable
 from typing import Final
 
 from coldloop.errors import BUSY, ColdloopError, DamagedAnswerError, ModelFileError, RequestRefusedError
-from coldloop.journal import Journal
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
+from coldloop.service.journal import Journal
 
 REPEAT_S: Final = 10.0
 """The same reason is logged at most once in this real time."""

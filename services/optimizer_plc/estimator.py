@@ -5,13 +5,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import kept, kernel
 from coldloop.errors import ConfigurationError
-from coldloop.process import SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
-from optimizer_plc.arithmetic import DOUBLE, Real
+from coldloop.kernels.compiled import kept, kernel
+from coldloop.process.signals import SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
-from optimizer_plc.linear_algebra import add_transposed_product, multiply, respond
-from optimizer_plc.prediction import PredictionModel, Transition
+from optimizer_plc.qp.arithmetic import DOUBLE, Real
+from optimizer_plc.qp.linear_algebra import add_transposed_product, multiply, respond
+from optimizer_plc.qp.prediction import PredictionModel, Transition
 
 Array = NDArray[np.float64]
 

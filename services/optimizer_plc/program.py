@@ -10,10 +10,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.first_use import kernels_of
-from coldloop.limits import InputLimits
-from coldloop.lti_model import LtiModel
-from coldloop.process import TICK_S, TICKS_PER_SAMPLE
+from coldloop.kernels.first_use import kernels_of
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import LtiModel
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import (
     INPUT_SAMPLES,
@@ -23,14 +23,14 @@ from coldloop.registers.optimizer_plc import (
     Prediction,
     UpdatingRuleStatus,
 )
-from coldloop.sequence import InputSequence, with_checksum
+from coldloop.safety.sequence import InputSequence, with_checksum
 from optimizer_plc import scheme
-from optimizer_plc.arithmetic import real_of
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import estimator_of
-from optimizer_plc.prediction import PredictionModel
-from optimizer_plc.problem import PredictiveProblem, Situation
+from optimizer_plc.qp.arithmetic import real_of
+from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.problem import PredictiveProblem, Situation
 from optimizer_plc.rules import UpdatingRule, make_rule
 from optimizer_plc.session_state import empty_memory
 from optimizer_plc.settings import ProgramSettings

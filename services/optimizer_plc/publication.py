@@ -3,9 +3,7 @@
 from collections.abc import Mapping
 from typing import Final
 
-from coldloop.journal import Journal, JournalPublication
-from coldloop.pace import Pace
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import Caller, IllegalValueError, RegisterBank
 from coldloop.registers.codec import WordOrder
@@ -20,6 +18,8 @@ from coldloop.registers.optimizer_plc import (
     Prediction,
     UpdatingRuleStatus,
 )
+from coldloop.service.journal import Journal, JournalPublication
+from coldloop.session.pace import Pace
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.control_link import ControlLink
 

@@ -20,18 +20,18 @@ from coldloop.errors import (
     RequestRefusedError,
     UnfitValueError,
 )
-from coldloop.lti_model import load
-from coldloop.metrics_server import MetricsServer
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
-from coldloop.pace import Pace
-from coldloop.process import TICK_S
+from coldloop.process.lti_model import load
+from coldloop.process.signals import TICK_S
 from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import AwaitUpdate, Update, Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState
-from coldloop.sequence import InputSequence
-from coldloop.service import SERVING
-from coldloop.session import TimeMode
-from coldloop.telemetry import Telemetry
+from coldloop.safety.sequence import InputSequence
+from coldloop.service.metrics_server import MetricsServer
+from coldloop.service.start import SERVING
+from coldloop.service.telemetry import Telemetry
+from coldloop.session.pace import Pace
+from coldloop.session.settings import TimeMode
 from optimizer_plc.control_client import ControlClient
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.publication import Publication

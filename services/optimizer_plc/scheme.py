@@ -9,14 +9,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import kernel
-from coldloop.process import TICK_S, TICKS_PER_SAMPLE
+from coldloop.kernels.compiled import kernel
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
-from optimizer_plc.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
 from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
-from optimizer_plc.instance import Maps, instance, keep_first_rate
-from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
-from optimizer_plc.profile import inputs_of, shifted
+from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
+from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
+from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
+from optimizer_plc.qp.profile import inputs_of, shifted
 from optimizer_plc.rules.interface import Observation, UpdatingRule, assessed, decide_by
 from optimizer_plc.session_state import Delivery, Memory
 from optimizer_plc.settings import ProgramSettings

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.registers.control_plc import SEQUENCE_ROWS
-from optimizer_plc.arithmetic import Real
-from optimizer_plc.design import N_INPUTS
 from optimizer_plc.estimator import Belief, no_belief
+from optimizer_plc.qp.arithmetic import Real
+from optimizer_plc.qp.design import N_INPUTS
 from optimizer_plc.rules.interface import MEMORY
 
 Array = NDArray[np.float64]

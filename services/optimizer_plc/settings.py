@@ -6,16 +6,16 @@ from typing import Annotated, ClassVar, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from coldloop.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
-from coldloop.limits import InputLimits
-from coldloop.metrics_settings import MetricsSettings
+from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
-from coldloop.model_settings import ModelSettings
-from coldloop.process import TICK_S
+from coldloop.process.limits import InputLimits
+from coldloop.process.model_settings import ModelSettings
+from coldloop.process.signals import TICK_S
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
-from coldloop.session import SessionSettings
-from coldloop.telemetry_settings import TelemetrySettings
+from coldloop.service.metrics_settings import MetricsSettings
+from coldloop.service.telemetry_settings import TelemetrySettings
+from coldloop.session.settings import SessionSettings
 from optimizer_plc.budget import MAX_PERIOD_TICKS, BudgetSettings
 from optimizer_plc.computing_settings import (
     Arithmetic,
@@ -28,8 +28,8 @@ from optimizer_plc.computing_settings import (
     OsqpSettings,
     QpoasesSettings,
 )
-from optimizer_plc.design import ControlDesign
-from optimizer_plc.penalties import OF_ALPHA, OF_PRESETS, PRESETS, PenaltySettings, Preset, alpha_of, completed
+from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.qp.penalties import OF_ALPHA, OF_PRESETS, PRESETS, PenaltySettings, Preset, alpha_of, completed
 
 SHOWN: Final = ("limits", "optimizer_plc.program")
 """What of the configuration decides results: shown in the registers."""

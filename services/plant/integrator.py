@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from coldloop.compiled import kernel
-from plant.cold_box import ColdBox, cold_box_of, evaluate
+from coldloop.kernels.compiled import kernel
+from plant.cold_box.physics import ColdBox, cold_box_of, evaluate
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import RealArray
 

@@ -4,18 +4,18 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import ConfigurationError, ModelFileError
-from coldloop.first_use import kernels_of
-from coldloop.model_file import COLD_BOX, ModelHeader
-from plant.cold_box import REFERENCE, ColdBox
+from coldloop.kernels.first_use import kernels_of
+from coldloop.process.model_file import COLD_BOX, ModelHeader
+from plant.cold_box.physics import REFERENCE, ColdBox
 from plant.components.valve import Valve
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
-from plant.rack import MakePlant
-from plant.refrigerator_events import EventSchedule
+from plant.rack.rack import MakePlant
+from plant.refrigerator.events import EventSchedule
+from plant.refrigerator.station_settings import StationControlKind
 from plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSettings
-from plant.station_settings import StationControlKind
 
 if TYPE_CHECKING:
-    from plant.refrigerator_file import RefrigeratorFile
+    from plant.refrigerator.file import RefrigeratorFile
 
 NO_MISMATCH: Final = MismatchSettings()
 
@@ -33,14 +33,14 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
         return partial(make_program, header, section.sensors, mismatch=section.mismatch)
     if section.mismatch != NO_MISMATCH:
         raise ConfigurationError("plant.mismatch: of a cold box alone; set plant.kind to cold-box, or leave it out")
-    from plant.refrigerator_file import SHIPPED, read_refrigerator_file  # noqa: PLC0415 a cold box starts without it
+    from plant.refrigerator.file import SHIPPED, read_refrigerator_file  # noqa: PLC0415 a cold box starts without it
 
     path = section.refrigerator.file or SHIPPED
     file = read_refrigerator_file(path)
     if section.station.control is StationControlKind.LQ and section.station.weights != file.weights:
         raise ConfigurationError(
             f"plant.station.weights: the gains in {path} are of other weights; make a file with"
-            " `python -m plant.refrigerator_model FILE` and name it in plant.refrigerator.file"
+            " `python -m plant.refrigerator.model FILE` and name it in plant.refrigerator.file"
         )
     return partial(_make_refrigerator, header, section, file)
 
@@ -75,7 +75,7 @@ def _box(mismatch: MismatchSettings) -> ColdBox:
 def _make_refrigerator(
     header: ModelHeader, section: PlantSection, file: "RefrigeratorFile", load: HeatLoad, seed: int
 ) -> PlantProgram:
-    from plant.refrigerator_program import RefrigeratorProgram  # noqa: PLC0415
+    from plant.refrigerator.program import RefrigeratorProgram  # noqa: PLC0415
 
     happening = section.refrigerator
     with kernels_of("the refrigerator", about_s=20):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.errors import LoadFileError
-from coldloop.process import LAST_TICK, TICK_S
+from coldloop.process.signals import LAST_TICK, TICK_S
 from coldloop.registers.plant import MAX_LOAD_W, LoadStep
 from plant.program import LoadProfile
 

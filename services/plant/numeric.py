@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import inlined
+from coldloop.kernels.compiled import inlined
 
 RealArray: TypeAlias = NDArray[np.float64]
 Array: TypeAlias = NDArray[Any]  # float64 or complex128

@@ -4,11 +4,11 @@ from functools import cache
 from pathlib import Path
 
 from coldloop.errors import ModelFileError
-from coldloop.model_file import COLD_BOX, ModelHeader, read_header
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
-from plant.cold_box import REFERENCE
+from coldloop.process.model_file import COLD_BOX, ModelHeader, read_header
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from plant.cold_box.model import parameters_digest
+from plant.cold_box.physics import REFERENCE
 from plant.helium.properties import load_helium
-from plant.model import parameters_digest
 
 
 def own_header(file: Path) -> ModelHeader:
@@ -29,7 +29,7 @@ def own_header(file: Path) -> ModelHeader:
 def _own_parameters_digest(plant: str) -> str:
     if plant == COLD_BOX:
         return parameters_digest(REFERENCE, load_helium())
-    from plant.refrigerator import REFERENCE_REFRIGERATOR  # noqa: PLC0415 a cold box alone starts without it
-    from plant.refrigerator_file import refrigerator_digest  # noqa: PLC0415
+    from plant.refrigerator.file import refrigerator_digest  # noqa: PLC0415
+    from plant.refrigerator.physics import REFERENCE_REFRIGERATOR  # noqa: PLC0415 a cold box alone starts without it
 
     return refrigerator_digest(REFERENCE_REFRIGERATOR, load_helium())

@@ -9,9 +9,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from coldloop.process import INPUT_NAMES, LAST_TICK, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.signals import INPUT_NAMES, LAST_TICK, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.plant import StationSample, StationStatus, Surroundings
-from plant.cold_box import ColdBox, outputs
+from plant.cold_box.physics import ColdBox, outputs
 from plant.helium.properties import load_helium
 from plant.integrator import advance_and_read, plain_tuples
 from plant.numeric import RealArray

@@ -9,20 +9,20 @@ import logging
 import time
 
 from coldloop import __version__
-from coldloop.clock import Pacer, Schedule
 from coldloop.errors import ColdloopError
-from coldloop.metrics_server import MetricsServer
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import SessionPace
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, PlantSession
-from coldloop.service import SERVING
-from coldloop.telemetry import Telemetry
+from coldloop.service.metrics_server import MetricsServer
+from coldloop.service.start import SERVING
+from coldloop.service.telemetry import Telemetry
+from coldloop.session.clock import Pacer, Schedule
 from plant.kinds import plant_maker
 from plant.own_model import own_header
-from plant.registers import RackRegisters
+from plant.rack.registers import RackRegisters
 from plant.settings import PlantSettings
 
 log = logging.getLogger("coldloop.plant")

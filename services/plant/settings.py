@@ -6,18 +6,18 @@ from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from coldloop.endpoints import PLANT_PORT
-from coldloop.limits import InputLimits
-from coldloop.metrics_settings import MetricsSettings
+from coldloop.modbus.endpoints import PLANT_PORT
 from coldloop.modbus.settings import ServerSettings
-from coldloop.model_settings import ModelSettings
-from coldloop.process import TICK_S
+from coldloop.process.limits import InputLimits
+from coldloop.process.model_settings import ModelSettings
+from coldloop.process.signals import TICK_S
 from coldloop.registers.codec import WordOrder
-from coldloop.retained import RetainSettings
-from coldloop.session import SessionSettings
-from coldloop.telemetry_settings import TelemetrySettings
-from plant.refrigerator_events import RANGES, EventTarget, RefrigeratorEvent
-from plant.station_settings import StationSettings
+from coldloop.safety.retained import RetainSettings
+from coldloop.service.metrics_settings import MetricsSettings
+from coldloop.service.telemetry_settings import TelemetrySettings
+from coldloop.session.settings import SessionSettings
+from plant.refrigerator.events import RANGES, EventTarget, RefrigeratorEvent
+from plant.refrigerator.station_settings import StationSettings
 
 SHOWN: Final = (
     "plant.kind", "plant.station", "plant.refrigerator", "plant.mismatch", "plant.sensors", "plant.clock_error_ppm",

@@ -98,8 +98,8 @@ def assert_recorded_as_an_ordinary_run(coldloop: "Coldloop", out: Path, ordinary
 
 
 SOON_ON_DISK = """
-import sys, rig.file_sinks
-rig.file_sinks.GROUP_TICKS = rig.file_sinks.HELD_BACK_TICKS = 256
+import sys, rig.results.file_sinks
+rig.results.file_sinks.GROUP_TICKS = rig.results.file_sinks.HELD_BACK_TICKS = 256
 from rig.__main__ import main
 sys.exit(main())
 """

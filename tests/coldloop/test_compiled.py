@@ -7,7 +7,7 @@ import numba
 import numpy as np
 import pytest
 
-from coldloop.compiled import kept
+from coldloop.kernels.compiled import kept
 
 GAINS = np.arange(6.0).reshape(2, 3)
 

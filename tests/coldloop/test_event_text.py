@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.event_text import describe, log_event, utc_text
-from coldloop.journal import Journal
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, LinkCause, Mode, OperatorMode, PlantLinkState, Verdict
 from coldloop.registers.plant import SensorFaultKind
 from coldloop.registers.safety import AlarmKind
+from coldloop.service.event_text import describe, log_event, utc_text
+from coldloop.service.journal import Journal
 
 
 def event(kind: int, subject: int = 0, cause: int = 0, value: float = 0.0, who: str = "") -> Event:

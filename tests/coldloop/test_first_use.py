@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from coldloop import first_use
-from coldloop.first_use import Kernels, announce_with, kernels_of, needs_compiling, write_line
+from coldloop.kernels import first_use
+from coldloop.kernels.first_use import Kernels, announce_with, kernels_of, needs_compiling, write_line
 
 
 @pytest.fixture

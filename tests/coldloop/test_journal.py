@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.journal import ANY_SUBJECT, KEPT, LOOKED_AT, Journal, JournalPublication
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.control_plc import CONTROL_MAP
 from coldloop.registers.text import from_words
+from coldloop.service.journal import ANY_SUBJECT, KEPT, LOOKED_AT, Journal, JournalPublication
 
 ALL = JournalQuery(0, 0, ANY_SUBJECT)
 KINDS = st.sampled_from([EventKind.MODE, EventKind.ALARM_RAISED, EventKind.LEASE])

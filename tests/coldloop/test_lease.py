@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coldloop.lease import LINGER_S, SIMPLE_CLIENT, Lease
 from coldloop.registers.audit import WHO_WORDS
 from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.declaration import Role
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from coldloop.registers.text import to_words
+from coldloop.safety.lease import LINGER_S, SIMPLE_CLIENT, Lease
 
 SILENCE_S = 5.0
 

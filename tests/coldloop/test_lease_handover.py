@@ -2,8 +2,8 @@
 
 import pytest
 
-from coldloop.lease import Lease
 from coldloop.registers.bank import ALL_ROLES, BusyError, Caller
+from coldloop.safety.lease import Lease
 
 NUMBER = 7
 

@@ -9,11 +9,11 @@ import subprocess
 import pytest
 
 from coldloop.errors import PortInUseError
-from coldloop.metrics import Family, Sample, bank_families, exposition
-from coldloop.metrics_server import MOST_OPEN, MetricsServer
-from coldloop.metrics_settings import MetricsSettings
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
+from coldloop.service.metrics import Family, Sample, bank_families, exposition
+from coldloop.service.metrics_server import MOST_OPEN, MetricsServer
+from coldloop.service.metrics_settings import MetricsSettings
 
 
 def bank() -> RegisterBank:

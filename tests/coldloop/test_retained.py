@@ -10,7 +10,7 @@ from typing import Any, Self
 
 import pytest
 
-from coldloop.retained import RetainedFile, RetainedStateError, _description, encoded
+from coldloop.safety.retained import RetainedFile, RetainedStateError, _description, encoded
 
 OLD = {"session": 3, "tick": 1000, "applied": [43.0, 75.0, 36.0]}
 NEW = {"session": 3, "tick": 1001, "applied": [43.1, 76.0, 36.0]}

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from coldloop.retained import RetainedFile, RetainedStateError
-from coldloop.retained_writer import RetainedStateWriter
+from coldloop.safety.retained import RetainedFile, RetainedStateError
+from coldloop.safety.retained_writer import RetainedStateWriter
 
 LONG_S = 120.0
 """Longer than anything here takes."""

@@ -6,7 +6,7 @@ import pytest
 
 from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
-from coldloop.seal import CRC_BYTES, Seal, seal_of, sealed, sealed_bytes
+from coldloop.registers.seal import CRC_BYTES, Seal, seal_of, sealed, sealed_bytes
 
 MEASUREMENT = PLANT_MAP.block_of(Measurement)
 RECORD = Measurement(7, 385.0, (1.0,) * 22, (2.0,) * 28, 1)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from coldloop.registers.codec import WordOrder, as_transmitted, codec_of
 from coldloop.registers.control_plc import CONTROL_MAP, SequenceHeader, SequenceRow
-from coldloop.sequence import InputSequence, checksum, with_checksum
+from coldloop.safety.sequence import InputSequence, checksum, with_checksum
 
 ROWS = [SequenceRow(43.0 + 0.01 * tick, 75.0 - tick, 36.0) for tick in range(20)]
 HEADER = SequenceHeader(number=7, update=6, first_tick=140, length=20, tau_u=20, model_digest=0x2B8F1A90, crc=0)

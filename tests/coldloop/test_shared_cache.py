@@ -12,8 +12,8 @@ import pytest
 PROGRAM = """
 import sys
 from numba.core import event
-from coldloop.compiled import kernel
-from coldloop.first_use import kernels_of
+from coldloop.kernels.compiled import kernel
+from coldloop.kernels.first_use import kernels_of
 
 @kernel
 def inner(x):

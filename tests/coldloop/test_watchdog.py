@@ -2,7 +2,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.registers.safety import WatchdogState
-from coldloop.watchdog import Watchdog
+from coldloop.safety.watchdog import Watchdog
 
 
 @given(time=st.integers(1, 50), triggers=st.sets(st.integers(1, 200)))

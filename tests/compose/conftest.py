@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from rig import cli
-from rig.ports import ReservedPorts
+from rig.cosim.ports import ReservedPorts
 
 ROOT = Path(__file__).parents[2]
 SERVICES = ("plant", "control-plc", "optimizer-plc")

@@ -20,7 +20,7 @@ from coldloop.registers.control_plc import CONTROL_MAP, ControlSession
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.plant import PLANT_MAP, PlantSession
-from rig.certificates import Authority
+from rig.cli.certificates import Authority
 from tests.harness.processes import END_S, Processes
 
 PROGRAM = Path(__file__).parents[2] / "docker" / "healthcheck.py"

@@ -4,14 +4,14 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from coldloop.limits import InputLimits
-from coldloop.model_file import read_header
-from coldloop.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process import L1, T5
+from coldloop.process.limits import InputLimits
+from coldloop.process.model_file import read_header
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.signals import L1, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.sequence import InputSequence, with_checksum
+from coldloop.safety.sequence import InputSequence, with_checksum
 from control_plc.program import ControlProgram, OperatingPoint
 from control_plc.settings import ControlSection
 

@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from coldloop.journal import Journal
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmPriority, AlarmState
 from coldloop.registers.text import from_words
+from coldloop.service.journal import Journal
 from control_plc.alarm_settings import DEFAULT_RULES, AlarmSettings
 from control_plc.alarms import TRANSITIONS, AlarmPanel
 

@@ -14,13 +14,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from coldloop.errors import DamagedAnswerError, LinkError, PeerUnreachableError, RequestRefusedError
-from coldloop.journal import Journal
-from coldloop.lease import Lease
-from coldloop.limits import InputLimits, RateReference
-from coldloop.model_file import read_header
-from coldloop.model_settings import DEFAULT_MODEL_FILE
-from coldloop.pace import Pace
-from coldloop.process import TICK_S
+from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.model_file import read_header
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.signals import TICK_S
 from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import (
@@ -35,7 +32,10 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import LeaseState
-from coldloop.sequence import InputSequence, with_checksum
+from coldloop.safety.lease import Lease
+from coldloop.safety.sequence import InputSequence, with_checksum
+from coldloop.service.journal import Journal
+from coldloop.session.pace import Pace
 from control_plc.plant_link import PlantLink
 from control_plc.program import make_program
 from control_plc.rack_clock import PHASE, RackClock
@@ -43,7 +43,7 @@ from control_plc.retained_state import Memory, RetainedState
 from control_plc.scan_cycle import ScanCycle
 from control_plc.settings import ControlSection
 from plant.program import LoadProfile
-from plant.rack import Rack, Session
+from plant.rack.rack import Rack, Session
 from plant.settings import SafeAction, WatchdogSettings
 
 HEADER = read_header(DEFAULT_MODEL_FILE)

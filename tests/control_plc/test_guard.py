@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from coldloop.limits import InputLimits, RateReference
+from coldloop.process.limits import InputLimits, RateReference
 from coldloop.registers.control_plc import SequenceRow
 from control_plc.guard import OutputGuard
 

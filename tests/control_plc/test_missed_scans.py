@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.limits import InputLimits
-from coldloop.pace import Pace
-from coldloop.process import L1, T5
+from coldloop.process.limits import InputLimits
+from coldloop.process.signals import L1, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow, Verdict
+from coldloop.session.pace import Pace
 from control_plc.guard import OutputGuard
 from control_plc.retained_state import Memory, RetainedState
 

@@ -5,11 +5,11 @@ import math
 import pytest
 
 from coldloop.errors import DamagedAnswerError, LinkError, PeerUnreachableError, RequestRefusedError
-from coldloop.journal import Journal
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import LinkCause, PlantLinkState
 from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind
+from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 from control_plc.plant_link import FROZEN_TICKS, PlantLink
 from control_plc.scan_cycle import cause_of

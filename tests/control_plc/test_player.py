@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.limits import InputLimits
-from coldloop.process import LAST_NUMBER
+from coldloop.process.limits import InputLimits
+from coldloop.process.signals import LAST_NUMBER
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Mode, Plan, SequenceRow, Update, Verdict
 from control_plc.guard import OutputGuard

@@ -13,11 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coldloop.errors import ImplausibleAnswerError
-from coldloop.journal import Journal
-from coldloop.lease import SIMPLE_CLIENT
-from coldloop.limits import InputLimits
-from coldloop.model_file import read_header
-from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.limits import InputLimits
+from coldloop.process.model_file import read_header
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import ANYBODY, RefusedAccessError
 from coldloop.registers.codec import as_transmitted, codec_of
 from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode, PlantLinkState
@@ -25,13 +23,15 @@ from coldloop.registers.declaration import Block, Role, fields_of
 from coldloop.registers.domain import DomainError
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.plant import PLANT_MAP, Measurement
-from coldloop.seal import sealed, sealed_bytes
+from coldloop.registers.seal import sealed, sealed_bytes
+from coldloop.safety.lease import SIMPLE_CLIENT
+from coldloop.service.journal import Journal
 from control_plc.plant_link import PlantLink
 from control_plc.program import make_program
 from control_plc.runtime import ControlPlc
 from control_plc.scan_cycle import ScanCycle
 from control_plc.settings import ControlSection, ControlSettings
-from plant.outputs import AppliedOutputs
+from plant.rack.outputs import AppliedOutputs
 from tests.link.poison import values_of
 
 HEADER: Final = read_header(DEFAULT_MODEL_FILE)

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
-from coldloop.model_file import read_header
-from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.model_file import read_header
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EVENT_ROWS, Event
 from coldloop.registers.bank import ANYBODY, Caller, RegisterBank
 from coldloop.registers.common import Identity
@@ -27,15 +27,15 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
-from coldloop.retained import RetainedFile
-from coldloop.seal import sealed
+from coldloop.registers.seal import sealed
+from coldloop.safety.retained import RetainedFile
 from control_plc.certificate_watch import EXPIRES_SOON, UNREADABLE
 from control_plc.retained_state import OWNER
 from control_plc.runtime import ControlPlc
 from control_plc.sessions import ADOPT_AFTER_S
 from control_plc.settings import ControlSettings
-from rig.certificates import Authority
-from rig.ports import ReservedPorts
+from rig.cli.certificates import Authority
+from rig.cosim.ports import ReservedPorts
 
 WITHIN_S = 60.0
 HEADER = read_header(DEFAULT_MODEL_FILE)

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from coldloop.limits import InputLimits, RateReference
+from coldloop.process.limits import InputLimits, RateReference
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Acknowledgement, SequenceRow, Verdict
-from coldloop.sequence import InputSequence
+from coldloop.safety.sequence import InputSequence
 
 if TYPE_CHECKING:
     from tests.control_plc.conftest import Bench

@@ -8,11 +8,10 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from coldloop.limits import InputLimits, RateReference
-from coldloop.model_file import read_header
-from coldloop.model_settings import DEFAULT_MODEL_FILE
-from coldloop.pace import Pace
-from coldloop.process import L1, T5
+from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.model_file import read_header
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.signals import L1, T5
 from coldloop.registers.audit import EventKind
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import (
@@ -28,7 +27,8 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState
-from coldloop.sequence import InputSequence, with_checksum
+from coldloop.safety.sequence import InputSequence, with_checksum
+from coldloop.session.pace import Pace
 from control_plc.program import ControlProgram, make_program
 from control_plc.retained_state import Memory, RetainedState
 from control_plc.settings import ControlSection

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from rig.cli import make_parser
-from rig.register_listing import FORMATS, MAPS
+from rig.cli.register_listing import FORMATS, MAPS
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

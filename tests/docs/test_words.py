@@ -4,9 +4,9 @@ import re
 import struct
 from pathlib import Path
 
-from coldloop.event_text import word
 from coldloop.registers.common import MAGIC
 from coldloop.registers.safety import AlarmKind
+from coldloop.service.event_text import word
 from control_plc.alarm_settings import PASSING, AlarmSettings
 
 DOCS = Path(__file__).parents[2] / "docs"

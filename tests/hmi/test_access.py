@@ -11,8 +11,8 @@ import pytest
 from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 
-from coldloop.endpoints import Endpoint
 from coldloop.errors import ConfigurationError, UsageError
+from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
 from hmi.access import REQUEST_BURST, REQUESTS_A_BROWSER, RateLimit, Sessions, host_of, is_own_origin, port_of
 from hmi.audit import Audit
@@ -22,8 +22,8 @@ from hmi.model import Model
 from hmi.page_server import Exhibit, PageServer
 from hmi.settings import HmiSection, LoginSettings
 from hmi.users import PageRole, User, Users, hash_password, write_user
-from rig.page_process import pointed_at
-from rig.rig_endpoints import RigEndpoints
+from rig.cosim.endpoints import RigEndpoints
+from rig.live.page_process import pointed_at
 from tests.hmi.conftest import OPERATOR, VIEWER, Site
 
 WHOLE_HASH = hash_password("a long password")

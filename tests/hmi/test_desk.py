@@ -6,12 +6,12 @@ from typing import Any, TypeVar
 import pytest
 
 from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError, UsageError
-from coldloop.journal import Journal
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.plant import LoadAhead, LoadStatus
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
+from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 from hmi.command_work import lead_ticks
 from hmi.commands import Command, PlayLoad, SetFactor, SetLoad, SetMode, TreatAlarm, clock_text, duration_text

@@ -8,15 +8,15 @@ from collections.abc import Iterator
 
 import pytest
 
-from coldloop.endpoints import Endpoint
 from coldloop.errors import LinkError
-from coldloop.metrics import exposition
-from coldloop.process import OUTPUT_NAMES
+from coldloop.modbus.endpoints import Endpoint
+from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalPage
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Mode, Process
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
+from coldloop.service.metrics import exposition
 from hmi.access import Party
 from hmi.broadcast import WAITING, Broadcast
 from hmi.commands import read_load

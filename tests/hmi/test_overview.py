@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process import INPUT_NAMES, OUTPUT_NAMES
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES
 from tests.hmi.conftest import SERVICES, Site, Witness, eventually
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from coldloop.process import OUTPUT_NAMES, STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
+from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop.registers.plant import StationAlarm, StationStatus
 from hmi.model import Model
 from hmi.reading import STATIC

@@ -9,10 +9,10 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from coldloop.process import OUTPUT_NAMES
+from coldloop.process.signals import OUTPUT_NAMES
 from hmi.explanation import Branch
-from rig.recorded_page import RecordedPage, _bits
-from rig.run_folder import RunFolder
+from rig.live.recorded_page import RecordedPage, _bits
+from rig.results.run_folder import RunFolder
 from tests.conftest import Coldloop, first_of_three_ports
 from tests.harness.processes import END_S, Processes
 from tests.hmi.conftest import RECORDED_S, Served, eventually

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from coldloop.registers.codec import RecordCodec, codec_of
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, fields_of
-from coldloop.seal import Seal, seal_of, sealed_bytes
+from coldloop.registers.seal import Seal, seal_of, sealed_bytes
 
 READS: Final = (3, 23)
 HEAD: Final = 9

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.limits import InputLimits
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
-from coldloop.model_file import read_header
-from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.limits import InputLimits
+from coldloop.process.model_file import read_header
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import ControlSession, Grant, LinkCause, PlantLinkState
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, OutputVerdict
 from coldloop.registers.safety import AlarmKind
-from coldloop.seal import sealed
+from coldloop.registers.seal import sealed
 
 if TYPE_CHECKING:
     from tests.harness.processes import Processes

@@ -5,7 +5,7 @@ import contextlib
 from statistics import median
 from typing import TYPE_CHECKING
 
-from coldloop.process import TICK_S
+from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.plant import PLANT_MAP, Actuators
 from coldloop.registers.safety import AlarmKind

@@ -26,7 +26,7 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap, Role
 from coldloop.registers.plant import PLANT_MAP
-from rig.certificates import Authority, Pair
+from rig.cli.certificates import Authority, Pair
 
 PATIENCE_S = 100.0
 

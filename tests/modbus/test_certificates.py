@@ -9,13 +9,13 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from coldloop.endpoints import Endpoint
 from coldloop.errors import ConfigurationError, PeerUnreachableError, UntrustedPeerError
 from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import certificate_days_left, first_expiry, server_context
 from coldloop.registers.control_plc import CONTROL_MAP
-from rig.certificates import Authority, Pair, revoked_now
+from rig.cli.certificates import Authority, Pair, revoked_now
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Pki, Running, Serve

@@ -16,7 +16,7 @@ from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, Grant
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.plant import PLANT_MAP, Actuators, LoadStep, Measurement, PlantSample, PlantSession
-from coldloop.seal import sealed
+from coldloop.registers.seal import sealed
 
 if TYPE_CHECKING:
     from coldloop.registers.bank import Caller

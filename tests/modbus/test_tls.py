@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import pytest
 from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, PrivateFormat
 
-from coldloop.endpoints import Endpoint
 from coldloop.errors import ConfigurationError, PeerUnreachableError, RequestRefusedError, UntrustedPeerError
 from coldloop.modbus.access import decoded_role, encoded_role
 from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, AwaitUpdate, Grant, SequenceRow
-from rig.certificates import Authority
+from rig.cli.certificates import Authority
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Pki, Running, Serve

@@ -21,8 +21,8 @@ from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.control_plc import CONTROL_MAP, Heartbeat
 from coldloop.registers.declaration import Block, Field, Kind, Register, RegisterMap, fields_of
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, PlantSession
-from coldloop.seal import Seal, seal_of, sealed
-from rig.register_listing import MAPS
+from coldloop.registers.seal import Seal, seal_of, sealed
+from rig.cli.register_listing import MAPS
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Plug, Serve

@@ -11,10 +11,9 @@ from typing import Any
 
 import pytest
 
-from coldloop.lease import Lease
-from coldloop.lti_model import LtiModel, load
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
-from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import (
@@ -32,8 +31,9 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.registers.plant import PLANT_MAP
-from coldloop.seal import sealed
-from coldloop.sequence import InputSequence, checksum
+from coldloop.registers.seal import sealed
+from coldloop.safety.lease import Lease
+from coldloop.safety.sequence import InputSequence, checksum
 from optimizer_plc.runtime import OptimizerPlc
 from optimizer_plc.settings import OptimizerSettings
 

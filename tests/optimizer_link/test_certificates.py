@@ -10,7 +10,7 @@ from coldloop.modbus.settings import TlsSettings
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from optimizer_plc.runtime import OptimizerPlc
 from optimizer_plc.settings import OptimizerSettings
-from rig.certificates import Authority, Pair
+from rig.cli.certificates import Authority, Pair
 
 if TYPE_CHECKING:
     from tests.optimizer_link.conftest import Listen, PlayedControlPlc, Until

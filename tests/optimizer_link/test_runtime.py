@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.errors import ModelFileError
-from coldloop.lti_model import LtiModel
 from coldloop.modbus.client import RegisterClient
+from coldloop.process.lti_model import LtiModel
 from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.bank import Caller
 from coldloop.registers.common import Identity

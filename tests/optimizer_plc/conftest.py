@@ -10,23 +10,23 @@ import pytest
 from numpy.typing import NDArray
 
 import optimizer_plc.program
-from coldloop.limits import InputLimits
-from coldloop.lti_model import LtiModel, load
-from coldloop.model_file import read_header
-from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.model_file import read_header
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.plant import Measurement
-from coldloop.sequence import InputSequence
+from coldloop.safety.sequence import InputSequence
 from control_plc.program import make_program
 from control_plc.settings import ControlSection
-from optimizer_plc.design import ControlDesign
-from optimizer_plc.prediction import PredictionModel
-from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import Answer, Solver, make_solver
-from plant.cold_box import REFERENCE
+from plant.cold_box.physics import REFERENCE
 from plant.load import find_load
 from plant.program import PlantProgram
 

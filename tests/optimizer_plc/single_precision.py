@@ -15,9 +15,9 @@ import numba
 from numba.core.dispatcher import Dispatcher
 
 import optimizer_plc
-from coldloop.limits import InputLimits
-from coldloop.lti_model import LtiModel, load
-from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import Update, Verdict
 from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings
 from optimizer_plc.program import OptimizerProgram

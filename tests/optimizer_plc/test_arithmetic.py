@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coldloop.limits import InputLimits
-from coldloop.lti_model import LtiModel
-from optimizer_plc.arithmetic import real_of
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import LtiModel
 from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, OdeSettings
-from optimizer_plc.costs import augmented_cost
-from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.qp.arithmetic import real_of
+from optimizer_plc.qp.costs import augmented_cost
+from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings
 from optimizer_plc.solvers.ode import ode_solver
 from tests.harness.processes import Processes

@@ -14,10 +14,10 @@ from coldloop.errors import (
     RequestRefusedError,
     UntrustedPeerError,
 )
-from coldloop.journal import Journal
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
+from coldloop.service.journal import Journal
 from optimizer_plc.control_link import REPEAT_S, ControlLink
 
 S = ControlLinkState

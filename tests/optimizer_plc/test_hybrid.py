@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
-from optimizer_plc.problem import PredictiveProblem
+from optimizer_plc.qp.problem import PredictiveProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
 from optimizer_plc.solvers import Answer, hybrid, make_solver
 from optimizer_plc.solvers.hybrid import (

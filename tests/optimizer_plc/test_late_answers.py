@@ -2,8 +2,8 @@
 
 import pytest
 
-from coldloop.limits import InputLimits
-from coldloop.lti_model import LtiModel
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Update
 from optimizer_plc.budget import MAX_PERIOD_TICKS
 from optimizer_plc.program import OptimizerProgram

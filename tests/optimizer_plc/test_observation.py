@@ -14,16 +14,16 @@ import pytest
 from numpy.typing import NDArray
 
 import optimizer_plc.program
-from coldloop.limits import InputLimits
-from coldloop.lti_model import LtiModel
-from coldloop.process import TICK_S
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import LtiModel
+from coldloop.process.signals import TICK_S
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
-from coldloop.sequence import InputSequence
+from coldloop.safety.sequence import InputSequence
 from optimizer_plc import solvers
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
-from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.rules import Assessment, Observation
 from optimizer_plc.rules.interface import decides_by
 from optimizer_plc.settings import ProgramSettings

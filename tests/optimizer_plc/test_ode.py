@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
+from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.solvers import KernelSolver
 from optimizer_plc.solvers.ode import ode_solver
 

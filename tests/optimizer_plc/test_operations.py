@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from optimizer_plc import costs, linear_algebra, operations, problem
 from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.penalties import DEFAULT_PENALTIES
-from optimizer_plc.problem import QuadraticProblem
-from optimizer_plc.reference_plc import ACTIVE_ROWS, QPOASES_ON_LAPTOP_S, cholesky_times, fitted, residuals, slow_down
+from optimizer_plc.qp import costs, linear_algebra, problem
+from optimizer_plc.qp.penalties import DEFAULT_PENALTIES
+from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers import interior_point, ode
 from optimizer_plc.solvers.ode import flow_in
+from rig.plc import operations
+from rig.plc.reference_plc import ACTIVE_ROWS, QPOASES_ON_LAPTOP_S, cholesky_times, fitted, residuals, slow_down
 
 
 class Counted:

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from coldloop.limits import InputLimits
+from coldloop.process.limits import InputLimits
 from optimizer_plc.computing_settings import PENALTY_WEIGHT, OdeSettings
-from optimizer_plc.costs import augmented_cost, indicators
-from optimizer_plc.design import ControlDesign
-from optimizer_plc.penalties import PRESETS, PenaltySettings, Preset
-from optimizer_plc.prediction import PredictionModel
-from optimizer_plc.problem import PredictiveProblem, Situation
+from optimizer_plc.qp.costs import augmented_cost, indicators
+from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.qp.penalties import PRESETS, PenaltySettings, Preset
+from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.problem import PredictiveProblem, Situation
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers.ode import ode_solver
 

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from coldloop.limits import InputLimits, RateReference
-from coldloop.lti_model import LtiModel
-from coldloop.process import L1, T5
-from optimizer_plc import costs
-from optimizer_plc.costs import augmented_cost, indicators, matrices_of, quadratic_cost
-from optimizer_plc.design import ControlDesign, trivial_design
-from optimizer_plc.prediction import PredictionModel
-from optimizer_plc.problem import PredictiveProblem, Situation
+from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.lti_model import LtiModel
+from coldloop.process.signals import L1, T5
+from optimizer_plc.qp import costs
+from optimizer_plc.qp.costs import augmented_cost, indicators, matrices_of, quadratic_cost
+from optimizer_plc.qp.design import ControlDesign, trivial_design
+from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.problem import PredictiveProblem, Situation
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Optimum, Situations

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optimizer_plc.profile import interpolation, shift
+from optimizer_plc.qp.profile import interpolation, shift
 
 KNOTS = (1, 2, 4, 8, 16, 50, 100)
 

@@ -11,20 +11,20 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
-from coldloop.lti_model import LtiModel
+from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Verdict
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import FastGradientSettings, InteriorPointSettings, QpoasesSettings
-from optimizer_plc.problem import PredictiveProblem, QuadraticProblem
+from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.settings import OptimizerSection, ProgramSettings, SolverName
 from optimizer_plc.solvers import Solver, judged, make_solver, qpoases
 from optimizer_plc.solvers.fast_gradient import fast_gradient_solver, step_sizes, stiffest_hessian
 from optimizer_plc.solvers.interior_point import interior_point_solver
 from optimizer_plc.solvers.qpoases import QpoasesSolver
 from plant.load import find_load
-from rig.one_process import OneProcessRig
-from rig.recording import Recorder
-from rig.scenario import Scenario
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario
+from rig.results.recording import Recorder
 from rig.settings import Settings
 
 if TYPE_CHECKING:
@@ -274,7 +274,7 @@ def test_a_problem_without_solution_leaves_the_guess_and_the_next_one_is_solved(
 def test_no_solver_prints(processes: "Processes") -> None:
     program = (
         "import numpy as np\n"
-        "from optimizer_plc.problem import QuadraticProblem\n"
+        "from optimizer_plc.qp.problem import QuadraticProblem\n"
         "from optimizer_plc.settings import ProgramSettings, SolverName\n"
         "from optimizer_plc.solvers import make_solver\n"
         "one = np.ones(1)\n"

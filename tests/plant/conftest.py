@@ -8,23 +8,23 @@ import numpy as np
 import pytest
 
 import coldloop
-from coldloop.lti_model import LtiModel, load
 from coldloop.modbus.identification import DeviceIdentity
 from coldloop.modbus.requests import RequestHandler, Written
-from coldloop.model_file import read_header
-from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.model_file import read_header
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EVENT_ROWS, Event, EventKind
 from coldloop.registers.bank import ALL_ROLES, Caller, RefusedAccessError
 from coldloop.registers.codec import codec_of
 from coldloop.registers.declaration import Role
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
-from coldloop.seal import Seal, seal_of, sealed
-from plant.cold_box import REFERENCE, ColdBox, derivative, outputs
+from coldloop.registers.seal import Seal, seal_of, sealed
+from plant.cold_box.physics import REFERENCE, ColdBox, derivative, outputs
 from plant.helium.properties import Helium, load_helium
 from plant.integrator import advance
 from plant.kinds import plant_maker
 from plant.numeric import RealArray
-from plant.registers import RackRegisters
+from plant.rack.registers import RackRegisters
 from plant.settings import PlantSettings
 
 R = TypeVar("R", bound=tuple[Any, ...])

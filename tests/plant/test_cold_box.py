@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import pytest
 
-from plant.cold_box import REFERENCE, streams
-from plant.equilibrium import NoEquilibriumError, find_equilibrium
-from plant.linearisation import linearisation_error, state_scales
-from plant.model import build_model, parameters_digest
+from plant.cold_box.equilibrium import NoEquilibriumError, find_equilibrium
+from plant.cold_box.linearisation import linearisation_error, state_scales
+from plant.cold_box.model import build_model, parameters_digest
+from plant.cold_box.physics import REFERENCE, streams
 from plant.numeric import RealArray
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plant.cold_box import REFERENCE
+from plant.cold_box.physics import REFERENCE
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow, driving_difference, exchange, take_up
 from plant.components.phase_separator import contents, level, separate
 from plant.components.return_line import return_flow

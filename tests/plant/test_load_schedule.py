@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.registers.plant import MAX_LOAD_W, LoadStep
-from plant.load_schedule import MOST_UPCOMING, LoadSchedule
 from plant.program import LoadProfile
+from plant.rack.load_schedule import MOST_UPCOMING, LoadSchedule
 
 
 def schedule(*steps: tuple[int, float]) -> LoadSchedule:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from plant.pressure_steps import LOAD, Response, pressures_after, response_of, table
-from plant.refrigerator_file import SHIPPED, read_refrigerator_file
-from plant.station_settings import StationControlKind
+from plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from plant.refrigerator.pressure_steps import LOAD, Response, pressures_after, response_of, table
+from plant.refrigerator.station_settings import StationControlKind
 
 FILE = read_refrigerator_file(SHIPPED)
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.lti_model import LtiModel
-from coldloop.process import OUTPUT_NAMES
-from plant.cold_box import REFERENCE
+from coldloop.process.lti_model import LtiModel
+from coldloop.process.signals import OUTPUT_NAMES
+from plant.cold_box.physics import REFERENCE
 from plant.program import LoadProfile, MeasurementNoise, PlantProgram
 
 LEVEL_AND_T5 = tuple(0.01 if name in ("L1", "T5") else 0.0 for name in OUTPUT_NAMES)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from coldloop.process import L1, LAST_TICK, T5
+from coldloop.process.signals import L1, LAST_TICK, T5
 from coldloop.registers.audit import EventKind
 from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import (
@@ -23,9 +23,9 @@ from coldloop.registers.plant import (
     SensorFaultKind,
 )
 from coldloop.registers.safety import WatchdogState, WatchdogStatus, WatchdogTime
-from coldloop.retained import RetainedFile
-from coldloop.seal import sealed
-from plant.retained_state import OWNER
+from coldloop.registers.seal import sealed
+from coldloop.safety.retained import RetainedFile
+from plant.rack.retained_state import OWNER
 from tests.plant.conftest import HEADER
 
 if TYPE_CHECKING:

@@ -5,11 +5,11 @@ from functools import partial
 
 import pytest
 
-from coldloop.clock import Pacer
 from coldloop.errors import ColdloopError
 from coldloop.registers.bank import ANYBODY
 from coldloop.registers.plant import PLANT_MAP, Actuators, PlantSession
-from plant.registers import RackRegisters
+from coldloop.session.clock import Pacer
+from plant.rack.registers import RackRegisters
 from plant.runtime import PlantRuntime
 from plant.settings import PlantSettings
 
@@ -46,7 +46,7 @@ async def test_the_clock_is_as_fast_as_is_configured(clock_error_ppm: float, mon
     clock = SleepersClock()
     monkeypatch.setattr("plant.runtime.time", clock)
     monkeypatch.setattr("plant.runtime.Pacer", partial(Pacer, now=clock.monotonic))
-    monkeypatch.setattr("coldloop.clock.asyncio.sleep", clock.sleep)
+    monkeypatch.setattr("coldloop.session.clock.asyncio.sleep", clock.sleep)
     plant = runtime("realtime", clock_error_ppm=clock_error_ppm)
 
     def position() -> tuple[float, float]:

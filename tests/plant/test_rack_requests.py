@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.journal import ANY_SUBJECT
 from coldloop.registers.audit import EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import (
@@ -20,6 +19,7 @@ from coldloop.registers.plant import (
     SensorFaultKind,
 )
 from coldloop.registers.text import from_words
+from coldloop.service.journal import ANY_SUBJECT
 
 if TYPE_CHECKING:
     from tests.plant.conftest import RackOnTheBus

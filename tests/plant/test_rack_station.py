@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.event_text import describe
 from coldloop.registers.audit import EventKind
 from coldloop.registers.plant import (
     STATION_ROWS,
@@ -15,6 +14,7 @@ from coldloop.registers.plant import (
     StationStatus,
     Surroundings,
 )
+from coldloop.service.event_text import describe
 
 if TYPE_CHECKING:
     from conftest import RackOnTheBus

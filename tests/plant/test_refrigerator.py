@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from coldloop.process import OUTPUT_NAMES
+from coldloop.process.signals import OUTPUT_NAMES
+from plant.cold_box.equilibrium import Equilibrium
+from plant.cold_box.model import build_model
 from plant.components.nitrogen_bath import LATENT_HEAT
 from plant.components.turbine import expand
-from plant.equilibrium import Equilibrium
 from plant.helium.properties import (
     WARM_CP,
     load_helium,
@@ -20,9 +21,11 @@ from plant.helium.properties import (
     vapour_enthalpy_and_cp,
 )
 from plant.integrator import advance
-from plant.model import build_model
 from plant.numeric import RealArray
-from plant.refrigerator import (
+from plant.refrigerator.equilibrium import Rest, find_refrigerator_equilibrium
+from plant.refrigerator.file import SHIPPED, read_refrigerator_file, refrigerator_digest
+from plant.refrigerator.linearisation import jacobian, rate_scales
+from plant.refrigerator.physics import (
     COMMAND_NAMES,
     DISTURBANCE_NAMES,
     REFERENCE_REFRIGERATOR,
@@ -33,10 +36,7 @@ from plant.refrigerator import (
     rates,
     read,
 )
-from plant.refrigerator_equilibrium import Rest, find_refrigerator_equilibrium
-from plant.refrigerator_file import SHIPPED, read_refrigerator_file, refrigerator_digest
-from plant.refrigerator_linearisation import jacobian, rate_scales
-from plant.station_design import line_model, lq_gains
+from plant.refrigerator.station_design import line_model, lq_gains
 
 HELIUM = load_helium()
 PLANT = REFERENCE_REFRIGERATOR

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from coldloop.lti_model import load
-from coldloop.model_settings import SHIPPED_MODELS, ModelSettings
-from coldloop.process import OUTPUT_NAMES, STATE_NAMES
-from optimizer_plc.design import ControlDesign
-from optimizer_plc.prediction import state_weights
+from coldloop.process.lti_model import load
+from coldloop.process.model_settings import SHIPPED_MODELS, ModelSettings
+from coldloop.process.signals import OUTPUT_NAMES, STATE_NAMES
+from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.qp.prediction import state_weights
 from plant.program import LoadProfile
-from plant.refrigerator_events import EventSchedule
-from plant.refrigerator_file import SHIPPED, read_refrigerator_file
-from plant.refrigerator_prediction import prediction_model
-from plant.refrigerator_program import RefrigeratorProgram
-from plant.station_settings import StationSettings
+from plant.refrigerator.events import EventSchedule
+from plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from plant.refrigerator.prediction import prediction_model
+from plant.refrigerator.program import RefrigeratorProgram
+from plant.refrigerator.station_settings import StationSettings
 
 MODEL = load(SHIPPED_MODELS["refrigerator"])
 FILE = read_refrigerator_file(SHIPPED)

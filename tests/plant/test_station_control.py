@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ConfigurationError, ModelFileError
-from coldloop.model_file import read_header
-from coldloop.model_settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
-from coldloop.process import STATION_SIGNAL_NAMES
+from coldloop.process.model_file import read_header
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
+from coldloop.process.signals import STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
 from plant.kinds import plant_maker
 from plant.program import LoadProfile
-from plant.refrigerator import REFERENCE_REFRIGERATOR
-from plant.refrigerator_events import EventSchedule, RefrigeratorEvent
-from plant.refrigerator_file import SHIPPED, read_refrigerator_file
-from plant.refrigerator_program import RefrigeratorProgram
+from plant.refrigerator.events import EventSchedule, RefrigeratorEvent
+from plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from plant.refrigerator.physics import REFERENCE_REFRIGERATOR
+from plant.refrigerator.program import RefrigeratorProgram
+from plant.refrigerator.station_control import StationControl
+from plant.refrigerator.station_law import StationMeasurement
+from plant.refrigerator.station_settings import StationSettings
 from plant.settings import PlantSection
-from plant.station_control import StationControl
-from plant.station_law import StationMeasurement
-from plant.station_settings import StationSettings
 
 FILE = read_refrigerator_file(SHIPPED)
 HP, LP, LEVEL, LOST = (STATION_SIGNAL_NAMES.index(name) for name in ("P12", "P11", "L_N2", "lost"))

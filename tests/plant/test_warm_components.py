@@ -25,7 +25,7 @@ from plant.helium.properties import (
     vapour_enthalpy_and_cp,
     vapour_temperature,
 )
-from plant.refrigerator import REFERENCE_REFRIGERATOR, Refrigerator, check_refrigerator
+from plant.refrigerator.physics import REFERENCE_REFRIGERATOR, Refrigerator, check_refrigerator
 
 HELIUM = load_helium()
 STATION = REFERENCE_REFRIGERATOR.station

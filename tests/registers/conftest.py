@@ -8,7 +8,7 @@ import pytest
 from hypothesis import strategies as st
 
 from coldloop.registers.declaration import Block, Field, Kind, fields_of
-from coldloop.seal import sealed
+from coldloop.registers.seal import sealed
 
 Records = Callable[[Block], st.SearchStrategy[tuple[Any, ...]]]
 

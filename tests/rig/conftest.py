@@ -13,21 +13,21 @@ from pydantic import BaseModel
 import control_plc.runtime
 import optimizer_plc.runtime
 import plant.runtime
-from coldloop.model_file import read_header
+from coldloop.process.model_file import read_header
 from coldloop.registers.codec import WordOrder
 from control_plc.settings import ControlSettings
 from optimizer_plc.settings import OptimizerSettings
 from plant.load import find_load
 from plant.program import LoadProfile
 from plant.settings import PlantSettings
-from rig.one_process import OneProcessRig
-from rig.ports import ReservedPorts
-from rig.recording import Recorder, Recording
-from rig.rig_endpoints import RigEndpoints
-from rig.scenario import Scenario
-from rig.session_client import SessionClient
+from rig.cosim.endpoints import RigEndpoints
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.ports import ReservedPorts
+from rig.cosim.scenario import Scenario
+from rig.cosim.session_client import SessionClient
+from rig.cosim.wiring import SERVICES, endpoints_on, wired
+from rig.results.recording import Recorder, Recording
 from rig.settings import Settings
-from rig.wiring import SERVICES, endpoints_on, wired
 from tests.harness.processes import Processes
 
 PATIENCE_S = 120.0

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-import rig.networked_run
-from coldloop.model_file import read_document, write_document
-from coldloop.model_settings import DEFAULT_MODEL_FILE
+import rig.cosim.networked_run
+from coldloop.process.model_file import read_document, write_document
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from tests.harness.processes import Processes
 
 if TYPE_CHECKING:
@@ -226,7 +226,7 @@ def test_a_model_file_that_is_not_there_is_named(coldloop: "Coldloop", tmp_path:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rig.networked_run, "ATTACH_PATIENCE_S", 0.1)
+    monkeypatch.setattr(rig.cosim.networked_run, "ATTACH_PATIENCE_S", 0.1)
 
 
 @pytest.fixture

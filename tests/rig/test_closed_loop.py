@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from coldloop.limits import InputLimits, RateReference
-from coldloop.model_file import read_header
-from coldloop.process import L1, T5, TICKS_PER_SAMPLE
+from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.model_file import read_header
+from coldloop.process.signals import L1, T5, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import Verdict
-from optimizer_plc.design import ControlDesign
+from optimizer_plc.qp.design import ControlDesign
 from plant.kinds import make_program
 from plant.program import LoadProfile
 from plant.settings import SensorSettings
-from rig.recording import Recording
-from rig.scenario import Scenario
+from rig.cosim.scenario import Scenario
+from rig.results.recording import Recording
 from rig.settings import Settings
 
 if TYPE_CHECKING:

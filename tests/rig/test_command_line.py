@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.session import TimeMode
-from optimizer_plc.penalties import Preset
+from coldloop.session.settings import TimeMode
+from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.settings import SolverName
 from plant.load import NAMED
 from rig.chaos.plan import shipped_plans
 from rig.cli import COMMANDS, make_parser
-from rig.commands import choices
-from rig.register_listing import FORMATS, MAPS
+from rig.cli.commands import choices
+from rig.cli.register_listing import FORMATS, MAPS
+from rig.cli.tag_exports import EXPORTS
 from rig.studies import APART, STUDIES
-from rig.tag_exports import EXPORTS
 from tests.harness.processes import Ended, Processes
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from coldloop.lti_model import load
-from coldloop.model_settings import DEFAULT_MODEL_FILE
-from rig.register_listing import COLUMNS, MAPS
+from coldloop.process.lti_model import load
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from rig.cli.register_listing import COLUMNS, MAPS
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

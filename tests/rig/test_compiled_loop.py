@@ -9,18 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import rig.compiled.portable  # noqa: F401 lets numba compile what is plain Python
+import rig.cosim.compiled.portable  # noqa: F401 lets numba compile what is plain Python
 from coldloop.config import load_configuration
-from coldloop.limits import InputLimits, RateReference
-from coldloop.single_precision import neighbour, single
+from coldloop.kernels.single_precision import neighbour, single
+from coldloop.process.limits import InputLimits, RateReference
 from control_plc.output_limits import admit, beginning, plain
 from plant.load import find_load
 from plant.program import LoadProfile
-from rig.compiled.control import guard_records
-from rig.compiled.stretches import CompiledStretches, Stretch
-from rig.one_process import OneProcessRig
-from rig.recording import MemorySink, Recorder
-from rig.scenario import Scenario
+from rig.cosim.compiled.control import guard_records
+from rig.cosim.compiled.stretches import CompiledStretches, Stretch
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario
+from rig.results.recording import MemorySink, Recorder
 from rig.settings import Settings
 
 PROGRAM = "optimizer_plc.program."

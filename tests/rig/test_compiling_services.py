@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rig import compiling_services
-from rig.compiling_services import show_compiling
+from rig.cosim import compiling_services
+from rig.cosim.compiling_services import show_compiling
 
 SERVES = '{"event": "serving", "port": 5020}\n'
 

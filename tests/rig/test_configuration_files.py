@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coldloop.config import DERIVED, as_toml, load_configuration
-from optimizer_plc.penalties import OF_PRESETS, PRESETS, Preset
+from optimizer_plc.qp.penalties import OF_PRESETS, PRESETS, Preset
 from optimizer_plc.settings import ALPHAS, ProgramSettings
 from rig import simulate
 from rig.settings import Settings

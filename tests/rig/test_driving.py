@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from coldloop.process import L1, OUTPUT_NAMES
+from coldloop.process.signals import L1, OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import SensorFaultKind
-from rig.driving import CONTROL, PLANT, DrivingHistory
+from rig.results.driving import CONTROL, PLANT, DrivingHistory
 
 
 def mode(tick: int, subject: Mode, cause: Cause = Cause.NONE) -> Event:

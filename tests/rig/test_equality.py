@@ -13,11 +13,11 @@ from optimizer_plc.settings import AdaptiveSettings, OptimizerSection, ProgramSe
 from plant.load import find_load
 from plant.program import LoadProfile
 from plant.settings import PlantSection, SensorSettings
-from rig.scenario import Scenario
+from rig.cosim.scenario import Scenario
 from rig.settings import Settings
 
 if TYPE_CHECKING:
-    from rig.recording import Recording
+    from rig.results.recording import Recording
     from tests.conftest import Coldloop
     from tests.rig.conftest import Bus, OnTheBus, Simulate
 

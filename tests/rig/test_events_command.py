@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from coldloop.journal import KEPT, Journal, JournalPublication
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.modbus.settings import AccessSettings, TlsSettings
@@ -24,8 +23,9 @@ from coldloop.registers.control_plc import CONTROL_MAP, Mode
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.plant import PLANT_MAP
 from coldloop.registers.safety import AlarmKind
-from rig.commands.events import COLUMNS
-from rig.journal_reader import JournalReader
+from coldloop.service.journal import KEPT, Journal, JournalPublication
+from rig.cli.commands.events import COLUMNS
+from rig.cosim.journal_reader import JournalReader
 from tests.harness.processes import Processes
 
 if TYPE_CHECKING:

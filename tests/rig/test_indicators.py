@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coldloop.lti_model import LtiModel, load
-from coldloop.model_settings import DEFAULT_MODEL_FILE
-from coldloop.process import L1, STATE_NAMES, T5
+from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.signals import L1, STATE_NAMES, T5
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
-from optimizer_plc.design import ControlDesign
-from rig.indicators import Indicators, RunEvaluation, StageCost
-from rig.recording import SampleBlock
+from optimizer_plc.qp.design import ControlDesign
+from rig.results.indicators import Indicators, RunEvaluation, StageCost
+from rig.results.recording import SampleBlock
 
 DESIGN = ControlDesign()
 PRESSURE, VOLUME, FIRST_TEMPERATURE = 0, 1, 2

@@ -12,13 +12,13 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-import rig.disk_reserve
-import rig.file_sinks
+import rig.results.disk_reserve
+import rig.results.file_sinks
 from coldloop.errors import LinkError
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
-from rig.one_process import OneProcessRig
-from rig.recording import BLOCK_TICKS, KEPT_TICKS, Recorder, SampleBlock, Sink
+from rig.cosim.one_process import OneProcessRig
+from rig.results.recording import BLOCK_TICKS, KEPT_TICKS, Recorder, SampleBlock, Sink
 from tests.harness.processes import Processes
 
 if TYPE_CHECKING:
@@ -50,8 +50,8 @@ def assert_incomplete_but_readable(folder: Path, reason: str) -> int:
 
 
 SOON_ON_DISK = """
-import sys, rig.file_sinks
-rig.file_sinks.GROUP_TICKS = rig.file_sinks.HELD_BACK_TICKS = 512
+import sys, rig.results.file_sinks
+rig.results.file_sinks.GROUP_TICKS = rig.results.file_sinks.HELD_BACK_TICKS = 512
 from rig.__main__ import main
 sys.exit(main())
 """
@@ -142,22 +142,22 @@ class SmallDisk:
 
     def __init__(self, limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self._limit = limit
-        write = rig.disk_reserve.ReservedFile.write
+        write = rig.results.disk_reserve.ReservedFile.write
 
-        def limited(file: rig.disk_reserve.ReservedFile, data: bytes) -> int:
+        def limited(file: rig.results.disk_reserve.ReservedFile, data: bytes) -> int:
             self._limit -= len(data)
             if self._limit < 0 and not file._reserve.released:  # noqa: SLF001
                 file._reserve.release()  # noqa: SLF001
             return write(file, data)
 
-        monkeypatch.setattr(rig.disk_reserve.ReservedFile, "write", limited)
+        monkeypatch.setattr(rig.results.disk_reserve.ReservedFile, "write", limited)
 
 
 def test_a_disk_that_fills_up_leaves_what_was_recorded(
     coldloop: "Coldloop", results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     SmallDisk(1_000_000, monkeypatch)
-    monkeypatch.setattr(rig.file_sinks, "GROUP_TICKS", 1024)
+    monkeypatch.setattr(rig.results.file_sinks, "GROUP_TICKS", 1024)
     outcome = coldloop("run", "--in-process", "--load", "a", "--figures", "png", "--out", results)
     assert outcome.code == 1
     assert "the disk is full" in outcome.complaints[-1]

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from coldloop.errors import LinkError
-from rig.kept_up import PAUSES_S, end_of, keep_up
+from rig.cosim.kept_up import PAUSES_S, end_of, keep_up
 
 NONE = (0.0,) * len(PAUSES_S)
 
@@ -39,7 +39,7 @@ async def test_what_ends_again_and_again_is_given_up_after_five(capsys: pytest.C
 
 
 async def test_what_has_run_for_long_begins_to_count_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rig.kept_up.STEADY_S", -1.0)
+    monkeypatch.setattr("rig.cosim.kept_up.STEADY_S", -1.0)
     process = Mortal(lives=12)
     with pytest.raises(TimeoutError):
         await asyncio.wait_for(keep_up(process, pauses_s=NONE), 1.0)

@@ -23,9 +23,9 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import PLANT_MAP, LiveLoad, LoadAhead, LoadStatus, LoadStep, PlantSession
 from coldloop.registers.safety import AlarmKind
-from coldloop.seal import sealed
-from rig.journal_reader import JournalReader
-from rig.local_services import LocalServices
+from coldloop.registers.seal import sealed
+from rig.cosim.journal_reader import JournalReader
+from rig.cosim.local_services import LocalServices
 from rig.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("processes", "realtime")

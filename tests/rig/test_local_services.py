@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from coldloop.errors import LinkError, PeerUnreachableError
-from rig.local_services import LocalServices
+from rig.cosim.local_services import LocalServices
 from rig.settings import Settings
 
 

@@ -31,9 +31,9 @@ from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.plant import PLANT_MAP, LoadStatus
 from coldloop.registers.text import to_words
 from plant.own_model import own_header
+from rig.cosim.wiring import SERVICES
 from rig.settings import Settings
 from rig.testing.event_loop import BackgroundLoop
-from rig.wiring import SERVICES
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop, Outcome
@@ -116,7 +116,7 @@ def ask(
     coldloop: "Coldloop", fake: FakeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> "Callable[..., Outcome]":
     """A command to the fake rig, which does not move in a run."""
-    monkeypatch.setattr("rig.session_client.QUIET_S", 0.5)
+    monkeypatch.setattr("rig.cosim.session_client.QUIET_S", 0.5)
 
     def asked(*words: object) -> "Outcome":
         if words[0] == "run":
@@ -285,7 +285,7 @@ def test_a_journal_whose_answer_never_advances_is_given_up(fake: FakeRig, ask: "
 
 
 def test_a_rig_that_answers_slowly_is_given_up(ask: "Callable[..., Outcome]", monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rig.answer_time.ANSWER_S", 0.3)
+    monkeypatch.setattr("rig.cosim.answer_time.ANSWER_S", 0.3)
 
     async def late(*_: object) -> list[bytes]:
         await asyncio.sleep(30)

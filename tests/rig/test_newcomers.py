@@ -8,7 +8,7 @@ import pytest
 
 from coldloop.errors import UsageError
 from rig import Simulation, simulate
-from rig.started_rigs import check_ports
+from rig.live.started_rigs import check_ports
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop, Outcome

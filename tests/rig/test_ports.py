@@ -7,7 +7,7 @@ import sys
 import pytest
 import uvloop
 
-from rig.ports import HOST, ReservedPorts
+from rig.cosim.ports import HOST, ReservedPorts
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="two sockets share a port in this way on Linux alone")
 

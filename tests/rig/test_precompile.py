@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from rig.one_process import OneProcessRig
-from rig.recording import Recorder
-from rig.running import make_scenario
+from rig.cosim.one_process import OneProcessRig
+from rig.results.recording import Recorder
+from rig.runs.running import make_scenario
 from rig.settings import Settings
 
 ROOT = Path(__file__).parents[2]

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import pytest
 
-import rig.session_client
-from coldloop.limits import InputLimits
+import rig.cosim.session_client
 from coldloop.modbus.client import RegisterClient
+from coldloop.process.limits import InputLimits
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Mode, Plan, Process, Status, Verdict
 from coldloop.registers.declaration import RegisterMap
@@ -19,13 +19,13 @@ from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import PLANT_MAP, LoadStep, PlantSession
 from control_plc.settings import ControlSection, LadderSettings
 from plant.program import LoadProfile
-from rig.scenario import Scenario
-from rig.session_reader import SampleReader
+from rig.cosim.scenario import Scenario
+from rig.cosim.session_reader import SampleReader
 from rig.settings import Settings
 from tests.harness import processes as harness
 
 if TYPE_CHECKING:
-    from rig.recording import Recording
+    from rig.results.recording import Recording
     from tests.rig.conftest import Bus, OnTheBus, Simulate
 
 pytestmark = pytest.mark.usefixtures("realtime")
@@ -191,22 +191,22 @@ class ClockOfTicks:
             return self._tick
 
         monkeypatch.setattr(SampleReader, "read", noted)
-        monkeypatch.setattr(rig.session_client, "time", self)
+        monkeypatch.setattr(rig.cosim.session_client, "time", self)
 
     def monotonic(self) -> float:
-        return 0.9 * rig.session_client.QUIET_S * self._tick
+        return 0.9 * rig.cosim.session_client.QUIET_S * self._tick
 
 
 async def test_a_slow_run_is_not_given_up_while_it_moves(
     load_a: LoadProfile, on_the_bus: "OnTheBus", monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = ClockOfTicks(monkeypatch)
-    monkeypatch.setattr(rig.session_client, "LONGEST_PAUSE_S", 0.002)  # most looks find nothing new
+    monkeypatch.setattr(rig.cosim.session_client, "LONGEST_PAUSE_S", 0.002)  # most looks find nothing new
     async with on_the_bus() as bus:
         recording = await bus.record(Scenario(ticks=80, load=load_a, updating_period_s=0.0, seed=1, realtime=True,
                                               factor=40.0))  # fmt: skip
     assert len(recording.load) == 80
-    assert clock.monotonic() > 10 * rig.session_client.QUIET_S
+    assert clock.monotonic() > 10 * rig.cosim.session_client.QUIET_S
 
 
 async def test_a_run_in_real_time_takes_over_from_another_one(

@@ -14,7 +14,7 @@ import pytest
 from scipy.io import loadmat
 
 from rig import cli
-from rig.run_folder import RunFolder
+from rig.results.run_folder import RunFolder
 from tests.conftest import draw_nothing
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pyarrow.parquet as pq
 import pytest
 
-from coldloop.process import STATION_SIGNAL_NAMES
+from coldloop.process.signals import STATION_SIGNAL_NAMES
 from rig import simulate
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from coldloop.errors import UsageError
-from coldloop.lti_model import load
-from coldloop.process import (
+from coldloop.process.lti_model import load
+from coldloop.process.signals import (
     INPUT_NAMES,
     INPUT_UNITS,
     OUTPUT_NAMES,
@@ -27,12 +27,12 @@ from coldloop.process import (
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
 from rig import cli
-from rig.columns import FILES
-from rig.commands.options import PLACES
-from rig.indicators import evaluate
-from rig.recording import LinkStatistics, Recorder, Recording
-from rig.results import claim_folder_of_now, whole_file, write_json
-from rig.scenario import Scenario
+from rig.cli.commands.options import PLACES
+from rig.cosim.scenario import Scenario
+from rig.results.columns import FILES
+from rig.results.folders import claim_folder_of_now, whole_file, write_json
+from rig.results.indicators import evaluate
+from rig.results.recording import LinkStatistics, Recorder, Recording
 from rig.settings import Settings
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
 from rig import cli
-from rig.started_rigs import running_rig, state_folder
+from rig.live.started_rigs import running_rig, state_folder
 from tests.conftest import Coldloop, first_of_three_ports
 from tests.harness.processes import Processes
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from coldloop.process import INPUT_NAMES
-from rig.plot import DRAWN, Bounds, RunCurves, draw_run
-from rig.run_folder import RunFolder
-from rig.run_plot import curves_of
+from coldloop.process.signals import INPUT_NAMES
+from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run
+from rig.figures.run_plot import curves_of
+from rig.results.run_folder import RunFolder
 from tests.conftest import Coldloop
 
 TICKS = 4000

@@ -6,7 +6,7 @@ import pytest
 
 from coldloop.errors import UsageError
 from rig import Simulation, simulate
-from rig.columns import TRACE
+from rig.results.columns import TRACE
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +17,7 @@ def minute() -> Simulation:
 @pytest.mark.usefixtures("undrawn")
 def test_a_simulation_has_the_trace_of_the_command(minute: Simulation, tmp_path: Path) -> None:
     from rig import cli  # noqa: PLC0415
-    from rig.run_folder import RunFolder  # noqa: PLC0415
+    from rig.results.run_folder import RunFolder  # noqa: PLC0415
 
     out = tmp_path / "run"
     assert cli.main(["run", "--in-process", "--load", "e", "--duration", "60s", "--out", str(out)]) == 0

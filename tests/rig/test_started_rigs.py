@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coldloop.errors import UsageError
-from rig.private_folder import base_folder, make_private, new_own, read_own, write_own
-from rig.process_identity import identity_of
-from rig.started_rigs import LOCK_FILE, STATE_FILE, RigLock, RunningRig, rigs_up, running_rig, state_folder
+from rig.live.private_folder import base_folder, make_private, new_own, read_own, write_own
+from rig.live.process_identity import identity_of
+from rig.live.started_rigs import LOCK_FILE, STATE_FILE, RigLock, RunningRig, rigs_up, running_rig, state_folder
 from tests.conftest import first_of_three_ports
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import CONTROL_MAP
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.registers.safety import AlarmKind
-from rig.register_listing import MAPS
-from rig.tag_exports import exported, runs
+from rig.cli.register_listing import MAPS
+from rig.cli.tag_exports import exported, runs
 from tests.conftest import Coldloop
 
 T5_ADDRESS = 216

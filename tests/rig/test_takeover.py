@@ -12,7 +12,7 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
 from coldloop.registers.plant import PLANT_MAP, PlantSession
 from plant.program import LoadProfile
-from rig.scenario import Scenario
+from rig.cosim.scenario import Scenario
 
 if TYPE_CHECKING:
     from tests.rig.conftest import Bus, OnTheBus, Simulate

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.modbus.client import RegisterClient
-from coldloop.model_file import read_document, write_document
-from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.model_file import read_document, write_document
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.control_plc import CONTROL_MAP, PlantLinkState, PlantLinkStatus
 from coldloop.registers.safety import Alarm, AlarmKind
 

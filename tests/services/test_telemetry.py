@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from coldloop.telemetry import Telemetry
-from coldloop.telemetry_settings import TelemetrySettings
+from coldloop.service.telemetry import Telemetry
+from coldloop.service.telemetry_settings import TelemetrySettings
 
 if TYPE_CHECKING:
     from tests.services.conftest import Broker, Serve, ServeFrozen, Start

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from distributed import Client
 
-from rig.indicators import Indicators
+from rig.results.indicators import Indicators
 from rig.studies.execution import Store, Workers
 from rig.studies.request import UPDATE_COLUMNS, Outcome, RunRequest, perform
 from rig.studies.results import conduct

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rig.indicators import Indicators
-from rig.studies.contest import REFERENCE, SOLVERS, WAYS, ContestStudy
+from rig.results.indicators import Indicators
+from rig.studies.beyond.contest import REFERENCE, SOLVERS, WAYS, ContestStudy
 from rig.studies.request import Outcome, RunRequest, settings_of
 from rig.studies.study import StudyOptions
 

@@ -6,13 +6,13 @@ from itertools import product
 import pytest
 
 import rig.studies.hindsight
-from coldloop.lti_model import load as load_model
-from coldloop.process import TICK_S
+from coldloop.process.lti_model import load as load_model
+from coldloop.process.signals import TICK_S
 from coldloop.registers.optimizer_plc import Optimization
-from optimizer_plc.design import ControlDesign
+from optimizer_plc.qp.design import ControlDesign
 from plant.program import LoadProfile
-from rig.indicators import StageCost
-from rig.scenario import Scenario
+from rig.cosim.scenario import Scenario
+from rig.results.indicators import StageCost
 from rig.settings import Settings
 from rig.studies.hindsight import (
     PERIODS_S,
@@ -22,9 +22,9 @@ from rig.studies.hindsight import (
     beam_search,
     segment_ends,
 )
+from rig.studies.paper.updating_period import INTERRUPT
 from rig.studies.request import Outcome, Procedure, perform, settings_of
 from rig.studies.study import Load, StudyOptions, draw_of
-from rig.studies.updating_period import INTERRUPT
 
 NOTHING = Optimization(*[0] * len(Optimization._fields))
 PRICES = {

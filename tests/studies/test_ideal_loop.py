@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coldloop.lti_model import load as load_model
-from optimizer_plc.costs import augmented_cost
-from optimizer_plc.problem import QuadraticProblem
+from coldloop.process.lti_model import load as load_model
+from optimizer_plc.qp.costs import augmented_cost
+from optimizer_plc.qp.problem import QuadraticProblem
 from plant.program import LoadProfile
-from rig.recording import Recorder, Recording
-from rig.scenario import Scenario
+from rig.cosim.ideal_loop import Solved, run_ideal_loop
+from rig.cosim.scenario import Scenario
+from rig.results.recording import Recorder, Recording
 from rig.settings import Settings
-from rig.studies.ideal_loop import Solved, run_ideal_loop
 from rig.studies.request import Outcome, Procedure, perform
 from rig.studies.study import Load
 

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from coldloop.process import STATION_SIGNAL_NAMES
+from coldloop.process.signals import STATION_SIGNAL_NAMES
 from rig.studies import STUDIES
-from rig.studies.cholesky import SLOW_DOWN, SPEED
-from rig.studies.coupling import CASES as PLANTS
-from rig.studies.solver_comparison import measures
+from rig.studies.beyond.coupling import CASES as PLANTS
+from rig.studies.paper.cholesky import SLOW_DOWN, SPEED
+from rig.studies.paper.solver_comparison import measures
+from rig.studies.paper.trade_off import share_falling, won_and_lost
+from rig.studies.paper.trajectories import furthest_outside, iterations_by_event, load_steps
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult
-from rig.studies.trade_off import share_falling, won_and_lost
-from rig.studies.trajectories import furthest_outside, iterations_by_event, load_steps
 
 if TYPE_CHECKING:
     from rig.studies.request import Outcome

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from rig.indicators import Indicators
-from rig.studies.hindsight import Objective
-from rig.studies.oracles import (
+from rig.results.indicators import Indicators
+from rig.studies.beyond.oracles import (
     BEST,
     FAST,
     FASTEST,
@@ -23,8 +22,9 @@ from rig.studies.oracles import (
     verdict,
     worst,
 )
+from rig.studies.beyond.robustness import CONDITIONS, POLICIES, REFERENCE, RobustnessStudy, ratio_table
+from rig.studies.hindsight import Objective
 from rig.studies.request import Outcome
-from rig.studies.robustness import CONDITIONS, POLICIES, REFERENCE, RobustnessStudy, ratio_table
 from rig.studies.study import StudyOptions
 
 if TYPE_CHECKING:

@@ -9,22 +9,22 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import StudyError
-from coldloop.limits import InputLimits
-from coldloop.lti_model import load as load_model
-from coldloop.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import load as load_model
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from optimizer_plc.computing_settings import QpoasesSettings
-from optimizer_plc.design import ControlDesign
-from optimizer_plc.prediction import PredictionModel
-from optimizer_plc.problem import PredictiveProblem, QuadraticProblem, Situation
+from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem, Situation
 from optimizer_plc.settings import ProgramSettings, SolverName
 from optimizer_plc.solvers import make_solver
 from plant.load import find_load
-from rig.scenario import Scenario
+from rig.cosim.scenario import Scenario
 from rig.studies import STUDIES
 from rig.studies.harsh_problems import harsh_request, harsh_table, harsh_values
 from rig.studies.intervals import interval_of_mean, over_draws
-from rig.studies.open_loop import LABELS, OpenLoop, open_loop_table, paired_request, powers_of, watch
 from rig.studies.paired_run import equal_counts, harsh_run, paired_indicators, paired_run
+from rig.studies.paper.open_loop import LABELS, OpenLoop, open_loop_table, paired_request, powers_of, watch
 from rig.studies.played_profiles import PlayedProfiles
 from rig.studies.problem_sequence import ProblemSequence, problem_sequence
 from rig.studies.request import Outcome, perform

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from coldloop.errors import StudyError
-from optimizer_plc.penalties import Preset
+from optimizer_plc.qp.penalties import Preset
 from plant.program import LoadProfile
-from rig.indicators import Indicators
-from rig.studies.best_periods import end_over_best, groups, share_inside
-from rig.studies.open_loop import paired_loads
-from rig.studies.penalties import PenaltiesStudy, misfit
-from rig.studies.penalty_sums import Paired
-from rig.studies.penalty_variants import OWN, PRESETS, VARIANTS, Variant, paired, powers_of
+from rig.results.indicators import Indicators
+from rig.studies.beyond.penalties import PenaltiesStudy, misfit
+from rig.studies.beyond.penalty_sums import Paired
+from rig.studies.beyond.penalty_variants import OWN, PRESETS, VARIANTS, Variant, paired, powers_of
+from rig.studies.paper.best_periods import end_over_best, groups, share_inside
+from rig.studies.paper.open_loop import paired_loads
+from rig.studies.paper.updating_period import is_inside
 from rig.studies.request import Outcome, RunRequest, settings_of
 from rig.studies.study import Load, StudyOptions
-from rig.studies.updating_period import is_inside
 
 if TYPE_CHECKING:
     from tests.studies.conftest import Conducted

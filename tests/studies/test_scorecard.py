@@ -16,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from rig import paper
 from rig.report.document import PLACEHOLDER, as_page, deviations, explained, scorecard_table
 from rig.report.reproduction import EXPLANATIONS, circumstances
 from rig.report.scorecard import (
@@ -35,9 +34,10 @@ from rig.report.scorecard import (
     withdrawn,
 )
 from rig.studies import STUDIES
+from rig.studies import published as paper
 from rig.studies.crossing import crossing
-from rig.studies.load_response import response
-from rig.studies.solver_comparison import measures
+from rig.studies.paper.load_response import response
+from rig.studies.paper.solver_comparison import measures
 from rig.studies.study import StudyOptions
 
 ROOT = Path(__file__).parents[2]

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rig.studies import STUDIES
-from rig.studies.load_response import held_periods, response, response_table
+from rig.studies.paper.load_response import held_periods, response, response_table
+from rig.studies.paper.updating_period import FEW, POLICIES
 from rig.studies.study import StudyOptions
-from rig.studies.updating_period import FEW, POLICIES
 
 if TYPE_CHECKING:
     from pathlib import Path

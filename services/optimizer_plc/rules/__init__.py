@@ -5,10 +5,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import kernel
+from coldloop.kernels.compiled import kernel
 from coldloop.registers.optimizer_plc import UpdatingRuleStatus
-from optimizer_plc.arithmetic import DOUBLE, Real
 from optimizer_plc.budget import PlcBudget
+from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.rules import algorithm_1, contraction
 from optimizer_plc.rules.algorithm_1 import Algorithm1
 from optimizer_plc.rules.contraction import ContractionRule

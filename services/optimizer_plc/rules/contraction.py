@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import kernel
+from coldloop.kernels.compiled import kernel
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
 from optimizer_plc.rules.interface import Assessment, Observation, decides_by
 

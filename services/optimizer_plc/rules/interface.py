@@ -12,7 +12,7 @@ import numpy as np
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from coldloop.compiled import kernel
+from coldloop.kernels.compiled import kernel
 from coldloop.registers.optimizer_plc import UpdatingRuleStatus
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optimizer_plc.computing_settings import DaqpSettings
-from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Answer, collected
 
 Array = NDArray[np.float64]

@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import kernel
+from coldloop.kernels.compiled import kernel
 from optimizer_plc.computing_settings import FastGradientSettings
-from optimizer_plc.costs import Matrices, augmented_cost, gradient, matrices_of
-from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.qp.costs import Matrices, augmented_cost, gradient, matrices_of
+from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Answer, Costs
 from optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
 

@@ -18,11 +18,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import kernel
+from coldloop.kernels.compiled import kernel
 from optimizer_plc.computing_settings import HybridSettings, InteriorPointSettings, OdeSettings
-from optimizer_plc.costs import matrices_of
-from optimizer_plc.penalties import DEFAULT_PENALTIES, PenaltySettings
-from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.qp.costs import matrices_of
+from optimizer_plc.qp.penalties import DEFAULT_PENALTIES, PenaltySettings
+from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers import interior_point, ode
 from optimizer_plc.solvers.interface import Answer, Costs
 from optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by

@@ -6,9 +6,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from optimizer_plc.costs import augmented_cost
-from optimizer_plc.problem import QuadraticProblem
-from optimizer_plc.solution import Solution, judge, penalty_multipliers
+from optimizer_plc.qp.costs import augmented_cost
+from optimizer_plc.qp.problem import QuadraticProblem
+from optimizer_plc.qp.solution import Solution, judge, penalty_multipliers
 
 Array = NDArray[np.float64]
 

@@ -21,12 +21,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import kernel
-from optimizer_plc.arithmetic import Real
+from coldloop.kernels.compiled import kernel
 from optimizer_plc.computing_settings import InteriorPointSettings
-from optimizer_plc.costs import augmented_cost
-from optimizer_plc.linear_algebra import cholesky, cholesky_solve
-from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.qp.arithmetic import Real
+from optimizer_plc.qp.costs import augmented_cost
+from optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve
+from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Answer, Costs
 from optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
 

@@ -11,13 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.compiled import kernel
-from optimizer_plc.arithmetic import Real
+from coldloop.kernels.compiled import kernel
 from optimizer_plc.computing_settings import OdeSettings
-from optimizer_plc.costs import Matrices, cost_with_excess, excess_by_columns, gradient_with_excess, matrices_of
-from optimizer_plc.linear_algebra import cholesky, cholesky_solve
-from optimizer_plc.penalties import DEFAULT_PENALTIES, PenaltySettings
-from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.qp.arithmetic import Real
+from optimizer_plc.qp.costs import Matrices, cost_with_excess, excess_by_columns, gradient_with_excess, matrices_of
+from optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve
+from optimizer_plc.qp.penalties import DEFAULT_PENALTIES, PenaltySettings
+from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Answer, Costs
 from optimizer_plc.solvers.kernel_solver import KernelSolver, solves_by
 

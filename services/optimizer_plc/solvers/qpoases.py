@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from optimizer_plc.computing_settings import QpoasesSettings
-from optimizer_plc.problem import QuadraticProblem
+from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Answer, collected
 
 Array = NDArray[np.float64]

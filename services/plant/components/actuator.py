@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from coldloop.compiled import kernel
+from coldloop.kernels.compiled import kernel
 from plant.components.parameters import require
 from plant.numeric import at_least, at_most
 

@@ -7,7 +7,7 @@ of such volumes is then what they hold, to rounding.
 
 from typing import NamedTuple
 
-from coldloop.compiled import kernel
+from coldloop.kernels.compiled import kernel
 from plant.components.parameters import require
 from plant.helium.properties import GAS_CONSTANT
 from plant.numeric import at_least

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.compiled import inlined, kernel
+from coldloop.kernels.compiled import inlined, kernel
 from plant.helium.interpolation import Surface
 from plant.helium.properties import Helium, Saturation, saturation, supply_cell, vapour_enthalpy_and_cp
 from plant.numeric import Array, at_least, at_most

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.compiled import kernel
+from coldloop.kernels.compiled import kernel
 from plant.components.parameters import require
 from plant.components.valve import Valve, effective_area
 from plant.numeric import at_least, at_most

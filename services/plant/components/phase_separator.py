@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from coldloop.compiled import inlined
+from coldloop.kernels.compiled import inlined
 from plant.helium.properties import Helium, saturation, saturation_slopes
 from plant.numeric import at_least, at_most
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.compiled import kernel
+from coldloop.kernels.compiled import kernel
 from plant.components.gas_volume import gas_density
 from plant.components.parameters import require
 from plant.helium.properties import GAS_CONSTANT

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.compiled import inlined
+from coldloop.kernels.compiled import inlined
 from plant.components.valve import Valve, effective_area
 from plant.helium.properties import Helium, enthalpy_after_isentropic_expansion, entropy_before_expansion
 from plant.numeric import at_least

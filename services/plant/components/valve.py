@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coldloop.compiled import inlined
+from coldloop.kernels.compiled import inlined
 from plant.numeric import at_least, at_most
 
 

@@ -7,7 +7,7 @@ counter-flow exchanger: at rest, cells in series are exactly one exchanger of th
 
 import numpy as np
 
-from coldloop.compiled import kernel
+from coldloop.kernels.compiled import kernel
 from plant.components.heat_exchanger import TRICKLE, HeatExchanger, HighPressureFlow, LowPressureFlow
 from plant.components.parameters import require
 from plant.helium.properties import WARM_CP, Helium, supply_cell

@@ -7,7 +7,7 @@ four). Arguments outside the grid are held at its edge.
 
 from typing import NamedTuple
 
-from coldloop.compiled import inlined
+from coldloop.kernels.compiled import inlined
 from plant.numeric import RealArray
 
 # Weights of (left value, left slope, right value, right slope).

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coldloop.compiled import inlined
+from coldloop.kernels.compiled import inlined
 from plant.helium.interpolation import (
     Curves,
     Surface,

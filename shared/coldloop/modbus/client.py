@@ -6,7 +6,6 @@ import struct
 from collections.abc import Sequence
 from typing import Any, Final, Self, TypeVar, cast
 
-from coldloop.endpoints import Endpoint
 from coldloop.errors import (
     DamagedAnswerError,
     ImplausibleAnswerError,
@@ -15,6 +14,7 @@ from coldloop.errors import (
     UnfitValueError,
     UntrustedPeerError,
 )
+from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.peer_check import check_peer
 from coldloop.modbus.requests import (
     MAX_READ_WORDS,
@@ -29,7 +29,7 @@ from coldloop.registers.codec import RecordCodec, WordOrder, codec_of
 from coldloop.registers.common import Identity
 from coldloop.registers.declaration import Block, RegisterMap
 from coldloop.registers.domain import DomainError
-from coldloop.seal import Seal, seal_of, sealed_bytes
+from coldloop.registers.seal import Seal, seal_of, sealed_bytes
 
 R = TypeVar("R", bound=tuple[Any, ...])
 S = TypeVar("S", bound=tuple[Any, ...])

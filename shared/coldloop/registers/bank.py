@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 from coldloop.registers.codec import RecordCodec, ValueCodec, WordOrder, codec_of
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, Role, fields_of
 from coldloop.registers.domain import Domain, DomainError
-from coldloop.seal import Seal, seal_of, sealed_bytes
+from coldloop.registers.seal import Seal, seal_of, sealed_bytes
 
 R = TypeVar("R", bound=tuple[Any, ...])
 

@@ -3,8 +3,8 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.pace import Pace
 from coldloop.registers.declaration import Block, f32, u16, u32
+from coldloop.session.pace import Pace
 
 MAGIC: Final = 123.456
 

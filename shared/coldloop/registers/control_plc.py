@@ -3,7 +3,7 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.process import (
+from coldloop.process.signals import (
     INPUT_NAMES,
     INPUT_UNITS,
     LAST_NUMBER,

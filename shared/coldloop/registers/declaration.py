@@ -153,7 +153,7 @@ class Block:
     writer: Role | None = None
     rows: int = 1
     sealed: bool = False
-    """Each row ends with the CRC-32 of the words before it (`coldloop.seal`)."""
+    """Each row ends with the CRC-32 of the words before it (`coldloop.registers.seal`)."""
 
     @cached_property
     def row_words(self) -> int:

@@ -3,7 +3,7 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.process import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK

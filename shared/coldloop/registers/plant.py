@@ -5,7 +5,7 @@ from enum import IntEnum, IntFlag
 from itertools import accumulate, pairwise
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.process import (
+from coldloop.process.signals import (
     INPUT_NAMES,
     INPUT_UNITS,
     LAST_TICK,

@@ -1,0 +1,126 @@
+"""The command `coldloop`."""
+
+import argparse
+import logging
+import os
+import platform
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib import import_module
+from typing import Final, NoReturn
+
+from coldloop import __version__
+from coldloop.errors import ColdloopError, printable
+from rig.interruption import INTERRUPTION
+
+COMMANDS: Final = {
+    "run": "run the loop and record it",
+    "up": "keep the rig up, in real time, on fixed ports",
+    "down": "end a rig that is up",
+    "status": "what a rig that is up is doing",
+    "page": "the operator's page of a rig that is up, or of recorded runs",
+    "set": "load, mode, setpoint, factor, pause, resume, acknowledge: commands to a rig that is up",
+    "rerun": "repeat a recorded run and compare the traces",
+    "plot": "draw a recorded run again, as PNG, PDF or SVG",
+    "report": "one HTML page of a recorded run, with interactive plots",
+    "compare": "a table and a figure of several recorded runs",
+    "export": "a recorded run as CSV, MATLAB or HDF5 files",
+    "chaos": "a run with faults on purpose, and what became of it",
+    "study": "do the runs of a study and draw its figure",
+    "reproduce": "all studies of the paper, one report and a scorecard",
+    "budget": "what the reference PLC can compute, and in which time",
+    "events": "the journal of a running service",
+    "registers": "the register maps",
+    "certificates": "certificates for Modbus/TCP Security on a test site",
+    "model": "the prediction model",
+    "config": "the effective configuration and where each value comes from",
+    "completion": "a script that completes commands and options in a shell",
+}
+INTERRUPTED = 130
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Reports a usage error as one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with exit code 2."""
+        self.exit(2, f"{self.prog}: {printable(message)}; see {self.prog} --help\n")
+
+
+def make_parser(chosen: str | None) -> argparse.ArgumentParser:
+    """Return the parser of all commands, with the options of the chosen one; other commands are not imported."""
+    parser = OneLineParser(prog="coldloop", description="A networked PLC rig for fast MPC on a helium refrigerator.")
+    parser.add_argument("--version", action="version", version=_version())
+    parser.set_defaults(execute=None)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=OneLineParser)
+    for name, summary in COMMANDS.items():
+        command = commands.add_parser(name, help=summary)
+        if name == chosen:
+            module = import_module(f"rig.cli.commands.{name}")
+            command.description = module.__doc__
+            module.declare(command)
+    version = commands.add_parser("version", help="the version")
+    version.set_defaults(execute=_print_version)
+    return parser
+
+
+def _version() -> str:
+    return f"coldloop {__version__} (Python {platform.python_version()})"
+
+
+def _print_version(_: argparse.Namespace) -> int:
+    sys.stdout.write(f"{_version()}\n")
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; return its exit code: 0 done, 1 failed, 2 wrong usage, 130 interrupted."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    with INTERRUPTION:
+        if "_ARGCOMPLETE" in os.environ:
+            _complete()
+        parser = make_parser(given[0] if given else None)
+        try:
+            code = _execute(parser, given)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            _discard_output()
+            return 0
+        except OSError as error:  # commands report errors of their own files: what is left is standard output
+            _discard_output()
+            sys.stderr.write(f"coldloop: {error.filename or 'standard output'}: {error.strerror}\n")
+            return 1
+        return code
+
+
+def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
+    options = parser.parse_args(given)
+    if options.execute is None:
+        parser.print_help()
+        return 0
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    try:
+        return int(options.execute(options))
+    except ColdloopError as error:
+        sys.stderr.write(f"coldloop: {error}\n")
+        return error.exit_code
+    except KeyboardInterrupt:
+        sys.stderr.write("coldloop: interrupted\n")
+        return INTERRUPTED
+
+
+def _complete() -> NoReturn:
+    """Answer a shell that asks how the line goes on."""
+    from argcomplete import autocomplete  # noqa: PLC0415 only a shell needs it
+
+    words = os.environ.get("COMP_LINE", "").split()
+    parser = make_parser(words[1] if len(words) > 1 and words[1] in COMMANDS else None)
+    autocomplete(parser)
+    sys.exit(0)
+
+
+def _discard_output() -> None:
+    """Let the interpreter's last flush of standard output succeed."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,28 @@
+"""`coldloop config`: the effective configuration, and where each value comes from."""
+
+import argparse
+import sys
+
+from coldloop.service.command_line import add_configuration_options
+from rig.cli.commands.options import configuration
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_configuration_options(parser)
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Print one line a value, as TOML with its source behind it."""
+    from coldloop.config import as_toml
+
+    rows = configuration(options).effective()
+    texts = [
+        f"# {key} = not set" if value is None else f"{key} = {as_toml(value)}"  # TOML has no word for what is not set
+        for key, value, _ in rows
+    ]
+    width = min(60, max(len(text) for text in texts))
+    for text, (_, _, source) in zip(texts, rows, strict=True):
+        sys.stdout.write(f"{text.ljust(width)}  # {source}\n")
+    return 0

@@ -1,0 +1,25 @@
+"""`coldloop down`: ends a rig that `coldloop up` has started here."""
+
+import argparse
+import sys
+
+from coldloop.service.command_line import add_configuration_options
+from rig.cli.commands.options import add_rig_options, first_port_here
+
+PATIENCE_S = 15.0
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_configuration_options(parser)
+    add_rig_options(parser)
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """End it, and wait until it has ended."""
+    from rig.live.started_rigs import take_down
+
+    pid = take_down(first_port_here(options), PATIENCE_S)
+    sys.stdout.write(f"the rig is down (process {pid})\n")
+    return 0

@@ -1,0 +1,220 @@
+"""Options that several subcommands share, and how their values are read."""
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from coldloop.errors import UsageError
+from coldloop.process.signals import TICK_S
+from rig.cli.commands.choices import LOADS
+
+if TYPE_CHECKING:
+    from coldloop.config import Configuration
+    from rig.cosim.endpoints import RigEndpoints
+    from rig.operator_settings import OperatorSettings
+    from rig.settings import Settings
+
+KEYS = {
+    "load": ("plant.load", "--load"),
+    "seed": ("plant.seed", "--seed"),
+    "solver": ("optimizer_plc.program.solver", "--solver"),
+    "preset": ("optimizer_plc.program.preset", "--preset"),
+    "updating_period": ("optimizer_plc.program.updating_period_s", "--updating-period"),
+    "mode": ("session.mode", "--mode"),
+    "factor": ("session.factor", "--factor"),
+    "page_port": ("hmi.port", "--page-port"),
+}
+"""Options that set one key of the configuration."""
+
+
+LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
+
+
+class HostPort(NamedTuple):
+    """Address of a server."""
+
+    host: str
+    port: int
+
+
+def updating_period(text: str) -> float:
+    """Return an updating period in seconds, 0 for `adaptive`."""
+    return 0.0 if text == "adaptive" else _period(text, "neither 'adaptive' nor seconds from 0.5 to 5")
+
+
+def fixed_updating_period(text: str) -> float:
+    """Return an updating period in seconds."""
+    value = _period(text, "not seconds from 0.5 to 5")
+    if value < 2 * TICK_S or value % TICK_S:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s from 0.5 to 5 s")
+    return value
+
+
+def _period(text: str, what: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value <= 5:
+        raise argparse.ArgumentTypeError(f"'{text}' is {what}")
+    return value
+
+
+def check_load(name: str | None) -> None:
+    """Refuse a load that is neither a name nor a file, before anything that takes time; the file is read later.
+
+    Raises:
+        UsageError: There is no such load.
+    """
+    if name is not None and name.partition("@")[0] not in LOADS and not (name and Path(name).exists()):
+        raise UsageError(f"load '{name}': neither a file nor one of {', '.join(LOADS)}")
+
+
+def endpoint(text: str) -> HostPort:
+    """Return HOST:PORT as an address."""
+    host, separator, port = text.rpartition(":")
+    if not separator or not host or not port.isdecimal() or not 0 < int(port) < 0x10000:
+        raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT")
+    return HostPort(host.strip("[]"), int(port))
+
+
+def port_base(text: str) -> int:
+    """Return the first of three ports in a row."""
+    if not text.isdecimal() or not 1 <= int(text) <= 0xFFFF - 2:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a port from 1 to {0xFFFF - 2}")
+    return int(text)
+
+
+def add_rig_options(parser: argparse.ArgumentParser, *, again: bool = False) -> None:
+    """Declare where a rig that is up is found; `again` for a subcommand, as `add_configuration_options` has it."""
+    default = argparse.SUPPRESS if again else None
+    parser.add_argument("--rig", nargs=3, type=endpoint, default=default, metavar="HOST:PORT",
+                        help="plant, control PLC, optimiser PLC (default: the one rig that is up here)")  # fmt: skip
+    parser.add_argument("--port-base", type=port_base, default=default, metavar="PORT",
+                        help="first of its three ports in a row here, where several rigs are up")  # fmt: skip
+    parser.add_argument("--tls", type=Path, default=default, metavar="FOLDER",
+                        help="folder with the operator's certificate; a rig that is up here tells its own")  # fmt: skip
+
+
+def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Settings") -> "RigEndpoints":
+    """Return where a rig that is up is found.
+
+    Raises:
+        UsageError: --rig and --port-base were both given, the folder of --tls has no configuration, no rig is up, or
+            several are.
+    """
+    from coldloop.modbus.endpoints import Endpoint
+    from coldloop.modbus.settings import TlsSettings
+    from rig.cosim.endpoints import RigEndpoints
+    from rig.live.started_rigs import find_rig, ports_from, require_listener
+
+    _refuse_two_places(options)
+    tls, folder = settings.rig.tls, options.tls
+    known = None if options.rig else find_rig(options.port_base)
+    ports = ports_from(options.port_base) if known is None else known.ports
+    if not options.rig and known is None:
+        require_listener(ports[0])
+    if known is not None and known.tls and folder is None and tls is None:
+        folder = Path(known.tls)
+    if options.tls is None and folder is not None:
+        own = {key: value for key, (value, _) in _tls_site(folder).items() if key.startswith("rig.tls.")}
+        tls = TlsSettings.model_validate({key.removeprefix("rig.tls."): value for key, value in own.items()})
+    places = options.rig or [HostPort("127.0.0.1", port) for port in ports]
+    return RigEndpoints(*(
+        Endpoint(host=place.host, port=place.port, tls=tls, word_order=getattr(settings, service).word_order)
+        for service, place in zip(RigEndpoints._fields, places, strict=True)
+    ))  # fmt: skip
+
+
+def first_port_here(options: argparse.Namespace) -> int | None:
+    """Return the first port of the rig on this machine that `add_rig_options` names, None for the only one.
+
+    Raises:
+        UsageError: --rig and --port-base were both given, or the rig is on another machine.
+    """
+    _refuse_two_places(options)
+    if not options.rig:
+        return None if options.port_base is None else int(options.port_base)
+    plant: HostPort = options.rig[0]
+    if plant.host not in LOOPBACK:
+        raise UsageError(f"--rig {plant.host}:{plant.port}: a rig can be ended on its own machine only")
+    return plant.port
+
+
+def _refuse_two_places(options: argparse.Namespace) -> None:
+    if options.rig and options.port_base:
+        raise UsageError("--rig and --port-base: give one of them")
+
+
+def _tls_site(folder: Path) -> dict[str, tuple[object, str]]:
+    """Return the settings of a folder of `coldloop certificates`, and where they come from."""
+    from coldloop.config import flattened, parsed_toml
+
+    file = folder / "tls.toml"
+    try:
+        content = parsed_toml(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise UsageError(f"{file}: {reason}; make it with `coldloop certificates --out {folder}`") from None
+    return {key: (value, "--tls") for key, value in flattened(content).items()}
+
+
+def configuration(options: argparse.Namespace) -> "Configuration[Settings]":
+    """Return the effective configuration of a command."""
+    from coldloop.config import load_configuration
+    from rig.settings import Settings
+
+    given: Mapping[str, Any] = vars(options)
+    site = _tls_site(given["tls"]) if given.get("tls") is not None else {}
+    return load_configuration(
+        Settings,
+        file=options.config,
+        assignments=[*options.assignments, *given.get("further_assignments", ())],
+        options=site | {key: (given[name], flag) for name, (key, flag) in KEYS.items() if given.get(name) is not None},
+    )
+
+
+def operator_settings(options: argparse.Namespace) -> "OperatorSettings":
+    """Return what a command of an operator reads of the configuration.
+
+    Raises:
+        UsageError: A key was set that has no effect on it.
+    """
+    from coldloop.config import load_configuration
+    from rig.operator_settings import OTHERS, OperatorSettings
+
+    assignments = [*options.assignments, *vars(options).get("further_assignments", ())]
+    site = _tls_site(options.tls) if options.tls is not None else {}
+    effective = load_configuration(
+        OperatorSettings, file=options.config, assignments=assignments, options=site, others=OTHERS
+    )
+    for key, source in effective.sources.items():
+        if source.startswith("--set") and not (key.startswith(("limits", "rig")) or key.endswith(".word_order")):
+            raise UsageError(f"{source}: has no effect on this command, which asks a rig that has its own; drop it")
+    return effective.settings
+
+
+def refuse_ineffective(effective: "Configuration[Settings]", keys: Mapping[str, str]) -> None:
+    """Refuse values from the command line that the command replaces by its own.
+
+    Args:
+        effective: The configuration.
+        keys: Dotted keys, and what to do instead.
+
+    Raises:
+        UsageError: One of them was set.
+    """
+    for key, remedy in keys.items():
+        source = effective.sources.get(key, "")
+        if source.startswith("--"):
+            raise UsageError(f"{source}: has no effect on this command: {remedy}")
+
+
+OWN_PORTS = "services that it starts get ports of their own; `coldloop up --port-base` has fixed ones"
+PLACES = (
+    "plant.server.port", "plant.server.host", "control_plc.server.port", "control_plc.server.host",
+    "optimizer_plc.server.port", "optimizer_plc.server.host", "control_plc.plant.port", "control_plc.plant.host",
+    "optimizer_plc.control_plc.port", "optimizer_plc.control_plc.host",
+)  # fmt: skip
+"""Keys that say where services are."""

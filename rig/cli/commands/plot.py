@@ -1,0 +1,28 @@
+"""`coldloop plot`: the figure of a recorded run again, as PNG, PDF or SVG."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from rig.cli.commands.choices import FIGURE_FORMATS
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png", "pdf", "svg"],
+                        metavar="FORMAT", help="png, pdf, svg (default: all)")  # fmt: skip
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Draw."""
+    from coldloop.errors import ResultsError
+    from rig.figures.run_plot import plot_run
+
+    try:
+        paths = plot_run(options.run, options.figures)
+    except OSError as error:
+        raise ResultsError(f"{options.run}: {error.strerror}; the figure was not written") from None
+    sys.stdout.writelines(f"{path}\n" for path in paths)
+    return 0

@@ -1,0 +1,35 @@
+"""`coldloop registers`: the register maps, as a table, Markdown, CSV or JSON, or as tags of other programs."""
+
+import argparse
+import sys
+
+from rig.cli.commands.choices import REGISTER_FORMATS, SERVICES, TAG_FORMATS
+from rig.cli.commands.options import HostPort, port_base
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--format", choices=(*REGISTER_FORMATS, *TAG_FORMATS), default="table",
+                        help="fuxa, ignition, node-red and telegraf: what these programs import")  # fmt: skip
+    parser.add_argument("--service", choices=SERVICES, help="default: all")
+    parser.add_argument("--host", default="127.0.0.1", help="where these programs find the rig (default: 127.0.0.1)")
+    parser.add_argument("--port-base", type=port_base, metavar="PORT", help="first of three ports in a row")
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Print the list."""
+    from rig.cli.register_listing import FORMATS, MAPS
+
+    maps = [MAPS[options.service]] if options.service else list(MAPS.values())
+    if options.format in FORMATS:
+        sys.stdout.write(FORMATS[options.format](maps))
+        return 0
+    from rig.cli.tag_exports import EXPORTS
+    from rig.cosim.wiring import SERVICES as IN_ORDER
+    from rig.live.started_rigs import ports_from
+
+    ports = ports_from(options.port_base)
+    places = {service: HostPort(options.host, port) for service, port in zip(IN_ORDER, ports, strict=True)}
+    sys.stdout.write(EXPORTS[options.format](maps, places))
+    return 0

@@ -1,0 +1,20 @@
+"""`coldloop reproduce`: every study of the paper, one report, and a scorecard."""
+
+import argparse
+import sys
+
+from rig.cli.commands.study import add_scale_options, study_options, workers
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_scale_options(parser)
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Do all studies and write the report."""
+    from rig.report.reproduction import reproduce
+
+    sys.stdout.write(reproduce(study_options(options), workers(options), options.out))
+    return 0

@@ -1,0 +1,30 @@
+"""`coldloop rerun`: repeat a recorded run from its manifest, in one process, and compare the traces."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Final
+
+from coldloop.errors import UsageError
+
+MANIFEST: Final = "manifest.json"
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("manifest", type=Path, metavar="MANIFEST", help="manifest.json of a run, or its folder")
+    parser.add_argument("--out", type=Path, help="folder for the results of the repetition (default: none are kept)")
+    parser.add_argument("--force", action="store_true", help="replace the run in a folder that is not empty")
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run again; 0 for the same trace, 1 for another one."""
+    from rig.runs.rerun import repeat
+
+    path: Path = options.manifest
+    if path.is_file() and path.name != MANIFEST:
+        raise UsageError(f"{path}: not the {MANIFEST} of a run; name that, or its folder")
+    same, text = repeat(path.parent if path.name == MANIFEST else path, options.out, force=options.force)
+    sys.stdout.write(text)
+    return 0 if same else 1

@@ -1,0 +1,47 @@
+"""`coldloop status`: what a rig that is up is doing."""
+
+import argparse
+import asyncio
+import sys
+from contextlib import AsyncExitStack
+from typing import Final
+
+from coldloop.service.command_line import add_configuration_options
+from rig.cli.commands.options import add_rig_options, operator_settings, rig_endpoints
+
+LOOK_S: Final = 1.0
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_configuration_options(parser)
+    add_rig_options(parser)
+    parser.add_argument("--follow", action="store_true", help="a line a second until Ctrl-C")
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Print the state once, or again and again."""
+    from rig.until_interrupted import run_until_interrupted
+
+    interrupted = run_until_interrupted(lambda: _show(options))
+    return 130 if interrupted and not options.follow else 0
+
+
+async def _show(options: argparse.Namespace) -> None:
+    from rig.cosim.answer_time import answered_in_time
+    from rig.cosim.operator_client import OperatorClient
+    from rig.live.status import line, page, read_status
+
+    settings = operator_settings(options)
+    client = OperatorClient(rig_endpoints(options, settings), settings.limits)
+    async with AsyncExitStack() as stack:
+        async with answered_in_time("to read the status"):
+            await stack.enter_async_context(client)
+            status = await read_status(client)
+        sys.stdout.write(f"{line(status)}\n" if options.follow else page(status))
+        while options.follow:
+            sys.stdout.flush()
+            await asyncio.sleep(LOOK_S)
+            async with answered_in_time("to read the status"):
+                sys.stdout.write(f"{line(await read_status(client))}\n")

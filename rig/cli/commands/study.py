@@ -1,0 +1,117 @@
+"""`coldloop study`: a question that takes many runs, from the paper or beyond it."""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from coldloop.errors import UsageError
+from rig.cli.commands.choices import STUDIES
+from rig.cli.commands.options import check_load
+from rig.durations import duration
+
+if TYPE_CHECKING:
+    from rig.studies.execution import Workers
+    from rig.studies.study import Study, StudyOptions
+
+OF_RUNS: Final = ("load", "duration", "seeds", "workers", "scheduler", "quick", "shard", "merge")
+"""Options that only a study with runs has a use for."""
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    name = parser.add_argument("name", nargs="?", metavar="NAME", help="see --list")
+    name.completer = lambda **_: STUDIES  # type: ignore[attr-defined]  # argcomplete looks for it
+    parser.add_argument("--list", action="store_true", help="name the studies")
+    parser.add_argument("--duration", type=duration, help="plant time of each run (default: that of its load)")
+    parser.add_argument("--load", nargs="+", metavar="LOAD", default=[],
+                        help="named loads or CSV files time_s,load_w")  # fmt: skip
+    parts = parser.add_mutually_exclusive_group()
+    parts.add_argument("--shard", metavar="I/N", help="do every N-th run only, from the I-th on, and no evaluation")
+    parts.add_argument("--merge", type=Path, nargs="+", metavar="FOLDER",
+                       help="gather the runs of all shards from the --out folders they were done with, and evaluate"
+                       )  # fmt: skip
+    add_scale_options(parser)
+    parser.set_defaults(execute=execute)
+
+
+def add_scale_options(parser: argparse.ArgumentParser) -> None:
+    """Declare how much is done, by whom, and where the results go."""
+    scale = parser.add_mutually_exclusive_group()
+    scale.add_argument("--draws", "--seeds", dest="seeds", type=_positive, metavar="N",
+                       help="draws of each load; of a file, draws of the sensors' noise (default: the study's own)"
+                       )  # fmt: skip
+    scale.add_argument("--quick", action="store_true", help="one seed, ten minutes, fewer points")
+    parser.add_argument("--workers", type=_positive, metavar="N", help="processes to use (default: one a core)")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler that is up, such as tcp://host:8786")
+    parser.add_argument("--out", type=Path, default=Path("studies"), help="folder for all results (default: studies)")
+
+
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 on")
+    return int(text)
+
+
+def workers(options: argparse.Namespace) -> "Workers":
+    """Return who does the runs.
+
+    Raises:
+        UsageError: Both workers and a scheduler are given.
+    """
+    from rig.studies.execution import Workers
+
+    if options.scheduler and options.workers:
+        raise UsageError("--workers is for a local cluster and --scheduler for one that is up: give one of them")
+    return Workers(options.workers or os.cpu_count() or 1, options.scheduler)
+
+
+def study_options(options: argparse.Namespace) -> "StudyOptions":
+    """Return the extent of the study."""
+    from rig.studies.study import StudyOptions
+
+    given = vars(options)
+    return StudyOptions(options.seeds, given.get("duration"), tuple(given.get("load", ())), options.quick)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Do a study, or list them."""
+    if options.name is not None and options.name not in STUDIES:
+        raise UsageError(f"study {options.name}: there is no such study; `coldloop study --list` names them")
+    for name in options.load:
+        check_load(name)
+    from rig.studies import APART
+    from rig.studies import STUDIES as REPORTED
+
+    everything = {**REPORTED, **APART}
+    if options.list or options.name is None:
+        for name, study in everything.items():
+            sys.stdout.write(f"{name:18} {study.title}\n")
+        return 0
+    _do(everything[options.name], options)
+    return 0
+
+
+def _do(study: "Study", options: argparse.Namespace) -> None:
+    from rig.studies.results import conduct
+    from rig.studies.shards import Shard, conduct_shard, merge
+    from rig.studies.study import RUNS
+
+    asked = study_options(options)
+    useless = [f"--{name}" for name in OF_RUNS if getattr(options, name)]
+    if useless and not study.requests(asked):
+        raise UsageError(f"study {study.name} has no runs: {', '.join(useless)} would have no effect")
+    if options.merge:
+        if options.workers or options.scheduler:
+            raise UsageError("--merge does no runs: leave out --workers and --scheduler")
+        merge(study, asked, options.merge, options.out)
+    if options.shard:
+        shard = Shard.parse(options.shard)
+        runs = conduct_shard(study, asked, workers(options), options.out, shard)
+        sys.stdout.write(f"shard {shard} of {study.name}: {runs} runs in {options.out / RUNS}\n")
+        return
+    result = conduct(study, asked, workers(options), options.out)
+    for what, values in result.values.items():
+        sys.stdout.write(f"{what}: {', '.join(f'{value:.4g}' for value in values)}\n")
+    sys.stdout.write(f"results in {options.out / study.name}\n")

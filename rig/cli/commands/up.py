@@ -1,0 +1,63 @@
+"""`coldloop up`: the rig on fixed ports, in real time, until Ctrl-C."""
+
+import argparse
+from pathlib import Path
+
+from coldloop.service.command_line import add_configuration_options
+from rig.cli.commands.choices import LOADS, PRESETS, SOLVERS
+from rig.cli.commands.options import PLACES, check_load, port_base, refuse_ineffective, updating_period
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_configuration_options(parser)
+    parser.add_argument("--factor", type=float, help="seconds of plant time in a second (default: 1)")
+    load = parser.add_argument(
+        "--load", help=f"{', '.join(LOADS)}, or a CSV file time_s,load_w; its end is held (default: 2h)"
+    )
+    load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
+    parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
+    parser.add_argument("--preset", choices=PRESETS, help="penalties and start of the solver (default: tuned)")
+    parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
+                        help="default: adaptive")  # fmt: skip
+    parser.add_argument("--seed", type=int, help="seed of the sensors' noise (default: 1)")
+    parser.add_argument("--tls", type=Path, metavar="FOLDER",
+                        help="Modbus/TCP Security with what `coldloop certificates --out FOLDER` made")  # fmt: skip
+    parser.add_argument("--port-base", type=port_base, metavar="PORT",
+                        help="first of three ports in a row (default: 5020)")  # fmt: skip
+    parser.add_argument("--page", action="store_true", help="serve the operator's page, too")
+    parser.add_argument("--page-port", type=int, metavar="PORT", help="its port (default: 8020); implies --page")
+    parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")
+    parser.add_argument("--quiet", action="store_true", help="do not say where everything is")
+    parser.add_argument("--locked", type=int, help=argparse.SUPPRESS)  # what --detach has locked for this process
+    parser.set_defaults(execute=execute, mode="realtime")
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Start the rig; end it with Ctrl-C."""
+    check_load(options.load)
+    from rig.cli.commands.options import configuration
+    from rig.live.started_rigs import RigLock, check_ports, detached, ports_from
+    from rig.runs.running import check_certificates
+
+    effective = configuration(options)
+    refuse_ineffective(
+        effective, {**dict.fromkeys(PLACES, "give --port-base"), "session.autostart": "it begins a session"}
+    )
+    check_certificates(effective.settings)
+    ports = ports_from(options.port_base)
+    lock = RigLock(ports[0], options.locked)
+    check_ports(ports)
+    page = options.page or options.page_port is not None
+    if page:
+        from rig.live.page_process import check_page
+
+        check_page(effective.settings.hmi)
+    if options.detach:
+        return detached(ports, lock)
+    from rig.live.up import UpRig
+    from rig.until_interrupted import run_until_interrupted
+
+    rig = UpRig(effective.settings, ports, options.tls, page=page)
+    run_until_interrupted(lambda: rig.run(announce=not options.quiet))
+    return 0

@@ -1,0 +1,119 @@
+"""The control PLC's program, and what ordinary ticks change of it."""
+
+from typing import Any
+
+import numpy as np
+
+from coldloop.registers.control_plc import Mode, OperatorMode, Process, SequenceHeader, SequenceRow, Update
+from coldloop.registers.safety import AlarmKind
+from coldloop.safety.sequence import InputSequence, with_checksum
+from control_plc.output_limits import GuardState
+from control_plc.program import ControlProgram
+from rig.cosim.compiled.records import GUARD, NOT, SCAN, Alarms, Array, Trace, empty_rows, record
+
+BANDS = (AlarmKind.LEVEL_BAND, AlarmKind.T5_BAND)
+LONGEST_SILENCE = 22
+"""Ticks between two signs of life of an optimiser that answers every update."""
+
+
+def is_ordinary(program: ControlProgram) -> bool:
+    """Tell whether the next tick is an ordinary one, as far as the control PLC is concerned."""
+    return (
+        program.mode is Mode.MPC
+        and program.operator.mode == OperatorMode.AUTO
+        and program.optimizer_present
+        and program.player.is_ordinary(program.tick)
+        and not program.sensors.bad
+        and not program.guard.state.astray
+        and program.alarms.are_quiet
+        and not program.watchdog.expired
+        and (not program.watchdog.time or program.watchdog.time > LONGEST_SILENCE)
+    )
+
+
+def alarms_of(program: ControlProgram) -> Alarms:
+    """Return the two band alarms as they are."""
+    settings, panel = program.alarm_settings, program.alarms
+    level, t5 = (bool(panel.rows[kind].active) for kind in BANDS)
+    return Alarms(settings.level_band, settings.t5_band, level, t5, *map(panel.delay, BANDS))
+
+
+def scan_record(program: ControlProgram) -> Any:  # noqa: ANN401 a record
+    """Return the state of player, sensors, alarms and watchdog, shape (1,)."""
+    scans, player = record(SCAN), program.player
+    s, update, playing = scans[0], player.update, player.sequence
+    if update is None or playing is None:
+        raise RuntimeError("an ordinary tick plays a sequence")
+    s["first"] = s["tick"] = program.tick
+    s["next_update"], s["updates"] = player.next_update_tick, player.updates
+    s["update_tick"], s["update_load"], s["load_step"] = update.tick, update.load, player.load_step
+    header = playing.header
+    s["number"], s["first_tick"], s["length"], s["tau_u"] = (
+        header.number, header.first_tick, header.length, header.tau_u
+    )  # fmt: skip
+    s["triggered"], s["lowest"] = program.watchdog.triggered, program.watchdog.lowest
+    s["level_since"], s["t5_since"] = (NOT if since is None else since for since in program.alarms.pending(*BANDS))
+    s["stands"], s["seen"] = program.sensors.stands, program.sensors.before
+    return scans
+
+
+def guard_records(state: GuardState) -> Any:  # noqa: ANN401 records
+    """Return the state of the output guard, and room for a twin of it, shape (2,)."""
+    guards = np.zeros(2, GUARD)
+    g, slots = guards[0], len(state.moves)
+    for name in ("applied", "anchor", "start", "share", "moved", "changes"):
+        g[name] = getattr(state, name)
+    g["moves"][:slots], g["before"][:slots] = state.moves, state.before
+    return guards
+
+
+def give_back_guard(program: ControlProgram, g: Any) -> None:  # noqa: ANN401 a record
+    """Let the guard go on from a record."""
+    state, slots = program.guard.state, len(program.guard.state.moves)
+    state.applied[:], state.anchor[:] = g["applied"].tolist(), g["anchor"].tolist()
+    state.moves[:], state.before[:] = g["moves"][:slots].tolist(), g["before"][:slots].tolist()
+    state.start, state.moved, state.changes = int(g["start"]), int(g["moved"]), int(g["changes"])
+    state.share = float(g["share"])
+    program.guard.applied = SequenceRow(*state.applied)
+
+
+def give_back_scan(program: ControlProgram, s: Any, trace: Trace) -> None:  # noqa: ANN401 a record
+    """Let sensors, alarms, watchdog and process go on after the ticks of a record, of which there are some."""
+    last = int(s["tick"]) - 1
+    row = last - int(s["first"])
+    y = tuple(trace.y[row].tolist())
+    program.tick, program.alarms.now = last + 1, last
+    program.process = Process(last, float(trace.load[row]), tuple(trace.u[row].tolist()), y)
+    program.sensors.stands[:] = s["stands"].tolist()
+    program.sensors.seen(last, y)
+    program.watchdog.triggered, program.watchdog.lowest = int(s["triggered"]), int(s["lowest"])
+    for kind, since in zip(BANDS, (int(s["level_since"]), int(s["t5_since"])), strict=True):
+        program.alarms.set_pending(kind, None if since == NOT else since)
+
+
+def latched_update(program: ControlProgram, s: Any, trace: Trace) -> Update:  # noqa: ANN401 a record
+    """Return the update under way, which was latched within the trace."""
+    tick = int(s["update_tick"])
+    row = tick - int(s["first"])
+    u, y, x = (tuple(values[row].tolist()) for values in (trace.u, trace.y, trace.x))
+    return Update(
+        session=program.session, update=int(s["updates"]) - 1, tick=tick, playing=int(s["number"]),
+        load=float(trace.load[row]), u_before=tuple(s["u_before"].tolist()), u=u, y=y, x=x,
+    )  # fmt: skip
+
+
+def played_sequence(s: Any, update: int, rows: Array, model_digest: int) -> InputSequence:  # noqa: ANN401 a record
+    """Return the sequence being played, which answers `update`."""
+    length = int(s["length"])
+    header = SequenceHeader(
+        number=int(s["number"]), update=update, first_tick=int(s["first_tick"]), length=length, tau_u=int(s["tau_u"]),
+        model_digest=model_digest, crc=0,
+    )  # fmt: skip
+    return with_checksum(header, [SequenceRow(*row) for row in rows[:length].tolist()])
+
+
+def sequence_rows(sequence: InputSequence) -> Array:
+    """Return the rows of a sequence, and room for those of the next one, shape (2, 240, 3)."""
+    rows = empty_rows()
+    rows[0, : len(sequence.rows)] = sequence.rows
+    return rows

@@ -1,0 +1,225 @@
+"""Ticks and updates of the three programs as one compiled loop, while nothing unusual happens.
+
+An ordinary tick plays a row of a sequence in time, with good sensors and no alarm that changes. Before each tick `look`
+finds out whether it is one; when not, the loop ends with nothing of that tick done, and the programs do it. Values that
+would cross the link are rounded as the link rounds them, through the rows of the trace.
+"""
+
+from typing import Any, Final
+
+import numpy as np
+
+import rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is plain Python
+from coldloop.kernels.compiled import kernel
+from coldloop.process.signals import L1, T5
+from control_plc.output_limits import admit, admits, copy_state, in_range
+from control_plc.sensors import CONTROLLED, are_inside, watch_standing
+from optimizer_plc import scheme
+from optimizer_plc.scheme import BY_THE_RULE
+from optimizer_plc.session_state import Memory
+from rig.cosim.compiled.plants import advance_plant
+from rig.cosim.compiled.records import NOT, Alarms, Array, Optimizer, PlantState, Reports, Trace, World
+
+DONE: Final = 0
+UNUSUAL: Final = 1
+UPDATE: Final = 2
+"""An updating instant, which the caller does itself."""
+
+
+@kernel
+def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> bool:  # noqa: ANN401 a record
+    """Write load, outputs and state of the present tick into the trace; tell whether the tick is an ordinary one."""
+    row = s.tick - s.first
+    while s.load_index + 1 < w.load_ticks.shape[0] and w.load_ticks[s.load_index + 1] <= s.tick:
+        s.load_index += 1
+    load = w.load_watts[s.load_index]
+    trace.load[row], trace.y[row], trace.x[row], trace.station[row] = load, plant.y, plant.x, plant.station
+    y, x = trace.y[row], trace.x[row]
+    known = 0.0 <= load <= w.largest_load
+    for i in range(x.shape[0]):
+        known = known and np.isfinite(x[i])
+    interrupted = s.load_step > 0.0 and abs(load - s.update_load) > s.load_step
+    frozen = False
+    for place in range(len(CONTROLLED)):
+        stands = y[CONTROLLED[place]] == s.seen[CONTROLLED[place]]
+        frozen = frozen or (stands and s.stands[place] + 1 >= w.frozen_ticks)
+    changes = is_due(alarms.level_band, alarms.level_active, alarms.level_delay, s.level_since, s.tick, y[L1])
+    changes = changes or is_due(alarms.t5_band, alarms.t5_active, alarms.t5_delay, s.t5_since, s.tick, y[T5])
+    return known and not (interrupted or frozen or changes) and are_inside(y, w.low, w.high)
+
+
+@kernel
+def is_due(band: tuple[float, float], active: bool, delay: int, since: int, tick: int, value: float) -> bool:  # noqa: FBT001
+    """Tell whether a band alarm follows its condition at this tick, `delay` ticks after it has changed."""
+    if (not band[0] <= value <= band[1]) == active:
+        return False
+    return tick - (tick if since == NOT else since) >= delay
+
+
+@kernel
+def pending(band: tuple[float, float], active: bool, since: int, tick: int, value: float) -> int:  # noqa: FBT001
+    """Return since when the condition of a band alarm has been another than the alarm shows, or NOT."""
+    if (not band[0] <= value <= band[1]) == active:
+        return NOT
+    return tick if since == NOT else since
+
+
+@kernel
+def scan(
+    w: World, alarms: Alarms, s: Any, guard: Any, rows: Array, plant: PlantState, trace: Trace  # noqa: ANN401 records
+) -> None:  # fmt: skip
+    """Do the tick that `look` has looked at: outputs, the plant's step, the measurement."""
+    tick, row = s.tick, s.tick - s.first
+    admit(guard, w.limits, tick, rows[tick - s.first_tick], tick == s.first_tick)
+    u, load = guard.applied, w.load_watts[s.load_index]
+    trace.u[row] = u
+    advance_plant(w.plant, plant, u, load, row)
+    if plant.noise.shape[0]:
+        for i in range(plant.y.shape[0]):
+            plant.y[i] = plant.y[i] + w.biases[i] + w.deviations[i] * plant.noise[row, i]
+    y = trace.y[row]
+    watch_standing(s.stands, s.seen, y, 1)
+    s.level_since = pending(alarms.level_band, alarms.level_active, s.level_since, tick, y[L1])
+    s.t5_since = pending(alarms.t5_band, alarms.t5_active, s.t5_since, tick, y[T5])
+    s.tick = tick + 1
+
+
+@kernel
+def play(
+    w: World, alarms: Alarms, scans: Any, guards: Any, rows: Array, plant: PlantState, trace: Trace, until: int  # noqa: ANN401
+) -> int:  # fmt: skip
+    """Play the sequence up to the next updating instant; return DONE at the tick `until`, UNUSUAL or UPDATE."""
+    s, guard = scans[0], guards[0]
+    while s.tick < until:
+        if s.tick == s.next_update:
+            return UPDATE
+        if s.tick - s.first_tick >= s.length or not look(w, alarms, s, plant, trace):
+            return UNUSUAL
+        scan(w, alarms, s, guard, rows, plant, trace)
+    return DONE
+
+
+@kernel
+def go_on(
+    w: World,
+    alarms: Alarms,
+    o: Optimizer,
+    scans: Any,  # noqa: ANN401
+    guards: Any,  # noqa: ANN401
+    rows: Array,
+    plant: PlantState,
+    trace: Trace,
+    reports: Reports,
+    until: int,
+) -> int:
+    """Do ticks and updates; return DONE at the tick `until`, or UNUSUAL.
+
+    An answer is computed when the programs would deliver it: at its instant, or at once where a load step may cut it
+    off. One that has not begun when something unusual happens is not reported: it is computed again, with the same
+    bits. `rows` (2, 240, 3) are those of the sequence being played, and of the one that was offered.
+    """
+    s, guard, twin = scans[0], guards[0], guards[1]
+    u_before, answered = np.empty(3), False
+    outcome = DONE
+    while s.tick < until:
+        tick, instant = s.tick, s.tick == s.next_update
+        outcome = UNUSUAL
+        if not look(w, alarms, s, plant, trace):
+            break
+        if not answered and (instant or s.load_step > 0.0):
+            answered = s.next_update <= until and answer(w, o, s, guard, twin, rows, reports)
+            if not answered:
+                break
+        if instant:
+            begin_sequence(s, rows, o.memory)
+            answered = False
+        if tick - s.first_tick >= s.length:
+            break
+        u_before[:] = guard.applied
+        scan(w, alarms, s, guard, rows[0], plant, trace)
+        if instant:
+            latch(w, o, s, trace, tick, u_before)
+        outcome = DONE
+    if answered:
+        s.solved -= 1
+    return outcome
+
+
+@kernel
+def answer(
+    w: World, o: Optimizer, s: Any, guard: Any, twin: Any, rows: Array, reports: Reports  # noqa: ANN401
+) -> bool:  # fmt: skip
+    """Solve the problem of the update under way; tell whether the control PLC would accept the sequence."""
+    m = o.memory
+    scheme.solve(o.constants, o.method, m)
+    offered, length = rows[1], m.sent.numbers[0].length
+    offered[:length] = m.sent.rows[:length]
+    accepted = s.next_update - s.first_tick <= s.length
+    for tick in range(length):
+        accepted = accepted and in_range(w.limits, offered[tick])
+    copy_state(guard, twin, w.limits)
+    if accepted:
+        for tick in range(s.tick, s.next_update):
+            admit(twin, w.limits, tick, rows[0, tick - s.first_tick], tick == s.first_tick)
+    if not (accepted and admits(twin, w.limits, s.next_update, offered, length)):
+        return False
+    report(s, m, reports)
+    trigger(w, s, s.tick)
+    return True
+
+
+@kernel
+def begin_sequence(s: Any, rows: Array, m: Memory) -> None:  # noqa: ANN401
+    """Let the answer be what is played."""
+    scheme.begin_sent(m)
+    playing = m.playing.numbers[0]
+    rows[0, : playing.length] = rows[1, : playing.length]
+    s.number, s.first_tick, s.length, s.tau_u = playing.number, s.tick, playing.length, playing.ticks
+    s.accepted += 1
+
+
+@kernel
+def latch(
+    w: World, o: Optimizer, s: Any, trace: Trace, tick: int, u_before: Array  # noqa: ANN401
+) -> None:  # fmt: skip
+    """Latch an update at `tick`, whose scan has been done, and plan the updating period that begins there."""
+    m, row = o.memory, tick - s.first
+    real = m.u.dtype.type
+    s.update_tick, s.update_load = tick, trace.load[row]
+    s.u_before[:] = u_before
+    for i in range(m.u.shape[0]):
+        m.u[i] = real(trace.u[row, i]) - o.constants.estimator.u0[i]
+    before, y, x = measured(u_before, m), measured(trace.y[row], m), measured(trace.x[row], m)
+    scheme.plan(o.constants, o.rule, m, BY_THE_RULE, s.updates, tick, before, real(trace.load[row]), y, x)
+    s.updates += 1
+    s.next_update, s.load_step = tick + m.numbers[0].ticks, w.load_step
+    trigger(w, s, tick + 1)
+
+
+@kernel
+def measured(values: Array, m: Memory) -> Array:
+    """Return values in the optimiser's floating-point type."""
+    result = np.empty(values.shape[0], m.u.dtype)
+    for i in range(values.shape[0]):
+        result[i] = values[i]
+    return result
+
+
+@kernel
+def trigger(w: World, s: Any, tick: int) -> None:  # noqa: ANN401
+    """Let the optimiser's watchdog note a sign of life."""
+    s.lowest = min(s.lowest, w.watchdog, max(0, w.watchdog - (tick - s.triggered)))
+    s.triggered = tick
+
+
+@kernel
+def report(s: Any, m: Memory, reports: Reports) -> None:  # noqa: ANN401
+    """Write what was done with the update under way."""
+    now, sent = m.numbers[0], m.sent.numbers[0]
+    counts, values = reports.counts[s.solved], reports.values[s.solved]
+    counts[0], counts[1], counts[2], counts[3] = now.update, now.tick, now.ticks, sent.iterations
+    values[0], values[1], values[2], values[3] = now.effective, sent.hot_start, sent.delivered, sent.j_dev
+    values[4], values[5] = sent.j_cst, sent.violation
+    values[6], values[7], values[8], values[9] = now.efficiency, now.mismatch, now.contraction, now.gamma
+    values[10] = m.belief.numbers[0].mismatch
+    s.solved += 1

@@ -1,0 +1,108 @@
+"""Does stretches of ordinary ticks in compiled loops, on behalf of the three programs."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.plant import MAX_LOAD_W
+from control_plc.program import ControlProgram
+from optimizer_plc.program import OptimizerProgram
+from plant.program import LoadProfile, PlantProgram
+from rig.cosim.compiled import control, loops, optimizer, plants
+from rig.cosim.compiled.records import BLOCK_TICKS, PlantState, World, empty_reports, empty_trace
+from rig.results.recorded import NO_STATION, STATION_COLUMNS, SampleBlock
+
+SHORTEST: Final = 6
+"""Ticks to an updating instant below which the programs are as quick."""
+
+
+class Stretch(NamedTuple):
+    """What was done without the programs."""
+
+    block: SampleBlock
+    updates: list[Optimization]
+
+
+class CompiledStretches:
+    """Runs the programs of one session ahead as long as nothing unusual happens.
+
+    Args:
+        plant: Of either kind.
+        control: The control PLC.
+        optimizer: The optimiser, in its session.
+        load: What the plant's load follows.
+    """
+
+    def __init__(
+        self, plant: PlantProgram, control_plc: ControlProgram, optimizer_plc: OptimizerProgram, load: LoadProfile
+    ) -> None:  # fmt: skip
+        self._plant, self._control, self._optimizer = plant, control_plc, optimizer_plc
+        self._is_compiled = optimizer.is_compiled(optimizer_plc)
+        self._trace, self._reports = empty_trace(STATION_COLUMNS if plant.station else 0), empty_reports()
+        self._pause_until = 0
+        sensors = control_plc.sensors
+        self._world = World(
+            plants.constants_of(plant), plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
+            control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), sensors.frozen_ticks, MAX_LOAD_W,
+            control_plc.watchdog.time, optimizer_plc.settings.interrupting_load_step_w,
+        )  # fmt: skip
+
+    def ahead(self, until: int) -> Stretch | None:
+        """Do ordinary ticks before the tick `until`, at most a block; return them, or None if there are none."""
+        if self._control.tick < self._pause_until or not control.is_ordinary(self._control):
+            return None
+        answered = self._control.player.has_answer
+        whole = self._is_compiled and not answered and optimizer.is_ordinary(self._optimizer)
+        if not whole and not answered and self._control.player.load_step:
+            return None  # the programs deliver at once what a load step may cut off
+        until = min(until, (self._control.tick // BLOCK_TICKS + 1) * BLOCK_TICKS)
+        ticks = until - self._control.tick
+        with self._plant.noise(ticks) as noise:
+            plant = plants.state_of(self._plant, noise, ticks)
+            stretch = self._updates_too(plant, until) if whole else self._ticks_alone(plant, until)
+        if stretch is None:  # the programs go on alone to the next updating instant
+            self._pause_until = self._control.player.next_update_tick
+        return stretch
+
+    def _ticks_alone(self, plant: PlantState, until: int) -> Stretch | None:
+        """Play on to the next updating instant, where that is worth while."""
+        program, sequence = self._control, self._control.player.sequence
+        if sequence is None or program.player.next_update_tick - program.tick < SHORTEST:
+            return None
+        scans, guards = control.scan_record(program), control.guard_records(program.guard.state)
+        rows = control.sequence_rows(sequence)
+        loops.play(self._world, control.alarms_of(program), scans, guards, rows[0], plant, self._trace, until)
+        s = scans[0]
+        if s["tick"] == s["first"]:
+            return None
+        return Stretch(self._give_back(plant, s, guards[0]), [])
+
+    def _updates_too(self, plant: PlantState, until: int) -> Stretch | None:
+        program, optimizer_plc, playing = self._control, self._optimizer, self._control.player.sequence
+        if playing is None:
+            raise RuntimeError("an ordinary update plays a sequence")
+        scans, guards = control.scan_record(program), control.guard_records(program.guard.state)
+        rows = control.sequence_rows(playing)
+        loops.go_on(
+            self._world, control.alarms_of(program), optimizer.parts_of(optimizer_plc), scans, guards, rows, plant,
+            self._trace, self._reports, until,
+        )  # fmt: skip
+        s = scans[0]
+        if s["tick"] == s["first"]:
+            return None
+        block, solved = self._give_back(plant, s, guards[0]), int(s["solved"])
+        if solved:
+            update = control.latched_update(program, s, self._trace)
+            sequence = control.played_sequence(s, update.update - 1, rows[0], optimizer_plc.model_digest)
+            program.player.take_over(sequence, update, int(s["next_update"]), int(s["accepted"]))
+        return Stretch(block, optimizer.optimizations(self._reports, solved))
+
+    def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:
+        """Let plant and control PLC go on from what the loop has left; return the ticks it has done."""
+        plants.give_back(self._plant, plant, int(s["tick"]), guard["applied"])
+        control.give_back_guard(self._control, guard)
+        control.give_back_scan(self._control, s, self._trace)
+        ticks = int(s["tick"]) - int(s["first"])
+        load, u, y, x, station = (part[:ticks].copy() for part in self._trace)
+        return SampleBlock(int(s["first"]), load, u, y, x, station if station.size else NO_STATION)

@@ -1,0 +1,79 @@
+"""A rig that ran in real time before somebody attached to it runs on in real time afterwards."""
+
+import logging
+from typing import NamedTuple
+
+from coldloop.errors import LinkError
+from coldloop.process.signals import TICK_S
+from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.control_plc import Operator, OperatorMode
+from coldloop.registers.plant import LOAD_ROWS, LiveLoad, LoadStatus, LoadStep, PlantSession
+from coldloop.registers.seal import sealed
+from plant.program import LoadProfile
+from rig.cosim.load_stream import LoadStream
+from rig.cosim.operator_client import LEAD_TICKS, write_pace
+from rig.cosim.session_client import SessionClient
+
+log = logging.getLogger("coldloop.rig")
+
+
+class Found(NamedTuple):
+    """What a rig did when we came."""
+
+    pace: SessionPace
+    operator: Operator
+    load: LoadProfile
+    """From the tick on at which we came."""
+
+
+async def look_around(rig: SessionClient) -> Found | None:
+    """Return what a rig does, if it does something in real time.
+
+    Raises:
+        LinkError: A service does not answer.
+    """
+    identity, pace = await rig.plant.read(Identity), await rig.plant.read(SessionPace)
+    if not identity.session or not pace.realtime:
+        return None
+    return Found(pace, await rig.control.read(Operator), await _load_from(rig, identity.tick))
+
+
+async def _load_from(rig: SessionClient, now: int) -> LoadProfile:
+    """Return the load from now on: of the session's table, unless somebody has written another one since."""
+    status, asked = await rig.plant.read(LoadStatus), await rig.plant.read(PlantSession)
+    steps: list[LoadStep] = []
+    if status.upcoming:
+        steps = await rig.plant.read_rows(LoadStep, 0, min(asked.load_steps, LOAD_ROWS))
+    if not steps or steps[-1].tick != status.last_tick:
+        steps = []
+    coming = [step for step in steps if step.tick > now]
+    try:
+        return LoadProfile((0, *(step.tick - now for step in coming)), (status.watts, *(step.watts for step in coming)))
+    except ValueError as error:
+        raise LinkError(f"{rig.plant.peer}: its load is none: {error}") from None
+
+
+async def give_back(rig: SessionClient, found: Found | None, session: int) -> None:
+    """Let the session of our run go on as the rig was found: real time, factor, load, who drives.
+
+    Nothing is done where the rig was in lock-step, or where somebody else has begun another session. What cannot be
+    given back is logged: the run is recorded all the same.
+    """
+    if found is None:
+        return
+    try:
+        identity = await rig.plant.read(Identity)
+        if identity.session != session:
+            return
+        await write_pace((rig.plant, rig.control, rig.optimizer), found.pace._replace(session=0))
+        if found.operator.mode != OperatorMode.AUTO:
+            await rig.control.write(found.operator)
+        tick = (await rig.plant.read(Identity)).tick
+        await rig.plant.write(sealed(LiveLoad(0, found.load.watts[0])))
+        coming = LoadProfile(found.load.times, found.load.watts)
+        lead = LEAD_TICKS * max(1, round(found.pace.factor))
+        await LoadStream(rig.plant, session, coming, begin=tick + lead).feed(tick)
+    except LinkError as error:
+        log.warning("the rig does not run on as it was found: %s", error)
+    else:
+        log.info("given back at %g s", tick * TICK_S)

@@ -1,0 +1,104 @@
+"""A load of any length, written to the plant ahead of its clock."""
+
+from bisect import bisect_right
+from typing import TYPE_CHECKING, Final
+
+from coldloop.errors import LinkError, RequestRefusedError, UsageError
+from coldloop.modbus.client import RegisterClient
+from coldloop.registers.plant import AHEAD_STEPS, LOAD_ROWS, LoadAhead, LoadStatus, LoadStep
+from coldloop.registers.seal import sealed
+
+if TYPE_CHECKING:  # the simulation behind it takes a second
+    from plant.program import LoadProfile
+
+LAST_TICK: Final = 2**32 - 1
+KEPT_AHEAD: Final = LOAD_ROWS
+"""Steps that the plant is to know in advance; it keeps twice as many."""
+
+
+class LoadStream:
+    """Keeps the plant supplied with the steps of a load.
+
+    Args:
+        plant: Client of the plant.
+        session: Whose load it is.
+        load: All of it.
+        sent: Steps that the plant has already.
+        begin: Tick of the session at which the load begins.
+        ahead: Steps that the plant is to know in advance.
+
+    Raises:
+        UsageError: A step is beyond the last tick of a session.
+    """
+
+    def __init__(
+        self,
+        plant: RegisterClient,
+        session: int,
+        load: "LoadProfile",
+        *,
+        sent: int = 0,
+        begin: int = 0,
+        ahead: int = KEPT_AHEAD,
+    ) -> None:
+        self._plant = plant
+        self._session = session
+        self._times = [begin + tick for tick in load.times]
+        if self._times[-1] > LAST_TICK:
+            raise UsageError(f"a load with a step at tick {self._times[-1]}: the last tick of a session is {LAST_TICK}")
+        self._watts = load.watts
+        self._sent = sent
+        self._ahead = ahead
+
+    @property
+    def steps(self) -> int:
+        """Steps of the load."""
+        return len(self._times)
+
+    @property
+    def done(self) -> bool:
+        """Whether the plant has all steps."""
+        return self._sent >= len(self._times)
+
+    @property
+    def known_until(self) -> int | None:
+        """First tick whose load the plant does not know yet; None when it knows all of it."""
+        return None if self.done else self._times[self._sent]
+
+    async def feed(self, tick: int) -> None:
+        """Write what the plant should know at `tick`.
+
+        Raises:
+            LinkError: The plant does not answer, or the steps have come too late.
+        """
+        while not self.done and self._sent - bisect_right(self._times, tick) < self._ahead:
+            record = self._next()
+            try:
+                await self._plant.write(sealed(record))
+            except RequestRefusedError as error:
+                raise LinkError(
+                    f"{error}: the load from tick {record.tick} on was not taken: it came too late, or the session is "
+                    "another one"
+                ) from None
+            self._sent += record.length
+
+    def _next(self) -> LoadAhead:
+        some = slice(self._sent, self._sent + AHEAD_STEPS)
+        return LoadAhead.first_of(self._session, self._times[some], self._watts[some])
+
+    async def was_replaced(self) -> bool:
+        """Return whether another client has written the load since: the last step known is not the last one sent."""
+        status = await self._plant.read(LoadStatus)
+        last = self._times[self._sent - 1] if self._sent else 0
+        return status.last_tick != last
+
+
+async def write_table(plant: RegisterClient, load: "LoadProfile") -> int:
+    """Write the load table of a session that is to begin; return the steps that are in it.
+
+    Raises:
+        LinkError: The plant does not answer, or refuses.
+    """
+    steps = [LoadStep(*step) for step in zip(load.times[:LOAD_ROWS], load.watts[:LOAD_ROWS], strict=True)]
+    await plant.write_rows(steps)
+    return len(steps)

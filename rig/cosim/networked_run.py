@@ -1,0 +1,100 @@
+"""A run over the bus: on services that are started for it, or on a rig that is up."""
+
+import asyncio
+from collections.abc import Awaitable, Coroutine, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from coldloop.config import Configuration
+from coldloop.modbus.endpoints import Endpoint
+from coldloop.service.start import run_event_loop
+from rig.cosim.answer_time import answered_in_time
+from rig.cosim.endpoints import RigEndpoints
+from rig.cosim.handing_back import give_back, look_around
+from rig.cosim.job import Job, StopRequest, Way
+from rig.cosim.local_services import run_on_localhost
+from rig.cosim.rig_configuration import attached, running_configuration
+from rig.cosim.scenario import Scenario
+from rig.cosim.session_client import SessionClient
+from rig.results.recording import Recorder
+from rig.settings import Settings
+
+ATTACH_PATIENCE_S: Final = 5.0
+
+
+def as_attached(effective: Configuration[Settings], endpoints: Sequence[Endpoint]) -> Configuration[Settings]:
+    """Return a configuration with what a rig that is up really runs.
+
+    Raises:
+        UsageError: The user asks for something else, which a client cannot change.
+        LinkError: A service does not answer.
+    """
+    running: dict[str, Any] = {}
+
+    async def read() -> int:
+        rig = RigEndpoints(*endpoints)
+        async with answered_in_time("to read what the rig runs"):
+            running.update(await running_configuration(rig, effective.settings, ATTACH_PATIENCE_S))
+        return 0
+
+    run_event_loop(read)
+    return attached(effective, running)
+
+
+def drive(job: Job, recorder: Recorder, folder: Path, stop: StopRequest) -> None:
+    """Do the run of a job.
+
+    Raises:
+        ColdloopError: It is not complete.
+    """
+    run_event_loop(lambda: _stoppable(_run(job, recorder, folder), stop))
+
+
+def _run(job: Job, recorder: Recorder, folder: Path) -> Awaitable[None]:
+    settings, scenario = job.effective.settings, job.scenario
+    if job.conduct is not None:
+        return job.conduct(recorder, folder)
+    if job.way is Way.ATTACHED:
+        return _attached(RigEndpoints(*job.endpoints), settings, scenario, recorder)
+    return run_on_localhost(settings, scenario, recorder, folder / "logs")
+
+
+async def _stoppable(run: Awaitable[None], stop: StopRequest) -> int:
+    task = asyncio.ensure_future(run)
+    loop = asyncio.get_running_loop()
+    stop.cancel = lambda: loop.call_soon_threadsafe(task.cancel)
+    try:
+        if stop.error is not None:
+            task.cancel()
+        await task
+    except asyncio.CancelledError:
+        if stop.error is None:
+            raise
+        raise stop.error from None
+    finally:
+        stop.cancel = None
+    return 0
+
+
+async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scenario, recorder: Recorder) -> None:
+    rig = SessionClient(endpoints, settings)
+    try:
+        await rig.connect(ATTACH_PATIENCE_S)
+        async with answered_in_time("to read what the rig does"):
+            found = await look_around(rig)
+        try:
+            await rig.run(scenario, recorder)
+        finally:
+            await _to_its_end(give_back(rig, found, rig.session))
+    finally:
+        rig.close()
+
+
+async def _to_its_end(work: Coroutine[Any, Any, None]) -> None:
+    """Do all of it, also when this task is cancelled meanwhile."""
+    task = asyncio.ensure_future(work)
+    try:
+        await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await task
+        raise

@@ -1,0 +1,125 @@
+"""The three programs in one process, by direct calls; what would cross the bus is rounded as the bus would round it."""
+
+from contextlib import AbstractContextManager
+from typing import NamedTuple, Protocol
+
+from coldloop.kernels.first_use import kernels_of
+from coldloop.process.lti_model import load as load_model
+from coldloop.registers.codec import as_transmitted
+from coldloop.registers.control_plc import Update, Verdict
+from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.plant import LoadStep, Measurement, PlantSample, StationSample
+from control_plc.program import ControlProgram
+from control_plc.program import make_program as make_control_program
+from optimizer_plc.program import OptimizerProgram
+from plant.kinds import plant_maker
+from plant.own_model import own_header
+from plant.program import LoadProfile, PlantProgram
+from rig.cosim.compiled.stretches import CompiledStretches
+from rig.cosim.scenario import Scenario
+from rig.results.recording import Recorder
+from rig.settings import Settings
+
+
+class Listener(Protocol):
+    """Takes what the programs do, as it would cross the bus."""
+
+    def sample(self, sample: PlantSample) -> None:
+        """Take a tick of the plant."""
+
+    def station(self, sample: StationSample) -> None:
+        """Take a tick of the compression station, where the plant has one."""
+
+    def update(self, update: Optimization) -> None:
+        """Take an update that was answered."""
+
+
+class Programs(NamedTuple):
+    """The programs of a session, connected by calls."""
+
+    plant: PlantProgram
+    control: ControlProgram
+    optimizer: OptimizerProgram
+
+    def tick(self, listener: Listener) -> None:
+        """Do one tick."""
+        if self.control.awaiting_sequence:
+            self._deliver(listener)
+        update = self._scan(listener)
+        if update is not None:
+            self.control.accept_plan(as_transmitted(self.optimizer.plan(as_transmitted(update))))
+
+    def _deliver(self, listener: Listener) -> None:
+        sequence = self.optimizer.solve()
+        answer = self.control.offer(sequence)
+        listener.update(as_transmitted(self.optimizer.report(Verdict(answer.verdict))))
+
+    def _scan(self, listener: Listener) -> Update | None:
+        plant = self.plant
+        actuators = as_transmitted(self.control.begin_scan())
+        u = actuators[1:4]
+        plant.apply(u)
+        measurement = as_transmitted(
+            Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session)
+        )
+        if plant.station is not None:
+            listener.station(as_transmitted(plant.station))
+        listener.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
+        plant.advance()
+        return self.control.end_scan(measurement)
+
+
+def load_table(load: LoadProfile) -> LoadProfile:
+    """Return a load as the plant's table has it after crossing the bus."""
+    steps = [as_transmitted(LoadStep(*step)) for step in zip(load.times, load.watts, strict=True)]
+    return LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
+
+
+class OneProcessRig:
+    """Plant, control PLC and optimiser PLC, connected by calls.
+
+    Args:
+        settings: Configuration.
+        compiled: Ordinary ticks are done in compiled loops, with the same bits.
+    """
+
+    def __init__(self, settings: Settings, *, compiled: bool = True) -> None:
+        header = own_header(settings.model.file)
+        self._settings = settings
+        self._header = header
+        self._compiled = compiled
+        program = settings.optimizer_plc.program
+        with self._kernels():
+            self.optimizer = OptimizerProgram(load_model(settings.model.file), program, settings.limits)
+        self.control = make_control_program(header, settings.control_plc, settings.limits)
+
+    def run(self, scenario: Scenario, recorder: Recorder) -> None:
+        """Run a scenario from the operating point, in lock-step."""
+        with self._kernels():
+            self._run(scenario, recorder)
+
+    def _kernels(self) -> AbstractContextManager[None]:
+        """Announce what is compiled as the kernels of a run like this one."""
+        plant, solver = self._settings.plant.kind.replace("-", " "), self._settings.optimizer_plc.program.solver
+        return kernels_of(f"the {plant} and the {solver} solver in one process", about_s=50)
+
+    def _run(self, scenario: Scenario, recorder: Recorder) -> None:
+        load = load_table(scenario.load)
+        plant = plant_maker(self._header, self._settings.plant)(load, scenario.seed)
+        programs = Programs(plant, self.control, self.optimizer)
+        self.optimizer.restart(scenario.updating_period_s)
+        noted = self.control.journal.count
+        self.control.restart(session=1)
+        stretches = None
+        if self._compiled:
+            stretches = CompiledStretches(plant, self.control, self.optimizer, load)
+        recorder.begin()
+        while self.control.tick < scenario.ticks:
+            stretch = stretches.ahead(scenario.ticks) if stretches else None
+            if stretch is not None:
+                recorder.stretch(*stretch)
+                continue
+            programs.tick(recorder)
+            for event in self.control.journal.since(noted):
+                recorder.event(event)
+                noted = event.number

@@ -1,0 +1,29 @@
+"""What a run is to do, whichever way it is run."""
+
+from dataclasses import dataclass
+
+from coldloop.process.signals import TICK_S
+from plant.load import HOUR_TICKS, named_families
+from plant.program import LoadProfile
+
+BEHIND_LAST_STEP = round(300 / TICK_S)
+"""How long a run goes on after the last step of a load file, unless given otherwise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """One run from the operating point on."""
+
+    ticks: int
+    load: LoadProfile
+    updating_period_s: float
+    """0 is adaptive."""
+    seed: int
+    realtime: bool = False
+    factor: float = 1.0
+
+
+def natural_ticks(name: str, load: LoadProfile) -> int:
+    """Return how long a run under the load of this name or file goes on when nobody says."""
+    families = named_families(name)
+    return len(families) * HOUR_TICKS if families else load.times[-1] + BEHIND_LAST_STEP

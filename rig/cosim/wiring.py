@@ -1,0 +1,66 @@
+"""Where three services on localhost listen, and where their clients are pointed at."""
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from coldloop.modbus.endpoints import Endpoint
+from rig.cosim.endpoints import RigEndpoints
+from rig.settings import Settings
+
+SERVICES: Final = ("plant", "control_plc", "optimizer_plc")
+START_PATIENCE_S: Final = 600.0
+"""Services that need other kernels than before compile them first, on a slow machine for minutes."""
+
+
+class Detours(NamedTuple):
+    """Ports that clients are pointed at instead of those of their servers."""
+
+    plant: int
+    """For the control PLC."""
+    control_plc: int
+    """For the optimiser."""
+
+
+def endpoints_on(ports: Sequence[int], settings: Settings) -> RigEndpoints:
+    """Return where the services are for the rig, on these ports."""
+    return RigEndpoints(*(_endpoint(settings, service, port) for service, port in zip(SERVICES, ports, strict=True)))
+
+
+def _endpoint(settings: Settings, service: str, port: int) -> Endpoint:
+    section = getattr(settings, service)
+    return Endpoint(
+        port=port,
+        word_order=section.word_order,
+        tls=settings.rig.tls if section.server.tls else None,
+    )
+
+
+def wired(settings: Settings, endpoints: RigEndpoints, detours: Detours | None = None) -> Settings:
+    """Return the settings with the servers on these endpoints and the clients pointed at them, or at the detours."""
+
+    def client(endpoint: Endpoint, configured: Endpoint, detour: int | None) -> Endpoint:
+        port = endpoint.port if detour is None else detour
+        return endpoint.model_copy(update={"port": port, "timeout_s": configured.timeout_s, "tls": configured.tls})
+
+    def server(section: str, endpoint: Endpoint) -> object:
+        return getattr(settings, section).server.model_copy(update={"host": endpoint.host, "port": endpoint.port})
+
+    plant, control_plc = detours or (None, None)
+    return settings.model_copy(
+        update={
+            "session": settings.session.model_copy(update={"autostart": False}),
+            "plant": settings.plant.model_copy(update={"server": server("plant", endpoints.plant)}),
+            "control_plc": settings.control_plc.model_copy(
+                update={
+                    "server": server("control_plc", endpoints.control_plc),
+                    "plant": client(endpoints.plant, settings.control_plc.plant, plant),
+                }
+            ),
+            "optimizer_plc": settings.optimizer_plc.model_copy(
+                update={
+                    "server": server("optimizer_plc", endpoints.optimizer_plc),
+                    "control_plc": client(endpoints.control_plc, settings.optimizer_plc.control_plc, control_plc),
+                }
+            ),
+        }
+    )

@@ -1,0 +1,119 @@
+"""Several recorded runs side by side: indicators, what differs in their configuration, and their curves."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from coldloop.errors import ResultsError
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS
+from rig.figures.plot import (
+    COLOURS,
+    DRAWN,
+    LONGEST_TAU_U_S,
+    STYLE,
+    Bounds,
+    draw_tau_u,
+    legend_above,
+    limit,
+    time_unit,
+)
+from rig.figures.run_plot import save_figure
+from rig.results.run_folder import Curves, RunFolder
+
+FIGURES: Final = (
+    "complete", "ticks", "updates", "J_BF", "J_open_mean", "J_dev", "J_cst", "c1", "c2", "tau_u_mean",
+    "tau_u_mean_per_update", "iterations_total", "L1_outside_band_pct", "T5_outside_band_pct", "deadline_misses",
+    "trace_sha256",
+)  # fmt: skip
+PANELS: Final = (
+    ("load_w", "heat load (W)"), ("L1", "L1 (%)"), ("T5", "T5 (K)"),
+    *((name, f"{name} ({unit})") for name, unit in zip(INPUT_NAMES, INPUT_UNITS, strict=True)),
+    ("tau_u_s", "tau_u (s)"), ("stage_cost", "stage cost (1)"),
+)  # fmt: skip
+
+
+def compare(paths: Sequence[Path], out: Path) -> str:
+    """Draw the runs over each other; return their table as text.
+
+    Raises:
+        UsageError: A folder has no run.
+        ResultsError: The figure cannot be written.
+    """
+    runs = [RunFolder(path) for path in paths]
+    labels = _labels(paths)
+    try:
+        save_figure(draw_comparison(runs, labels), out)
+    except OSError as error:
+        raise ResultsError(f"{out}: {error.strerror}; choose another --out") from None
+    return comparison_table(runs, labels) + f"figure in {out}\n"
+
+
+def _labels(paths: Sequence[Path]) -> list[str]:
+    names = [path.resolve().name for path in paths]
+    return names if len(set(names)) == len(names) else [str(path) for path in paths]
+
+
+def comparison_table(runs: Sequence[RunFolder], labels: Sequence[str]) -> str:
+    """Return the indicators, then the keys of the configuration that differ, a column a run."""
+    summaries = [run.summary for run in runs]
+    rows = [["", *labels]]
+    rows += [[name, *(_cell(summary.get(name)) for summary in summaries)] for name in FIGURES]
+    keys = sorted({key for run in runs for key in run.configuration})
+    different = [key for key in keys if len({repr(run.configuration.get(key)) for run in runs}) > 1]
+    rows += [[key, *(_cell(run.configuration.get(key)) for run in runs)] for key in different]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [[row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in rows]
+    return "".join("  ".join(line).rstrip() + "\n" for line in lines)
+
+
+def _cell(value: Any) -> str:  # noqa: ANN401 a value of a JSON document
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    return f"{value[:12]}" if isinstance(value, str) and len(value) == 64 else str(value)
+
+
+def draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure:
+    """Return the curves of the runs over each other."""
+    curves = [run.series(DRAWN) for run in runs]
+    scale_s, unit = time_unit(max((one["time_s"] for one in curves), key=lambda times: float(times[-1])))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.5, 13), layout="constrained")
+        axes: dict[str, Axes] = dict(
+            zip(dict(PANELS), figure.subplots(len(PANELS), 1, sharex=True), strict=True)
+        )  # fmt: skip
+        for one, label, colour in zip(curves, labels, _colours(len(runs)), strict=True):
+            for name, place in axes.items():
+                if name == "tau_u_s":
+                    draw_tau_u(place, one["time_s"] / scale_s, one[name], one["time_s"], colour, label)
+                else:
+                    place.plot(one["time_s"] / scale_s, one[name], color=colour, linewidth=0.9, label=label)
+        _scale(axes, runs[0], curves)
+        for name, label in PANELS:
+            axes[name].set_ylabel(label)
+            legend_above(axes[name])
+        axes["stage_cost"].set_xlabel(f"plant time ({unit})")
+        axes["stage_cost"].set_xlim(0, max(float(one["time_s"][-1]) for one in curves) / scale_s)
+        figure.align_ylabels(list(axes.values()))
+        figure.suptitle("  ·  ".join(labels))
+    return figure
+
+
+def _colours(count: int) -> list[str]:
+    return [COLOURS[i % len(COLOURS)] for i in range(count)]
+
+
+def _scale(axes: dict[str, Axes], first: RunFolder, curves: Sequence[Curves]) -> None:
+    bounds = Bounds.of(first.configuration)
+    for name, edges in {**bounds.bands, **bounds.inputs}.items():
+        values = np.concatenate([one[name] for one in curves])
+        limit(axes[name], values, edges, f"{'band' if name in bounds.bands else 'bounds'} {edges[0]:g} to {edges[1]:g}")
+    axes["tau_u_s"].set_ylim(0, LONGEST_TAU_U_S + 0.3)
+    axes["stage_cost"].set_yscale("log")
+    axes["stage_cost"].set_ylim(bottom=1e-6)

@@ -1,0 +1,227 @@
+"""The picture of a run, in the manner of the paper's time figures."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS
+
+Series = NDArray[np.floating]
+
+INK, ACCENT, THIRD, BAND = "#1f3b57", "#c8553d", "#5b8e7d", "#b8c4ce"
+COLOURS: Final = (INK, ACCENT, THIRD, "#8a6fae", "#b08d2f", "#4d4d4d")
+"""Of curves that are drawn over each other."""
+MODE_COLOURS: Final = {"mpc": INK, "rest": "#7f9cb8", "hold": "#d9a441", "classical": ACCENT, "manual": THIRD}
+STYLE: Final[Any] = {
+    "font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False,
+    "legend.frameon": False, "legend.fontsize": 8, "svg.hashsalt": "coldloop", "axes.formatter.useoffset": False,
+}  # fmt: skip
+DRAWN: Final = ("load_w", "L1", "T5", *INPUT_NAMES, "tau_u_s", "stage_cost")
+"""Columns of the trace that are drawn."""
+LEAST_COST: Final = 1e-6
+"""Stage costs below it are drawn as it: at rest the cost is rounding."""
+NARROWEST: Final = 1 / 2000
+"""Share of the whole time that can be seen."""
+SMOOTHING_S: Final = 60.0
+"""Window of the mean of tau_u: adaptive periods change at nearly every update."""
+LONGEST_TAU_U_S: Final = 5.0
+PANELS: Final = {"left": 0.083, "right": 0.993, "top": 0.962, "bottom": 0.048, "hspace": 0.3}
+"""Where the panels are, in shares of the figure. Matplotlib's layout engine would draw the figure three times more."""
+LABEL_AT: Final = -0.068
+"""Where letters and labels of panels are, in widths of a panel: beside numbers of six characters."""
+
+
+class Bounds(NamedTuple):
+    """What outputs and inputs may be: lowest and highest, by column."""
+
+    bands: Mapping[str, tuple[float, float]]
+    inputs: Mapping[str, tuple[float, float]]
+
+    @classmethod
+    def of(cls, configuration: Mapping[str, Any]) -> "Bounds":
+        """Return the bounds of a configuration by dotted key."""
+        design = "optimizer_plc.program.design.output_"
+        bands = zip(configuration[f"{design}low"], configuration[f"{design}high"], strict=True)
+        inputs = zip(configuration["limits.low"], configuration["limits.high"], strict=True)
+        return cls(dict(zip(("L1", "T5"), bands, strict=True)), dict(zip(INPUT_NAMES, inputs, strict=True)))
+
+
+class RunCurves(NamedTuple):
+    """What is drawn of a run."""
+
+    series: Mapping[str, Series]
+    """`time_s` and the columns `DRAWN`."""
+    events: Sequence[Mapping[str, Any]]
+    bounds: Bounds
+    title: str
+    identity: str
+    """Which run it was: a line below the figure."""
+    pressures: Mapping[str, tuple[float, float]] = {}
+    """Of a whole refrigerator: where the station's alarms begin (bar), for each of its pressures in `series`."""
+
+
+def draw_run(curves: RunCurves) -> Figure:
+    """Return load, outputs with their bands, inputs with their bounds, updating period, cost, modes and alarms."""
+    scale_s, unit = time_unit(curves.series["time_s"])
+    time = curves.series["time_s"] / scale_s
+    heights = [1.0] * (8 + len(curves.pressures)) + ([0.45] if curves.events else [])
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.5, 13.5 + 1.6 * len(curves.pressures)))
+        axes: list[Axes] = list(
+            figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, gridspec_kw=PANELS)
+        )
+        _curve(axes[0], time, curves.series["load_w"], "heat load (W)", "NCR22_HL")
+        for place, (name, band), unit_ in zip(axes[1:3], curves.bounds.bands.items(), ("%", "K"), strict=True):
+            _curve(place, time, curves.series[name], f"{name} ({unit_})", name)
+            limit(place, curves.series[name], band, f"band {band[0]:g} to {band[1]:g} {unit_}")
+        for place, (name, bound), unit_ in zip(axes[3:6], curves.bounds.inputs.items(), INPUT_UNITS, strict=True):
+            _curve(place, time, curves.series[name], f"{name} ({unit_})", name)
+            limit(place, curves.series[name], bound, f"bounds {bound[0]:g} to {bound[1]:g} {unit_}")
+        for place, (name, ends) in zip(axes[6:], curves.pressures.items(), strict=False):
+            _curve(place, time, curves.series[name], f"{name} (bar)", name)
+            limit(place, curves.series[name], ends, f"no alarm from {ends[0]:g} to {ends[1]:g} bar")
+        _updating_period(axes[len(curves.pressures) + 6], time, curves.series)
+        _cost(axes[len(curves.pressures) + 7], time, curves.series["stage_cost"])
+        if curves.events:
+            _ribbons(axes[-1], curves.events, scale_s, float(time[-1]))
+        for place, letter in zip(axes, "abcdefghijk", strict=False):
+            legend_above(place)
+            place.text(LABEL_AT, 1.03, f"({letter})", transform=place.transAxes, fontsize=8, ha="center")
+            place.yaxis.set_label_coords(LABEL_AT, 0.5)
+        axes[-1].set_xlabel(f"plant time ({unit})")
+        axes[-1].set_xlim(float(time[0]), float(time[-1]) if len(time) > 1 else float(time[0]) + 1)
+        figure.suptitle(curves.title, y=0.99)
+        figure.supxlabel(curves.identity, y=0.004, fontsize=6.5, color="#5a6672")
+    return figure
+
+
+def time_unit(time_s: Series) -> tuple[float, str]:
+    """Return the length (s) and the name of the unit that suits a time axis."""
+    span = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
+    if span >= 2 * 3600:
+        return 3600.0, "h"
+    return (60.0, "min") if span >= 180 else (1.0, "s")
+
+
+def legend_above(axes: Axes) -> None:
+    """Put the legend above the panel, where it covers no curve."""
+    handles, _ = axes.get_legend_handles_labels()
+    if handles and axes.get_legend() is None:
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=len(handles), borderaxespad=0.1)
+
+
+def _curve(axes: Axes, time: Series, values: Series, label: str, name: str) -> None:
+    axes.plot(time, values, color=INK, linewidth=1, label=name, drawstyle="steps-post")
+    axes.set_ylabel(label)
+
+
+def limit(axes: Axes, values: Series, limits: tuple[float, float], label: str) -> None:
+    """Draw a band or bounds; the values decide the scale, and an edge that is far from them stays outside."""
+    low, high = view_with_limits(values, limits)
+    out_of_view = [edge for edge in limits if not low <= edge <= high]
+    note = " (edges outside the view)" if len(out_of_view) == 2 else ""
+    is_seen = limits[0] < high and limits[1] > low
+    axes.axhspan(*limits, color=BAND, alpha=0.3, linewidth=0, label=label + note if is_seen else None)
+    for edge in limits:
+        axes.axhline(edge, color=ACCENT, linewidth=0.8, linestyle="--")
+    axes.set_ylim(low, high)
+
+
+def view_with_limits(values: Series, limits: tuple[float, float]) -> tuple[float, float]:
+    """Return the scale that shows the values, and those of the limits that are not far from them."""
+    low, high = view(values)
+    span = high - low
+    return (
+        min(low, limits[0] - 0.06 * span) if low - span < limits[0] else low,
+        max(high, limits[1] + 0.06 * span) if high + span > limits[1] else high,
+    )
+
+
+def view(values: Series) -> tuple[float, float]:
+    """Return the scale that shows the values: their range and a margin, of 0.1 % at least."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return 0.0, 1.0
+    low, high = float(finite.min()), float(finite.max())
+    margin = max(0.08 * (high - low), 1e-3 * max(abs(low), abs(high)), 1e-6)
+    return low - margin, high + margin
+
+
+def _updating_period(axes: Axes, time: Series, series: Mapping[str, Series]) -> None:
+    tau_u = series["tau_u_s"]
+    axes.set_ylabel("tau_u (s)")
+    axes.set_ylim(0, LONGEST_TAU_U_S + 0.3)
+    if np.isnan(tau_u).all():
+        axes.text(0.5, 0.5, "no updates", transform=axes.transAxes, ha="center", va="center", color=ACCENT)
+        return
+    draw_tau_u(axes, time, tau_u, series["time_s"], INK, "tau_u")
+
+
+def draw_tau_u(axes: Axes, time: Series, tau_u: Series, time_s: Series, colour: str, label: str) -> None:
+    """Draw the updating period at these times as steps; where it chatters, also its mean over a minute."""
+    changes = int(np.count_nonzero(np.diff(np.nan_to_num(tau_u))))
+    chatters = changes > 100
+    axes.plot(time, tau_u, color=colour, linewidth=0.5 if chatters else 1.0, alpha=0.45 if chatters else 1.0,
+              drawstyle="steps-post", label=label)  # fmt: skip
+    if chatters:
+        step = float(np.median(np.diff(time_s))) or 1.0
+        axes.plot(time, moving_mean(tau_u, max(1, round(SMOOTHING_S / step))), color=colour, linewidth=1.3,
+                  label=f"{label}, mean over {SMOOTHING_S:g} s")  # fmt: skip
+
+
+def moving_mean(values: Series, window: int) -> Series:
+    """Return the mean over a centred window of so many values, which is cut off at the ends; NaN does not count."""
+    known = np.isfinite(values)
+    kernel = np.ones(min(window, len(values)))
+    count = np.convolve(known, kernel, "same")
+    total = np.convolve(np.where(known, values, 0.0), kernel, "same")
+    mean: Series = np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0.5)
+    return mean
+
+
+def _cost(axes: Axes, time: Series, cost: Series) -> None:
+    axes.plot(time, np.maximum(cost, LEAST_COST), color=INK, linewidth=1, label="stage cost")
+    axes.set_ylabel("stage cost (1)")
+    if spans_a_decade(cost):
+        axes.set_yscale("log")
+
+
+def spans_a_decade(cost: Series) -> bool:
+    """Return whether a cost is to be drawn on a logarithmic axis."""
+    finite = cost[np.isfinite(cost)]
+    return bool(len(finite)) and float(finite.max()) > 10 * max(float(finite.min()), LEAST_COST)
+
+
+def _ribbons(axes: Axes, events: Sequence[Mapping[str, Any]], scale_s: float, end: float) -> None:
+    """Draw who drives as a ribbon, and below it when alarms are active."""
+    modes = [(event["time_s"] / scale_s, event["subject"]) for event in events if event["kind"] == "mode"]
+    ends = [time for time, _ in modes[1:]] + [end]
+    for (begin, mode), until in zip(modes, ends, strict=False):
+        axes.broken_barh([(begin, max(until - begin, 0.0))], (0.55, 0.4), color=MODE_COLOURS.get(mode, BAND))
+    for begin, until in alarm_times(events, scale_s, end):
+        axes.broken_barh([(begin, until - begin)], (0.05, 0.4), color="#b3261e", alpha=0.5)
+    seen = {mode for (begin, mode), until in zip(modes, ends, strict=False) if until - begin > NARROWEST * end}
+    present = [Patch(color=colour, label=mode) for mode, colour in MODE_COLOURS.items() if mode in seen]
+    axes.set_yticks([0.25, 0.75], ["alarms", "mode"])
+    axes.set_ylim(0, 1)
+    axes.grid(visible=False)
+    axes.legend(handles=present, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=5, borderaxespad=0.1)
+
+
+def alarm_times(events: Sequence[Mapping[str, Any]], scale_s: float, end: float) -> list[tuple[float, float]]:
+    """Return when each alarm was active."""
+    active: dict[str, float] = {}
+    times = []
+    for event in events:
+        time = event["time_s"] / scale_s
+        if event["kind"] == "alarm raised":
+            active.setdefault(event["subject"], time)
+        elif event["kind"] == "alarm returned" and event["subject"] in active:
+            times.append((active.pop(event["subject"]), time))
+    return times + [(begin, end) for begin in active.values()]

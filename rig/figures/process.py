@@ -1,0 +1,91 @@
+"""The figure of a run, drawn by a process of its own: matplotlib is loaded while the run goes on, on another core.
+
+python -m rig.figures.process <folder and formats as JSON on standard input> the error, if any, on standard output
+"""
+
+import contextlib
+import gc
+import json
+import pickle
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from coldloop.errors import ColdloopError, ResultsError
+
+COMMAND: Final = (sys.executable, "-m", "rig.figures.process")
+
+
+class FigureProcess:
+    """Draws the figure of a run; a context at whose end its process has ended.
+
+    Args:
+        formats: Of the figure, such as png.
+    """
+
+    def __init__(self, formats: Sequence[str]) -> None:
+        self._formats = list(formats)
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        """End the process, which has nothing to draw when there is no run."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+
+    def start(self) -> None:
+        """Start the process, which then waits for a run; without this `draw` does."""
+        pipe = subprocess.PIPE
+        # A session of its own: a Ctrl-C is the command's to answer, which has what was recorded drawn.
+        self._process = subprocess.Popen(  # noqa: S603 our own module
+            COMMAND, stdin=pipe, stdout=pipe, stderr=pipe, start_new_session=True
+        )
+
+    def draw(self, folder: Path) -> None:
+        """Draw the run of a folder, `run.png` for the format png.
+
+        Raises:
+            OSError: A file cannot be written.
+            UsageError: There is no run in the folder, or a file of it cannot be replaced.
+            ResultsError: The process has failed.
+        """
+        if self._process is None:
+            self.start()
+        process, self._process = self._process, None
+        if process is None:
+            raise RuntimeError("start makes a process")
+        answer, said = process.communicate(json.dumps([str(folder), self._formats]).encode())
+        if answer:
+            raise pickle.loads(answer)  # noqa: S301 our own process
+        if process.returncode:
+            reason = said.decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
+            raise ResultsError(
+                f"{folder}: the figure was not drawn: {reason[-1]}; try `coldloop plot {folder}`, the rest is complete"
+            )
+
+
+def main() -> None:
+    """Draw the run that standard input names; none when it is closed."""
+    from rig.figures.run_plot import draw_nothing, plot_run  # noqa: PLC0415 what takes long comes before the wait
+
+    draw_nothing()
+    request = sys.stdin.buffer.read()
+    if not request:
+        return
+    folder, formats = json.loads(request)
+    try:
+        plot_run(Path(folder), formats)
+    except (OSError, ColdloopError) as error:
+        with contextlib.suppress(BrokenPipeError):
+            sys.stdout.buffer.write(pickle.dumps(error))
+    gc.freeze()  # whoever waits for the end need not wait until all modules have been searched for cycles
+
+
+if __name__ == "__main__":
+    main()

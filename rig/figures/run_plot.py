@@ -1,0 +1,95 @@
+"""The figure of a run from its folder, as PNG, PDF or SVG."""
+
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from coldloop.process.signals import INPUT_NAMES
+from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run
+from rig.results.columns import STATION_FILE
+from rig.results.folders import whole_file
+from rig.results.run_folder import RunFolder
+
+DPI: Final = 130
+
+
+def plot_run(folder: Path, formats: Sequence[str]) -> list[Path]:
+    """Draw the run of a folder; return the files, `run.png` for the format png.
+
+    Raises:
+        OSError: A file cannot be written.
+        UsageError: There is no run in the folder.
+    """
+    figure = draw_run(curves_of(RunFolder(folder)))
+    paths = [folder / f"run.{extension}" for extension in formats]
+    for path in paths:
+        save_figure(figure, path)
+    return paths
+
+
+def draw_nothing() -> None:
+    """Draw one tick into memory: fonts, and what else the first figure of a process needs, are loaded then."""
+    series = {name: np.zeros(1) for name in ("time_s", *DRAWN)}
+    bounds = Bounds(dict.fromkeys(("L1", "T5"), (0.0, 1.0)), dict.fromkeys(INPUT_NAMES, (0.0, 1.0)))
+    draw_run(RunCurves(series, [], bounds, "", "")).savefig(BytesIO(), dpi=DPI)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure in the format of the file's name; nothing in it depends on the time of day."""
+    extension = path.suffix.removeprefix(".")
+    metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(extension)
+    whole_file(path, lambda draft: figure.savefig(draft, dpi=DPI, format=extension, metadata=metadata))
+
+
+def curves_of(run: RunFolder) -> RunCurves:
+    """Return what is drawn of a run."""
+    pressures = _pressures(run)
+    series = run.series(DRAWN)
+    if pressures:
+        station = run.series(list(pressures), file_name=STATION_FILE)
+        series |= {name: np.interp(series["time_s"], station["time_s"], station[name]) for name in pressures}
+    return RunCurves(
+        series,
+        run.events(),
+        Bounds.of(run.configuration),
+        title_of(run.configuration),
+        identity_of(run.manifest),
+        pressures,
+    )
+
+
+def _pressures(run: RunFolder) -> dict[str, tuple[float, float]]:
+    """Return the pressures of a station with the limits of their alarms, bar; none where there is no station."""
+    if not (run.path / STATION_FILE).exists():
+        return {}
+    alarms = {
+        key: float(run.configuration[f"plant.station.alarms.{key}_bar"])
+        for key in ("hp_low", "hp_high", "lp_low", "lp_high")
+    }
+    return {"P12": (alarms["hp_low"], alarms["hp_high"]), "P11": (alarms["lp_low"], alarms["lp_high"])}
+
+
+def title_of(configuration: Mapping[str, Any]) -> str:
+    """Return what a run was, in a few words."""
+    load = f"load {Path(configuration['plant.load']).name}"
+    if configuration["control_plc.driver"] == "classical":
+        return f"{load}, classical loops"
+    period = configuration["optimizer_plc.program.updating_period_s"]
+    updating = f"tau_u {period:g} s" if period else "tau_u adaptive"
+    return f"{load}, solver {configuration['optimizer_plc.program.solver']}, {updating}"
+
+
+def identity_of(manifest: Mapping[str, Any]) -> str:
+    """Return which run it was: trace, version, start, way; and whether it is complete."""
+    trace = manifest["hashes"]["trace_sha256"] or ""
+    parts = [
+        f"trace {trace[:12]}", f"coldloop {manifest['coldloop']}", manifest["started_utc"], manifest["way"],
+        f"model {manifest['hashes']['model_sha256'][:12]}",
+    ]  # fmt: skip
+    if not manifest["complete"]:
+        parts.append(f"INCOMPLETE, {manifest['recorded_ticks']} of {manifest['ticks']} ticks: {manifest['reason']}")
+    return "  ·  ".join(parts)

@@ -1,0 +1,147 @@
+"""A run folder as the operator's page replays it."""
+
+from collections.abc import Mapping, Sequence
+from functools import cache, cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.config import load_configuration
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
+from coldloop.registers.control_plc import Cause, Mode, Process
+from coldloop.registers.declaration import fields_of
+from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
+from coldloop.registers.plant import StationSample
+from coldloop.registers.safety import Alarm
+from coldloop.service.event_text import EventText, word
+from hmi.model import Told
+from hmi.replay import Frame
+from optimizer_plc.budget import PlcBudget
+from optimizer_plc.rules import make_rule
+from optimizer_plc.settings import OptimizerSettings
+from optimizer_plc.solvers import make_solver
+from rig.results.columns import STATION_FILE
+from rig.results.recorded_alarms import alarms_after
+from rig.results.run_folder import RunFolder
+
+PROCESS: Final = ("load_w", *INPUT_NAMES, *OUTPUT_NAMES)
+SECTIONS: Final = ("model", "limits", "session", "optimizer_plc", "telemetry")
+_MODES: Final = {word(mode): int(mode) for mode in Mode}
+_CAUSES: Final = {word(cause): int(cause) for cause in Cause}
+
+
+class RecordedPage:
+    """A run on disk; its trace is kept in memory, 0.5 MB an hour.
+
+    Raises:
+        UsageError: There is no run, or it cannot be read.
+    """
+
+    def __init__(self, folder: RunFolder) -> None:
+        self._folder = folder
+        self.name = folder.path.resolve().name
+        with folder.file("trace.parquet") as file:
+            table = file.read(columns=[*PROCESS, "mode", "cause", "bad_sensors"])
+        self._values = np.column_stack([table[name].to_numpy() for name in PROCESS]).astype(np.float32)
+        self._modes = table["mode"].to_pylist()
+        self._causes = table["cause"].to_pylist()
+        self._since = _beginnings(self._modes)
+        self._bad_sensors = [_bits(names) for names in table["bad_sensors"].to_pylist()]
+        self._settings = self._read_settings()
+        self._station = self._read_station()
+
+    @property
+    def configuration(self) -> Mapping[str, Any]:
+        """What it was run with, by dotted key."""
+        return self._folder.configuration
+
+    def _read_station(self) -> NDArray[np.float32] | None:
+        """Return signals, mode and alarms of the station, a row a tick; None of a cold box alone."""
+        if not (self._folder.path / STATION_FILE).exists():
+            return None
+        with self._folder.file(STATION_FILE) as file:
+            table = file.read(columns=[*STATION_SIGNAL_NAMES, "mode", "alarms"])
+        return np.column_stack([column.to_numpy() for column in table.columns]).astype(np.float32)
+
+    def _read_settings(self) -> OptimizerSettings:
+        """Return what the optimiser was configured with."""
+        values = {key: value for key, value in self._folder.configuration.items() if key.split(".")[0] in SECTIONS}
+        options: Mapping[str, tuple[object, str]] = {key: (value, "manifest") for key, value in values.items()}
+        return load_configuration(OptimizerSettings, environment={}, options=options).settings
+
+    @property
+    def ticks(self) -> int:
+        """Ticks that were recorded."""
+        return len(self._values)
+
+    @cached_property
+    def updates(self) -> list[Optimization]:
+        """Updates whose sequence was played."""
+        with self._folder.file("updates.parquet") as file:
+            rows = file.read().to_pylist()
+        return [_optimization(row) for row in rows]
+
+    @cached_property
+    def events(self) -> list[Told]:
+        """Events of the journals, in the order of their ticks."""
+        return sorted((_told(row) for row in self._folder.events()), key=lambda told: told.tick)
+
+    @cached_property
+    def rule(self) -> UpdatingRuleStatus:
+        """What decided the updating period."""
+        program = self._settings.optimizer_plc.program
+        budget = PlcBudget(program.budget, make_solver(program).tau_1_s)
+        rule = make_rule(program, budget, round(program.updating_period_s / TICK_S))
+        return rule.status._replace(**budget.times._asdict())
+
+    @property
+    def limits(self) -> OperatingLimits:
+        """Bands, bounds and rates."""
+        design, limits = self._settings.optimizer_plc.program.design, self._settings.limits
+        return OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
+
+    def frame(self, tick: int) -> Frame:
+        """Return one tick."""
+        load, *values = self._values[tick].tolist()
+        u, y = tuple(values[: len(INPUT_NAMES)]), tuple(values[len(INPUT_NAMES) :])
+        mode = _MODES.get(self._modes[tick], int(Mode.MPC))
+        cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
+        bad, station = self._bad_sensors[tick], self._station_at(tick)
+        return Frame(Process(tick, load, u, y), mode, cause, self._since[tick], bad, station)
+
+    def alarms(self, events: Sequence[Told]) -> list[Alarm]:
+        """Return the alarms after these events."""
+        return alarms_after(events)
+
+    def _station_at(self, tick: int) -> StationSample | None:
+        if self._station is None or tick >= len(self._station):
+            return None
+        *signals, mode, alarms = self._station[tick].tolist()
+        return StationSample(tick, tuple(signals), int(mode), int(alarms))
+
+
+def _beginnings(modes: Sequence[str]) -> list[int]:
+    """Return for each tick the one at which its mode began."""
+    found: list[int] = []
+    for tick, mode in enumerate(modes):
+        found.append(found[-1] if tick and mode == modes[tick - 1] else tick)
+    return found
+
+
+@cache
+def _bits(names: str) -> int:
+    """Return the bits of outputs that are named in a text."""
+    return sum(1 << OUTPUT_NAMES.index(name) for name in names.split())
+
+
+def _optimization(row: Mapping[str, Any]) -> Optimization:
+    names = [name for name in fields_of(Optimization) if name != "tau_u"]
+    values: dict[str, Any] = {name: 0.0 if row[name] is None else row[name] for name in names}
+    return Optimization(**values, tau_u=round(row["tau_u_s"] / TICK_S))
+
+
+def _told(row: Mapping[str, Any]) -> Told:
+    value = "" if row["value"] is None else f"{row['value']:.7g}"
+    text = EventText(row["kind"], row["subject"], row["cause"], value, row["unit"], row["who"])
+    return Told(row["service"], row["number"], row["boot"], row["utc"], row["tick"], text)

@@ -1,0 +1,99 @@
+"""What a rig that is up is doing, read over Modbus."""
+
+from typing import Final, NamedTuple
+
+from coldloop.process.signals import L1, T5, TICK_S
+from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, Process
+from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
+from coldloop.registers.plant import LoadStatus
+from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
+from coldloop.service.event_text import alarm_cause, word, word_of
+from rig.cosim.operator_client import OperatorClient
+
+QUIET: Final = (AlarmState.NORMAL, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)
+
+
+class RigStatus(NamedTuple):
+    """One look at all three services."""
+
+    plant: Identity
+    pace: SessionPace
+    ladder: LadderStatus
+    operator: Operator
+    process: Process
+    load: LoadStatus
+    update: Optimization | None
+    """The last one that was done; None before the first."""
+    alarms: tuple[str, ...]
+
+
+async def read_status(client: OperatorClient) -> RigStatus:
+    """Return the state of a rig.
+
+    Raises:
+        LinkError: A service does not answer.
+    """
+    control = client.control
+    done = await client.optimizer.read(Identity)
+    update = None
+    if done.heartbeat:
+        (update,) = await client.optimizer.read_rows(Optimization, (done.heartbeat - 1) % HISTORY_ROWS, 1)
+    rows = await control.read_rows(Alarm, 0, len(AlarmKind))
+    alarms = tuple(_alarm(kind, row) for kind, row in zip(AlarmKind, rows, strict=True) if row.state not in QUIET)
+    return RigStatus(
+        plant=await client.plant.read(Identity),
+        pace=await client.plant.read(SessionPace),
+        ladder=await control.read(LadderStatus),
+        operator=await control.read(Operator),
+        process=await control.read(Process),
+        load=await client.plant.read(LoadStatus),
+        update=update,
+        alarms=alarms,
+    )
+
+
+def _alarm(kind: AlarmKind, row: Alarm) -> str:
+    cause = alarm_cause(kind, row.cause)
+    state = word_of(AlarmState, row.state)
+    return f"{word(kind)}{f' ({cause})' if cause else ''}, {state}"
+
+
+def _pace(status: RigStatus) -> str:
+    pace = status.pace
+    if not status.plant.session:
+        return "no session"
+    if not pace.realtime:
+        return "lock-step"
+    return f"paused (factor {pace.factor:g})" if pace.paused else f"{pace.factor:g} x real time"
+
+
+def _tau_u(status: RigStatus) -> str:
+    return "-" if status.update is None else f"{status.update.tau_u * TICK_S:g} s"
+
+
+def page(status: RigStatus) -> str:
+    """Return the state as a page."""
+    ladder, load, y = status.ladder, status.load, status.process.y
+    following = f", {load.next_watts:g} W from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
+    rows = [
+        ("session", f"{status.plant.session}, {_pace(status)}, {status.plant.tick * TICK_S:.2f} s"),
+        ("mode", f"{word_of(Mode, ladder.mode)} ({word_of(Cause, ladder.cause)}) since {ladder.since * TICK_S:g} s"),
+        ("operator", word_of(OperatorMode, status.operator.mode)),
+        ("load", f"{load.watts:g} W{following}"),
+        ("L1", f"{y[L1]:.3f} %"),
+        ("T5", f"{y[T5]:.3f} K"),
+        ("tau_u", _tau_u(status)),
+        ("alarms", "; ".join(status.alarms) or "none"),
+    ]  # fmt: skip
+    return "".join(f"{name:8} {text}\n" for name, text in rows)
+
+
+def line(status: RigStatus) -> str:
+    """Return the state as one line."""
+    y = status.process.y
+    return (
+        f"{status.plant.tick * TICK_S:10.2f} s  {word_of(Mode, status.ladder.mode):9}  {status.load.watts:6.1f} W  "
+        f"L1 {y[L1]:6.2f} %  T5 {y[T5]:6.2f} K  tau_u {_tau_u(status):>6}  "
+        f"{'; '.join(status.alarms) or 'no alarms'}"
+    )

@@ -1,0 +1,146 @@
+"""A rig that stays up: three services on fixed ports, in real time, until they are ended."""
+
+import asyncio
+import sys
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
+from pathlib import Path
+from typing import Final
+
+from coldloop.errors import LinkError
+from coldloop.registers.common import Identity
+from coldloop.safety.retained import RetainSettings
+from rig.cosim.kept_up import keep_up, say
+from rig.cosim.local_services import KeptService, LocalServices
+from rig.cosim.session_client import SessionClient
+from rig.cosim.wiring import SERVICES, START_PATIENCE_S
+from rig.live.page_process import PageProcess
+from rig.live.private_folder import make_own_folder, make_private
+from rig.live.started_rigs import DEFAULT_PORTS, STATE_FILE, RunningRig
+from rig.runs.running import make_scenario
+from rig.settings import Settings
+
+LOOK_S: Final = 0.5
+"""Between two looks at the load that the plant knows of."""
+
+
+RETAINING: Final = ("plant", "control_plc")
+"""Services that go on after a restart where they were, with a file for their state."""
+
+
+class UpRig:
+    """Starts the services, begins a session in real time, and keeps both up until it is cancelled.
+
+    A service or page that ends is started again (`rig.cosim.kept_up`), and goes on with the state that it has retained.
+    """
+
+    def __init__(self, settings: Settings, ports: Sequence[int], tls: Path | None, *, page: bool = False) -> None:
+        self.folder = make_own_folder(str(ports[0]))
+        self._settings = _retaining(settings, self.folder)
+        self._scenario = make_scenario(settings)
+        self._page = page
+        self._ports = tuple(ports)
+        self._tls = tls
+
+    async def run(self, *, announce: bool) -> None:
+        """Run until cancelled; load steps beyond what the plant holds are written as time goes on.
+
+        Raises:
+            ColdloopError: The session could not begin, or a service has ended again and again.
+        """
+        services = LocalServices(self._settings, make_private(self.folder / "logs"), ports=self._ports)
+        async with services:
+            rig = SessionClient(services.endpoints, self._settings)
+            page = PageProcess(self._settings.hmi, services.endpoints, self.folder) if self._page else None
+            try:
+                async with page or nullcontext():
+                    await services.during(self._begin(rig, page, announce=announce))
+                    await self._keep(services, rig, page)
+            finally:
+                rig.close()
+                (self.folder / STATE_FILE).unlink(missing_ok=True)
+
+    async def _begin(self, rig: SessionClient, page: PageProcess | None, *, announce: bool) -> None:
+        await rig.connect(START_PATIENCE_S)
+        await rig.start(self._scenario)
+        tls = "" if self._tls is None else str(self._tls.resolve())
+        if page is not None:
+            await page.is_served()
+        if announce:
+            sys.stdout.write(whereabouts(self._settings, self._ports, self.folder))
+            sys.stdout.write(page.whereabouts if page is not None else "")
+            sys.stdout.flush()
+        RunningRig.of_this_process(self._ports, tls).write()
+
+    async def _keep(self, services: LocalServices, rig: SessionClient, page: PageProcess | None) -> None:
+        work = [self._hold(rig), *(self._keep_service(services, service, rig) for service in SERVICES)]
+        if page is not None:
+            work.append(_keep_page(page))
+        tasks = [asyncio.create_task(one) for one in work]
+        try:
+            await asyncio.gather(*tasks)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _hold(self, rig: SessionClient) -> None:
+        while True:
+            with suppress(LinkError):  # the plant is being started again
+                await rig.hold(LOOK_S)
+            await asyncio.sleep(LOOK_S)
+
+    async def _keep_service(self, services: LocalServices, service: str, rig: SessionClient) -> None:
+        async def has_a_session() -> None:
+            if service not in RETAINING:  # the optimiser learns it from the control PLC
+                return
+            with suppress(LinkError):  # it has ended again
+                await rig.clients[service].connect(START_PATIENCE_S)
+                if not (await rig.clients[service].read(Identity)).session:
+                    session = await rig.start(self._scenario)
+                    say(f"session {session} has begun: the {service} service had no state to go on with")
+
+        await keep_up(KeptService(services, service), has_a_session)
+
+
+async def _keep_page(page: PageProcess) -> None:
+    """Keep the page up; the rig goes on without one that is given up."""
+    try:
+        await keep_up(page)
+    except LinkError as error:
+        say(str(error))
+
+
+def _retaining(settings: Settings, folder: Path) -> Settings:
+    """Return settings with which services retain their state, if they can; that of an earlier rig is removed."""
+    sections = {}
+    for service in RETAINING:
+        section = getattr(settings, service)
+        if section.retain.file is None:
+            file = folder / f"retained_{service}.json"
+            file.unlink(missing_ok=True)
+            sections[service] = section.model_copy(update={"retain": RetainSettings(file=file)})
+    return settings.model_copy(update=sections)
+
+
+def whereabouts(settings: Settings, ports: Sequence[int], folder: Path) -> str:
+    """Return where everything is, with a line to paste."""
+    base = "" if tuple(ports) == DEFAULT_PORTS else f" --port-base {ports[0]}"
+    tls = any(getattr(settings, service).server.tls for service in SERVICES)
+    lines = [
+        f"the rig is up: load {settings.plant.load}, {settings.session.factor:g} x real time",
+        *(f"  {service:14} 127.0.0.1:{port}" for service, port in zip(SERVICES, ports, strict=True)),
+        f"  logs           {folder / 'logs'}",
+    ]
+    if tls:
+        lines += ["Modbus/TCP Security: clients show a certificate; `coldloop certificates` has made some"]
+    else:
+        lines += [
+            "read T5 (K):",
+            f"  mbpoll -0 -1 -m tcp -p {ports[0]} -t 4:float -B -r 216 -c 1 127.0.0.1",
+        ]
+    lines += [
+        f"coldloop status{base} --follow    what it does",
+        f"coldloop set{base} load 420       and load FILE.csv, mode, setpoint, factor, pause, resume, acknowledge",
+    ]
+    return "\n".join(lines) + "\n"

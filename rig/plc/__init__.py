@@ -1,0 +1,1 @@
+"""What the reference PLC can do: its speed and memory, operations counted, budgets, certified iterations."""

@@ -1,0 +1,56 @@
+"""Certified iterations as text."""
+
+from coldloop.process.signals import SAMPLING_PERIOD_S
+from rig.plc.budget_tables import aligned
+from rig.plc.certification import LONGEST, SCENARIO_TICKS, Certificate, certify, failure_bound
+from rig.progress import make_console
+from rig.settings import Settings
+
+
+def certification_table(settings: Settings, scenarios: int, tolerance_pct: float, confidence_pct: float) -> str:
+    """Sample scenarios and return what they certify, as text.
+
+    Args:
+        settings: Of plant, problem, solvers and budget.
+        scenarios: N, 1 or more.
+        tolerance_pct: An answer is good when its J is within this of the optimum.
+        confidence_pct: Of the bounds.
+    """
+    beta = 1.0 - confidence_pct / 100.0
+    with make_console().status("") as status:
+        found = certify(
+            settings, scenarios, tolerance_pct / 100.0, beta,
+            lambda done: status.update(f"{done} of {scenarios} scenarios"),
+        )  # fmt: skip
+    none_failed = 100.0 * failure_bound(0, scenarios, beta)
+    power = settings.optimizer_plc.program.budget.power
+    lines = [
+        (
+            f"{scenarios} independent scenarios of {SCENARIO_TICKS // 240} min under random telegraphs, problems "
+            f"every {SAMPLING_PERIOD_S:g} s; good is an answer within {tolerance_pct:g} % of the optimal J"
+        ),
+        (
+            f"with confidence {confidence_pct:g} %: at most so many problems at a random instant are not good after "
+            f"the iterations that fit into {SAMPLING_PERIOD_S:g} s at P = {power:g};"
+        ),
+        (
+            "at most so many scenarios have one that is not; and at most "
+            f"{none_failed:.2f} % have one that needs more iterations than the most needed"
+        ),
+        "",
+        *aligned(
+            [
+                ("solver", "fit into 5 s", "problems failed", "at most", "scenarios failed", "at most", "most needed"),
+                *(_row(one, scenarios) for one in found),
+            ]
+        ),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _row(one: Certificate, scenarios: int) -> tuple[str, ...]:
+    return (
+        one.solver, f"{one.fitting}", f"{one.failures} of {scenarios}", f"{100 * one.failure_bound:.1f} %",
+        f"{one.run_failures} of {scenarios}", f"{100 * one.run_bound:.1f} %",
+        f"{one.worst}" if one.worst <= LONGEST else f"over {LONGEST}",
+    )  # fmt: skip

@@ -1,0 +1,148 @@
+"""Indicators of a run (paper, section V), summed while it goes on or from a recording."""
+
+import hashlib
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.process.lti_model import LtiModel
+from coldloop.process.signals import L1, STATE_NAMES, T5, TICK_S, TICKS_PER_SAMPLE
+from coldloop.registers.optimizer_plc import Optimization
+from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.qp.prediction import state_weights
+from rig.results.recording import BLOCK_TICKS, Recording, SampleBlock, Sink
+
+
+class Indicators(NamedTuple):
+    """Costs are in the units of the predictive problem's J; sums run over the problems solved, as in the paper.
+
+    What does not exist is NaN: without updates all that is predicted, without ticks all that is measured.
+    """
+
+    J_dev: float
+    """Sum over the problems of the predicted deviation cost."""
+    J_cst: float
+    """Sum over the problems of the predicted violation cost."""
+    J_open_mean: float
+    """Mean of J_dev + J_cst per unit of time: comparable between updating periods. A problem weighs by the time since
+    the last delivery, which counts the time lost by an interrupted one."""
+    J_BF: float
+    """Closed-loop cost: sum of the instantaneous cost over the sampling periods of 5 s."""
+    c1: float
+    """Largest predicted constraint violation, in the units of the row."""
+    c2: float
+    """Mean over the problems of the largest predicted violation."""
+    tau_u_mean: float
+    """Mean updating period over time, s: the mean length of the period that a moment belongs to."""
+    tau_u_mean_per_update: float
+    """Mean updating period over the updates, s, in which short periods count more often."""
+    iterations_total: int
+    L1_outside_band_pct: float
+    """Share of the ticks that are known."""
+    T5_outside_band_pct: float
+
+
+class StageCost:
+    """The stage cost of what was really reached: deviations from the operating point, and violations of the bands."""
+
+    def __init__(self, model: LtiModel, design: ControlDesign) -> None:
+        n = len(STATE_NAMES)  # a model of the whole refrigerator has further ones, which weigh nothing
+        self._x0, self._u0 = model.x0[:n], model.u0
+        self._state_weights = state_weights(model, design)[:n]
+        self._design = design
+
+    def of(self, block: SampleBlock) -> NDArray[np.float64]:
+        """Return the cost of each tick, shape (N,)."""
+        design = self._design
+        x = block.x.astype(float) - self._x0
+        u = block.u.astype(float) - self._u0
+        constrained = block.y[:, [L1, T5]].astype(float)
+        violation = np.maximum(constrained - design.output_high, 0) + np.maximum(design.output_low - constrained, 0)
+        cost: NDArray[np.float64] = (
+            (x**2 * self._state_weights).sum(axis=1)
+            + (u**2 * design.input_weight).sum(axis=1)
+            + (violation**2 * design.violation_weight).sum(axis=1)
+        )
+        return cost
+
+
+class RunEvaluation(Sink):
+    """Sums the indicators of a run, and its digest, in constant memory; ticks that are unknown add nothing."""
+
+    def __init__(self, model: LtiModel, design: ControlDesign) -> None:
+        self._cost = StageCost(model, design)
+        self._design = design
+        self._digest = hashlib.sha256()
+        self._outside = np.zeros(2, dtype=int)
+        self._stage_costs = 0.0
+        self._j_dev = self._j_cst = self._weighted = self._violations = self._largest = 0.0
+        self._taus = self._squared_taus = self._delivered = self._known = 0
+        self.ticks = self.updates = self.iterations = 0
+
+    def block(self, block: SampleBlock) -> None:
+        """Take ticks."""
+        constrained = block.y[:, [L1, T5]]
+        outside = (constrained < self._design.output_low) | (constrained > self._design.output_high)
+        self._outside += outside.sum(axis=0)
+        self._known += int(np.isfinite(block.load).sum())
+        self._stage_costs += float(np.nansum(self._cost.of(block)))
+        self._digest.update(block.digested)
+        self.ticks += len(block.load)
+
+    def update(self, update: Optimization) -> None:
+        """Take an update."""
+        delivered = update.tick + update.tau_u
+        self._j_dev += update.j_dev
+        self._j_cst += update.j_cst
+        self._weighted += (update.j_dev + update.j_cst) * (delivered - self._delivered)
+        self._delivered = delivered
+        self._violations += update.violation
+        self._largest = max(self._largest, update.violation)
+        self._taus += update.tau_u
+        self._squared_taus += update.tau_u**2
+        self.iterations += update.iterations
+        self.updates += 1
+
+    @property
+    def trace_sha256(self) -> str:
+        """SHA-256 over load, inputs, outputs, states and station of all ticks, as little-endian single precision."""
+        return self._digest.hexdigest()
+
+    @property
+    def indicators(self) -> Indicators:
+        """The indicators of what was taken so far."""
+        count, known = self.updates or math.nan, self._known or math.nan
+        exists = 1.0 if self.updates else math.nan
+        level, temperature = 100.0 * self._outside / known
+        return Indicators(
+            J_dev=self._j_dev * exists,
+            J_cst=self._j_cst * exists,
+            J_open_mean=self._weighted / (self._delivered or math.nan),
+            J_BF=self._stage_costs / TICKS_PER_SAMPLE if self._known else math.nan,
+            c1=self._largest * exists,
+            c2=self._violations / count,
+            tau_u_mean=self._squared_taus * TICK_S / (self._taus or math.nan),
+            tau_u_mean_per_update=self._taus * TICK_S / count,
+            iterations_total=self.iterations,
+            L1_outside_band_pct=float(level),
+            T5_outside_band_pct=float(temperature),
+        )
+
+
+def instantaneous_cost(recording: Recording, model: LtiModel, design: ControlDesign) -> NDArray[np.float64]:
+    """Return the stage cost of each tick, shape (N,): deviations and violations of what was really reached."""
+    return StageCost(model, design).of(recording.block)
+
+
+def evaluate(recording: Recording, model: LtiModel, design: ControlDesign) -> Indicators:
+    """Return the indicators of a recording, as `RunEvaluation` would have summed them."""
+    evaluation = RunEvaluation(model, design)
+    rest = recording.block
+    while len(rest.load):
+        block, rest = rest.split(BLOCK_TICKS)
+        evaluation.block(block)
+    for update in recording.updates:
+        evaluation.update(update)
+    return evaluation.indicators

@@ -1,0 +1,105 @@
+"""A folder that a run has left behind, and how it is read."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from coldloop.errors import UsageError
+from rig.results.arrow_arrays import numbers_of
+from rig.results.columns import FORMAT
+
+Curves = dict[str, NDArray[np.float64]]
+"""Columns by name; what is null is NaN."""
+
+DRAWN_TICKS: Final = 60_000
+"""A longer trace is drawn by the least and the largest value of many ticks."""
+
+
+class RunFolder:
+    """Results on disk, of the present format.
+
+    Raises:
+        UsageError: There are none, or they are of another version, or damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.manifest = self._document("manifest.json")
+        if self.manifest.get("format") != FORMAT:
+            raise UsageError(f"{path}: results of another version of Coldloop; this one reads format {FORMAT}")
+
+    def _document(self, name: str) -> dict[str, Any]:
+        try:
+            document: dict[str, Any] = json.loads((self.path / name).read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise UsageError(f"{self.path / name}: {reason}; name the folder of a run that has ended") from None
+        if not isinstance(document, dict):
+            raise UsageError(f"{self.path / name}: not an object; name the folder of a run that has ended")
+        return document
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The summary."""
+        return self._document("summary.json")
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """The configuration by dotted key."""
+        configured: dict[str, Any] = self.manifest["configuration"]
+        return configured
+
+    def file(self, name: str) -> pq.ParquetFile:
+        """Return a Parquet file of the run.
+
+        Raises:
+            UsageError: It cannot be read.
+        """
+        try:
+            return pq.ParquetFile(self.path / name)
+        except (OSError, pa.ArrowException) as error:
+            raise UsageError(f"{self.path / name}: {str(error).splitlines()[0]}") from None
+
+    def series(self, columns: Sequence[str], longest: int = DRAWN_TICKS, file_name: str = "trace.parquet") -> Curves:
+        """Return columns of the trace, or of another file with a row a tick, for drawing: `time_s` and these.
+
+        It takes constant memory.
+
+        A trace of more than `longest` ticks is reduced to two points for each of `longest / 2` intervals.
+        """
+        names = ["time_s", *columns]
+        with self.file(file_name) as file:
+            every = max(1, math.ceil(file.metadata.num_rows / (longest / 2))) if file.metadata.num_rows > longest else 1
+            batches = file.iter_batches(batch_size=every * 4096, columns=names)
+            parts = [_reduced(batch_series(batch), every) for batch in batches]
+        return {name: np.concatenate([part[name] for part in parts] or [np.empty(0)]) for name in names}
+
+    def events(self) -> list[dict[str, Any]]:
+        """Return the events."""
+        with self.file("events.parquet") as file:
+            rows: list[dict[str, Any]] = file.read().to_pylist()
+        return rows
+
+
+def batch_series(batch: pa.RecordBatch) -> Curves:
+    """Return the columns of a batch as numbers."""
+    return {name: numbers_of(batch[name]) for name in batch.schema.names}
+
+
+def _reduced(series: Curves, every: int) -> Curves:
+    """Return for each interval of so many ticks the least and the largest value of each column."""
+    if every == 1:
+        return series
+    starts = np.arange(0, len(series["time_s"]), every)
+    reduced: Curves = {}
+    for name, values in series.items():
+        pair = [np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)]
+        reduced[name] = np.stack(pair, axis=1).ravel()
+    return reduced

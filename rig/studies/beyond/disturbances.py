@@ -1,0 +1,125 @@
+"""What happens to a refrigerator besides its load: trips, nitrogen, leaks, weather, pulses; under MPC and the loops."""
+
+from typing import Final, NamedTuple
+
+from matplotlib.figure import Figure
+
+from coldloop.registers.plant import StationAlarm, StationMode
+from rig.figures.plot import COLOURS
+from rig.studies.beyond.coupling import REFRIGERATOR, SHOWN_ANYWAY, TRACE_TICKS
+from rig.studies.drawing import legend_outside, panels
+from rig.studies.request import Outcome, RunRequest
+from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
+
+EVENTS: Final = "plant.refrigerator.events="
+
+
+class Event(NamedTuple):
+    """What happens, under which load."""
+
+    load: str
+    assignments: tuple[str, ...]
+
+
+HAPPENINGS: Final = {
+    "nothing": Event("a", ()),
+    "a compressor trips for 2 min": Event(
+        "a", (f"{EVENTS}[{{at_s=600,target='nc1',value=0}},{{at_s=720,target='nc1',value=1}}]",)
+    ),
+    "no nitrogen for 45 min": Event(
+        "a", (f"{EVENTS}[{{at_s=300,target='nitrogen',value=0}},{{at_s=3000,target='nitrogen',value=1}}]",)
+    ),
+    "a leak for 20 min": Event(
+        "a", (f"{EVENTS}[{{at_s=600,target='leak',value=1}},{{at_s=1800,target='leak',value=0}}]",)
+    ),
+    "10 K warmer outside": Event("a", (f"{EVENTS}[{{at_s=600,target='ambient',value=310}}]",)),
+    "a train of pulses": Event("pulses", ()),
+}
+DRIVERS: Final = {"MPC": (), "classical loops": ("control_plc.driver=classical",)}
+STATION: Final = {"LQ": (), "PI": ("plant.station.control=pi",)}
+COLUMNS: Final = (
+    "event", "cold box", "station", "J_BF", "L1 outside (%)", "T5 outside (%)", "L1 (%)", "T5 (K)", "HP (bar)",
+    "LP (bar)", "lost (kg)", "modes", "alarms",
+)  # fmt: skip
+
+
+class DisturbancesStudy:
+    """Events of a refrigerator, with LQ and PI at the station, MPC and loops at the cold box."""
+
+    name = "disturbances"
+    title = "Beyond the paper: what happens to a refrigerator"
+
+    def requests(self, options: StudyOptions) -> list[RunRequest]:
+        """Return every event with every pair of controllers."""
+        return [run for event in HAPPENINGS.values() for load in _loads(event, options) for run in _runs(event, load)]
+
+    def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
+        """Tell bands, pressures, modes and alarms of each run."""
+        result = StudyResult(COLUMNS, [], {})
+        lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
+        for name, event in HAPPENINGS.items():
+            for load in _loads(event, options):
+                runs = [outcomes[request] for request in _runs(event, load)]
+                for (driver, station), run in zip(_pairs(), runs, strict=True):
+                    row = (f"{name} ({load.name})", driver, station, *_told(run))
+                    result.rows.append(row)
+                    lines.append("| " + " | ".join(f"{c:.4g}" if isinstance(c, float) else str(c) for c in row) + " |")
+                if load.draw == 1:
+                    result.figures[name] = _courses(runs)
+        if len(result.rows) > SHOWN_ANYWAY:
+            result.remarks.append("\n".join(lines))
+        return result
+
+
+def _pairs() -> list[tuple[str, str]]:
+    return [(driver, station) for driver in DRIVERS for station in STATION]
+
+
+def _loads(event: Event, options: StudyOptions) -> list[Load]:
+    return loads(options, event.load)[options.loads[0] if options.loads else event.load]
+
+
+def _runs(event: Event, load: Load) -> list[RunRequest]:
+    return [
+        load.request(
+            0.0, REFRIGERATOR, *event.assignments, *DRIVERS[driver], *STATION[station], trace_ticks=TRACE_TICKS
+        )
+        for driver, station in _pairs()
+    ]
+
+
+def _told(run: Outcome) -> tuple[str | float, ...]:
+    i = run.indicators
+    spans = [
+        f"{run.series(name).min():.{digits}f}..{run.series(name).max():.{digits}f}"
+        for name, digits in (("L1", 2), ("T5", 2), ("P12", 2), ("P11", 3))
+    ]
+    modes = sorted({StationMode(int(mode)).name.lower() for mode in run.series("mode")})
+    raised = {
+        alarm.name.lower() for bits in set(run.series("alarms")) for alarm in StationAlarm(int(bits)) if alarm.name
+    }
+    lost = round(float(run.series("lost")[-1]), 3)
+    return (
+        i.J_BF, i.L1_outside_band_pct, i.T5_outside_band_pct, *spans, lost, ", ".join(modes),
+        ", ".join(sorted(raised)) or "none",
+    )  # fmt: skip
+
+
+def _courses(runs: list[Outcome]) -> Figure:
+    shown = (
+        ("load", "load (W)"), ("L1", "L1 (%)"), ("T5", "T5 (K)"), ("P12", "HP (bar)"), ("P11", "LP (bar)"),
+        ("L_N2", "nitrogen (%)"), ("T9", "T9 (K)"), ("mode", "station"),
+    )  # fmt: skip
+    with panels(len(shown), 1, (9.0, 11.0), sharex=True) as (figure, axes):
+        for (pair, run), colour in zip(zip(_pairs(), runs, strict=True), COLOURS, strict=False):
+            for (name, _), place in zip(shown, axes, strict=True):
+                place.plot(
+                    run.series("time_s") / 60, run.series(name), color=colour, linewidth=0.9, label=", ".join(pair)
+                )
+        for (_, label), place in zip(shown, axes, strict=True):
+            place.set_ylabel(label)
+        axes[-1].set_yticks(list(StationMode), [mode.name.lower().replace("_", " ") for mode in StationMode])
+        axes[-1].set_xlabel("plant time (min)")
+        legend_outside(figure, axes[0])
+        figure.align_ylabels(axes)
+    return figure

@@ -1,0 +1,110 @@
+"""Where the best of the fixed updating periods lies, for several settings of a solver."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from optimizer_plc.qp.penalties import Preset
+from rig.figures.plot import ACCENT, INK, THIRD
+from rig.studies import published
+from rig.studies.beyond.penalty_variants import Variant
+from rig.studies.drawing import legend_outside, panels, paper
+from rig.studies.intervals import Interval, geometric_mean, resampled
+from rig.studies.paper.updating_period import TUNING_DRAWS, is_inside
+from rig.studies.request import Series
+from rig.studies.results import markdown_table
+from rig.studies.study import Cell, Load
+
+COSTS: Final = {"J_open_mean": "open loop", "J_BF": "J_BF"}
+PeriodCosts = dict[Load, Mapping[str, Series]]
+"""By hour: costs of the periods, by kind of cost."""
+
+
+def groups(costs: PeriodCosts) -> dict[str, list[Load]]:
+    """Return the hours a to f, and those of other draws that nothing was tuned on."""
+    first = [load for load in costs if load.draw == 1]
+    fresh = [load for load in costs if load.draw not in (1, *TUNING_DRAWS)]
+    return {title: some for title, some in (("hours a to f", first), ("fresh hours", fresh)) if some}
+
+
+def table_of(costs: PeriodCosts, some: Sequence[Load], cost: str) -> Series:
+    """Return the costs of the periods in some hours, shape (hours, periods)."""
+    return np.array([costs[load][cost] for load in some])
+
+
+def share_inside(table: Series) -> Interval:
+    """Return the share of hours, rows of `table`, whose best period is inside, with its interval over the hours."""
+    return resampled(lambda rows: float(np.mean([is_inside(row) for row in rows])), table)
+
+
+def end_over_best(table: Series, end: int) -> Interval:
+    """Return by how much the first (0) or the last (-1) period costs more than the best, geometric mean of hours."""
+    return resampled(lambda rows: geometric_mean(rows[:, end] / rows.min(axis=1)), table)
+
+
+def period_values(preset: str, costs: PeriodCosts) -> dict[str, list[float]]:
+    """Return shares of hours with an interior best period by name."""
+    return {
+        f"{preset}: interior optimum, share of {title}, {name}": [share_inside(table_of(costs, some, cost)).value]
+        for title, some in groups(costs).items()
+        for cost, name in COSTS.items()
+    }
+
+
+def period_remarks(timed: Mapping[Variant, PeriodCosts], periods: Sequence[float]) -> list[str]:
+    """Return a table for each cost."""
+    theirs = np.array([hour["cost_fixed_pct"] for hour in published.updating_period().values()])
+    remarks = []
+    for cost, name in COSTS.items():
+        rows: list[tuple[Cell, ...]] = []
+        for setting, costs in timed.items():
+            for title, some in groups(costs).items():
+                rows.append((setting.label, title, *_row(table_of(costs, some, cost), periods)))
+        if cost == "J_open_mean" and theirs.shape[1] == len(periods):
+            rows.insert(0, ("the paper's points", "hours a to f", *_row(theirs, periods)))
+        caption = (
+            f"**Best of the fixed periods, {name}**: in how many hours it is neither the shortest nor the longest, "
+            "which it is in each (s), and what the shortest and the longest cost over it, geometric mean of the hours; "
+            "in brackets 95 % percentile intervals over the hours."
+        )
+        header = ("setting", "hours", "inside, share", "best in each hour (s)", f"{periods[0]:g} s over the best",
+                  f"{periods[-1]:g} s over the best")  # fmt: skip
+        remarks.append(f"{caption}\n\n{markdown_table(header, rows)}")
+    return remarks
+
+
+def _row(table: Series, periods: Sequence[float]) -> tuple[Cell, ...]:
+    best = " ".join(f"{periods[place]:g}" for place in table.argmin(axis=1))
+    ends = (end_over_best(table, end).brief() for end in (0, -1))
+    return share_inside(table).brief(2), best, *ends
+
+
+def period_figure(timed: Mapping[Variant, PeriodCosts], periods: Sequence[float]) -> Figure:
+    """Draw the first draw of each hour over its best period, both presets and the paper's points."""
+    colours = {Preset.TUNED: INK, Preset.AS_PRINTED: ACCENT}
+    presets = {setting: costs for setting, costs in timed.items() if not setting.change}
+    names = [load.name for load in next(iter(presets.values())) if load.draw == 1]
+    rows = -(-len(names) // 2)
+    with panels(rows, 2, (9.5, 3.1 * rows)) as (figure, axes):
+        for name, place in zip(names, axes, strict=False):
+            for setting, costs in presets.items():
+                of_hour = next(of_load for load, of_load in costs.items() if load.name == name)["J_open_mean"]
+                place.plot(periods, of_hour / of_hour.min(), color=colours[setting.preset], marker=".",
+                           label=setting.label)  # fmt: skip
+            theirs = published.updating_period().get(name)
+            if theirs:
+                fixed = theirs["cost_fixed_pct"]
+                paper(place, theirs["tau_u_s"], fixed / fixed.min(), THIRD, "paper")
+            place.set_title(f"({name})", loc="left")
+            place.set_ylabel("cost over that of the best (1)")
+            place.set_yscale("log")
+            place.set_yticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
+            place.minorticks_off()
+        legend_outside(figure, axes[0])
+        for place in axes[-2:]:
+            place.set_xlabel("updating period (s)")
+        for place in axes[len(names) :]:
+            place.set_visible(False)
+    return figure

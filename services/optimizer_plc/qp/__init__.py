@@ -1,0 +1,1 @@
+"""The quadratic problem: prediction, condensing, constraints, costs, the parametrised profile."""

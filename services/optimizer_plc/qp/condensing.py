@@ -1,0 +1,94 @@
+"""Condensing: the prediction over the horizon and its cost as functions of the decision variables z alone.
+
+z (n,) holds, knot by knot, the 3 inputs (deviations from the operating point over `input_scale`) and then, knot by
+knot, the 4 slacks of the output bands. The state and the load are stacked as s = (x, w), shape (n_x + 1,).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optimizer_plc.qp.design import N_INPUTS, N_SLACKS, ControlDesign
+from optimizer_plc.qp.linear_algebra import multiply
+from optimizer_plc.qp.prediction import PredictionModel, state_weights
+
+Array = NDArray[np.float64]
+
+
+class Condensed(NamedTuple):
+    """J_0 = z' Phi z + (phi_map' s)' z + s' constant_map s, and the constrained outputs of the N samples."""
+
+    Phi: Array
+    """Shape (n, n), with the weights of the slacks."""
+    phi_map: Array
+    """Shape (n_x + 1, n)."""
+    constant_map: Array
+    """Shape (n_x + 1, n_x + 1)."""
+    outputs_z: Array
+    """L1 and T5 at the end of each sample, as deviations, shape (N, 2, n)."""
+    outputs_s: Array
+    """Shape (N, 2, n_x + 1)."""
+
+
+def condense(prediction: PredictionModel, design: ControlDesign, weights: Array) -> Condensed:
+    """Return the condensed cost and outputs; `weights` (N, knots) are those of the knots in each sample."""
+    n, nx = (N_INPUTS + N_SLACKS) * weights.shape[1], prediction.n_states
+    A, B, F = prediction.sample
+    to_z = np.zeros((nx, n))
+    to_s = np.hstack([np.eye(nx), np.zeros((nx, 1))])
+    Q = state_weights(prediction.model, design)
+    R = np.asarray(design.input_weight)
+    C, D, G = (matrix[list(prediction.constrained)] for matrix in (prediction.C, prediction.D, prediction.G))
+    Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))
+    outputs_z, outputs_s = [], []
+    for of_knots in weights:
+        u_of_z = input_map(of_knots, design)
+        to_z = multiply(A, to_z) + multiply(B, u_of_z)
+        to_s = multiply(A, to_s)
+        to_s[:, -1] += F[:, 0]
+        weighted_z, weighted_s = Q[:, None] * to_z, Q[:, None] * to_s
+        Phi += multiply(transposed(to_z), weighted_z) + multiply(transposed(u_of_z), R[:, None] * u_of_z)
+        cross += 2.0 * multiply(transposed(to_s), weighted_z)
+        constant += multiply(transposed(to_s), weighted_s)
+        outputs_z.append(multiply(C, to_z) + multiply(D, u_of_z))
+        through_w = multiply(C, to_s)
+        through_w[:, -1] += G[:, 0]
+        outputs_s.append(through_w)
+    Phi = np.ascontiguousarray(Phi + _slack_weights(weights, design))
+    return Condensed(Phi, cross, constant, np.array(outputs_z), np.array(outputs_s))
+
+
+def input_map(of_knots: Array, design: ControlDesign) -> Array:
+    """Return the matrix (3, n) from z to the input deviation at a sample with these knot weights (knots,)."""
+    u_of_z = np.zeros((N_INPUTS, (N_INPUTS + N_SLACKS) * len(of_knots)))
+    for knot, weight in enumerate(of_knots):
+        for i in range(N_INPUTS):
+            u_of_z[i, N_INPUTS * knot + i] = weight * design.input_scale[i]
+    return u_of_z
+
+
+def slack_map(of_knots: Array) -> Array:
+    """Return the matrix (4, n) from z to the slacks at a sample with these knot weights (knots,)."""
+    n_inputs = N_INPUTS * len(of_knots)
+    slack_of_z = np.zeros((N_SLACKS, n_inputs + N_SLACKS * len(of_knots)))
+    for knot, weight in enumerate(of_knots):
+        for i in range(N_SLACKS):
+            slack_of_z[i, n_inputs + N_SLACKS * knot + i] = weight
+    return slack_of_z
+
+
+def _slack_weights(weights: Array, design: ControlDesign) -> Array:
+    level, temperature = design.violation_weight
+    rho = np.array([level, level, temperature, temperature])
+    n = (N_INPUTS + N_SLACKS) * weights.shape[1]
+    total = np.zeros((n, n))
+    for of_knots in weights:
+        slack_of_z = slack_map(of_knots)
+        total += multiply(transposed(slack_of_z), rho[:, None] * slack_of_z)
+    return total
+
+
+def transposed(M: Array) -> Array:
+    """Return M' with its rows contiguous."""
+    return np.ascontiguousarray(M.T)

@@ -1,0 +1,98 @@
+"""The rows of Gamma z <= gamma: bands of the outputs, which slacks widen, and rates of the inputs."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.process.limits import InputLimits
+from optimizer_plc.qp.condensing import Condensed, slack_map
+from optimizer_plc.qp.design import N_INPUTS, N_SLACKS, ControlDesign
+from optimizer_plc.qp.penalties import PenaltySettings
+
+Array = NDArray[np.float64]
+
+
+class OutputRows(NamedTuple):
+    """Rows -y_j - s <= -low and y_j - s <= high at each constraint instant, for L1 and then T5."""
+
+    Gamma: Array
+    """Shape (rows, n)."""
+    bounds: Array
+    """gamma at the operating point, shape (rows,)."""
+    states: Array
+    """How gamma depends on s = (x, w), shape (n_x + 1, rows)."""
+    gains: Array
+    """What the rows were multiplied by, shape (rows,): 1 for the output of the larger rho."""
+
+
+class RateRows(NamedTuple):
+    """Rows +-(u_b - u_a) <= (b - a) rate for each interval between decision instants, unless always true.
+
+    The first interval starts at the input applied before the first knot.
+    """
+
+    Gamma: Array
+    """Shape (rows, n)."""
+    bounds: Array
+    """gamma with no input before, shape (rows,)."""
+    first: Array
+    """1.0 for the rows of the first interval, shape (rows,)."""
+    before: Array
+    """How gamma depends on the input before, shape (3, rows)."""
+    gains: Array
+    """What the rows were multiplied by, shape (rows,)."""
+
+
+def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0: Array) -> OutputRows:
+    """Return the rows of the bands; `weights` (N, knots) are those of the knots, `y0` L1 and T5 at rest."""
+    rho = np.array(design.violation_weight)
+    rows, states, bounds, gains = [], [], [], []
+    for instant in design.constraint_instants:
+        slack_of_z = slack_map(weights[instant - 1])
+        for output in range(2):
+            y_z, y_s = condensed.outputs_z[instant - 1][output], condensed.outputs_s[instant - 1][output]
+            low, high = design.output_low[output] - y0[output], design.output_high[output] - y0[output]
+            rows += [-y_z - slack_of_z[2 * output], y_z - slack_of_z[2 * output + 1]]
+            states += [y_s, -y_s]
+            bounds += [-low, high]
+            gains += 2 * [np.sqrt(rho[output] / rho.max())]
+    gain = np.array(gains)
+    return OutputRows(
+        Gamma=np.array(rows) * gain[:, None],
+        bounds=np.array(bounds) * gain,
+        states=np.ascontiguousarray((np.array(states) * gain[:, None]).T),
+        gains=gain,
+    )
+
+
+def rate_rows(design: ControlDesign, limits: InputLimits, penalties: PenaltySettings) -> RateRows:
+    """Return the rows of the rates, scaled by what breaking them costs."""
+    ranges = np.asarray(limits.high) - np.asarray(limits.low)
+    size = (N_INPUTS + N_SLACKS) * len(design.decision_instants)
+    gains_of_inputs = np.sqrt(penalties.rate_rows) / np.array(design.input_scale)
+    rows, bounds, before, first, gained = [], [], [], [], []
+    starts = (design.decision_instants[0] - 1, *design.decision_instants[:-1])
+    for knot, (start, end) in enumerate(zip(starts, design.decision_instants, strict=True)):
+        for i in range(N_INPUTS):
+            limit = (end - start) * limits.rate[i]
+            if limit >= ranges[i]:
+                continue
+            row = np.zeros(size)
+            row[N_INPUTS * knot + i] = design.input_scale[i]
+            if knot:
+                row[N_INPUTS * (knot - 1) + i] = -design.input_scale[i]
+            for sign in (1.0, -1.0):
+                rows.append(sign * row)
+                bounds.append(limit)
+                first.append(float(knot == 0))
+                before.append(sign * np.eye(N_INPUTS)[i] * (knot == 0))
+                gained.append(gains_of_inputs[i])
+    gains = np.array(gained)
+    return RateRows(
+        Gamma=np.array(rows) * gains[:, None],
+        bounds=np.array(bounds) * gains,
+        first=np.array(first),
+        before=np.ascontiguousarray((np.array(before) * gains[:, None]).T),
+        gains=gains,
+    )

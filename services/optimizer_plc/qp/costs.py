@@ -1,0 +1,208 @@
+"""What a profile costs: the augmented cost J that solvers decrease, its gradient, and the indicators of section V.
+
+Gamma z - gamma and the gradient are computed here for all solvers, except by the interior-point method, which has its
+variables in an order of its own.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.kernels.compiled import kernel
+from optimizer_plc.qp.linear_algebra import Columns, add_product, add_transposed_product, by_columns
+from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem, Situation
+
+Array = NDArray[np.float64]
+
+
+@kernel
+def quadratic_cost(Phi: Array, phi: Array, z: Array) -> float:
+    """Return z' Phi z + z' phi."""
+    total = z.dtype.type(0.0)
+    for i in range(z.shape[0]):
+        row = phi[i]
+        for j in range(z.shape[0]):
+            row += Phi[i, j] * z[j]
+        total += row * z[i]
+    return total
+
+
+@kernel
+def augmented_cost(qp: QuadraticProblem, z: Array, alpha: float) -> float:
+    """Return J(z) = J_0(z) + alpha sum max(Gamma z - gamma, 0)^2, without the constant, for z inside its box."""
+    return quadratic_cost(qp.Phi, qp.phi, z) + alpha * positive_squares(row_excess(qp, z))
+
+
+@kernel
+def row_excess(qp: QuadraticProblem, z: Array) -> Array:
+    """Return Gamma z - gamma, shape (m,)."""
+    excess = -qp.gamma
+    for r in range(excess.shape[0]):
+        for j in range(z.shape[0]):
+            excess[r] += qp.Gamma[r, j] * z[j]
+    return excess
+
+
+@kernel
+def positive_squares(excess: Array) -> float:
+    """Return sum max(excess, 0)^2 over `excess` (m,)."""
+    zero = excess.dtype.type(0.0)
+    total = zero
+    for r in range(excess.shape[0]):
+        if excess[r] > zero:
+            total += excess[r] * excess[r]
+    return total
+
+
+class Matrices(NamedTuple):
+    """The constant matrices of a problem, stored for products without the zeros at the ends of columns and rows."""
+
+    Phi: Columns
+    """Shape (n, n)."""
+    Gamma: Columns
+    """Shape (m, n)."""
+    rows: Columns
+    """Gamma transposed: the rows of Gamma as columns."""
+
+
+def matrices_of(qp: QuadraticProblem) -> Matrices:
+    """Return the matrices of a problem."""
+    return Matrices(by_columns(qp.Phi), by_columns(qp.Gamma), by_columns(np.ascontiguousarray(qp.Gamma.T)))
+
+
+@kernel
+def cost_with_excess(constant: Matrices, qp: QuadraticProblem, z: Array, excess: Array, alpha: float) -> float:
+    """Return what `augmented_cost` does, to the bit, for a problem with these matrices, from `excess_by_columns`."""
+    slope = qp.phi.copy()
+    add_product(constant.Phi, z, slope)
+    total = z.dtype.type(0.0)
+    for i in range(z.shape[0]):
+        total += slope[i] * z[i]
+    return total + alpha * positive_squares(excess)
+
+
+@kernel
+def excess_by_columns(constant: Matrices, qp: QuadraticProblem, z: Array) -> Array:
+    """Return what `row_excess` does, to the bit, for a problem with these matrices."""
+    excess = -qp.gamma
+    add_product(constant.Gamma, z, excess)
+    return excess
+
+
+@kernel
+def gradient(
+    constant: Matrices, qp: QuadraticProblem, z: Array, alpha: float, result: Array, active: Array
+) -> None:  # fmt: skip
+    """Write dJ/dz into `result` (n,) and which rows push into `active` (m,) as 1.0 or 0.0."""
+    gradient_with_excess(constant, qp, z, excess_by_columns(constant, qp, z), alpha, result, active)
+
+
+@kernel
+def gradient_with_excess(
+    constant: Matrices, qp: QuadraticProblem, z: Array, excess: Array, alpha: float, result: Array, active: Array
+) -> None:  # fmt: skip
+    """Write the same where Gamma z - gamma (m,) is known."""
+    n = z.shape[0]
+    zero, one, two = z.dtype.type(0.0), z.dtype.type(1.0), z.dtype.type(2.0)
+    for i in range(n):
+        result[i] = zero
+    add_product(constant.Phi, z, result)
+    for i in range(n):
+        result[i] = two * result[i] + qp.phi[i]
+    rows = constant.rows
+    for r in range(excess.shape[0]):
+        active[r] = zero
+        if excess[r] > zero:
+            active[r] = one
+            factor = two * alpha * excess[r]
+            for j in range(rows.first[r], rows.end[r]):
+                result[j] += factor * rows.transposed[r, j]
+
+
+class Indicators(NamedTuple):
+    """Predicted costs and violation of a profile."""
+
+    j_dev: float
+    """Deviation cost over the horizon."""
+    j_cst: float
+    """Violation cost over the horizon, from the predicted outputs and never from the slacks, which may lie."""
+    violation: float
+    """Largest violated row, max(Gamma p - gamma, 0), in the units of the row (%, K, or input units)."""
+
+
+class OutputMaps(NamedTuple):
+    """How the constrained outputs over the horizon of N samples follow from a profile and a situation."""
+
+    resting: Array
+    """L1 and T5 in turn at the operating point, shape (2 N,)."""
+    of_z: Array
+    """Shape (n, 2 N)."""
+    of_x: Array
+    """Shape (n_x, 2 N)."""
+    of_w: Array
+    """Shape (2 N,)."""
+    bands: Array
+    """Low, high and weight of L1 and T5, shape (3, 2)."""
+    row_gains: Array
+    """What the rows of Gamma were multiplied by, shape (m,)."""
+
+
+def output_maps(problem: PredictiveProblem) -> OutputMaps:
+    """Return the maps of a problem."""
+    return OutputMaps(
+        problem.resting_outputs, problem.stacked_outputs_z, problem.stacked_outputs_x, problem.stacked_outputs_w,
+        problem.bands, problem.row_gains,
+    )  # fmt: skip
+
+
+def indicators(problem: PredictiveProblem, qp: QuadraticProblem, z: Array, situation: Situation) -> Indicators:
+    """Return the indicators of profile z in a situation (paper, section V); `qp` is the problem's instance there."""
+    maps, real = output_maps(problem), z.dtype.type
+    return Indicators(*map(float, predicted_indicators(maps, qp, z, situation.x, real(situation.w), problem.n_inputs)))
+
+
+@kernel
+def predicted_indicators(
+    maps: OutputMaps, qp: QuadraticProblem, z: Array, x: Array, w: float, n_inputs: int
+) -> Indicators:
+    """Return the indicators of profile z (n,) at the state x (n_x,) under the load w (W), both as deviations."""
+    outputs = maps.resting.copy()
+    add_transposed_product(maps.of_z, z, outputs)
+    add_transposed_product(maps.of_x, x, outputs)
+    j_cst = violation_cost(outputs, maps.of_w, w, maps.bands)
+    j_dev = deviation_cost(qp, z, n_inputs) + qp.constant
+    return Indicators(j_dev, j_cst, largest_violation(qp, z, maps.row_gains))
+
+
+@kernel
+def deviation_cost(qp: QuadraticProblem, z: Array, n_inputs: int) -> float:
+    """Return J_0 of the inputs alone, without slacks and without the constant."""
+    slackless = z.copy()
+    slackless[n_inputs:] = z.dtype.type(0.0)
+    return quadratic_cost(qp.Phi, qp.phi, slackless)
+
+
+@kernel
+def violation_cost(outputs: Array, through_w: Array, w: float, bands: Array) -> float:
+    """Return the weighted squares of what outputs + through_w w miss their bands by.
+
+    Outputs (2 N) are L1 and T5 in turn; bands (3, 2) are low, high and weight.
+    """
+    zero = outputs.dtype.type(0.0)
+    total = zero
+    for i in range(outputs.shape[0]):
+        y = outputs[i] + through_w[i] * w
+        miss = max(y - bands[1, i % 2], zero) + max(bands[0, i % 2] - y, zero)
+        total += bands[2, i % 2] * miss * miss
+    return total
+
+
+@kernel
+def largest_violation(qp: QuadraticProblem, z: Array, gains: Array) -> float:
+    """Return max(Gamma z - gamma, 0) over the rows, each divided by its gain."""
+    largest = z.dtype.type(0.0)
+    excess = row_excess(qp, z)
+    for r in range(excess.shape[0]):
+        largest = max(largest, excess[r] / gains[r])
+    return largest

@@ -1,0 +1,74 @@
+"""What broken constraints cost in the augmented cost J, and presets of it; it imports nothing that takes time.
+
+J = J_0 + alpha sum max(Gamma z - gamma, 0)^2 + box alpha sum max(z - high, low - z, 0)^2 is the paper's eq. augmentedJ
+with mu = 2. `docs/penalties.md` says what each of these settings does to costs and figures.
+"""
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Annotated, Any, Final
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+
+from optimizer_plc.qp.design import ControlDesign
+
+Triple = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+
+
+class PenaltySettings(BaseModel):
+    """Weights of the penalties, relative to one another and to the cost weights."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    output_rows: PositiveFloat = 30.0
+    """alpha over rho, the weight of a band violation. A violation v is shared between its slack and its row: the row
+    keeps v / (1 + output_rows), and J has output_rows / (1 + output_rows) rho v^2 for it."""
+    rate_rows: Triple = (16.0, 16.0, 16.0)
+    """Weight of the rate rows over alpha, per square of `design.input_scale`. With the squares of `input_scale` the
+    rows are in % and W, all with the same alpha, as the paper prints it."""
+    box: Annotated[float, Field(ge=0.0)] = 0.0
+    """Weight of the box over alpha, per square of a scaled variable. Iterates are projected into the box whatever this
+    is; it acts at the middle stage of a step of the ODE-based solver only."""
+    first_knot_in_box: bool = True
+    """Whether the first knot keeps the rate from the input before it as a bound of the box, too, and not as a row only.
+    Where it does not, its input is moved to within that rate before it is sent."""
+
+
+DEFAULT_PENALTIES: Final = PenaltySettings()
+
+
+def alpha_of(penalties: PenaltySettings, design: ControlDesign) -> float:
+    """Return alpha, which the output of the larger rho has; the rows of the other one are scaled to theirs."""
+    return penalties.output_rows * max(design.violation_weight)
+
+
+class Preset(StrEnum):
+    """Sets of settings by name; what is set explicitly in the same place comes before the preset's."""
+
+    TUNED = "tuned"
+    """The defaults: as good as this project knows how to make the truncated solver."""
+    AS_PRINTED = "as-printed"
+    """What the paper prints and no more. Of the numbers that it leaves open, alpha is rho, all rows have the same alpha
+    in their own units, and cost_scale is the one whose costs come down with the iterations as in the paper's figure."""
+
+
+PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
+    Preset.TUNED: {},
+    Preset.AS_PRINTED: {
+        "penalties": {"output_rows": 1.0, "rate_rows": (100.0, 2500.0, 100.0), "box": 1.0, "first_knot_in_box": False},
+        "ode": {"cost_scale": 1e-8, "look_ahead_rows": False, "hold_at_bounds": False},
+    },
+}
+"""Settings of each preset by section of `optimizer_plc.program`."""
+OF_PRESETS: Final = tuple(
+    f"{section}.{key}" for section, values in PRESETS[Preset.AS_PRINTED].items() for key in values
+)
+"""Keys of `optimizer_plc.program` that a preset decides."""
+OF_ALPHA: Final = ("penalties.output_rows", "design.violation_weight")
+"""Keys that decide alpha: see `alpha_of`."""
+
+
+def completed(section: BaseModel, values: Mapping[str, Any]) -> BaseModel:
+    """Return a section with the values for those of its keys that were not set explicitly."""
+    missing = {key: value for key, value in values.items() if key not in section.model_fields_set}
+    return section.model_copy(update=missing) if missing else section

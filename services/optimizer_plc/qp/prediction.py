@@ -1,0 +1,100 @@
+"""The discrete prediction model, at the sampling period and at every updating period.
+
+One matrix triple for a tick comes with the model file; those of longer periods are its powers, so no matrix
+exponential is needed on line.
+"""
+
+from copy import copy
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.process.lti_model import LtiModel
+from coldloop.process.signals import L1, STATE_NAMES, T5, TICKS_PER_SAMPLE
+from optimizer_plc.qp.arithmetic import DOUBLE, Real
+from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.qp.linear_algebra import multiply
+
+Array = NDArray[np.float64]
+
+
+class Transition(NamedTuple):
+    """x(t + period) = A x(t) + B u + F w, for constant u and w; deviations from the operating point."""
+
+    A: Array
+    B: Array
+    F: Array
+
+    def then(self, later: "Transition") -> "Transition":
+        """Return the transition over this period followed by `later`, under the same inputs."""
+        return Transition(
+            multiply(later.A, self.A),
+            multiply(later.A, self.B) + later.B,
+            multiply(later.A, self.F) + later.F,
+        )
+
+
+class PredictionModel:
+    """LTI model of the plant around its operating point.
+
+    `transitions[k]` spans k ticks, k = 1..ticks of a sampling period. Outputs are y = C x + D u + G w, of which
+    `constrained` are the rows of L1 and T5.
+    """
+
+    constrained = (L1, T5)
+
+    def __init__(self, model: LtiModel) -> None:
+        self.model = model
+        tick = Transition(*(np.array(M, order="C") for M in (model.A_tick, model.B_tick, model.F_tick[:, None])))
+        self.C, self.D, self.G = np.array(model.C), np.array(model.D), np.array(model.G[:, None])
+        self.x0, self.u0, self.y0 = model.x0, model.u0, model.y0
+        self.w0 = DOUBLE(model.w0)
+        self.real = DOUBLE
+        self.transitions = {1: tick}
+        for ticks in range(2, TICKS_PER_SAMPLE + 1):
+            self.transitions[ticks] = self.transitions[ticks - 1].then(tick)
+
+    def rounded(self, real: Real) -> "PredictionModel":
+        """Return this model in another floating-point type, rounded once."""
+        twin = copy(self)
+        twin.C, twin.D, twin.G, twin.x0, twin.u0, twin.y0 = (
+            M.astype(real, copy=False) for M in (self.C, self.D, self.G, self.x0, self.u0, self.y0)
+        )
+        twin.w0, twin.real = real(self.w0), real
+        twin.transitions = {
+            ticks: Transition(*(M.astype(real, copy=False) for M in step)) for ticks, step in self.transitions.items()
+        }
+        return twin
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.model.A.shape[0])
+
+    @cached_property
+    def sample(self) -> Transition:
+        """The transition over one sampling period of 5 s."""
+        return self.transitions[TICKS_PER_SAMPLE]
+
+    @property
+    def outputs(self) -> Transition:
+        """C, D and G, which give outputs as a transition gives states."""
+        return Transition(self.C, self.D, self.G)
+
+
+def state_weights(model: LtiModel, design: ControlDesign) -> Array:
+    """Return the diagonal of Q, shape (n,): pressure, level and the mean of the cold box's temperatures weigh alike.
+
+    States beyond those of the cold box weigh nothing.
+    """
+    n = len(STATE_NAMES)
+    scales = np.full(n, design.temperature_scale)
+    scales[0] = design.pressure_scale
+    scales[1] = design.level_scale / model.C[L1, 1]
+    shares = np.full(n, 1.0 / (n - 2))
+    shares[:2] = 1.0
+    weights = np.zeros(model.A.shape[0])
+    weights[:n] = design.state_weight * shares / scales**2
+    return weights

@@ -1,0 +1,174 @@
+"""The condensed quadratic problem: min z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high.
+
+z holds, knot by knot, the 3 inputs (deviations from the operating point over `input_scale`) and then, knot by knot,
+the 4 slacks of the output bands. phi and gamma are affine in the predicted state, the load and the input applied
+before the first knot; Phi and Gamma are constant. There is no factor 1/2 before Phi (`docs/science.md`, ruling 11).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.process.limits import InputLimits
+from coldloop.process.signals import TICKS_PER_SAMPLE
+from optimizer_plc.qp.arithmetic import DOUBLE, Real
+from optimizer_plc.qp.condensing import Condensed, condense, transposed
+from optimizer_plc.qp.constraints import OutputRows, RateRows, output_rows, rate_rows
+from optimizer_plc.qp.design import N_INPUTS, N_SLACKS, ControlDesign
+from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
+from optimizer_plc.qp.linear_algebra import add_transposed_product
+from optimizer_plc.qp.penalties import DEFAULT_PENALTIES, PenaltySettings
+from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.profile import inputs_of, interpolation, shift, shifted
+
+Array = NDArray[np.float64]
+
+SHIFTS = TICKS_PER_SAMPLE
+"""Longest shift, in ticks, that is tabulated: that of the longest updating period."""
+
+
+class QuadraticProblem(NamedTuple):
+    """One instance of the problem; shapes (n, n), (n,), (m, n), (m,), (n,), (n,). `constant` completes the cost."""
+
+    Phi: Array
+    phi: Array
+    Gamma: Array
+    gamma: Array
+    low: Array
+    high: Array
+    constant: float
+
+
+class Situation(NamedTuple):
+    """What an instance depends on, as deviations from the operating point."""
+
+    x: Array
+    w: float
+    u_before: Array
+    """Input applied just before the first knot takes effect."""
+    elapsed_ticks: int = TICKS_PER_SAMPLE
+    """Time since the update before; matters when the rate limit follows the elapsed time."""
+
+
+class PredictiveProblem:
+    """Builds instances of the QP for one design and one prediction model.
+
+    Penalties scale the rows: a problem that is solved exactly is the same whatever they are.
+
+    Sizes: n = 7 decision instants x 7 = 49 variables; m = 56 output rows and 38 rate rows with the paper's instants.
+    """
+
+    def __init__(
+        self,
+        prediction: PredictionModel,
+        design: ControlDesign,
+        limits: InputLimits,
+        real: Real = DOUBLE,
+        penalties: PenaltySettings = DEFAULT_PENALTIES,
+    ) -> None:
+        self.design = design
+        self.limits = limits
+        self.n_knots = len(design.decision_instants)
+        self.n_inputs = N_INPUTS * self.n_knots
+        self.size = (N_INPUTS + N_SLACKS) * self.n_knots
+        self._real = real
+        self._n_constrained = len(prediction.constrained)
+        weights = interpolation(design.decision_instants, np.arange(1.0, design.horizon + 1))
+        y0 = prediction.model.y0[list(prediction.constrained)]
+        condensed = condense(prediction, design, weights)
+        outputs, rates = output_rows(condensed, design, weights, y0), rate_rows(design, limits, penalties)
+        n_states = prediction.n_states
+        self.Phi = self._rounded(condensed.Phi)
+        self.Gamma = self._rounded(np.ascontiguousarray(np.vstack([outputs.Gamma, rates.Gamma])))
+        self.row_gains = self._rounded(np.concatenate([outputs.gains, rates.gains]))
+        scaled_rate = np.asarray(limits.rate) / np.asarray(design.input_scale)
+        first_rate = scaled_rate if penalties.first_knot_in_box else np.full(N_INPUTS, np.inf)
+        u0 = np.array(prediction.model.u0)
+        self.maps = Maps(*map(self._rounded, self._maps(condensed, outputs, rates, u0, first_rate)))
+        self.scaled_rate = self._rounded(scaled_rate)
+        self.knots_to_samples = self._rounded(weights)
+        self.shifts = self._rounded(
+            np.array([shift(design.decision_instants, ticks / TICKS_PER_SAMPLE) for ticks in range(SHIFTS + 1)])
+        )
+        self.bands = self._rounded(np.array([design.output_low, design.output_high, design.violation_weight]))
+        self.resting_outputs = self._rounded(np.tile(y0, design.horizon))
+        self.stacked_outputs_z = self._rounded(transposed(condensed.outputs_z.reshape(-1, self.size)))
+        stacked = condensed.outputs_s.reshape(-1, n_states + 1)
+        self.stacked_outputs_x = self._rounded(transposed(stacked[:, :n_states]))
+        self.stacked_outputs_w = self._rounded(np.array(stacked[:, n_states]))
+        self.input_scale = self._rounded(np.asarray(design.input_scale))
+        self.rate = self._rounded(np.asarray(limits.rate))
+        self._u0 = self._rounded(u0)
+
+    def _rounded(self, values: Array) -> Array:
+        """Return an array in the type of the on-line arithmetic."""
+        return values.astype(self._real, copy=False)
+
+    def _maps(
+        self, condensed: Condensed, outputs: OutputRows, rates: RateRows, u0: Array, first_rate: Array
+    ) -> Maps:  # fmt: skip
+        scale = np.asarray(self.design.input_scale)
+        low_u, high_u = (np.asarray(self.limits.low) - u0) / scale, (np.asarray(self.limits.high) - u0) / scale
+        slacks = N_SLACKS * self.n_knots
+        return Maps(
+            phi=condensed.phi_map,
+            constant=condensed.constant_map,
+            outputs=outputs.states,
+            output_bounds=outputs.bounds,
+            rate_bounds=rates.bounds,
+            rate_first=rates.first,
+            rate_before=rates.before,
+            low=np.concatenate([np.tile(low_u, self.n_knots), np.zeros(slacks)]),
+            high=np.concatenate([np.tile(high_u, self.n_knots), np.full(slacks, np.inf)]),
+            first_rate=first_rate,
+            input_scale=scale,
+        )
+
+    # -- instances ---------------------------------------------------------------------------------------------------
+
+    def at(self, situation: Situation) -> QuadraticProblem:
+        """Return the instance of the problem for a situation."""
+        share = self._real(self.limits.rate_share(situation.elapsed_ticks))
+        phi, gamma, low, high, constant = instance(self.maps, situation.x, situation.w, situation.u_before, share)
+        return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, self._real(constant))
+
+    def memory(self) -> int:
+        """Return the bytes of the constant arrays that an instance is made of: Phi, Gamma and the maps."""
+        return sum(M.nbytes for M in (self.Phi, self.Gamma, *self.maps))
+
+    # -- profiles ----------------------------------------------------------------------------------------------------
+
+    def shifted(self, z: Array, ticks: int) -> Array:
+        """Return the profile z shifted by `ticks` ticks."""
+        if ticks <= SHIFTS:
+            return shifted(self.shifts[ticks], z)
+        return shifted(self._rounded(shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE)), z)
+
+    def within_first_rate(self, z: Array, situation: Situation) -> Array:
+        """Return the profile z with its first knot within the rate of the input before it, as it can be sent."""
+        share = self._real(self.limits.rate_share(situation.elapsed_ticks))
+        result = z.copy()
+        keep_first_rate(self.maps, self.scaled_rate, situation.u_before, share, result)
+        return result
+
+    def inputs(self, z: Array, samples: int) -> Array:
+        """Return the inputs of the first `samples` sampling periods, shape (samples, 3), in physical units.
+
+        The rates between knots are rows of the problem, which a truncated solution may break; what is sent keeps them.
+        """
+        return inputs_of(self.knots_to_samples[:samples], z, self.input_scale, self._u0, self.rate)
+
+    def outputs(self, z: Array, situation: Situation) -> Array:
+        """Return L1 and T5 predicted for a profile at the end of each sampling period, shape (horizon, 2)."""
+        outputs = self.resting_outputs.copy()
+        add_transposed_product(self.stacked_outputs_z, z, outputs)
+        add_transposed_product(self.stacked_outputs_x, situation.x, outputs)
+        outputs += self.stacked_outputs_w * situation.w
+        return outputs.reshape(-1, self._n_constrained)
+
+    def hold(self, u: Array) -> Array:
+        """Return the profile that keeps the input deviation u, without slack."""
+        return np.concatenate(
+            [np.tile(u / self.input_scale, self.n_knots), np.zeros(N_SLACKS * self.n_knots, self._real)]
+        )

@@ -1,0 +1,69 @@
+"""The parametrised input profile U_pwc(p): piecewise affine between the decision instants, constant before the first.
+
+Instants count sampling periods: u_j holds during the j-th one, from (j - 1) to j periods ahead.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.kernels.compiled import kernel
+from optimizer_plc.qp.design import N_INPUTS, N_SLACKS
+
+Array = NDArray[np.float64]
+
+
+def interpolation(knots: tuple[int, ...], at: Array) -> Array:
+    """Return the matrix (len(at), len(knots)) whose product with the knots' values is the profile at `at`."""
+    positions = np.asarray(knots, dtype=float)
+    clamped = np.clip(np.asarray(at, dtype=float), positions[0], positions[-1])
+    weights = np.zeros((len(clamped), len(positions)))
+    for row, position in enumerate(clamped):
+        right = min(int(np.searchsorted(positions, position, side="right")), len(positions) - 1)
+        left = max(right - 1, 0)
+        span = positions[right] - positions[left]
+        share = (position - positions[left]) / span if span > 0 else 0.0
+        weights[row, left] += 1.0 - share
+        weights[row, right] += share
+    return weights
+
+
+def shift(knots: tuple[int, ...], periods: float) -> Array:
+    """Return the matrix that shifts a profile by `periods` sampling periods: the standard hot start.
+
+    The value behind the horizon is the last knot's.
+    """
+    return interpolation(knots, np.asarray(knots, dtype=float) + periods)
+
+
+@kernel
+def shifted(S: Array, z: Array) -> Array:
+    """Return the profile z (n,) whose values at the knots are combined by S (knots, knots), inputs and slacks alike."""
+    result = np.zeros_like(z)
+    knots, start = S.shape[0], 0
+    for width in (N_INPUTS, N_SLACKS):
+        for old in range(knots):
+            for new in range(knots):
+                if S[new, old] != z.dtype.type(0.0):
+                    for i in range(width):
+                        result[start + width * new + i] += S[new, old] * z[start + width * old + i]
+        start += width * knots
+    return result
+
+
+@kernel
+def inputs_of(weights: Array, z: Array, scale: Array, u0: Array, rate: Array) -> Array:
+    """Return the inputs (samples, 3) of a profile z (n,), for the knots' weights (samples, knots) in each sample.
+
+    They are in physical units, `u0` + `scale` z, and from one sample to the next within `rate`.
+    """
+    samples, m = weights.shape[0], scale.shape[0]
+    u = np.empty((samples, m), z.dtype)
+    for sample in range(samples):
+        for i in range(m):
+            value = z.dtype.type(0.0)
+            for knot in range(weights.shape[1]):
+                value += weights[sample, knot] * z[m * knot + i]
+            u[sample, i] = value * scale[i] + u0[i]
+            if sample:
+                u[sample, i] = min(max(u[sample, i], u[sample - 1, i] - rate[i]), u[sample - 1, i] + rate[i])
+    return u

@@ -1,0 +1,1 @@
+"""The cold box: its physics, operating point and linear model."""

@@ -1,0 +1,79 @@
+"""The operating point: the state at rest for given inputs and level, and the load that goes with it."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from plant.cold_box.linearisation import state_and_load_jacobian, state_scales
+from plant.cold_box.physics import ColdBox, derivative, outputs
+from plant.helium.properties import Helium
+from plant.integrator import advance
+from plant.numeric import RealArray
+
+RELAXATION_S = 3000.0
+RELAXATION_STEP_S = 0.5
+LEVEL_GAIN = 100.0  # W of load per % of level, while relaxing
+TOLERANCE = 1e-10  # scaled units per second
+MAX_NEWTON_STEPS = 30
+
+
+class Equilibrium(NamedTuple):
+    """A state at rest."""
+
+    x: RealArray
+    """Shape (28,)."""
+    u: RealArray
+    """Shape (3,)."""
+    w: float
+    """W."""
+    y: RealArray
+    """Shape (22,)."""
+    residual: float
+    """Largest |dx/dt|, in units of 2 kPa, 1 % of level and 1 K, per second."""
+
+
+class NoEquilibriumError(ValueError):
+    """The cold box does not come to rest under these inputs."""
+
+
+def find_equilibrium(u: RealArray, level: float, box: ColdBox, helium: Helium) -> Equilibrium:
+    """Return the state at which the cold box rests under `u` with the bath at `level` (%).
+
+    The load is the unknown that replaces the liquid volume. The plant first relaxes in simulated time, with the load
+    holding the level; Newton's method does the rest.
+
+    Raises:
+        NoEquilibriumError: Newton's method does not converge, for instance beyond the capacity maximum.
+    """
+    x, w = _relaxed(u, level, box, helium)
+    scales = state_scales(box)
+    for _ in range(MAX_NEWTON_STEPS):
+        dx = derivative(x, u, w, box, helium)
+        residual = float(np.max(np.abs(dx / scales)))
+        if residual < TOLERANCE:
+            return Equilibrium(x, u, w, outputs(x, u, w, box, helium), residual)
+        by_state, by_load = state_and_load_jacobian(x, u, w, box, helium)
+        by_state[:, 1] = by_load  # the level is given, the load is not
+        try:
+            step = np.linalg.solve(by_state, -dx)
+        except np.linalg.LinAlgError:
+            break
+        w += float(step[1])
+        step[1] = 0.0
+        x = x + step
+    raise NoEquilibriumError(f"no equilibrium at u = {u.tolist()}: the residual stays at {residual:.2g} per second")
+
+
+def _relaxed(u: RealArray, level: float, box: ColdBox, helium: Helium) -> tuple[RealArray, float]:
+    """Return a state near the equilibrium, and its load."""
+    volume = level / 100.0 * box.separator.volume
+    nef1 = np.linspace(9.5, 4.5, box.nef1.cells)
+    nef2 = np.linspace(18.0, 10.0, box.nef2.cells)
+    nef34 = np.linspace(box.T_in - 5.0, 19.0, box.nef34.cells)
+    x = np.concatenate([[box.P_LP + 0.18e5, volume], nef1, nef2, nef34])
+    w = 0.0
+    for _ in range(round(RELAXATION_S / RELAXATION_STEP_S)):
+        w = LEVEL_GAIN * 100.0 * (x[1] - volume) / box.separator.volume + 400.0
+        x = advance(x, u, w, RELAXATION_STEP_S, box, helium)
+    x[1] = volume
+    return x, float(w)

@@ -1,0 +1,74 @@
+"""The model file's maker: `python -m plant.model FILE` writes the linear model of the reference cold box."""
+
+import hashlib
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coldloop.process import signals as process
+from coldloop.process.lti_model import LtiModel, discretise
+from plant.cold_box import physics as cold_box
+from plant.cold_box.equilibrium import find_equilibrium
+from plant.cold_box.linearisation import linearise
+from plant.cold_box.physics import REFERENCE, ColdBox
+from plant.helium.properties import Helium, load_helium
+
+OPERATING_INPUTS = (43.0, 75.0, 36.0)  # CV155 %, NCR22_A W, CV156 %; left of the capacity maximum at CV155 = 50 %
+OPERATING_LEVEL = 60.0  # %
+
+
+def build_model(box: ColdBox = REFERENCE) -> LtiModel:
+    """Return the linear model of `box` at the operating point.
+
+    Raises:
+        plant.cold_box.equilibrium.NoEquilibriumError: the box does not come to rest at the operating inputs.
+    """
+    helium = load_helium()
+    rest = find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, box, helium)
+    linear = linearise(rest.x, rest.u, rest.w, box, helium)
+    tick = discretise(linear.A, linear.B, linear.F, process.TICK_S)
+    return LtiModel(
+        **linear._asdict(),
+        A_tick=tick.A,
+        B_tick=tick.B,
+        F_tick=tick.F,
+        x0=rest.x,
+        u0=rest.u,
+        w0=rest.w,
+        y0=rest.y,
+        state_names=process.STATE_NAMES,
+        state_units=process.STATE_UNITS,
+        input_names=process.INPUT_NAMES,
+        input_units=process.INPUT_UNITS,
+        output_names=process.OUTPUT_NAMES,
+        output_units=process.OUTPUT_UNITS,
+        load_name=cold_box.LOAD_NAME,
+        load_unit=cold_box.LOAD_UNIT,
+        parameters_digest=parameters_digest(box, helium),
+    )
+
+
+def parameters_digest(box: ColdBox, helium: Helium) -> str:
+    """Return the SHA-256 over every parameter and every table entry that the cold box reads, in hexadecimal."""
+    digest = hashlib.sha256()
+    _add(digest, (box, helium))
+    return digest.hexdigest()
+
+
+def _add(digest: Any, part: Any) -> None:  # noqa: ANN401 - hashlib's object and a nested tuple have no public type
+    if isinstance(part, tuple):
+        for name, value in zip(getattr(part, "_fields", ("",) * len(part)), part, strict=True):
+            if name == "departure":
+                continue  # from 16 bar, where a cold box alone always is
+            digest.update(f"{name}:".encode())
+            _add(digest, value)
+    elif isinstance(part, np.ndarray):
+        digest.update(part.astype("<f8").tobytes())
+    else:
+        digest.update(f"{part!r};".encode())
+
+
+if __name__ == "__main__":
+    build_model().save(Path(sys.argv[1]))

@@ -1,0 +1,184 @@
+"""The cold box: how the components are piped together, its states, inputs and outputs.
+
+High-pressure helium at 80 K is cooled in NEF34; part of it drives the turbine, the rest goes on through NEF2 and NEF1
+to the Joule-Thomson valve and the bath. The vapour returns through NEF1, meets the turbine's exhaust, and leaves
+through NEF2 and NEF34. To make another refrigerator, write such a module: choose components, order the states, call the
+components in the order in which the streams need each other.
+
+All functions are kernels and take x (28 states, `STATE_NAMES`), u (3 inputs, `INPUT_NAMES`), w (heat load NCR22_HL, W),
+real or complex.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coldloop.kernels.compiled import kernel
+from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow, exchange
+from plant.components.phase_separator import PhaseSeparator, level, separate
+from plant.components.return_line import ReturnLine, return_flow
+from plant.components.turbine import Expansion, Turbine, expand, turbine_flow
+from plant.components.valve import Valve, valve_mass_flow
+from plant.helium.properties import Helium, saturation, supply_enthalpy_and_density, vapour_temperature
+from plant.numeric import Array, at_least
+
+LOAD_NAME, LOAD_UNIT = "NCR22_HL", "W"
+CELLS = (8, 6, 12)  # of NEF1, NEF2, NEF34; the states are named in coldloop.process.signals
+PA_PER_BAR = 1e5
+
+
+class ColdBox(NamedTuple):
+    """Components and boundaries of the cold box; the defaults are the reference plant."""
+
+    separator: PhaseSeparator = PhaseSeparator(volume=0.20)
+    """The bath, NS1."""
+    jt_valve: Valve = Valve(flow_area=3.9e-6)
+    """CV155."""
+    turbine: Turbine = Turbine(Valve(flow_area=2.6e-5), nozzle=2.2e-7, efficiency=0.70, speed_coefficient=10.0)
+    """The turbine with CV156."""
+    nef1: HeatExchanger = HeatExchanger(UA=1400.0, volume=6e-3, aluminium=15.0, cells=CELLS[0])
+    """The coldest exchanger, between the bath and the mixing point."""
+    nef2: HeatExchanger = HeatExchanger(UA=2500.0, volume=6e-3, aluminium=15.0, cells=CELLS[1])
+    """The exchanger between the mixing point and the turbine's inlet."""
+    nef34: HeatExchanger = HeatExchanger(UA=11000.0, volume=30e-3, aluminium=80.0, cells=CELLS[2])
+    """The exchanger from the turbine's inlet up to the nitrogen pre-cooler."""
+    return_line: ReturnLine = ReturnLine(cold_resistance=0.05e5 / 0.028**2, warm_resistance=0.06e5 / 0.073**2)
+    """The low-pressure side."""
+    P_HP: float = 16e5
+    """Supply pressure, Pa, 5e5 to 19e5; the reference is that of the isobar's table."""
+    P_LP: float = 1.05e5
+    """Suction pressure of the compressor, Pa."""
+    T_in: float = 80.0
+    """Temperature after the nitrogen pre-cooler, K."""
+
+
+REFERENCE = ColdBox()
+
+
+@kernel
+def cold_box_of(fields: Any) -> ColdBox:  # noqa: ANN401 - any nesting of tuples
+    """Rebuild the parameters from nested plain tuples, see `plant.integrator.advance_and_read`."""
+    return ColdBox(
+        PhaseSeparator(*fields[0]),
+        Valve(*fields[1]),
+        Turbine(Valve(*fields[2][0]), fields[2][1], fields[2][2], fields[2][3]),
+        HeatExchanger(*fields[3]),
+        HeatExchanger(*fields[4]),
+        HeatExchanger(*fields[5]),
+        ReturnLine(*fields[6]),
+        fields[7],
+        fields[8],
+        fields[9],
+    )
+
+
+class Streams(NamedTuple):
+    """Flows and pressures that follow from the state at once, before the exchangers are marched."""
+
+    m_jt: float
+    """Through the Joule-Thomson valve, kg/s."""
+    h_jt: float
+    """Enthalpy into the bath, J/kg."""
+    m_v: float
+    """Vapour from the bath, kg/s."""
+    m_t: float
+    """Through the turbine, kg/s."""
+    P_turbine: float
+    """Between CV156 and the nozzle, Pa."""
+    P_mix: float
+    """Where the turbine's exhaust joins the return, Pa."""
+    exhaust: Expansion
+    """What leaves the turbine."""
+
+
+@kernel
+def streams(x: Array, u: Array, box: ColdBox, helium: Helium) -> Streams:
+    """Return the flows at the state `x` under the inputs `u`."""
+    h_jt, rho_jt = supply_enthalpy_and_density(box.P_HP, x[1 + box.nef1.cells], helium)
+    m_jt = valve_mass_flow(box.jt_valve, u[0], rho_jt, box.P_HP, x[0])
+    T_turbine = x[1 + box.nef1.cells + box.nef2.cells + box.nef34.cells]
+    h_turbine, rho_turbine = supply_enthalpy_and_density(box.P_HP, T_turbine, helium)
+    m_t, P_turbine = turbine_flow(box.turbine, u[2], box.P_HP, T_turbine, rho_turbine)
+    m_v, P_mix = return_flow(box.return_line, x[0], box.P_LP, m_t)
+    exhaust = expand(box.turbine, h_turbine, P_turbine, P_mix, helium)
+    return Streams(m_jt, h_jt, m_v, m_t, P_turbine, P_mix, exhaust)
+
+
+@kernel
+def mix(vapour: LowPressureFlow, s: Streams, helium: Helium) -> LowPressureFlow:
+    """Return the low-pressure flow after the turbine's exhaust has joined the vapour from NEF1."""
+    flow = s.m_v + s.m_t
+    h = (s.m_v * vapour.h + s.m_t * s.exhaust.h_out) / at_least(flow, 1e-12)
+    return LowPressureFlow(flow, s.P_mix, vapour_temperature(s.P_mix, h, saturation(s.P_mix, helium), helium), h)
+
+
+@kernel
+def evaluate(
+    x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Array, y: Array
+) -> tuple[Streams, LowPressureFlow]:
+    """Write the rates of the states into `dx` (28, per second) and the outputs into `y` (22, `OUTPUT_UNITS`).
+
+    Returns the flows, and what leaves at the warm end of the low-pressure side.
+    """
+    s = streams(x, u, box, helium)
+    first2 = 2 + box.nef1.cells
+    first34 = first2 + box.nef2.cells
+    sat = saturation(x[0], helium)
+    heat = at_least(u[1], 0.0) + w
+    dx[0], dx[1] = separate(box.separator, x[0], x[1], s.m_jt, s.h_jt, s.m_v, heat, helium)
+
+    vapour = LowPressureFlow(s.m_v, x[0], sat.T, sat.h_v)
+    into_nef1 = HighPressureFlow(s.m_jt, x[first34 - 1], box.P_HP)
+    cold = exchange(box.nef1, x[2:first2], into_nef1, vapour, helium, dx[2:first2])
+    mixed = mix(cold, s, helium)
+    into_nef2 = HighPressureFlow(s.m_jt, x[first34 + box.nef34.cells - 1], box.P_HP)
+    middle = exchange(box.nef2, x[first2:first34], into_nef2, mixed, helium, dx[first2:first34])
+    into_nef34 = HighPressureFlow(s.m_jt + s.m_t, box.T_in, box.P_HP)
+    warm = exchange(box.nef34, x[first34:], into_nef34, middle, helium, dx[first34:])
+
+    exhaust_saturation = saturation(s.P_mix, helium)
+    y[0] = level(box.separator, x[1])
+    y[1] = s.exhaust.speed
+    y[2] = sat.T
+    y[3] = x[first2 - 1]
+    y[4] = cold.T
+    y[5] = into_nef1.T
+    y[6] = vapour_temperature(s.P_mix, s.exhaust.h_out, exhaust_saturation, helium)
+    y[7] = into_nef2.T
+    y[8] = mixed.T
+    y[9] = middle.T
+    y[10] = box.T_in
+    y[11] = warm.T
+    _write_pressures(x[0], s, box, y[12:])
+    return s, warm
+
+
+@kernel
+def _write_pressures(P_bath: float, s: Streams, box: ColdBox, y: Array) -> None:
+    """Write P1 to P10, in bar."""
+    y[0] = P_bath / PA_PER_BAR
+    y[1] = box.P_HP / PA_PER_BAR
+    y[2] = s.P_mix / PA_PER_BAR
+    y[3] = box.P_HP / PA_PER_BAR
+    y[4] = s.P_mix / PA_PER_BAR
+    y[5] = s.P_turbine / PA_PER_BAR
+    y[6] = s.P_mix / PA_PER_BAR
+    y[7] = s.P_mix / PA_PER_BAR
+    y[8] = box.P_HP / PA_PER_BAR
+    y[9] = box.P_LP / PA_PER_BAR
+
+
+@kernel
+def derivative(x: Array, u: Array, w: float, box: ColdBox, helium: Helium) -> Array:
+    """Return dx/dt, shape (28,), in `STATE_UNITS` per second."""
+    dx = np.empty_like(x)
+    evaluate(x, u, w, box, helium, dx, np.empty(22, dtype=x.dtype))
+    return dx
+
+
+@kernel
+def outputs(x: Array, u: Array, w: float, box: ColdBox, helium: Helium) -> Array:
+    """Return y, shape (22,), in `OUTPUT_UNITS`."""
+    y = np.empty(22, dtype=x.dtype)
+    evaluate(x, u, w, box, helium, np.empty_like(x), y)
+    return y

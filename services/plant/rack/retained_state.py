@@ -1,0 +1,89 @@
+"""What the rack keeps over a restart: the simulation, what it applies, and the count of its journal."""
+
+import logging
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from coldloop.process.signals import LAST_TICK
+from coldloop.registers.codec import check_record
+from coldloop.registers.common import SessionPace
+from coldloop.registers.plant import MAX_LOAD_W
+from coldloop.safety.retained import RetainedFile, RetainedStateError
+from coldloop.session.pace import Pace
+
+log = logging.getLogger("coldloop.plant")
+
+OWNER = "plant/3"
+"""Who retained states belong to, and the version of what they hold."""
+
+Count = Annotated[int, Field(ge=0, lt=2**32)]
+
+
+class RetainedState(BaseModel):
+    """The state of a rack between two ticks."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    boot: Count
+    events: Annotated[int, Field(ge=0, lt=2**31)]
+    generation: Annotated[int, Field(ge=1, lt=2**32)]
+    holder: Count
+    session: Count
+    """0: there has been none, and what follows is the rack as it is configured."""
+    pace: Pace
+    watchdog: Annotated[int, Field(ge=0, lt=2**16)]
+    """Its time-out, in ticks."""
+    times: tuple[Annotated[int, Field(ge=0, le=LAST_TICK)], ...]
+    """Ticks of the load's steps."""
+    watts: tuple[Annotated[float, Field(ge=0, le=MAX_LOAD_W)], ...]
+    seed: Count
+    program: dict[str, Any]
+    """What `PlantProgram.resume` takes."""
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        check_record(SessionPace.shown(self.session, self.pace))
+        tick = self.program.get("tick", 0)
+        if not isinstance(tick, int) or not 0 <= tick <= LAST_TICK:
+            raise ValueError(f"no session has a tick {tick!r}")
+        return self
+
+
+class Memory:
+    """Keeps the state in a file, if one is configured; what cannot be trusted or written is logged."""
+
+    def __init__(self, file: Path | None, model_digest: int) -> None:
+        self._file = RetainedFile(file, OWNER, model_digest) if file else None
+        self.active = file is not None
+        self.refused = False
+        """There was a state before, and it is not used."""
+
+    def recall(self) -> RetainedState | None:
+        """Return the state of before, if there is one."""
+        if self._file is None:
+            return None
+        try:
+            content = self._file.load()
+            return None if content is None else RetainedState.model_validate(content)
+        except RetainedStateError as error:
+            self.refuse(str(error))
+        except ValidationError as error:
+            self.refuse(error.errors()[0]["msg"])
+        return None
+
+    def refuse(self, reason: str) -> None:
+        """Do without the state of before: the file is set aside, and the log says why."""
+        self.refused = True
+        if self._file is not None:
+            log.warning("retained state refused", extra={"reason": reason, "file": self._file.set_aside()})
+
+    def keep(self, state: RetainedState) -> None:
+        """Keep the state of now: it is the memory of a simulation, so every tick counts and no disk is waited for."""
+        if self._file is None:
+            return
+        try:
+            self._file.save(state.model_dump(), synced=False)
+        except RetainedStateError as error:
+            log.error("the state is not retained", extra={"reason": str(error)})  # noqa: TRY400 one line

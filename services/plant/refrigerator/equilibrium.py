@@ -1,0 +1,113 @@
+"""The refrigerator's operating point: the state at rest at given pressures, levels and inputs.
+
+Unknown beside the states are the load, the opening of the bypass and that of the nitrogen feed; in their place the
+levels, the two pressures and the buffer's content are given. The mass of the whole circuit is constant, so one
+equation follows from the others, and the steps of Newton's method are those of least squares.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError
+from plant.components.gas_volume import gas_mass
+from plant.components.nitrogen_bath import LIQUID_DENSITY
+from plant.helium.properties import Helium
+from plant.numeric import RealArray
+from plant.refrigerator.linearisation import jacobian, rate_scales
+from plant.refrigerator.physics import (
+    COMMAND_NAMES,
+    DISTURBANCE_NAMES,
+    STATE_NAMES,
+    Refrigerator,
+    advance_refrigerator,
+    rates,
+    read,
+)
+
+P_HP, P_LP, P_BUFFER = 16e5, 1.05e5, 6e5
+AMBIENT: Final = 300.0
+NITROGEN_LEVEL: Final = 60.0
+TOLERANCE: Final = 1e-10
+MAX_STEPS: Final = 60
+LONGEST_STEP_K: Final = 10.0
+RELAXATION_S, RELAXATION_STEP_S = 5000.0, 0.25
+
+V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2 = (
+    STATE_NAMES.index(name) for name in ("V_l", "M_HP", "M_LP", "M_buffer", "M_lost", "M_N2")
+)
+CV956, CV167 = STATE_NAMES.index("CV956"), STATE_NAMES.index("CV167")
+AS_ASKED: Final = tuple(STATE_NAMES.index(name) for name in ("NC1", "NC2", "CV952", "CV953"))
+"""Compressors run, and both valves of the buffer are shut, to the bit."""
+GIVEN: Final = (V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2, *AS_ASKED)
+
+
+class Rest(NamedTuple):
+    """The refrigerator at rest."""
+
+    x: RealArray
+    """Shape (48,)."""
+    u: RealArray
+    """Shape (3,)."""
+    v: RealArray
+    """Shape (4,)."""
+    d: RealArray
+    """Shape (6,)."""
+    y: RealArray
+    """Shape (22,)."""
+    signals: RealArray
+    """Shape (19,)."""
+    residual: float
+    """Largest |dx/dt| in units of `rate_scales`, per second."""
+
+
+def find_refrigerator_equilibrium(cold: Equilibrium, plant: Refrigerator, helium: Helium) -> Rest:
+    """Return the rest of `plant` at the cold box's inputs and level, near the rest `cold` of the cold box alone.
+
+    Raises:
+        NoEquilibriumError: Newton's method does not converge.
+    """
+    start = _start(cold, plant)
+    d = np.array([cold.w, AMBIENT, 0.0, 1.0, 1.0, 1.0])
+    v = np.array([start[CV956], 0.0, 0.0, start[CV167]])
+    x = _relaxed(start, cold.u, v, d, plant, helium)
+    free = [i for i in range(len(STATE_NAMES)) if i not in GIVEN]
+    scales = rate_scales(plant)
+    for _ in range(MAX_STEPS):
+        dx = rates(x, cold.u, v, d, plant, helium) / scales
+        residual = float(np.max(np.abs(dx)))
+        if residual < TOLERANCE:
+            return Rest(x, cold.u, v, d, *read(x, cold.u, v, d, plant, helium), residual)
+        J = jacobian(x, cold.u, v, d, plant, helium)[: len(STATE_NAMES)] / scales[:, np.newaxis]
+        load = len(STATE_NAMES) + 3 + len(COMMAND_NAMES) + DISTURBANCE_NAMES.index("NCR22_HL")
+        bypass, feed = len(STATE_NAMES) + 3, len(STATE_NAMES) + 6
+        step = np.linalg.lstsq(J[:, [*free, load, bypass, feed]], -dx, rcond=1e-13)[0]
+        temperatures = [k for k, i in enumerate(free) if STATE_NAMES[i].startswith("T_")]
+        step *= min(1.0, LONGEST_STEP_K / float(np.max(np.abs(step[temperatures]))))
+        x, v, d = x.copy(), v.copy(), d.copy()
+        x[free] += step[:-3]
+        d[0] += step[-3]
+        v[0], v[3] = v[0] + step[-2], v[3] + step[-1]
+    raise NoEquilibriumError(f"the refrigerator has no equilibrium: the residual stays at {residual:.2g} per second")
+
+
+def _relaxed(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refrigerator, helium: Helium) -> RealArray:
+    """Return the state after a time in which what is given is held."""
+    given = x[list(GIVEN)]
+    for _ in range(round(RELAXATION_S / RELAXATION_STEP_S)):
+        x = advance_refrigerator(x, u, v, d, RELAXATION_STEP_S, plant, helium)
+        x[list(GIVEN)] = given
+    return x
+
+
+def _start(cold: Equilibrium, plant: Refrigerator) -> RealArray:
+    station, precooler = plant.station, plant.precooler
+    hot = AMBIENT + station.cooler_approach
+    nitrogen = NITROGEN_LEVEL / 100.0 * precooler.nef5.volume * LIQUID_DENSITY
+    masses = [
+        gas_mass(station.hp, P_HP, hot),
+        gas_mass(station.lp, P_LP, AMBIENT),
+        gas_mass(station.buffer, P_BUFFER, AMBIENT),
+    ]
+    exchanger = np.linspace(hot - 25.0, 84.0, precooler.nef6.cells)
+    return np.concatenate([cold.x, exchanger, [80.0, nitrogen, 30.0], masses, [0.0, 1.0, 1.0, 25.0, 0.0, 0.0]])

@@ -1,0 +1,71 @@
+"""The maker of the refrigerator's file: `python -m plant.refrigerator.model FILE`.
+
+With `--config` or `--set plant.station.weights.lp_bar=0.02` its gains are of these weights.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from coldloop.config import load_configuration
+from coldloop.service.command_line import add_configuration_options
+from coldloop.service.start import SECTIONS
+from plant.cold_box.equilibrium import find_equilibrium
+from plant.cold_box.model import OPERATING_INPUTS, OPERATING_LEVEL
+from plant.helium.properties import load_helium
+from plant.refrigerator.equilibrium import Rest, find_refrigerator_equilibrium
+from plant.refrigerator.file import RefrigeratorFile, refrigerator_digest
+from plant.refrigerator.linearisation import jacobian
+from plant.refrigerator.physics import REFERENCE_REFRIGERATOR, Refrigerator, check_refrigerator
+from plant.refrigerator.station_design import line_model, lq_gains
+from plant.refrigerator.station_settings import LqWeights
+from plant.settings import PlantSettings
+
+
+def rest_of(plant: Refrigerator = REFERENCE_REFRIGERATOR) -> Rest:
+    """Return the operating point of a refrigerator.
+
+    Raises:
+        plant.components.parameters.ParameterError: A parameter is out of range.
+        plant.cold_box.equilibrium.NoEquilibriumError: It does not come to rest.
+    """
+    check_refrigerator(plant)
+    helium = load_helium()
+    cold = find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, plant.box, helium)
+    return find_refrigerator_equilibrium(cold, plant, helium)
+
+
+def make_refrigerator_file(
+    plant: Refrigerator = REFERENCE_REFRIGERATOR, weights: LqWeights | None = None
+) -> RefrigeratorFile:
+    """Return operating point and gains of a refrigerator; raises as `rest_of`."""
+    weights = weights or LqWeights()
+    helium, rest = load_helium(), rest_of(plant)
+    lines = line_model(jacobian(rest.x, rest.u, rest.v, rest.d, plant, helium))
+    first, second = lq_gains(lines, plant.station.actuator.lag, weights).tolist()
+    return RefrigeratorFile(
+        parameters_digest=refrigerator_digest(plant, helium),
+        x0=tuple(rest.x.tolist()),
+        u0=tuple(rest.u.tolist()),
+        v0=tuple(rest.v.tolist()),
+        w0=float(rest.d[0]),
+        gains=(tuple(first), tuple(second)),
+        weights=weights,
+    )
+
+
+def main() -> None:
+    """Write the file that the command line asks for."""
+    parser = argparse.ArgumentParser(description="Make the file of the refrigerator.")
+    add_configuration_options(parser)
+    parser.add_argument("file", type=Path, help="what to write")
+    options = parser.parse_args()
+    station = load_configuration(
+        PlantSettings, file=options.config, assignments=options.assignments, others=SECTIONS
+    ).settings.plant.station
+    make_refrigerator_file(weights=station.weights).save(options.file)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""The whole refrigerator: the cold box (S1, S2), the nitrogen pre-cooler (S3) and the compression station (S4), joined.
+
+What the cold box alone takes as given follows from the states here: its supply and suction pressure are those of the
+station's lines, its inlet temperature that of the nitrogen bath's coil.
+
+All functions are kernels, of real or complex numbers, and take
+
+* x: 48 states, `STATE_NAMES`: those of the cold box, the pre-cooler and the station, one after the other;
+* u: 3 inputs of the cold box (CV155 %, NCR22_A W, CV156 %);
+* v: 4 commands of the warm valves, `COMMAND_NAMES`, %;
+* d: 6 disturbances, `DISTURBANCE_NAMES`.
+
+In the circuit the exchangers' passes hold a constant mass, as in the cold box, and lines have no pressure drop besides
+that of the cold box's return.
+"""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from coldloop.kernels.compiled import kernel
+from coldloop.process import signals as process
+from plant.cold_box.physics import REFERENCE, ColdBox, cold_box_of, evaluate
+from plant.components.heat_exchanger import HighPressureFlow
+from plant.components.nitrogen_bath import nitrogen_level
+from plant.components.phase_separator import contents
+from plant.helium.properties import Helium, helium_of
+from plant.numeric import Array, RealArray
+from plant.refrigerator.compression_station import (
+    STATION_STATE_UNITS,
+    STATION_STATES,
+    CompressionStation,
+    StationFlows,
+    check_station,
+    station_of,
+    station_pressures,
+    station_rates,
+)
+from plant.refrigerator.precooler import (
+    PRECOOLER_STATE_UNITS,
+    PRECOOLER_STATES,
+    Precooler,
+    check_precooler,
+    precooler_of,
+    precooler_rates,
+)
+
+BOX_STATES: Final = len(process.STATE_NAMES)
+STATION: Final = BOX_STATES + len(PRECOOLER_STATES)
+"""Index of the station's first state."""
+STATE_NAMES: Final = (*process.STATE_NAMES, *PRECOOLER_STATES, *STATION_STATES)
+STATE_UNITS: Final = (*process.STATE_UNITS, *PRECOOLER_STATE_UNITS, *STATION_STATE_UNITS)
+COMMAND_NAMES: Final = process.STATION_VALVE_NAMES
+DISTURBANCE_NAMES: Final = ("NCR22_HL", "T_ambient", "leak", "nitrogen", "NC1", "NC2")
+"""Heat load (W), ambient temperature (K), leak at 16 bar (kg/s); 0 or 1: nitrogen in the tank, compressors to run."""
+
+SIGNAL_NAMES: Final = process.STATION_SIGNAL_NAMES
+SIGNALS: Final = len(SIGNAL_NAMES)
+
+
+class Refrigerator(NamedTuple):
+    """Components of the refrigerator; the defaults are the reference plant."""
+
+    box: ColdBox = REFERENCE
+    """Its boundary conditions P_HP, P_LP, T_in are not read."""
+    precooler: Precooler = Precooler()
+    station: CompressionStation = CompressionStation()
+
+
+REFERENCE_REFRIGERATOR: Final = Refrigerator()
+
+
+@kernel
+def refrigerator_of(fields: Any) -> Refrigerator:  # noqa: ANN401 - any nesting of tuples
+    """Rebuild the parameters from nested plain tuples, see `plant.integrator.advance_and_read`."""
+    return Refrigerator(cold_box_of(fields[0]), precooler_of(fields[1]), station_of(fields[2]))
+
+
+@kernel
+def evaluate_refrigerator(
+    x: Array,
+    u: Array,
+    v: Array,
+    d: Array,
+    plant: Refrigerator,
+    helium: Helium,
+    dx: Array,
+    y: Array,
+    signals: Array,
+) -> None:
+    """Write the rates (48, per second), the cold box's outputs (22) and the warm signals (19, `SIGNAL_NAMES`)."""
+    station, precooler = plant.station, plant.precooler
+    coil = BOX_STATES + precooler.nef6.cells
+    P = station_pressures(x[STATION:], station, d[1])
+    box = plant.box
+    joined = ColdBox(
+        box.separator, box.jt_valve, box.turbine, box.nef1, box.nef2, box.nef34, box.return_line, P.HP, P.LP, x[coil]
+    )
+    cold, leaving = evaluate(x[:BOX_STATES], u, d[0], joined, helium, dx[:BOX_STATES], y)
+    entering = HighPressureFlow(cold.m_jt + cold.m_t, d[1] + station.cooler_approach, P.HP)
+    cooling = precooler_rates(
+        x[BOX_STATES:STATION], v[3], entering, leaving, d[3], precooler, helium, dx[BOX_STATES:STATION]
+    )
+    flows = station_rates(
+        x[STATION:], v, P, entering.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station, dx[STATION:]
+    )
+    signals[0], signals[1], signals[2] = P.LP / 1e5, P.HP / 1e5, P.buffer / 1e5
+    signals[3], signals[4] = cooling.warm_end.T, x[coil - 1]
+    signals[5] = 1e3 * entering.mass_flow
+    _write_flows(flows, signals[6:])
+    signals[13] = nitrogen_level(precooler.nef5, x[coil + 1])
+    signals[14] = x[coil + 2]
+    signals[15] = 1e3 * cooling.boiling.boil_off
+    signals[16] = inventory(x, plant, helium)
+    signals[17] = x[STATION + 3]
+    signals[18] = d[1]
+
+
+@kernel
+def _write_flows(flows: StationFlows, signals: Array) -> None:
+    signals[0] = 1e3 * flows.compressed
+    signals[1], signals[2], signals[3] = 1e3 * flows.bypass, 1e3 * flows.discharge, 1e3 * flows.charge
+    signals[4] = 1e3 * flows.out
+    signals[5], signals[6] = 1e-3 * flows.power, 1e-3 * flows.cooling
+
+
+@kernel
+def inventory(x: Array, plant: Refrigerator, helium: Helium) -> float:
+    """Return the helium (kg) in lines, buffer and bath; what was lost is not in it."""
+    in_bath, _ = contents(plant.box.separator, x[0], x[1], helium)
+    total: float = x[STATION] + x[STATION + 1] + x[STATION + 2] + in_bath
+    return total
+
+
+@kernel
+def rates(x: Array, u: Array, v: Array, d: Array, plant: Refrigerator, helium: Helium) -> Array:
+    """Return dx/dt, shape (48,), in `STATE_UNITS` per second."""
+    dx = np.empty_like(x)
+    evaluate_refrigerator(x, u, v, d, plant, helium, dx, np.empty(22, x.dtype), np.empty(SIGNALS, x.dtype))
+    return dx
+
+
+@kernel
+def read(x: Array, u: Array, v: Array, d: Array, plant: Refrigerator, helium: Helium) -> tuple[Array, Array]:
+    """Return the outputs of the cold box, shape (22,), and the warm signals, shape (19,)."""
+    y, signals = np.empty(22, x.dtype), np.empty(SIGNALS, x.dtype)
+    evaluate_refrigerator(x, u, v, d, plant, helium, np.empty_like(x), y, signals)
+    return y, signals
+
+
+@kernel
+def advance_refrigerator(
+    x: RealArray, u: RealArray, v: RealArray, d: RealArray, dt: float, plant: Refrigerator, helium: Helium
+) -> RealArray:
+    """Return the state after `dt` seconds (shape (48,)), inputs held: one classical Runge-Kutta step.
+
+    Stable up to dt = 1 s at the operating point. Loops run in a fixed order: the result is the same to the bit
+    everywhere.
+    """
+    n = x.shape[0]
+    slope, y, signals = np.empty(n), np.empty(22), np.empty(SIGNALS)
+    stage, total = np.empty(n), np.empty(n)
+    evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
+    for i in range(n):
+        total[i] = slope[i]
+        stage[i] = x[i] + 0.5 * dt * slope[i]
+    for fraction in (0.5, 1.0):
+        evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
+        for i in range(n):
+            total[i] += 2.0 * slope[i]
+            stage[i] = x[i] + fraction * dt * slope[i]
+    evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
+    for i in range(n):
+        stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
+    return stage
+
+
+@kernel
+def advance_and_read_refrigerator(
+    x: RealArray,
+    u: RealArray,
+    v: RealArray,
+    d: RealArray,
+    dt: float,
+    plant: Any,  # noqa: ANN401 - any nesting of tuples
+    helium: Any,  # noqa: ANN401 - any nesting of tuples
+) -> tuple[RealArray, RealArray, RealArray]:
+    """Return the state after `dt` seconds, the outputs and the signals there; parameters come as `plain_tuples`."""
+    parameters, tables = refrigerator_of(plant), helium_of(helium)
+    ahead = advance_refrigerator(x, u, v, d, dt, parameters, tables)
+    y, signals = read(ahead, u, v, d, parameters, tables)
+    return ahead, y, signals
+
+
+def check_refrigerator(plant: Refrigerator) -> None:
+    """Refuse parameters that no refrigerator has (`plant.components.parameters.ParameterError`)."""
+    check_precooler(plant.precooler)
+    check_station(plant.station)

@@ -1,0 +1,91 @@
+"""The nitrogen pre-cooler, S3: the warm counter-flow exchanger NEF6 and the nitrogen bath NEF5.
+
+States, `PRECOOLER_STATES`: the cells of NEF6 from the hot end on and the coil of NEF5 (K), the nitrogen in the bath
+(kg), the opening of its feed valve CV167 (%).
+"""
+
+from typing import Any, Final, NamedTuple
+
+from coldloop.kernels.compiled import kernel
+from plant.components.actuator import Actuator, check_actuator, opening_rate
+from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow
+from plant.components.nitrogen_bath import Boiling, NitrogenBath, boil, check_nitrogen_bath
+from plant.components.valve import Valve
+from plant.components.warm_exchanger import check_warm_exchanger, exchange_warm
+from plant.helium.properties import WARM_CP, Helium, supply_cell
+from plant.numeric import Array
+
+NEF6_CELLS: Final = 8
+PRECOOLER_STATES: Final = (*(f"T_nef6_{i}" for i in range(1, NEF6_CELLS + 1)), "T_nef5", "M_N2", "CV167")
+PRECOOLER_STATE_UNITS: Final = (*["K"] * (NEF6_CELLS + 1), "kg", "%")
+
+
+class Precooler(NamedTuple):
+    """Components of S3; the defaults are the reference plant."""
+
+    nef6: HeatExchanger = HeatExchanger(UA=21500.0, volume=40e-3, aluminium=150.0, cells=NEF6_CELLS)
+    """From ambient temperature to the nitrogen bath."""
+    nef5: NitrogenBath = NitrogenBath(UA=336.44, volume=30e-3, wet_level=25.0, capacity=20e3, feed=Valve(1.3e-6))
+    """The bath; 20 g/s of nitrogen through the open feed valve."""
+    actuator: Actuator = Actuator(lag=2.0, fastest=10.0)
+    """Of CV167."""
+
+
+@kernel
+def precooler_of(fields: Any) -> Precooler:  # noqa: ANN401 - any nesting of tuples
+    """Rebuild the parameters from nested plain tuples."""
+    bath = fields[1]
+    return Precooler(
+        HeatExchanger(*fields[0]),
+        NitrogenBath(bath[0], bath[1], bath[2], bath[3], Valve(*bath[4])),
+        Actuator(*fields[2]),
+    )
+
+
+class Precooling(NamedTuple):
+    """What the pre-cooler does."""
+
+    warm_end: LowPressureFlow
+    """The low-pressure flow as it leaves for the compressors."""
+    boiling: Boiling
+
+
+@kernel
+def precooler_rates(
+    x: Array,
+    command: float,
+    high: HighPressureFlow,
+    low: LowPressureFlow,
+    supply: float,
+    precooler: Precooler,
+    helium: Helium,
+    dx: Array,
+) -> Precooling:
+    """Write the rates of the pre-cooler's states into `dx` (11, per second); return what it does.
+
+    Args:
+        x: States, `PRECOOLER_STATES`.
+        command: Opening that is asked of CV167, %.
+        high: From the compressors.
+        low: From the cold box.
+        supply: 1 with nitrogen in the tank, 0 without.
+        precooler: Parameters.
+        helium: Tables.
+        dx: Rates.
+    """
+    cells = precooler.nef6.cells
+    warm_end = exchange_warm(precooler.nef6, x[:cells], high, low, helium, dx[:cells])
+    h_in, _, _ = supply_cell(high.P, x[cells - 1], helium)
+    h_out, _, _ = supply_cell(high.P, x[cells], helium)
+    boiling = boil(precooler.nef5, x[cells + 1], high.mass_flow, WARM_CP, x[cells - 1], x[cells + 2], supply)
+    dx[cells] = (high.mass_flow * (h_in - h_out) - boiling.heat) / precooler.nef5.capacity
+    dx[cells + 1] = boiling.feed - boiling.boil_off
+    dx[cells + 2] = opening_rate(precooler.actuator, x[cells + 2], command)
+    return Precooling(warm_end, boiling)
+
+
+def check_precooler(precooler: Precooler) -> None:
+    """Refuse parameters that no pre-cooler has (`ParameterError`)."""
+    check_warm_exchanger("nef6", precooler.nef6, NEF6_CELLS)
+    check_nitrogen_bath("nef5", precooler.nef5)
+    check_actuator("cv167", precooler.actuator)

@@ -1,0 +1,159 @@
+"""The whole refrigerator as a program: the plant, its station's controller, and what happens to both."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
+from plant.helium.properties import load_helium
+from plant.integrator import plain_tuples
+from plant.numeric import RealArray
+from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+from plant.refrigerator.events import EventSchedule
+from plant.refrigerator.file import RefrigeratorFile
+from plant.refrigerator.physics import (
+    BOX_STATES,
+    REFERENCE_REFRIGERATOR,
+    check_refrigerator,
+    read,
+)
+from plant.refrigerator.station_control import station_law
+from plant.refrigerator.station_law import Commands
+from plant.refrigerator.station_settings import StationSettings
+from plant.refrigerator.tick import ALARMS, MODE, RefrigeratorMemory, advance_program_tick, control_tick
+
+
+class RefrigeratorProgram(PlantProgram):
+    """The simulated refrigerator with its station's controller, advanced tick by tick.
+
+    `state` and `measure` are those of the cold box, so that all who know a cold box know this plant; `station` is the
+    rest.
+
+    Args:
+        file: Operating point and gains; `x0` of the plant is its.
+        u0: Inputs held until the first `apply`, 3 numbers.
+        load: The heat load over time.
+        station: Settings of the station's controller.
+        events: What happens to the refrigerator.
+        noise: Noise on the cold box's measurements; None measures exactly.
+
+    Raises:
+        ValueError: An argument of wrong length, not finite, or out of range.
+    """
+
+    def __init__(
+        self,
+        *,
+        file: RefrigeratorFile,
+        u0: Sequence[float],
+        load: HeatLoad,
+        station: StationSettings,
+        events: EventSchedule,
+        noise: MeasurementNoise | None = None,
+    ) -> None:
+        check_refrigerator(REFERENCE_REFRIGERATOR)
+        self._plant, self._tables = plain_tuples(REFERENCE_REFRIGERATOR), plain_tuples(load_helium())
+        self.law = station_law(station, file.reference, REFERENCE_REFRIGERATOR.station)
+        """Of the station's controller."""
+        self._events = events
+        x, v = np.array(file.x0, dtype=np.float64), np.array(file.v0, dtype=np.float64)
+        d = self._disturbances(0, load.value(0))
+        y, signals = read(x, np.array(u0, dtype=np.float64), v, d, REFERENCE_REFRIGERATOR, load_helium())
+        self._memory = RefrigeratorMemory(x, y, signals, v, np.zeros(3), np.zeros(2, np.int64))
+        control_tick(self._memory, d, self.law)
+        super().__init__(box=REFERENCE_REFRIGERATOR.box, x0=file.x0[:BOX_STATES], u0=u0, load=load, noise=noise)
+
+    def _warm_up(self) -> None:
+        d = self._disturbances(0, self.load)
+        advance_program_tick(self.memory, self._u, d, d, self._plant, self._tables, self.law)
+
+    @property
+    def station(self) -> StationSample:
+        """Compression station and nitrogen at the current tick, with mode and alarms of its controller."""
+        m = self._memory
+        mode, alarms = StationMode(int(m.status[MODE])), StationAlarm(int(m.status[ALARMS]))
+        return StationSample(self.tick, tuple(m.signals.tolist()), mode, alarms)
+
+    @property
+    def station_status(self) -> StationStatus:
+        """The same for the registers, with what its controller asks for."""
+        sample = self.station
+        return StationStatus(sample.tick, sample.mode, sample.alarms, sample.signals, self.commands)
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """What is given at the current tick."""
+        return self._events.at(self.tick)
+
+    def give(self, surroundings: Surroundings) -> None:
+        """Change what is given, from the next tick on."""
+        self._events.put(self.tick + 1, surroundings)
+
+    @property
+    def commands(self) -> Commands:
+        """Openings that the station's controller asks for from the current tick on, %."""
+        return Commands(*self._memory.commands.tolist())
+
+    def advance(self) -> None:
+        """Go one tick forward."""
+        d, ahead = self._disturbances(self.tick, self.load), self._disturbances(self.tick + 1, 0.0)
+        advance_program_tick(self._memory, self._u, d, ahead, self._plant, self._tables, self.law)
+        self._x = self._memory.x[:BOX_STATES]
+        self.tick += 1
+        self._measured = self._sample(self._memory.y)
+
+    def _disturbances(self, tick: int, w: float) -> RealArray:
+        given, ambient = self._events.at(tick), self._events.ambient(tick)
+        return np.array([w, ambient, 1e-3 * given.leak, given.nitrogen, given.nc1, given.nc2], dtype=np.float64)
+
+    def ahead(self, ticks: int) -> RealArray:
+        """Return the disturbances, without load, of `ticks` ticks and of the one behind them, shape (ticks + 1, 6)."""
+        return np.array([self._disturbances(self.tick + later, 0.0) for later in range(ticks + 1)])
+
+    @property
+    def memory(self) -> RefrigeratorMemory:
+        """A copy of what a tick changes."""
+        m = self._memory
+        return RefrigeratorMemory(
+            m.x.copy(), m.y.copy(), m.signals.copy(), m.commands.copy(), m.integrals.copy(), m.status.copy()
+        )
+
+    def take_over_whole(self, tick: int, u: RealArray, memory: RefrigeratorMemory, y: RealArray) -> None:
+        """Go on at another tick with what `memory` and `measure` would tell there; `u` was held up to it."""
+        self.tick, self._u, self._memory = tick, u.copy(), memory
+        self._x, self._measured = memory.x[:BOX_STATES], tuple(y.tolist())
+
+    def resume(
+        self,
+        tick: int,
+        x: Sequence[float],
+        u: Sequence[float],
+        y: Sequence[float],
+        noise_state: Mapping[str, Any],
+        warm: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Go on from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
+        if warm is None:
+            raise ValueError("the retained state is that of a cold box, not of a refrigerator")
+        names = {"x": "x", "signals": "signals", "commands": "commands", "integrals": "control"}
+        kept = {name: np.array(warm[field], dtype=np.float64) for name, field in names.items()}
+        for name, values in kept.items():
+            if values.shape != getattr(self._memory, name).shape:
+                raise ValueError(f"{name}: expected {len(getattr(self._memory, name))} numbers")
+        super().resume(tick, x, u, y, noise_state)
+        for since, put in warm["given"]:
+            self._events.put(int(since), Surroundings(*put))
+        self._memory = self._memory._replace(
+            x=kept["x"], signals=kept["signals"], commands=kept["commands"], integrals=kept["integrals"]
+        )
+
+    def retained(self) -> dict[str, Any]:
+        """Return what `resume` needs, as plain data."""
+        m = self._memory
+        warm = {
+            "x": m.x.tolist(), "signals": m.signals.tolist(),
+            "control": m.integrals.tolist(), "commands": m.commands.tolist(),
+            "given": [(tick, list(put)) for tick, put in self._events.puts],
+        }  # fmt: skip
+        return {**super().retained(), "warm": warm}

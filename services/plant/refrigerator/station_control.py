@@ -1,0 +1,81 @@
+"""The controller of the compression station and of the nitrogen bath: measurements in, openings out, once a tick.
+
+A program like the others: no sockets, no clock. What it computes is `plant.refrigerator.station_law`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from coldloop.process.signals import TICK_S
+from coldloop.registers.plant import StationAlarm, StationMode
+from plant.refrigerator.compression_station import CompressionStation
+from plant.refrigerator.station_law import (
+    AlarmLimits,
+    Commands,
+    Loop,
+    StationLaw,
+    StationMeasurement,
+    control_station,
+    per_percent,
+    raised_alarms,
+)
+from plant.refrigerator.station_settings import PiTuning, StationControlKind, StationSettings
+
+
+class StationReference(NamedTuple):
+    """What the refrigerator's file tells the controller."""
+
+    gains: tuple[tuple[float, ...], tuple[float, ...]]
+    """K of the LQ controller, (2, 6)."""
+    bypass: float
+    """Opening of CV956 at the operating point, %."""
+    feed: float
+    """Opening of CV167 there, %."""
+
+
+class StationControl:
+    """Both pressure loops and the nitrogen loop.
+
+    Args:
+        settings: Configuration.
+        reference: Gains, and openings at the operating point.
+        station: Sizes of the valves.
+    """
+
+    def __init__(self, settings: StationSettings, reference: StationReference, station: CompressionStation) -> None:
+        self.law = station_law(settings, reference, station)
+        self.integrals = np.zeros(3)
+        """Of the errors of HP and LP, bar s, and of the nitrogen's level, % s."""
+        self.mode = StationMode.AUTOMATIC
+        self.alarms = StationAlarm(0)
+
+    def step(self, measured: StationMeasurement) -> Commands:
+        """Return the openings for the tick that begins."""
+        self.alarms = StationAlarm(raised_alarms(self.law.alarms, measured))
+        commands, mode = control_station(self.law, self.integrals, measured)
+        self.mode = StationMode(mode)
+        return commands
+
+
+def station_law(settings: StationSettings, reference: StationReference, station: CompressionStation) -> StationLaw:
+    """Return the constants of the law for a configuration, an operating point and the sizes of valves."""
+    limits = settings.alarms
+    return StationLaw(
+        is_lq=settings.control is StationControlKind.LQ,
+        hp=settings.hp_bar, lp=settings.lp_bar, charge_ends=settings.charge_ends_bar,
+        share=min(TICK_S / settings.anti_windup_s, 1.0),
+        gains=np.array(reference.gains),
+        nominal=reference.bypass * per_percent(station.bypass, settings.hp_bar),
+        bypass=station.bypass, discharge=station.discharge, charge=station.charge,
+        over_hp=_loop(settings.pi_hp), over_lp=_loop(settings.pi_lp), over_nitrogen=_loop(settings.pi_nitrogen),
+        nitrogen=settings.nitrogen_level, feed=reference.feed,
+        alarms=AlarmLimits(
+            limits.hp_high_bar, limits.hp_low_bar, limits.lp_high_bar, limits.lp_low_bar, limits.nitrogen_low,
+            limits.helium_lost_kg,
+        ),
+    )  # fmt: skip
+
+
+def _loop(tuning: PiTuning) -> Loop:
+    return Loop(tuning.gain, tuning.integral_s)

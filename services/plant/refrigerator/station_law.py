@@ -1,0 +1,247 @@
+"""The control law of the compression station and of the nitrogen bath as kernels: measurements in, openings out.
+
+It holds high and low pressure by three valves. Both designs think in flows: `bypass` from the high to the low pressure
+line, and `inventory`, positive from the buffer into the low-pressure line. The buffer is emptied into the low-pressure
+line and filled from the high-pressure one; with the bypass smaller by the same flow, filling it does to both lines what
+a negative inventory flow into the low-pressure line would do.
+"""
+
+from math import sqrt
+from typing import Final, NamedTuple
+
+from coldloop.kernels.compiled import kernel
+from coldloop.process.signals import TICK_S
+from coldloop.registers.plant import StationMode
+from plant.components.gas_valve import CHOKED
+from plant.components.valve import Valve
+from plant.helium.properties import GAS_CONSTANT
+from plant.numeric import RealArray
+
+PA_PER_BAR: Final = 1e5
+DESIGN_TEMPERATURE: Final = 300.0
+"""K, at which the controller takes the valves' flows to be."""
+ROUNDING: Final = 1e-9
+"""kg/s, by which flows that are the same may differ."""
+LEAST_PRESSURE: Final = 0.5
+"""bar, taken for the valves' flows when a line is emptier."""
+AUTOMATIC, LIMITED, CHARGE_STOPPED, ONE_COMPRESSOR, STOPPED = map(int, StationMode)
+
+
+class StationMeasurement(NamedTuple):
+    """What the station's sensors show at a tick."""
+
+    hp: float
+    """bar."""
+    lp: float
+    """bar."""
+    buffer: float
+    """bar."""
+    bypass: float
+    """Opening of CV956, %."""
+    discharge: float
+    """Opening of CV952, %."""
+    charge: float
+    """Opening of CV953, %."""
+    nitrogen: float
+    """Level, %."""
+    lost: float
+    """Helium that has left the circuit, kg."""
+    nc1: bool
+    """Whether the compressor is switched on."""
+    nc2: bool
+
+
+class Commands(NamedTuple):
+    """Openings asked of the warm valves, %; in the order of `plant.refrigerator.COMMAND_NAMES`."""
+
+    cv956: float
+    cv952: float
+    cv953: float
+    cv167: float
+
+
+class Loop(NamedTuple):
+    """A PI loop."""
+
+    gain: float
+    integral_s: float
+
+
+class AlarmLimits(NamedTuple):
+    """Where alarms begin: bar, % and kg."""
+
+    hp_high: float
+    hp_low: float
+    lp_high: float
+    lp_low: float
+    nitrogen_low: float
+    helium_lost: float
+
+
+class StationLaw(NamedTuple):
+    """Constants of the law."""
+
+    is_lq: bool
+    hp: float
+    """Set point of the high pressure, bar."""
+    lp: float
+    """Set point of the low pressure, bar."""
+    charge_ends: float
+    """So far above its set point (bar) does the low pressure close the charge valve."""
+    share: float
+    """Of what valves could not do, that the integrals follow in a tick."""
+    gains: RealArray
+    """K of the LQ controller, shape (2, 6)."""
+    nominal: float
+    """Bypass flow at the operating point, kg/s."""
+    bypass: Valve
+    discharge: Valve
+    charge: Valve
+    over_hp: Loop
+    """From the high pressure to the inventory flow, kg/s per bar."""
+    over_lp: Loop
+    """From the low pressure to the bypass flow, kg/s per bar."""
+    over_nitrogen: Loop
+    """From the level to the feed valve, % per %."""
+    nitrogen: float
+    """Set point of the level, %."""
+    feed: float
+    """Opening of CV167 at the operating point, %."""
+    alarms: AlarmLimits
+
+
+class Flows(NamedTuple):
+    """Virtual flows, kg/s."""
+
+    bypass: float
+    inventory: float
+
+
+@kernel
+def control_station(c: StationLaw, integrals: RealArray, m: StationMeasurement) -> tuple[Commands, int]:
+    """Return the openings for the tick that begins, and the mode (`StationMode`).
+
+    Args:
+        c: Constants.
+        integrals: Of the errors of HP and LP (bar s) and of the nitrogen's level (% s), shape (3,); overwritten.
+        m: What is measured.
+    """
+    feed = nitrogen_feed(c, integrals, m.nitrogen)
+    if not (m.nc1 or m.nc2):
+        integrals[:2] = 0.0
+        return Commands(0.0, 0.0, 0.0, feed), STOPPED
+    wanted = flows_of_lq(c, integrals, m) if c.is_lq else flows_of_pi(c, integrals, m)
+    given, openings = split(c, wanted, m)
+    follow(c, integrals, wanted, given, m)
+    return Commands(openings[0], openings[1], openings[2], feed), mode_of(c, wanted, given, m)
+
+
+@kernel
+def flows_of_lq(c: StationLaw, integrals: RealArray, m: StationMeasurement) -> Flows:
+    """Return the flows that state feedback asks for."""
+    opened = flowing(c, m)
+    state = (
+        m.hp - c.hp, m.lp - c.lp, opened.bypass - c.nominal, opened.inventory, integrals[0], integrals[1],
+    )  # fmt: skip
+    bypass = inventory = 0.0
+    for i in range(len(state)):
+        bypass += c.gains[0, i] * state[i]
+        inventory += c.gains[1, i] * state[i]
+    return Flows(c.nominal - bypass, -inventory)
+
+
+@kernel
+def flows_of_pi(c: StationLaw, integrals: RealArray, m: StationMeasurement) -> Flows:
+    """Return the flows that two single loops ask for."""
+    return Flows(
+        c.nominal - c.over_lp.gain * (m.lp - c.lp + integrals[1] / c.over_lp.integral_s),
+        -c.over_hp.gain * (m.hp - c.hp + integrals[0] / c.over_hp.integral_s),
+    )
+
+
+@kernel
+def flowing(c: StationLaw, m: StationMeasurement) -> Flows:
+    """Return what the valves pass at their present openings, as virtual flows."""
+    discharge = m.discharge * per_percent(c.discharge, m.hp)
+    charge = m.charge * per_percent(c.charge, m.buffer)
+    bypass = m.bypass * per_percent(c.bypass, m.hp)
+    return Flows(bypass + discharge, charge - discharge)
+
+
+@kernel
+def split(c: StationLaw, wanted: Flows, m: StationMeasurement) -> tuple[Flows, tuple[float, float, float]]:
+    """Return the flows that the valves can give, and their openings (%): bypass, discharge, charge."""
+    per_bypass, per_discharge = per_percent(c.bypass, m.hp), per_percent(c.discharge, m.hp)
+    per_charge = per_percent(c.charge, m.buffer)
+    inventory = min(max(wanted.inventory, -100.0 * per_discharge), 100.0 * per_charge * charge_room(c, m.lp))
+    discharge, charge = max(-inventory, 0.0), max(inventory, 0.0)
+    less = discharge if c.is_lq else 0.0
+    bypass = min(max(wanted.bypass - less, 0.0), 100.0 * per_bypass)
+    return Flows(bypass + less, inventory), (bypass / per_bypass, discharge / per_discharge, charge / per_charge)
+
+
+@kernel
+def charge_room(c: StationLaw, lp: float) -> float:
+    """Return the share of the charge valve that the low pressure allows, 0 to 1."""
+    above = (lp - c.lp) / c.charge_ends
+    return min(max(2.0 - 2.0 * above, 0.0), 1.0)
+
+
+@kernel
+def follow(c: StationLaw, integrals: RealArray, wanted: Flows, given: Flows, m: StationMeasurement) -> None:
+    """Integrate the errors, and lead the integrals to where they would have asked for what was given."""
+    bypass, inventory = given.bypass - wanted.bypass, given.inventory - wanted.inventory
+    if c.is_lq:
+        K = c.gains
+        determinant = K[0, 4] * K[1, 5] - K[0, 5] * K[1, 4]
+        back_hp = (K[1, 5] * bypass - K[0, 5] * inventory) / determinant
+        back_lp = (K[0, 4] * inventory - K[1, 4] * bypass) / determinant
+    else:
+        back_hp = inventory * c.over_hp.integral_s / c.over_hp.gain
+        back_lp = bypass * c.over_lp.integral_s / c.over_lp.gain
+    integrals[0] = integrals[0] + TICK_S * (m.hp - c.hp) - c.share * back_hp
+    integrals[1] = integrals[1] + TICK_S * (m.lp - c.lp) - c.share * back_lp
+
+
+@kernel
+def nitrogen_feed(c: StationLaw, integrals: RealArray, level: float) -> float:
+    """Return the opening of the nitrogen feed (%); its integral stops at the ends of the valve's range."""
+    error = c.nitrogen - level
+    wanted = c.feed + c.over_nitrogen.gain * (error + integrals[2] / c.over_nitrogen.integral_s)
+    given: float = min(max(wanted, 0.0), 100.0)
+    if given == wanted or (wanted > given) != (error > 0.0):
+        integrals[2] += TICK_S * error
+    return given
+
+
+@kernel
+def mode_of(c: StationLaw, wanted: Flows, given: Flows, m: StationMeasurement) -> int:
+    """Return what the law can do about the pressures, with a compressor running."""
+    if not (m.nc1 and m.nc2):
+        return ONE_COMPRESSOR
+    if wanted.inventory > given.inventory and charge_room(c, m.lp) < 1.0:
+        return CHARGE_STOPPED
+    missing = max(abs(wanted.bypass - given.bypass), abs(wanted.inventory - given.inventory))
+    return LIMITED if missing > ROUNDING else AUTOMATIC
+
+
+@kernel
+def raised_alarms(limits: AlarmLimits, m: StationMeasurement) -> int:
+    """Return the alarms at this tick, the bits of `StationAlarm` in their order."""
+    conditions = (
+        m.hp > limits.hp_high, m.hp < limits.hp_low, m.lp > limits.lp_high, m.lp < limits.lp_low,
+        not m.nc1, not m.nc2, m.nitrogen < limits.nitrogen_low, m.lost > limits.helium_lost,
+    )  # fmt: skip
+    raised = 0
+    for bit in range(len(conditions)):
+        if conditions[bit]:
+            raised += 1 << bit
+    return raised
+
+
+@kernel
+def per_percent(valve: Valve, pressure: float) -> float:
+    """Return the choked flow (kg/s) of a valve per % of opening at a pressure (bar) before it."""
+    P = PA_PER_BAR * max(pressure, LEAST_PRESSURE)
+    flow: float = valve.flow_area / 100.0 * P * CHOKED / sqrt(GAS_CONSTANT * DESIGN_TEMPERATURE)
+    return flow

@@ -1,0 +1,1 @@
+"""Numerical kernels: how they are compiled, cached and loaded."""

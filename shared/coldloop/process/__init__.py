@@ -1,0 +1,1 @@
+"""The process across the link: its signals and their units, the limits of its actuators, its linear model."""

@@ -1,0 +1,53 @@
+"""What the actuators allow: one setting that the QP, its solvers and the control PLC's guard share."""
+
+from enum import StrEnum
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+
+Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+class RateReference(StrEnum):
+    """What the rate limit of an update is measured against; the paper leaves it open (`docs/science.md`, ruling 15)."""
+
+    PER_UPDATE = "per-update"
+    """The full limit of a sampling period of 5 s at each update, however soon the next one follows."""
+    ELAPSED = "elapsed"
+    """The limit scaled by the time since the update before, tau_u / 5 s."""
+
+
+class InputLimits(BaseModel):
+    """Bounds and rates of the inputs, in the order (CV155 %, NCR22_A W, CV156 %) (paper, table I)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    low: Triple = (20.0, 0.0, 20.0)
+    high: Triple = (60.0, 150.0, 60.0)
+    rate: Triple = (0.5, 10.0, 0.1)
+    """Largest change in one sampling period of 5 s, up or down."""
+    rate_reference: RateReference = RateReference.PER_UPDATE
+    slew_s: Annotated[float, Field(ge=TICK_S, le=TICKS_PER_SAMPLE * TICK_S)] = 0.5
+    """Absolute slew limit, however often updates follow one another: within any time shorter than this an input moves
+    by at most `rate`. The default is the shortest updating period that there is: it never binds on our optimiser."""
+
+    @property
+    def slew_ticks(self) -> int:
+        """That time, in ticks."""
+        return max(1, round(self.slew_s / TICK_S))
+
+    def rate_share(self, elapsed_ticks: int) -> float:
+        """Return the share of `rate` that an update may use, `elapsed_ticks` ticks after the one before."""
+        if self.rate_reference is RateReference.PER_UPDATE:
+            return 1.0
+        return min(1.0, elapsed_ticks / TICKS_PER_SAMPLE)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if any(low >= high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError("each low is below its high")
+        if min(self.rate) <= 0:
+            raise ValueError("each rate is positive")
+        return self

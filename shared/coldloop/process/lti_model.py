@@ -1,0 +1,182 @@
+"""The linear model of the plant, all that the optimiser knows of it: made off line, loaded like a PLC download."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.errors import ModelFileError
+from coldloop.process.model_file import (
+    COLD_BOX,
+    FORMAT,
+    REMEDY,
+    VECTORS,
+    digest_of,
+    header_of,
+    read_document,
+    short_digest_of,
+    write_document,
+)
+from coldloop.process.signals import STATE_NAMES
+
+RealArray: TypeAlias = NDArray[np.float64]
+
+MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiscreteModel:
+    """x[k+1] = A x[k] + B u[k] + F w[k], in deviations from the operating point."""
+
+    A: RealArray
+    """Shape (n, n)."""
+    B: RealArray
+    """Shape (n, m)."""
+    F: RealArray
+    """Shape (n,)."""
+    period_s: float
+    """Sampling period, s."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LtiModel:
+    """dx/dt = A x + B u + F w, y = C x + D u + G w, in deviations from the operating point (x0, u0, w0, y0).
+
+    n states, m inputs, p outputs, one load; physical units throughout, time in seconds. The arrays are read-only.
+
+    Raises:
+        ValueError: shapes do not agree, or a number is not finite.
+    """
+
+    A: RealArray
+    """Shape (n, n)."""
+    B: RealArray
+    """Shape (n, m)."""
+    F: RealArray
+    """Shape (n,)."""
+    C: RealArray
+    """Shape (p, n)."""
+    D: RealArray
+    """Shape (p, m)."""
+    G: RealArray
+    """Shape (p,)."""
+    A_tick: RealArray
+    """Shape (n, n): the transition over one tick, inputs and load held. PLCs compose longer periods from it."""
+    B_tick: RealArray
+    """Shape (n, m)."""
+    F_tick: RealArray
+    """Shape (n,)."""
+    x0: RealArray
+    """Shape (n,)."""
+    u0: RealArray
+    """Shape (m,)."""
+    w0: float
+    """The load at the operating point."""
+    y0: RealArray
+    """Shape (p,)."""
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_names: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_names: tuple[str, ...]
+    output_units: tuple[str, ...]
+    load_name: str
+    load_unit: str
+    parameters_digest: str
+    """SHA-256 of the plant's parameters and property tables."""
+    plant: str = COLD_BOX
+    """Which plant it is the model of."""
+
+    def __post_init__(self) -> None:
+        n, m, p = len(self.state_names), len(self.input_names), len(self.output_names)
+        if (len(self.state_units), len(self.input_units), len(self.output_units)) != (n, m, p):
+            raise ValueError("names and units differ in number")
+        shapes = {"A": (n, n), "B": (n, m), "F": (n,), "C": (p, n), "D": (p, m), "G": (p,)}
+        shapes |= {"A_tick": (n, n), "B_tick": (n, m), "F_tick": (n,)}
+        shapes |= {"x0": (n,), "u0": (m,), "y0": (p,)}
+        for name, shape in shapes.items():
+            array = np.array(getattr(self, name), dtype=np.float64)
+            if array.shape != shape:
+                raise ValueError(f"{name} has shape {array.shape}, not {shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} is not finite")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if not np.isfinite(self.w0):
+            raise ValueError("w0 is not finite")
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the content, in hexadecimal: the model's identity on the bus."""
+        return digest_of(self._document())
+
+    @property
+    def short_digest(self) -> int:
+        """The first 32 bits of the digest, as they stand in the registers."""
+        return short_digest_of(self.digest)
+
+    def save(self, path: Path) -> None:
+        """Write the model as JSON with its digest; the file appears whole or not at all (OSError if it cannot)."""
+        write_document(path, self._document())
+
+    def discretised(self, period_s: float) -> DiscreteModel:
+        """Return the model sampled every `period_s` (s, positive), inputs and load held in between.
+
+        Raises:
+            ValueError: the period is not positive and finite.
+        """
+        return discretise(self.A, self.B, self.F, period_s)
+
+    def _document(self) -> dict[str, Any]:
+        document: dict[str, Any] = {"format": FORMAT}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if (field.name, value) == ("plant", COLD_BOX):
+                continue  # so is any file that names none
+            if isinstance(value, np.ndarray):
+                document[field.name] = value.tolist()
+            else:
+                document[field.name] = list(value) if isinstance(value, tuple) else value
+        return document
+
+
+def discretise(A: RealArray, B: RealArray, F: RealArray, period_s: float) -> DiscreteModel:
+    """Return dx/dt = A x + B u + F w sampled every `period_s` (s, positive), inputs and load held in between.
+
+    Raises:
+        ValueError: the period is not positive and finite.
+    """
+    from scipy.linalg import expm  # noqa: PLC0415 - only who discretises needs scipy
+
+    if not (np.isfinite(period_s) and period_s > 0.0):
+        raise ValueError(f"a sampling period is positive, not {period_s} s")
+    n, m = B.shape
+    augmented = np.zeros((n + m + 1, n + m + 1))
+    augmented[:n] = np.hstack([A, B, F[:, np.newaxis]]) * period_s
+    held = expm(augmented)
+    return DiscreteModel(A=held[:n, :n], B=held[:n, n : n + m], F=held[:n, n + m], period_s=period_s)
+
+
+def load(path: Path) -> LtiModel:
+    """Read a model file.
+
+    Raises:
+        ModelFileError: the file is missing, not JSON, of another version, damaged, not finite or of wrong shape.
+    """
+    document = read_document(path)
+    header = header_of(document, path)
+    described: dict[str, Any] = {
+        name: value for name, value in vars(header).items() if name not in ("digest", *VECTORS)
+    }
+    try:
+        arrays: dict[str, Any] = {name: np.array(document[name], dtype=np.float64) for name in (*MATRICES, *VECTORS)}
+        model = LtiModel(**described, **arrays)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelFileError(f"{path}: {error} in the model file; {REMEDY}") from error
+    if len(model.state_names) < len(STATE_NAMES):
+        raise ModelFileError(
+            f"{path}: {len(model.state_names)} states in the model file, a cold box has {len(STATE_NAMES)}; {REMEDY}"
+        )
+    return model

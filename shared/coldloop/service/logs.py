@@ -1,0 +1,136 @@
+"""Structured logs: one JSON object a line on standard error, by a thread that never holds up who logs.
+
+When nobody reads them, lines are dropped and counted; the next line that is written says how many in `dropped`.
+"""
+
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import Any, TextIO
+
+from coldloop.service.line_writer import LineWriter, to_stream
+
+log = logging.getLogger("coldloop.service.logs")
+
+STANDARD_ATTRIBUTES = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
+
+
+class JsonFormatter(logging.Formatter):
+    """Formats a record as JSON: time, level, service, logger, event, and whatever was passed as `extra`."""
+
+    def __init__(self, service: str) -> None:
+        super().__init__()
+        self._service = service
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        line: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "service": self._service,
+            "logger": record.name,
+            "event": record.getMessage(),
+        }
+        line.update((key, value) for key, value in record.__dict__.items() if key not in STANDARD_ATTRIBUTES)
+        if record.exc_info:
+            line["error"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str, ensure_ascii=False)
+
+
+MOST_EVENTS = 1000
+"""Different events that are counted at a time."""
+LAST_LINE_S = 0.2
+"""How long the last line is waited for, when those before it have been written."""
+
+
+class FloodFilter(logging.Filter):
+    """Lets at most `lines` of one event through in an interval; the next one says how many were left out."""
+
+    def __init__(self, lines: int = 20, interval_s: float = 10.0, now: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._lines = lines
+        self._interval_s = interval_s
+        self._now = now
+        self._seen: dict[tuple[str, ...], tuple[float, int]] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Tell whether a record is to be written."""
+        about = tuple(str(getattr(record, name, "")) for name in ("alarm", "mode"))
+        event, now = (record.name, str(record.msg), *about), self._now()
+        if len(self._seen) > MOST_EVENTS:
+            self._seen.clear()
+        since, count = self._seen.get(event, (now, 0))
+        if now - since >= self._interval_s:
+            if count > self._lines:
+                record.left_out = count - self._lines
+            since, count = now, 0
+        self._seen[event] = since, count + 1
+        return count < self._lines
+
+
+class QueueingHandler(logging.Handler):
+    """Formats records into the queue of a writer."""
+
+    def __init__(self, writer: LineWriter) -> None:
+        super().__init__()
+        self.writer = writer
+        self._told = 0
+        """Of the dropped lines, how many a later line has reported."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Let a record be written; called with the handler's lock held."""
+        dropped = self.writer.dropped
+        if dropped > self._told:
+            record.dropped = dropped - self._told
+        if self.writer.put(self._formatted(record)):
+            self._told = dropped
+
+    def _formatted(self, record: logging.LogRecord) -> str:
+        try:
+            return self.format(record)
+        except Exception as error:  # noqa: BLE001 - a scan does not fail because of what it logs
+            about = {"name": record.name, "levelname": record.levelname, "created": record.created}
+            what = {"msg": "a record cannot be formatted", "reason": repr(error), "text": str(record.msg)}
+            return self.format(logging.makeLogRecord({**about, **what}))
+
+    def flush(self) -> None:
+        """Wait until all is written, for a bounded time."""
+        self.writer.flush()
+
+    def close(self) -> None:
+        """Write what waits, for a bounded time, and end the writer."""
+        if self.writer.flush() and self.writer.dropped > self._told:
+            last = {"name": log.name, "levelno": logging.WARNING, "levelname": "WARNING", "msg": "lines dropped"}
+            self.handle(logging.makeLogRecord(last))
+        self.writer.close(LAST_LINE_S)
+        super().close()
+
+
+_handlers: list[QueueingHandler] = []
+"""The handler of this process, when its logs are set up."""
+
+
+def set_up_logs(service: str, level: str, stream: TextIO = sys.stderr) -> None:
+    """Send the logs of this process, from `level` up, to `stream`."""
+    handler = QueueingHandler(LineWriter(to_stream(stream)))
+    handler.setFormatter(JsonFormatter(service))
+    handler.addFilter(FloodFilter())
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+    logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # what it would say is raised by our client
+    _handlers[:] = [handler]
+
+
+def dropped() -> int:
+    """Return how many lines of this process were dropped, because nobody read those before them."""
+    return sum(handler.writer.dropped for handler in _handlers)
+
+
+def end_logs(last_line: str | None = None) -> None:
+    """Write a last line of plain text, if there is one, and what waits before it; for a bounded time."""
+    for handler in _handlers:
+        if last_line is not None:
+            handler.writer.put(last_line)
+        handler.close()

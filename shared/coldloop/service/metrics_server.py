@@ -1,0 +1,95 @@
+"""The registers of a service for Prometheus, over HTTP: `GET /metrics` and `/healthz`, and nothing else."""
+
+import asyncio
+import logging
+import time
+from typing import Final
+
+from coldloop.errors import PortInUseError
+from coldloop.registers.bank import RegisterBank
+from coldloop.service.metrics import CONTENT_TYPE, bank_families, exposition
+from coldloop.service.metrics_settings import MetricsSettings
+
+log = logging.getLogger("coldloop.service.metrics")
+
+LONGEST_REQUEST: Final = 4096
+PATIENCE_S: Final = 2.0
+"""Within this time a request is here, and its answer read."""
+MOST_OPEN: Final = 16
+"""Connections at a time; the oldest gives way. The service itself needs the others that the system allows."""
+KEPT_S: Final = 0.2
+"""An answer serves all who ask within this time: however many do, scans are not late because of them."""
+
+
+class MetricsServer:
+    """Answers one request a connection.
+
+    Args:
+        settings: Where it listens; port 0 is off.
+        bank: The registers that are shown.
+    """
+
+    def __init__(self, settings: MetricsSettings, bank: RegisterBank) -> None:
+        self._settings = settings
+        self._bank = bank
+        self._open: dict[asyncio.StreamWriter, None] = {}  # the oldest first
+        self._exposition = ""
+        self._kept_until = 0.0
+
+    async def run(self) -> None:
+        """Serve until cancelled; return at once where it is off.
+
+        Raises:
+            PortInUseError: Somebody else listens there.
+        """
+        host, port = self._settings.host, self._settings.port
+        if not port:
+            return
+        try:
+            server = await asyncio.start_server(self._answer, host, port, limit=LONGEST_REQUEST, backlog=MOST_OPEN)
+        except OSError as error:
+            raise PortInUseError(
+                f"{host}:{port}: {error.strerror}; give another one to `metrics.port` of the service"
+            ) from None
+        async with server:
+            await server.serve_forever()
+
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._open) >= MOST_OPEN:
+            oldest = next(iter(self._open))
+            del self._open[oldest]
+            oldest.transport.abort()
+        self._open[writer] = None
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                head = await reader.readuntil(b"\r\n\r\n")
+                writer.write(self._response(head.partition(b"\r\n")[0].decode("latin-1").split(" ")))
+                writer.close()
+                await writer.wait_closed()
+        except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            log.debug("a request for metrics that was none")
+        finally:
+            self._open.pop(writer, None)
+            writer.transport.abort()
+
+    def _response(self, line: list[str]) -> bytes:
+        method, path = (line[0], line[1].partition("?")[0]) if len(line) > 1 else ("", "")
+        if method != "GET":
+            return _encoded("405 Method Not Allowed", "only GET\n")
+        if path == "/metrics":
+            return _encoded("200 OK", self._registers())
+        if path == "/healthz":
+            return _encoded("200 OK", "live\n")
+        return _encoded("404 Not Found", "there are /metrics and /healthz\n")
+
+    def _registers(self) -> str:
+        now = time.monotonic()
+        if now >= self._kept_until:
+            self._exposition, self._kept_until = exposition(bank_families(self._bank)), now + KEPT_S
+        return self._exposition
+
+
+def _encoded(status: str, text: str) -> bytes:
+    body = text.encode()
+    lines = f"HTTP/1.1 {status}", f"Content-Type: {CONTENT_TYPE}", f"Content-Length: {len(body)}", "Connection: close"
+    return "\r\n".join((*lines, "", "")).encode() + body

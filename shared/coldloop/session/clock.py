@@ -1,0 +1,78 @@
+"""Plant time against real time.
+
+Plant time is an integer, the tick. In lock-step nobody looks at a clock. In real time with factor F a tick lasts
+0.25 s / F, everyone paces on the monotonic clock, and time is never stretched: what is late is late, and is recorded.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from coldloop.process.signals import TICK_S
+
+BIN_S = 5e-5
+BINS = 4000
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """When ticks are due: tick n at `start` + n * 0.25 s / `factor` of the monotonic clock."""
+
+    start: float
+    factor: float
+
+    def due(self, tick: float) -> float:
+        """Return when `tick` (or a moment between two) is due."""
+        return self.start + tick * TICK_S / self.factor
+
+    def position(self, now: float) -> float:
+        """Return where time is at `now`, in ticks."""
+        return (now - self.start) * self.factor / TICK_S
+
+
+class LatenessRecord:
+    """Maximum and percentiles of latenesses, in bounded memory (bins of 50 us up to 0.2 s)."""
+
+    def __init__(self) -> None:
+        self._bins = [0] * (BINS + 1)
+        self.count = 0
+        self.maximum_s = 0.0
+
+    def add(self, lateness_s: float) -> None:
+        """Record a lateness; negative ones count as 0."""
+        self._bins[min(BINS, max(0, int(lateness_s / BIN_S)))] += 1
+        self.count += 1
+        self.maximum_s = max(self.maximum_s, lateness_s)
+
+    def percentile_s(self, share: float) -> float:
+        """Return the smallest bin edge that at least `share` (0..1) of the latenesses do not exceed."""
+        if not self.count:
+            return 0.0
+        wanted = share * self.count
+        seen = 0
+        for position, number in enumerate(self._bins[:-1]):
+            seen += number
+            if seen >= wanted:
+                return min((position + 1) * BIN_S, self.maximum_s)
+        return self.maximum_s
+
+
+class Pacer:
+    """Waits for the ticks of a schedule and records how late each wait ended."""
+
+    def __init__(self, schedule: Schedule, now: Callable[[], float] = time.monotonic) -> None:
+        self.schedule = schedule
+        self.record = LatenessRecord()
+        self._now = now
+
+    async def until(self, tick: float) -> float:
+        """Sleep until `tick` is due; return by how many seconds that was missed.
+
+        The event loop gets its turn also when the tick has been due for long: other tasks are never kept waiting by
+        a clock that cannot follow its schedule.
+        """
+        await asyncio.sleep(max(0.0, self.schedule.due(tick) - self._now()))
+        lateness = max(0.0, self._now() - self.schedule.due(tick))
+        self.record.add(lateness)
+        return lateness
