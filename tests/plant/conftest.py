@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 import pytest
 
-import coldloop
 from coldloop.modbus.identification import DeviceIdentity
 from coldloop.modbus.requests import RequestHandler, Written
 from coldloop.process.lti_model import LtiModel, load
@@ -53,7 +52,7 @@ class Plant:
 
 @pytest.fixture(scope="session")
 def model_path() -> Path:
-    return Path(coldloop.__file__).parent / "data" / "cold_box_model.json"
+    return DEFAULT_MODEL_FILE
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 import argparse
 import asyncio
 import contextlib
+import gc
 import logging
 import signal
 import sys
@@ -53,6 +54,7 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
     except Exception:  # the interpreter would write it past the queue, and wait for whoever reads it
         log.exception("failed")
     end_logs(last_line)
+    gc.freeze()  # otherwise the interpreter looks for cycles in all modules before it ends
     return code
 
 
