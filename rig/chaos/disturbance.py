@@ -2,10 +2,26 @@
 
 import random
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from coldloop.modbus.framing import MalformedFrameError, next_frame
-from rig.chaos.faults import Abort, Delay, Direction, Drop, Duplicate, Flip, FrameFault, Reorder, Truncate
+from rig.chaos.faults import (
+    Abort,
+    Delay,
+    Direction,
+    Drop,
+    Duplicate,
+    ExceptionAnswer,
+    Flip,
+    FrameFault,
+    Reorder,
+    Truncate,
+    WrongUnit,
+)
+
+Replacing = Drop | Duplicate | ExceptionAnswer | Flip | WrongUnit
+UNIT: Final = 6
+"""Where a frame has its unit; the function comes next."""
 
 
 class Outcome(NamedTuple):
@@ -53,8 +69,8 @@ class Mangler:
             elif isinstance(fault, Reorder):
                 if pieces and not overtaken and self._hit(fault.share):
                     self._held, self.hold_s = pieces.pop(), fault.hold_ms / 1000
-            elif isinstance(fault, Drop | Duplicate | Flip):
-                pieces = self._changed(pieces, fault)
+            elif isinstance(fault, Replacing):
+                pieces = [new for piece in pieces for new in self._instead(piece, fault)]
         return Outcome(b"".join([*pieces, overtaken]), delay_s)
 
     def release(self) -> bytes:
@@ -62,17 +78,17 @@ class Mangler:
         held, self._held, self.hold_s = self._held, b"", None
         return held
 
-    def _changed(self, pieces: list[bytes], fault: Drop | Duplicate | Flip) -> list[bytes]:
-        changed: list[bytes] = []
-        for piece in pieces:
-            hit = self._hit(fault.share)
-            if isinstance(fault, Flip):
-                changed.append(self._flipped(piece, fault.bits) if hit else piece)
-            elif isinstance(fault, Drop):
-                changed += [] if hit else [piece]
-            else:
-                changed += [piece, piece] if hit else [piece]
-        return changed
+    def _instead(self, piece: bytes, fault: Replacing) -> list[bytes]:
+        """Return what goes on in the place of a frame."""
+        if not self._hit(fault.share):
+            return [piece]
+        if isinstance(fault, Drop):
+            return []
+        if isinstance(fault, Duplicate):
+            return [piece, piece]
+        if isinstance(fault, Flip):
+            return [self._flipped(piece, fault.bits)]
+        return [_with_other_words(piece, fault) if len(piece) > UNIT + 1 else piece]
 
     def _flipped(self, piece: bytes, bits: int) -> bytes:
         damaged = bytearray(piece)
@@ -82,6 +98,13 @@ class Mangler:
 
     def _hit(self, share: float) -> bool:
         return self._draw.random() < share
+
+
+def _with_other_words(frame: bytes, fault: ExceptionAnswer | WrongUnit) -> bytes:
+    unit, function = frame[UNIT], frame[UNIT + 1]
+    if isinstance(fault, WrongUnit):
+        return frame[:UNIT] + bytes([unit + 1 & 0xFF]) + frame[UNIT + 1 :]
+    return frame[:4] + b"\x00\x03" + bytes([unit, function | 0x80, fault.code])
 
 
 def take_frames(buffer: bytearray) -> list[bytes]:

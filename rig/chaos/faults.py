@@ -76,6 +76,12 @@ class LinkFault(Fault):
     link: Link
 
     @property
+    def in_words(self) -> str:
+        """What it is, and how often frames are hit."""
+        given = self.model_dump(mode="json", exclude={"at_s", "duration_s", "kind", "link"})
+        return " ".join([self.kind, *(f"{name}={value}" for name, value in given.items())])
+
+    @property
     def label(self) -> str:
         """What tables call it."""
         return f"{self.kind} link {self.link}"
@@ -158,6 +164,28 @@ class Flip(FrameFault):
     kind: Literal["flip"]
     share: Share
     bits: Annotated[int, Field(ge=1, le=64)] = 1
+
+
+class WrongUnit(FrameFault):
+    """Frames name another unit than they should."""
+
+    kind: Literal["wrong_unit"]
+    share: Share = 1.0
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        return super().label.replace("_", " ")
+
+
+class ExceptionAnswer(FrameFault):
+    """An exception in the place of the server's answer; the server has done what it was asked for."""
+
+    kind: Literal["exception"]
+    direction: Literal[Direction.ANSWERS] = Direction.ANSWERS
+    share: Share = 1.0
+    code: Annotated[int, Field(ge=1, le=255)] = 4
+    """4 is a failure of the server, 6 busy, 11 a gateway whose target does not answer."""
 
 
 class ProcessFault(Fault):
@@ -264,8 +292,12 @@ class WrongModel(Fault):
         return frozenset({"optimizer_plc"})
 
 
+AnyLinkFault = Annotated[
+    Abort | Delay | Drop | Duplicate | ExceptionAnswer | Flip | Freeze | Reorder | Reset | Truncate | WrongUnit,
+    Field(discriminator="kind"),
+]
 AnyFault = Annotated[
-    Abort | Delay | Drop | Duplicate | Reorder | Reset | Freeze | Truncate | Flip
+    AnyLinkFault
     | Kill | Pause | Restart | Clock | Sensor | Given | WrongModel,
     Field(discriminator="kind"),
 ]  # fmt: skip

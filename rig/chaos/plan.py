@@ -3,7 +3,7 @@
 import random
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Final, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -15,8 +15,11 @@ from plant.load import concatenated, find_load, named_families, telegraph
 from plant.program import LoadProfile
 from plant.settings import PlantKind
 from rig.chaos.faults import AnyFault, Given
+from rig.chaos.link_plan import LinkPlan
 from rig.cosim.scenario import Scenario
 from rig.settings import Settings
+
+P = TypeVar("P", bound=BaseModel)
 
 SHIPPED: Final = files("rig.chaos") / "plans"
 
@@ -166,11 +169,23 @@ def find_plan(name: str, changes: dict[str, Any]) -> Plan:
     shipped = SHIPPED / f"{name}.toml"
     if "/" not in name and shipped.is_file():
         return parse_plan(shipped.read_text(encoding="utf-8"), name, changes)
-    path = Path(name)
-    if not path.exists():
+    if not Path(name).exists():
         raise UsageError(f"plan {name}: neither a file nor a shipped plan; `coldloop chaos --list` names them")
+    return parse_plan(_text_of(name), name, changes)
+
+
+def find_link_plan(name: str, changes: dict[str, Any]) -> LinkPlan:
+    """Return the plan of a proxy's link that a file holds, with some of its values changed.
+
+    Raises:
+        UsageError: There is no such file, or something in it is wrong; one line that says what.
+    """
+    return _validated(LinkPlan, {**_content(_text_of(name), name), **changes}, name)
+
+
+def _text_of(name: str) -> str:
     try:
-        return parse_plan(path.read_text(encoding="utf-8"), name, changes)
+        return Path(name).read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise UsageError(f"{name}: not UTF-8 text; save it as UTF-8") from None
     except OSError as error:
@@ -179,16 +194,24 @@ def find_plan(name: str, changes: dict[str, Any]) -> Plan:
 
 def parse_plan(text: str, source: str, changes: dict[str, Any]) -> Plan:
     """Return the plan that a TOML text holds, with some of its values changed."""
-    try:
-        content = parsed_toml(text)
-    except ValueError as error:
-        raise UsageError(f"{source}: not TOML: {error}") from None
+    content = _content(text, source)
     if "duration_s" in changes:  # a shorter run has fewer faults
         content["faults"] = [
             fault for fault in content.get("faults", []) if _begins_before(fault, changes["duration_s"])
         ]
+    return _validated(Plan, {**content, **changes}, source)
+
+
+def _content(text: str, source: str) -> dict[str, Any]:
     try:
-        return Plan.model_validate({**content, **changes})
+        return parsed_toml(text)
+    except ValueError as error:
+        raise UsageError(f"{source}: not TOML: {error}") from None
+
+
+def _validated(kind: type[P], content: dict[str, Any], source: str) -> P:
+    try:
+        return kind.model_validate(content)
     except ValidationError as error:
         raise UsageError(f"{source}: {_explained(error)}") from None
 

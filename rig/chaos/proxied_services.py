@@ -32,8 +32,8 @@ class ProxiedServices:
         self.services = LocalServices(settings, folder / "logs", detours=detours, environment=_retained(folder))
         ends = self.services.endpoints
         self.proxies: Mapping[Link, LinkProxy] = {
-            Link.PLANT: LinkProxy(detours.plant, ends.plant.port, f"{seed}/plant"),
-            Link.OPTIMIZER: LinkProxy(detours.control_plc, ends.control_plc.port, f"{seed}/optimizer"),
+            Link.PLANT: LinkProxy(detours.plant, ends.plant, f"{seed}/plant"),
+            Link.OPTIMIZER: LinkProxy(detours.control_plc, ends.control_plc, f"{seed}/optimizer"),
         }
         self._stack = AsyncExitStack()
 

@@ -4,8 +4,10 @@ import asyncio
 import contextlib
 import socket
 import struct
+from collections.abc import Callable
 from typing import Final
 
+from coldloop.modbus.endpoints import Endpoint
 from rig.chaos.disturbance import Mangler, take_frames
 from rig.chaos.faults import Direction, FrameFault, Freeze, LinkFault, Reset
 
@@ -19,16 +21,22 @@ class LinkProxy:
 
     Args:
         port: Where to listen; 0 takes any free port.
-        target: Port of the server.
+        target: The server.
         seed: Decides what happens to which frame, with the number of the connection.
+        host: The address of this machine to listen at.
+        tell: Hears in a line of each connection that the server did not take.
 
     A frame is not read before the one in front of it has gone on, so nothing piles up here: what waits, waits in the
     buffers of TCP.
     """
 
-    def __init__(self, port: int, target: int, seed: str) -> None:
+    def __init__(
+        self, port: int, target: Endpoint, seed: str, *, host: str = HOST, tell: Callable[[str], object] | None = None
+    ) -> None:
         self.port = port
         self._target = target
+        self._host = host
+        self._tell = tell
         self._seed = seed
         self._faults: list[LinkFault] = []
         self._flowing = asyncio.Event()
@@ -40,7 +48,7 @@ class LinkProxy:
 
     async def start(self) -> None:
         """Listen."""
-        self._listener = await asyncio.start_server(self._serve, HOST, self.port)
+        self._listener = await asyncio.start_server(self._serve, self._host, self.port)
         self.port = self._listener.sockets[0].getsockname()[1]
 
     async def close(self) -> None:
@@ -78,12 +86,14 @@ class LinkProxy:
             if any(isinstance(fault, Reset) for fault in self._faults):
                 _reset(writer)
                 return
-            far_reader, far_writer = await asyncio.open_connection(HOST, self._target)
+            far_reader, far_writer = await asyncio.open_connection(self._target.host, self._target.port)
             ends.append(far_writer)
             self._open.update(ends)
             await self._pass_both_ways((reader, writer), (far_reader, far_writer))
-        except OSError:
+        except OSError as error:
             _reset(writer)  # nobody listens behind the proxy: as if nobody listened here
+            if self._tell is not None:
+                self._tell(f"{self._target.host}:{self._target.port}: {error.strerror or error}")
         except asyncio.CancelledError:  # the proxy is being closed: what is not sent yet is not waited for
             for end in ends:
                 end.transport.abort()

@@ -27,6 +27,7 @@ COMMANDS: Final = {
     "compare": "a table and a figure of several recorded runs",
     "export": "a recorded run as CSV, MATLAB or HDF5 files",
     "chaos": "a run with faults on purpose, and what became of it",
+    "proxy": "a disturbed link to any Modbus/TCP server: late, lost, damaged, cut, refused",
     "study": "do the runs of a study and draw its figure",
     "reproduce": "all studies of the paper, one report and a scorecard",
     "budget": "what the reference PLC can compute, and in which time",

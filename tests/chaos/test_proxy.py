@@ -9,6 +9,7 @@ import pytest
 
 from coldloop.errors import PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.modbus.settings import ServerSettings
 from coldloop.registers.bank import Caller, RegisterBank
@@ -44,7 +45,7 @@ async def line(timeout_s: float = 60.0) -> AsyncIterator[Line]:
         bank, settings=ServerSettings(port=0), on_write=on_write, identity=DeviceIdentity(product="x", revision="1")
     )
     await server.start()
-    proxy = LinkProxy(0, server.port, "1")
+    proxy = LinkProxy(0, Endpoint(port=server.port), "1")
     await proxy.start()
     client = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=proxy.port, timeout_s=timeout_s)
     try:
@@ -156,7 +157,7 @@ async def test_pipelined_requests_are_delayed_and_stay_in_order() -> None:
 
 async def test_without_a_server_behind_it_a_client_is_told_so() -> None:
     async with line() as it:
-        dead = LinkProxy(0, 1, "1")
+        dead = LinkProxy(0, Endpoint(port=1), "1")
         await dead.start()
         client = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=dead.port, timeout_s=60.0)
         with pytest.raises(PeerUnreachableError):

@@ -86,7 +86,7 @@ def test_a_damaged_file_is_refused_with_its_name_and_a_remedy(model_path: Path, 
         load(path)
     text = str(refused.value)
     assert str(path) in text
-    assert "plant.model" in text
+    assert "plant.cold_box.model" in text
     assert "\n" not in text
 
 

@@ -212,7 +212,7 @@ def test_a_damaged_model_file_is_refused(
     file = tmp_path / "model.json"
     file.write_bytes(content)
     outcome = coldloop(*RUN, "--set", f"model.file={file}", "--out", results)
-    assert_refused(outcome, FAILURE, str(file), part, "python -m plant.model")
+    assert_refused(outcome, FAILURE, str(file), part, "python -m plant.cold_box.model")
     assert not results.exists()
 
 

@@ -1,4 +1,4 @@
-"""The model file's maker: `python -m plant.model FILE` writes the linear model of the reference cold box."""
+"""The model file's maker: `python -m plant.cold_box.model FILE` writes the linear model of the reference cold box."""
 
 import hashlib
 import sys
