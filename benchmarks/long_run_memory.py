@@ -17,7 +17,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICK_S
 from plant.load import HOUR_TICKS, HOURS, concatenated, telegraph
 from rig.cosim.job import Job, Way
-from rig.figures.process import FigureProcess
+from rig.figures.worker import FigureProcess
 from rig.results.folders import claim_folder
 from rig.results.recording import SampleBlock, Sink
 from rig.runs.running import make_scenario, run_into

@@ -18,7 +18,7 @@ from coldloop.config import PREFIX
 from coldloop.errors import UsageError
 from rig import cli
 from rig.cosim.ports import ReservedPorts
-from rig.figures.process import FigureProcess
+from rig.figures.worker import FigureProcess
 from rig.live.started_rigs import check_ports
 from tests.harness.processes import Processes
 

@@ -12,7 +12,7 @@ FLOORS = {
     "services/plant": [["helium"], ["components"], ["cold_box"], ["refrigerator", "rack"]],
     "services/optimizer_plc": [["qp"], ["solvers", "rules"]],
     "rig": [
-        ["results"], ["figures", "cosim"], ["runs", "plc"], ["live", "studies", "chaos"],
+        ["results"], ["figures", "cosim"], ["runs", "plc_sizing"], ["live", "studies", "chaos"],
         ["testing", "report"], ["cli"],
     ],
 }  # fmt: skip

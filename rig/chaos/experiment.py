@@ -15,7 +15,7 @@ from rig.chaos.trace import ChaosTrace
 from rig.cosim.job import Job, Way
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
-from rig.figures.process import FigureProcess
+from rig.figures.worker import FigureProcess
 from rig.results.recording import Recorder, Recording
 from rig.runs.running import run_into
 from rig.settings import Settings

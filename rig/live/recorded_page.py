@@ -15,7 +15,7 @@ from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Upda
 from coldloop.registers.plant import StationSample
 from coldloop.registers.safety import Alarm
 from coldloop.service.event_text import EventText, word
-from hmi.model import Told
+from hmi.process_image import Told
 from hmi.replay import Frame
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.rules import make_rule

@@ -12,8 +12,8 @@ from typing import Annotated, Any, Final, NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
 
-from rig.plc.operations import cholesky
-from rig.plc.reference_plc import cholesky_times
+from rig.plc_sizing.operations import cholesky
+from rig.plc_sizing.reference_plc import cholesky_times
 from rig.studies import published as paper
 from rig.studies.paper.cholesky import SLOW_DOWN, SPEED
 from rig.studies.paper.solver_comparison import measures

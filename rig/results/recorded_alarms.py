@@ -9,7 +9,7 @@ from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
 from coldloop.service.event_text import alarm_cause, kind_word, word
 from control_plc.alarm_settings import AlarmSettings
 from control_plc.alarms import TRANSITIONS
-from hmi.model import Told
+from hmi.process_image import Told
 
 _KINDS: Final = {kind_word(event): event for events in TRANSITIONS.values() for event in events}
 _ALARMS: Final = {word(kind): kind for kind in AlarmKind}

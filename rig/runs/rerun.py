@@ -15,7 +15,7 @@ from coldloop.process.lti_model import load as load_model
 from rig.cosim.job import Job, Way
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
-from rig.figures.process import FigureProcess
+from rig.figures.worker import FigureProcess
 from rig.progress import RunProgress
 from rig.results.folders import claim_folder, installed_version
 from rig.results.indicators import RunEvaluation

@@ -13,7 +13,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICK_S
 from plant.settings import PlantKind
 from rig.cosim.scenario import Scenario
-from rig.figures.process import FigureProcess
+from rig.figures.worker import FigureProcess
 from rig.results.columns import ALL_FILES, schema_document
 from rig.results.disk_reserve import DiskReserve
 from rig.results.file_sinks import EventsSink, StationSink, TraceSink, UpdatesSink

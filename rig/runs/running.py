@@ -11,7 +11,7 @@ from plant.load import find_load
 from rig.cosim.job import Job, StopRequest, Way
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario, natural_ticks
-from rig.figures.process import FigureProcess
+from rig.figures.worker import FigureProcess
 from rig.interruption import INTERRUPTION
 from rig.results.recording import Recorder, Sink
 from rig.runs.run_files import RunFiles

@@ -32,7 +32,7 @@ from coldloop.service.start import SERVING
 from coldloop.service.telemetry import Telemetry
 from coldloop.session.pace import Pace
 from control_plc.certificate_watch import CertificateWatch
-from control_plc.clients import Clients
+from control_plc.client_requests import Clients
 from control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
 from control_plc.program import make_program
 from control_plc.publication import Publication

@@ -15,11 +15,11 @@ from coldloop.registers.control_plc import Mode, OperatorMode
 from coldloop.registers.optimizer_plc import BANDED_OUTPUTS, INPUT_SAMPLES, PREDICTED_SAMPLES, Optimization, Prediction
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.event_text import alarm_cause, word
+from hmi.compression_station import plant_document
 from hmi.explanation import explain
-from hmi.model import Model, Told
+from hmi.process_image import Model, Told
 from hmi.sentences import sentence
 from hmi.signals import MAPS, signals_of
-from hmi.station import plant_document
 from hmi.trends import NAMES, Gap, mode_name, rounded, thin
 
 Document = dict[str, Any]

@@ -14,7 +14,7 @@ from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import AlarmAction
 from hmi.command_work import WORK, CommandClient, NotTakenError, check_manual
 from hmi.commands import Command, FaultSensor, PlayLoad, SetLoad, SetSetpoint, TreatAlarm, clock_text, duration_text
-from hmi.model import Model
+from hmi.process_image import Model
 from hmi.signals import MAPS
 
 CONFIRM_WITHIN_S: Final = 60.0

@@ -6,7 +6,7 @@ from coldloop.registers.declaration import fields_of
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.service.event_text import word
 from coldloop.service.metrics import Family, Sample, block_families, build_family
-from hmi.model import Model
+from hmi.process_image import Model
 from hmi.signals import MAPS
 
 

@@ -18,8 +18,8 @@ from hmi.commanding import LONGEST_REQUEST, Commanding
 from hmi.connections import Connections
 from hmi.documents import encoded, state_document
 from hmi.guard import Guard
-from hmi.model import Model
 from hmi.operator_desk import OperatorDesk
+from hmi.process_image import Model
 from hmi.reading import STATIC, Reading, static_files
 from hmi.settings import HmiSection
 from hmi.users import Users

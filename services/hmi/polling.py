@@ -15,9 +15,9 @@ from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStat
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, ControlLinkStatus, Optimization, Prediction
 from coldloop.registers.plant import LoadStatus, StationStatus
 from coldloop.registers.safety import Alarm, AlarmKind
-from hmi.model import Model, Told
+from hmi.compression_station import KIND, REFRIGERATOR
+from hmi.process_image import Model, Told
 from hmi.signals import MAPS, shown_blocks
-from hmi.station import KIND, REFRIGERATOR
 
 log = logging.getLogger("coldloop.hmi")
 

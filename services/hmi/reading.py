@@ -27,8 +27,8 @@ from hmi.documents import (
 )
 from hmi.guard import Guard, add_headers, refusal
 from hmi.long_reads import LongReads
-from hmi.model import Model, Told
 from hmi.page_metrics import page_families
+from hmi.process_image import Model, Told
 from hmi.settings import HmiSection
 from hmi.trends import NAMES
 

@@ -17,8 +17,8 @@ from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Upda
 from coldloop.registers.plant import LoadStatus, StationSample, StationStatus
 from coldloop.registers.safety import Alarm
 from hmi.guard import refusal
-from hmi.model import Model, Told
 from hmi.page_server import Exhibit, PageServer
+from hmi.process_image import Model, Told
 from hmi.settings import HmiSection
 from hmi.signals import MAPS
 from hmi.trends import NO_STATION, station_values

@@ -5,10 +5,10 @@ import logging
 import time
 
 from coldloop.modbus.endpoints import Endpoint
-from hmi.model import Model
 from hmi.operator_desk import OperatorDesk
 from hmi.page_server import Exhibit, PageServer
 from hmi.polling import Poller
+from hmi.process_image import Model
 from hmi.settings import HmiSection, HmiSettings
 from hmi.signals import MAPS
 

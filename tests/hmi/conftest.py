@@ -20,7 +20,7 @@ import pytest
 
 from hmi.users import PageRole, write_user
 from rig import cli
-from rig.figures.process import FigureProcess
+from rig.figures.worker import FigureProcess
 from rig.settings import Settings
 from tests.harness.processes import END_S, Process, Processes
 

@@ -18,8 +18,8 @@ from hmi.access import REQUEST_BURST, REQUESTS_A_BROWSER, RateLimit, Sessions, h
 from hmi.audit import Audit
 from hmi.connections import Connections
 from hmi.guard import Guard
-from hmi.model import Model
 from hmi.page_server import Exhibit, PageServer
+from hmi.process_image import Model
 from hmi.settings import HmiSection, LoginSettings
 from hmi.users import PageRole, User, Users, hash_password, write_user
 from rig.cosim.endpoints import RigEndpoints

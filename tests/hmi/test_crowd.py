@@ -13,8 +13,8 @@ import pytest
 
 from coldloop.registers.control_plc import Process
 from hmi.audit import KEPT, LARGEST_FILE, MOST_KINDS, OLDER_FILES, REPEATS_S, Audit
-from hmi.model import Model
 from hmi.page_server import Exhibit, PageServer
+from hmi.process_image import Model
 from hmi.reading import MOST_NAMES, ROWS_AT_ONCE
 from hmi.settings import HmiSection
 from hmi.trends import NAMES

@@ -15,8 +15,8 @@ from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 from hmi.command_work import lead_ticks
 from hmi.commands import Command, PlayLoad, SetFactor, SetLoad, SetMode, TreatAlarm, clock_text, duration_text
-from hmi.model import Model
 from hmi.operator_desk import CONFIRM_WITHIN_S, OperatorDesk, Outcome
+from hmi.process_image import Model
 
 R = TypeVar("R", bound=tuple[Any, ...])
 

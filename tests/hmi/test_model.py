@@ -21,9 +21,9 @@ from hmi.access import Party
 from hmi.broadcast import WAITING, Broadcast
 from hmi.commands import read_load
 from hmi.documents import alarms_document, encoded, state_document, trend_document
-from hmi.model import STALE_S, Model, Told
 from hmi.page_metrics import page_families
 from hmi.polling import Poller
+from hmi.process_image import STALE_S, Model, Told
 from hmi.reading import safe_cell
 from hmi.signals import MAPS, signals_of, words_in
 from hmi.trends import MOST_ROWS, TrendStore, thin

@@ -11,10 +11,10 @@ import pytest
 
 from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
 from coldloop.registers.plant import StationAlarm, StationStatus
-from hmi.model import Model
+from hmi.compression_station import plant_document
+from hmi.process_image import Model
 from hmi.reading import STATIC
 from hmi.signals import MAPS, signals_of
-from hmi.station import plant_document
 from tests.hmi.conftest import Served, Site, eventually, opened, read_registers, record, write_registers
 
 if TYPE_CHECKING:

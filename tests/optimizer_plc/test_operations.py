@@ -13,8 +13,8 @@ from optimizer_plc.qp.penalties import DEFAULT_PENALTIES
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers import interior_point, ode
 from optimizer_plc.solvers.ode import flow_in
-from rig.plc import operations
-from rig.plc.reference_plc import ACTIVE_ROWS, QPOASES_ON_LAPTOP_S, cholesky_times, fitted, residuals, slow_down
+from rig.plc_sizing import operations
+from rig.plc_sizing.reference_plc import ACTIVE_ROWS, QPOASES_ON_LAPTOP_S, cholesky_times, fitted, residuals, slow_down
 
 
 class Counted:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.errors import ResultsError, UsageError
-from rig.figures import process as figure_process
-from rig.figures.process import FigureProcess
+from rig.figures import worker as figure_process
+from rig.figures.worker import FigureProcess
 from tests.conftest import draw_nothing
 
 if TYPE_CHECKING:

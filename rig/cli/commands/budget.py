@@ -58,7 +58,7 @@ def _power(text: str) -> float:
 def execute(options: argparse.Namespace) -> int:
     """Print the tables."""
     if options.certify is not None:
-        from rig.plc.certification_table import certification_table
+        from rig.plc_sizing.certification_table import certification_table
 
         if options.power is not None or options.period is not None:
             raise UsageError("--certify: is for the PLC that the configuration gives; leave out --power and "
@@ -66,7 +66,7 @@ def execute(options: argparse.Namespace) -> int:
         settings = configuration(options).settings
         sys.stdout.write(certification_table(settings, options.certify, options.tolerance, options.confidence))
         return 0
-    from rig.plc.budget_tables import budget_tables
+    from rig.plc_sizing.budget_tables import budget_tables
 
     sys.stdout.write(budget_tables(configuration(options).settings, options.power, options.period))
     return 0

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rig.cosim.job import Job
-    from rig.figures.process import FigureProcess
+    from rig.figures.worker import FigureProcess
     from rig.results.recording import Sink
 
 SHORT_RUN_TICKS: Final = 2400
@@ -61,7 +61,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Run, and write the results."""
     check_load(options.load)
-    from rig.figures.process import FigureProcess
+    from rig.figures.worker import FigureProcess
 
     with FigureProcess(options.figures) as figure:
         if options.in_process:

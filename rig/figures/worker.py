@@ -1,6 +1,6 @@
 """The figure of a run, drawn by a process of its own: matplotlib is loaded while the run goes on, on another core.
 
-python -m rig.figures.process <folder and formats as JSON on standard input> the error, if any, on standard output
+python -m rig.figures.worker <folder and formats as JSON on standard input> the error, if any, on standard output
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from typing import Final, Self
 
 from coldloop.errors import ColdloopError, ResultsError
 
-COMMAND: Final = (sys.executable, "-m", "rig.figures.process")
+COMMAND: Final = (sys.executable, "-m", "rig.figures.worker")
 
 
 class FigureProcess:

@@ -13,10 +13,10 @@ from optimizer_plc.qp.design import N_SLACKS, trivial_design
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem
 from optimizer_plc.settings import ProgramSettings
-from rig.plc import operations
-from rig.plc.memory import Footprint, estimator_memory, footprint
-from rig.plc.operations import Operations
-from rig.plc.reference_plc import (
+from rig.plc_sizing import operations
+from rig.plc_sizing.memory import Footprint, estimator_memory, footprint
+from rig.plc_sizing.operations import Operations
+from rig.plc_sizing.reference_plc import (
     ACTIVE_ROWS,
     MEMORY_BYTES,
     QPOASES_ON_LAPTOP_S,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.plc.operations import cholesky
+from rig.plc_sizing.operations import cholesky
 
 Array = NDArray[np.float64]
 

@@ -1,8 +1,8 @@
 """Certified iterations as text."""
 
 from coldloop.process.signals import SAMPLING_PERIOD_S
-from rig.plc.budget_tables import aligned
-from rig.plc.certification import LONGEST, SCENARIO_TICKS, Certificate, certify, failure_bound
+from rig.plc_sizing.budget_tables import aligned
+from rig.plc_sizing.certification import LONGEST, SCENARIO_TICKS, Certificate, certify, failure_bound
 from rig.progress import make_console
 from rig.settings import Settings
 

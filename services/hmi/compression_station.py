@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from coldloop.registers.plant import StationAlarm, StationMode, StationStatus
 from coldloop.service.event_text import word
-from hmi.model import Model
+from hmi.process_image import Model
 
 KIND: Final = "plant.kind"
 REFRIGERATOR: Final = "refrigerator"

@@ -11,7 +11,7 @@ from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.design import N_INPUTS
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem
-from rig.plc.operations import WORD
+from rig.plc_sizing.operations import WORD
 
 N_VECTORS = 8
 """Vectors of z's size that a step of the ODE solver has at a time, and half as many of gamma's."""
