@@ -30,7 +30,7 @@ class FakeClock:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
     made = FakeClock(0.125)
-    monkeypatch.setattr("coldloop.session.clock.asyncio.sleep", made.sleep)
+    monkeypatch.setattr("coldloop.session.clock.sleep", made.sleep)
     return made
 
 

@@ -4,8 +4,8 @@ Plant time is an integer, the tick. In lock-step nobody looks at a clock. In rea
 0.25 s / F, everyone paces on the monotonic clock, and time is never stretched: what is late is late, and is recorded.
 """
 
-import asyncio
 import time
+from asyncio import sleep
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -72,7 +72,7 @@ class Pacer:
         The event loop gets its turn also when the tick has been due for long: other tasks are never kept waiting by
         a clock that cannot follow its schedule.
         """
-        await asyncio.sleep(max(0.0, self.schedule.due(tick) - self._now()))
+        await sleep(max(0.0, self.schedule.due(tick) - self._now()))
         lateness = max(0.0, self._now() - self.schedule.due(tick))
         self.record.add(lateness)
         return lateness
