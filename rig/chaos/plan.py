@@ -184,8 +184,11 @@ def find_link_plan(name: str, changes: dict[str, Any]) -> LinkPlan:
 
 
 def _text_of(name: str) -> str:
+    path = Path(name)
+    if path.exists() and not path.is_file():
+        raise UsageError(f"{name}: not a regular file; name a readable TOML file")
     try:
-        return Path(name).read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise UsageError(f"{name}: not UTF-8 text; save it as UTF-8") from None
     except OSError as error:

@@ -1,5 +1,6 @@
 """`coldloop proxy`: a disturbed link to any server, seen by a client that we did not write."""
 
+import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -87,6 +88,18 @@ def test_a_wrong_plan_is_one_line_that_names_the_file_and_the_key(
     assert (outcome.code, len(outcome.complaints)) == (2, 1)
     assert f"{file}: " in outcome.complaints[0]
     assert words in outcome.complaints[0]
+
+
+@pytest.mark.parametrize("command", ["chaos", "proxy --listen 15021 --to 127.0.0.1:502"])
+def test_a_plan_is_a_regular_file(command: str, tmp_path: Path, coldloop: "Coldloop") -> None:
+    os.mkfifo(tmp_path / "fifo")
+    name, *options = command.split()
+    for path in (tmp_path, tmp_path / "fifo"):
+        outcome = coldloop(name, path, *options)
+        assert (outcome.code, outcome.complaints) == (
+            2,
+            [f"coldloop: {path}: not a regular file; name a readable TOML file"],
+        )
 
 
 @pytest.mark.parametrize(
