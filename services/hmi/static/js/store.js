@@ -6,7 +6,22 @@ const SILENT_MS = 1500, GIVEN_UP_MS = 5000, SEND_MS = 20000;
 
 export function onChange(listener) { listeners.push(listener); }
 
-function tell(changed) { for (const listener of listeners) listener(changed); }
+// Changes are drawn once a frame: a slow browser takes all that has come and shows the newest, instead of each late.
+let changed = null;
+function tell({ names, alarms, update }) {
+  if (changed === null) {
+    changed = { names: new Set(), alarms: false, update: false };
+    if (document.hidden) setTimeout(draw); else requestAnimationFrame(draw);
+  }
+  changed.names = names === null || changed.names === null ? null : new Set([...changed.names, ...names]);
+  changed.alarms ||= alarms; changed.update ||= update;
+}
+function draw() {
+  const what = changed;
+  changed = null;
+  if (state.heard) document.body.dataset.tick = state.tick;
+  for (const listener of listeners) listener(what);
+}
 
 export function take(message) {
   const reset = message.whole;
@@ -16,7 +31,6 @@ export function take(message) {
   if ("alarms" in message) state.alarms = message.alarms;
   if ("update" in message) state.update = message.update;
   if ("replay" in message) state.replay = message.replay;
-  document.body.dataset.tick = message.tick;
   tell({ names: reset ? null : new Set(Object.keys(message.values)), alarms: "alarms" in message, update: "update" in message });
 }
 
