@@ -26,6 +26,8 @@ def printed_by(processes: Processes) -> Benchmark:
     def run(program: str, *arguments: str) -> str:
         pipe = subprocess.PIPE
         ended = processes.python(str(FOLDER / program), *arguments, stdout=pipe, stderr=pipe).ended(PATIENCE_S)
+        if ended.code == 1 and "the machine is too busy" in ended.err:
+            pytest.skip(ended.err.strip())
         assert ended.code == 0, ended.err
         return ended.out
 
