@@ -84,7 +84,7 @@ class LinkFault(Fault):
     @property
     def label(self) -> str:
         """What tables call it."""
-        return f"{self.kind} link {self.link}"
+        return f"{super().label} link {self.link}"
 
 
 class FrameFault(LinkFault):
@@ -171,11 +171,6 @@ class WrongUnit(FrameFault):
 
     kind: Literal["wrong_unit"]
     share: Share = 1.0
-
-    @property
-    def label(self) -> str:
-        """What tables call it."""
-        return super().label.replace("_", " ")
 
 
 class ExceptionAnswer(FrameFault):

@@ -1,6 +1,6 @@
 """The points of the paper's figures, as far as its source holds them.
 
-Those of the PLC's speed are the optimiser's own (`rig.plc_sizing.reference_plc`).
+Those of the PLC's speed are in `rig.plc_sizing.reference_plc`.
 """
 
 import csv
