@@ -9,9 +9,10 @@
     FROZEN      it answers, and its clock does not move
 
 One rule decides: *no output is written unless what the rack applies was read back since the last break: sealed, finite,
-of this session, at a known tick.* Only IN_STEP writes, and only a reading that `read_back` accepts leads there; every
-doubt leads out of it. The rack holds its side of the rule: it takes no outputs that name another generation than the
-one that was read back. Pure: no sockets, no clock.
+of this session, at a known tick, and either what we had made it apply or read twice.* Only IN_STEP writes, and only a
+reading that `read_back` accepts leads there; every doubt leads out of it. A single answer that lies about the outputs
+thus moves nothing, even where it is the first after a break. The rack holds its side of the rule: it takes no outputs
+that name another generation than the one that was read back. Pure: no sockets, no clock.
 """
 
 import math
@@ -72,6 +73,10 @@ class PlantLink:
         """How long the rack's tick may stand, in ticks of our clock."""
         self.generation = 0
         """Generation of the rack's outputs that was read back; 0 is none."""
+        self._ours: tuple[tuple[float, ...], ...] = ()
+        """Outputs that the rack applies in that generation: those taken last, and those sent since."""
+        self._read: tuple[float, ...] = ()
+        """Session, generation and outputs of the last reading that asks to be confirmed."""
         self.session = 0
         """That of the rack when it last answered; so the tick."""
         self.tick = 0
@@ -92,7 +97,7 @@ class PlantLink:
 
     def begin(self) -> None:
         """Begin a session: read back first. What the rack applied in the one before does not matter."""
-        self.generation = 0
+        self.generation, self._read = 0, ()
         self._enter(PlantLinkState.JOINING, LinkCause.STARTED)
 
     def starting(self) -> None:
@@ -142,12 +147,17 @@ class PlantLink:
             self._enter(PlantLinkState.JOINING, LinkCause.IMPLAUSIBLE)
         elif stopped:
             self._enter(PlantLinkState.FROZEN, LinkCause.STOPPED)
-        else:
+        elif self._is_certain(reading, changed=changed):
             if changed and self.generation:  # somebody else, or its watchdog, has moved the outputs
                 self._alarms.raised(AlarmKind.PLANT_LOST, LinkCause.CHANGED)
-            self.generation = reading.generation
+            self.generation, self._ours, self._read = reading.generation, (tuple(reading.u),), ()
             return True
         return False
+
+    def addressed(self, outputs: Actuators) -> Actuators:
+        """Return outputs as they are sent: from us, to the generation that was read back. The rack may apply them."""
+        self._ours = (*self._ours[-1:], outputs[1:4])
+        return outputs._replace(holder=self.holder, generation=self.generation)
 
     def joined(self) -> None:
         """The program goes on from what was read back: outputs may be written."""
@@ -182,6 +192,12 @@ class PlantLink:
             self._alarms.returned(alarm)
 
     # -- inside --------------------------------------------------------------------------------------------------------
+
+    def _is_certain(self, reading: Measurement, *, changed: bool) -> bool:
+        """Tell whether the outputs of a reading are ours, or those that the reading before showed too."""
+        outputs, before = tuple(reading.u), self._read
+        self._read = (reading.session, reading.generation, *outputs)
+        return self._read == before or (not changed and outputs in self._ours)
 
     def _watch_others(self, answer: Measurement) -> None:
         """Raise the alarm when the rack has refused somebody else's outputs."""

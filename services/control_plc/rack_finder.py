@@ -20,7 +20,9 @@ log = logging.getLogger("coldloop.control_plc")
 SEARCH_S: Final = 0.5
 """How long one attempt to reach a lost rack may take, at least."""
 LOOK_PAUSE_S: Final = 0.1
-"""Between two looks at a rack that is not in step; the first one after a break is made at once."""
+"""Between two looks at a rack that is not in step."""
+AT_ONCE: Final = 2
+"""Looks after a break without a pause: the second confirms what the first has shown."""
 
 
 class RackFinder:
@@ -47,7 +49,7 @@ class RackFinder:
         """The rack has answered at least once since the start."""
 
     def look_at_once(self) -> None:
-        """Make the next look without a pause before it."""
+        """Make the next looks without a pause before them."""
         self._looks = 0
 
     async def reach(self) -> bool:
@@ -67,7 +69,7 @@ class RackFinder:
             changed: What ends the pause between two looks.
             patience_s: How long it may take in real time; None in lock-step.
         """
-        if self._looks:
+        if self._looks >= AT_ONCE:
             await self.pause(changed)
         self._looks += 1
         limit = None if patience_s is None else max(SEARCH_S, patience_s)

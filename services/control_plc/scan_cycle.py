@@ -53,8 +53,7 @@ class ScanCycle:
         """Return the outputs to be written now, or None: the rack is to be read, and nothing written."""
         self._sent = None
         if self._link.in_step:
-            outputs = self._program.begin_scan()
-            self._sent = outputs._replace(holder=self._link.holder, generation=self._link.generation)
+            self._sent = self._link.addressed(self._program.begin_scan())
         return self._sent
 
     def failed(self, error: LinkError) -> None:

@@ -26,6 +26,10 @@ def reading(tick: int = 5, **changed: object) -> Measurement:
     return shown._replace(**changed)  # type: ignore[arg-type]
 
 
+def read_twice(link: PlantLink, shown: Measurement, now: float | None = None) -> bool:
+    return not link.read_back(shown, 1, now) and link.read_back(shown, 1, now)
+
+
 def outputs(tick: int = 5) -> Actuators:
     return Actuators(tick, *U, 1, HOLDER, 3)
 
@@ -36,7 +40,7 @@ def link() -> PlantLink:
     journal = Journal()
     made = PlantLink(AlarmPanel(journal), journal, HOLDER)
     made.begin()
-    assert made.read_back(reading(), 1, None)
+    assert read_twice(made, reading())
     made.joined()
     made.settled()
     assert made.in_step
@@ -99,6 +103,29 @@ def test_only_a_finite_reading_of_this_session_leads_back(
     assert link.read_back(reading(), 1, None)
 
 
+def test_outputs_that_one_reading_shows_and_nobody_has_written_are_not_gone_on_from(link: PlantLink) -> None:
+    """A single lie, the first answer after a break: from 0 % the valve would be opened by what a tick allows."""
+    link.unanswered(LinkCause.NO_ANSWER)
+    for lie in (reading(u=(0.0, 75.0, 36.0)), reading(u=(50.0, 75.0, 36.0), generation=4), reading(generation=9)):
+        assert not link.read_back(lie, 1, None)
+        assert not link.in_step
+    assert link.read_back(reading(), 1, None), "as we had left it"
+
+
+def test_outputs_whose_answer_was_lost_are_ours_and_go_on_at_once(link: PlantLink) -> None:
+    sent = link.addressed(outputs()._replace(cv155=43.5))
+    assert (sent.holder, sent.generation) == (HOLDER, 3)
+    link.unanswered(LinkCause.NO_ANSWER)
+    assert link.read_back(reading(u=sent[1:4]), 1, None)
+
+
+def test_outputs_before_the_last_that_were_taken_are_no_longer_ours(link: PlantLink) -> None:
+    for cv155 in (43.5, 44.0):
+        link.addressed(outputs()._replace(cv155=cv155))
+    link.unanswered(LinkCause.NO_ANSWER)
+    assert not link.read_back(reading(), 1, None)
+
+
 def test_session_0_is_none_and_cannot_be_joined(link: PlantLink) -> None:
     link.unanswered(LinkCause.NO_ANSWER)
     assert not link.read_back(reading(session=0), 0, None)
@@ -136,7 +163,7 @@ def test_alarms_tell_what_is_wrong_and_return_when_a_scan_is_taken() -> None:
     link.unanswered(LinkCause.SECOND_MASTER)
     assert alarms.rows[AlarmKind.PLANT_FOREIGN].active
     assert not alarms.rows[AlarmKind.PLANT_LOST].active, "it answers"
-    assert link.read_back(reading(), 1, None)
+    assert read_twice(link, reading())
     link.joined()
     assert link.exchanged(outputs(), reading(), None)
     link.settled()
@@ -160,7 +187,7 @@ def test_outputs_that_somebody_else_has_moved_during_a_break_raise_the_alarm(lin
     alarms = link._alarms  # noqa: SLF001
     link.overslept()
     assert not alarms.rows[AlarmKind.PLANT_LOST].active
-    assert link.read_back(reading(u=(30.0, 50.0, 40.0), generation=4, holder=0), 1, None)
+    assert read_twice(link, reading(u=(30.0, 50.0, 40.0), generation=4, holder=0))
     row = alarms.rows[AlarmKind.PLANT_LOST]
     assert (row.active, row.cause) == (1, LinkCause.CHANGED)
 

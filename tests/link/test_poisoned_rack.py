@@ -39,6 +39,10 @@ def aged(age: float) -> Change:
     return lambda record: record._replace(age=age)  # type: ignore[attr-defined] # a measurement
 
 
+def applying(cv155: float) -> Change:
+    return lambda record: record._replace(u=(cv155, *record.u[1:]))  # type: ignore[attr-defined] # a measurement
+
+
 async def is_still_itself(site: "Field", control: "Control", poisoner: Poisoner) -> None:
     """Wait until the control PLC drives again; it asks no more often than it scans, and makes no step."""
     await site.follows(control)
@@ -60,6 +64,19 @@ async def test_an_age_that_makes_no_sense_is_one_bad_answer(field: "FieldAt") ->
             await is_still_itself(site, control, poisoner)
         raised = [(event.subject, event.cause) for event in await control.events(EventKind.ALARM_RAISED)]
         assert raised.count((AlarmKind.PLANT_LOST, LinkCause.IMPLAUSIBLE)) == 4
+
+
+async def test_a_lie_about_the_outputs_right_after_a_break_moves_nothing(field: "FieldAt") -> None:
+    """The reading that would be gone on from says what a valve may well be at: nobody has told it so."""
+    async with field() as site:
+        control, poisoner = await site.joined(), Poisoner()
+        site.link.treat = poisoner
+        await control.drive(*SETPOINTS)
+        await is_still_itself(site, control, poisoner)
+        for cv155 in (0.0, 45.0, 100.0):
+            poisoner.changes = [applying(math.nan), applying(cv155)]
+            await is_still_itself(site, control, poisoner)
+        assert (await control.link()).breaks == 3
 
 
 async def test_an_age_that_goes_on_to_make_no_sense_is_alarmed(field: "FieldAt") -> None:
