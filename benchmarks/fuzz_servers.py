@@ -29,10 +29,10 @@ from coldloop.modbus.settings import TlsSettings
 from coldloop.modbus.tls import client_context
 from coldloop.registers.common import STATISTICS_BLOCK
 from coldloop.registers.declaration import RegisterMap
+from coldloop.registers.maps import MAPS
 from rig import cli
 from rig.chaos.resources import resident_mb
 from rig.cli.certificate_files import CLIENTS
-from rig.cli.register_listing import MAPS
 from rig.cosim.local_services import LocalServices
 from rig.cosim.wiring import SERVICES
 from rig.settings import Settings

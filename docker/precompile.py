@@ -44,10 +44,10 @@ def default_plant() -> None:
 
 
 def _make_plant(kind: "PlantKind") -> None:
+    from coldloop.process.load_profile import LoadProfile  # noqa: PLC0415
     from coldloop.process.model_file import read_header  # noqa: PLC0415
     from coldloop.process.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from plant.kinds import plant_maker  # noqa: PLC0415
-    from plant.program import LoadProfile  # noqa: PLC0415
     from plant.settings import PlantSection  # noqa: PLC0415
 
     header = read_header(DEFAULT_MODEL_FILE)

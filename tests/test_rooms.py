@@ -8,7 +8,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = {
-    "shared/coldloop": [["kernels", "process"], ["session"], ["registers"], ["safety", "modbus"], ["service"]],
+    "shared/coldloop": [
+        ["kernels", "process"], ["session"], ["registers"], ["safety", "modbus"], ["service"], ["operating"],
+    ],
     "services/plant": [["helium"], ["components"], ["cold_box"], ["refrigerator", "rack"]],
     "services/optimizer_plc": [["qp"], ["solvers", "rules"]],
     "rig": [

@@ -9,10 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from coldloop.config import Configuration, parsed_toml
 from coldloop.errors import LoadFileError, UsageError
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.signals import TICK_S
 from coldloop.session.settings import TimeMode
 from plant.load import concatenated, find_load, named_families, telegraph
-from plant.program import LoadProfile
 from plant.settings import PlantKind
 from rig.chaos.faults import AnyFault, Given
 from rig.chaos.link_plan import LinkPlan

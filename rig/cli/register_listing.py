@@ -9,13 +9,9 @@ from typing import Final
 
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
 from coldloop.modbus.requests import MAX_READ_WORDS
-from coldloop.registers.control_plc import CONTROL_MAP
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import PLANT_MAP
 from coldloop.service.event_text import word
 
-MAPS: Final = {register_map.service: register_map for register_map in (PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP)}
 PORTS: Final = {"plant": PLANT_PORT, "control_plc": CONTROL_PORT, "optimizer_plc": OPTIMIZER_PORT}
 
 COLUMNS: Final = (

@@ -4,14 +4,14 @@ import logging
 from typing import NamedTuple
 
 from coldloop.errors import LinkError
+from coldloop.operating.execution import lead_ticks, write_pace
+from coldloop.operating.load_stream import LoadStream
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Operator, OperatorMode
 from coldloop.registers.plant import LOAD_ROWS, LiveLoad, LoadStatus, LoadStep, PlantSession
 from coldloop.registers.seal import sealed
-from plant.program import LoadProfile
-from rig.cosim.load_stream import LoadStream
-from rig.cosim.operator_client import LEAD_TICKS, write_pace
 from rig.cosim.session_client import SessionClient
 
 log = logging.getLogger("coldloop.rig")
@@ -71,8 +71,7 @@ async def give_back(rig: SessionClient, found: Found | None, session: int) -> No
         tick = (await rig.plant.read(Identity)).tick
         await rig.plant.write(sealed(LiveLoad(0, found.load.watts[0])))
         coming = LoadProfile(found.load.times, found.load.watts)
-        lead = LEAD_TICKS * max(1, round(found.pace.factor))
-        await LoadStream(rig.plant, session, coming, begin=tick + lead).feed(tick)
+        await LoadStream(rig.plant, session, coming, begin=tick + lead_ticks(found.pace)).feed(tick)
     except LinkError as error:
         log.warning("the rig does not run on as it was found: %s", error)
     else:

@@ -20,6 +20,8 @@ class Way(StrEnum):
     IN_PROCESS = "in-process"
     LOCALHOST = "localhost"
     ATTACHED = "attached"
+    RECORDED = "recorded"
+    """Nothing was driven: a session of others was looked at."""
     CHAOS = "chaos"
     """On localhost, with faults on purpose."""
 

@@ -16,6 +16,7 @@ from rig.cosim.local_services import run_on_localhost
 from rig.cosim.rig_configuration import attached, running_configuration
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
+from rig.cosim.session_recording import SessionUnderWay, find_session, record_session
 from rig.results.recording import Recorder
 from rig.settings import Settings
 
@@ -41,6 +42,29 @@ def as_attached(effective: Configuration[Settings], endpoints: Sequence[Endpoint
     return attached(effective, running)
 
 
+def session_under_way(effective: Configuration[Settings], endpoints: Sequence[Endpoint]) -> SessionUnderWay:
+    """Return the session of a rig that is up.
+
+    Raises:
+        UsageError: It has none.
+        LinkError: A service does not answer, or runs another model.
+    """
+    found: list[SessionUnderWay] = []
+
+    async def read() -> int:
+        rig = SessionClient(RigEndpoints(*endpoints), effective.settings)
+        try:
+            async with answered_in_time("to read what the rig does"):
+                await rig.connect(ATTACH_PATIENCE_S)
+                found.append(await find_session(rig))
+        finally:
+            rig.close()
+        return 0
+
+    run_event_loop(read)
+    return found[0]
+
+
 def drive(job: Job, recorder: Recorder, folder: Path, stop: StopRequest) -> None:
     """Do the run of a job.
 
@@ -54,6 +78,8 @@ def _run(job: Job, recorder: Recorder, folder: Path) -> Awaitable[None]:
     settings, scenario = job.effective.settings, job.scenario
     if job.conduct is not None:
         return job.conduct(recorder, folder)
+    if job.way is Way.RECORDED:
+        return _looked_at(RigEndpoints(*job.endpoints), settings, scenario, recorder)
     if job.way is Way.ATTACHED:
         return _attached(RigEndpoints(*job.endpoints), settings, scenario, recorder)
     return run_on_localhost(settings, scenario, recorder, folder / "logs")
@@ -74,6 +100,15 @@ async def _stoppable(run: Awaitable[None], stop: StopRequest) -> int:
     finally:
         stop.cancel = None
     return 0
+
+
+async def _looked_at(endpoints: RigEndpoints, settings: Settings, scenario: Scenario, recorder: Recorder) -> None:
+    rig = SessionClient(endpoints, settings, tolerant=True)
+    try:
+        await rig.connect(ATTACH_PATIENCE_S)
+        await record_session(rig, scenario, recorder)
+    finally:
+        rig.close()
 
 
 async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scenario, recorder: Recorder) -> None:

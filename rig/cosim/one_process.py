@@ -4,6 +4,7 @@ from contextlib import AbstractContextManager
 from typing import NamedTuple, Protocol
 
 from coldloop.kernels.first_use import kernels_of
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
@@ -14,7 +15,7 @@ from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
 from plant.kinds import plant_maker
 from plant.own_model import own_header
-from plant.program import LoadProfile, PlantProgram
+from plant.program import PlantProgram
 from rig.cosim.compiled.stretches import CompiledStretches
 from rig.cosim.scenario import Scenario
 from rig.results.recording import Recorder

@@ -117,11 +117,11 @@ def attached(effective: Configuration[Settings], running: Mapping[str, Any]) -> 
         for key in covered:
             if asked.get(key) != running[key]:
                 raise UsageError(
-                    f"{source}: the rig runs {key} = {_text(running[key])}, which --attach does not change; drop it, "
+                    f"{source}: the rig runs {key} = {_text(running[key])}, which a client does not change; drop it, "
                     "or start the rig with it"
                 )
         if not covered and source.startswith("--") and not given.startswith((*OF_SESSION, *OF_CLIENT)):
-            raise UsageError(f"{source}: a rig that is up has its own {given}, which --attach does not change; drop it")
+            raise UsageError(f"{source}: a rig that is up has its own {given}, which a client does not change; drop it")
     for key in FILES & running.keys():
         if asked.get(key) != running[key]:
             raise UsageError(

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.signals import TICK_S
 from plant.load import HOUR_TICKS, named_families
-from plant.program import LoadProfile
 
 BEHIND_LAST_STEP = round(300 / TICK_S)
 """How long a run goes on after the last step of a load file, unless given otherwise."""

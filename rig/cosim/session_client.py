@@ -11,6 +11,7 @@ from typing import Final, TypeVar
 
 from coldloop.errors import LinkError, ModelFileError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
+from coldloop.operating.load_stream import LAST_TICK, LoadStream, write_table
 from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, LadderStatus, Mode, Status
@@ -18,7 +19,6 @@ from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, STATION_ROWS, PlantSession, SensorFault, Surroundings
 from plant.own_model import own_header
 from rig.cosim.endpoints import RigEndpoints
-from rig.cosim.load_stream import LAST_TICK, LoadStream, write_table
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_events import SessionEvents
 from rig.cosim.session_reader import BATCH, SampleReader, UpdateReader
@@ -122,7 +122,9 @@ class SessionClient:
         self._events = await SessionEvents.after_now(self.control, self.plant, recorder)
         session = await self.start(scenario)
         self._scenario, self._recorder = scenario, recorder
-        self._samples = SampleReader(self.plant, recorder, session, scenario, tolerant=self._tolerant)
+        self._samples = SampleReader(
+            self.plant, recorder, session, scenario.ticks, realtime=scenario.realtime, tolerant=self._tolerant
+        )
         self._updates = UpdateReader(self.optimizer, recorder, session, tolerant=self._tolerant)
         recorder.begin()
 

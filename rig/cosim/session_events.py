@@ -7,7 +7,7 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.registers.audit import JournalPage
 from rig.cosim.journal_reader import JournalReader
 from rig.results.driving import CONTROL, PLANT
-from rig.results.recording import SETTLED_TICKS, Recorder
+from rig.results.recording import SETTLED_TICKS, Records
 
 LOOK_S: Final = 0.25
 """Real time between two looks at the journals."""
@@ -18,14 +18,14 @@ LOOK_TICKS: Final = SETTLED_TICKS // 2
 class SessionEvents:
     """Passes what control PLC and plant note from now on to a recorder."""
 
-    def __init__(self, readers: dict[str, JournalReader], recorder: Recorder) -> None:
+    def __init__(self, readers: dict[str, JournalReader], recorder: Records) -> None:
         self._readers = readers
         self._recorder = recorder
         self._looked_at = 0.0
         self._tick = 0
 
     @classmethod
-    async def after_now(cls, control: RegisterClient, plant: RegisterClient, recorder: Recorder) -> "SessionEvents":
+    async def after_now(cls, control: RegisterClient, plant: RegisterClient, recorder: Records) -> "SessionEvents":
         """Return a reader of all that is noted after what there is.
 
         Raises:

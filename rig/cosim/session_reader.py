@@ -11,8 +11,7 @@ from coldloop.registers.common import Identity
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, PlantSample, StationSample
-from rig.cosim.scenario import Scenario
-from rig.results.recording import Recorder
+from rig.results.recording import Records
 
 BATCH: Final = 64
 """Ticks to wait for before reading, in lock-step."""
@@ -27,20 +26,24 @@ class SampleReader:
         client: Of the plant.
         recorder: Takes the ticks.
         session: Whose ticks they are.
-        scenario: Says how many there will be.
+        end: Tick before which reading ends.
+        first: First tick to be read.
+        realtime: Ticks come one by one; otherwise some are waited for.
         tolerant: Ticks that are not kept any more are left out, and the plant may go back after a restart. Each tick
             is read as soon as possible, for a plant that is killed takes its history with it.
     """
 
     def __init__(
-        self, client: RegisterClient, recorder: Recorder, session: int, scenario: Scenario, *, tolerant: bool
-    ) -> None:
+        self, client: RegisterClient, recorder: Records, session: int, end: int, *, first: int = 0, realtime: bool,
+        tolerant: bool,
+    ) -> None:  # fmt: skip
         self._client = client
         self._recorder = recorder
         self._session = session
-        self._scenario = scenario
+        self._end = end
+        self._realtime = realtime
         self._tolerant = tolerant
-        self.read_until = 0
+        self.read_until = first
         """First tick that is still to be read."""
         self.has_station: bool | None = None
         """Whether the plant is a whole refrigerator; None while that is not known."""
@@ -57,7 +60,7 @@ class SampleReader:
                 f"{self._client.peer} was taken over by session {identity.session}, or was restarted without a "
                 "retained state: one run at a time"
             )
-        last = min(identity.tick, self._scenario.ticks)
+        last = min(identity.tick, self._end)
         if self._tolerant:
             self.read_until = max(min(self.read_until, last), last - HISTORY_ROWS + MARGIN)
         if last - self.read_until >= self._worthwhile:
@@ -66,9 +69,9 @@ class SampleReader:
 
     @property
     def _worthwhile(self) -> int:
-        if self._tolerant or self._scenario.realtime:
+        if self._tolerant or self._realtime:
             return 1
-        return max(1, min(BATCH, self._scenario.ticks - self.read_until))
+        return max(1, min(BATCH, self._end - self.read_until))
 
     async def _read_rows(self, last: int) -> None:
         """Read the ticks before `last`, as many together as requests may be under way, not across ends of histories."""
@@ -106,15 +109,18 @@ class UpdateReader:
         client: Of the optimiser.
         recorder: Takes the updates.
         session: Whose updates they are.
+        first: Number of the first one to be read.
         tolerant: Updates that are not kept any more are left out, and their numbers may go back after a restart.
     """
 
-    def __init__(self, client: RegisterClient, recorder: Recorder, session: int, *, tolerant: bool) -> None:
+    def __init__(
+        self, client: RegisterClient, recorder: Records, session: int, *, first: int = 0, tolerant: bool
+    ) -> None:
         self._client = client
         self._recorder = recorder
         self._session = session
         self._tolerant = tolerant
-        self._next = 0
+        self._next = first
         self._last: Optimization | None = None
 
     async def read(self) -> None:

@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
@@ -30,6 +30,31 @@ ANSWER_S: Final = 5.0
 """How long a connection to a port of this machine may take."""
 
 
+class ServiceProcess(NamedTuple):
+    """Process of a service."""
+
+    pid: int
+    identity: str
+    """See `rig.live.process_identity`."""
+
+    @classmethod
+    def of(cls, pid: int) -> Self:
+        """Return the process that has this number now."""
+        return cls(pid, identity_of(pid) or "")
+
+    @classmethod
+    def parsed(cls, content: Any) -> Self:  # noqa: ANN401 any JSON
+        """Return the process that a state file names.
+
+        Raises:
+            ValueError: It names none.
+        """
+        process = cls(*content)
+        if type(process.pid) is not int or not 1 < process.pid < 2**31 or not isinstance(process.identity, str):
+            raise ValueError("a process in it is none")
+        return process
+
+
 class RunningRig(NamedTuple):
     """A rig that was started on this machine."""
 
@@ -39,11 +64,13 @@ class RunningRig(NamedTuple):
     ports: tuple[int, ...]
     tls: str
     """Folder of certificates that it was started with; empty when none."""
+    services: dict[str, ServiceProcess]
 
     @classmethod
-    def of_this_process(cls, ports: Sequence[int], tls: str) -> Self:
-        """Return the rig that this process keeps up."""
-        return cls(os.getpid(), identity_of(os.getpid()) or "", tuple(ports), tls)
+    def of_this_process(cls, ports: Sequence[int], tls: str, services: Mapping[str, int]) -> Self:
+        """Return the rig that this process keeps up, with the processes of its services."""
+        processes = {service: ServiceProcess.of(pid) for service, pid in services.items()}
+        return cls(*ServiceProcess.of(os.getpid()), tuple(ports), tls, processes)
 
     def write(self) -> None:
         """Write the state file, from which commands know of this rig."""
@@ -58,14 +85,18 @@ class RunningRig(NamedTuple):
         """
         try:
             content: dict[str, Any] = json.loads(text)
-            rig = cls(content["pid"], content["identity"], tuple(content["ports"]), content["tls"])
+            own = ServiceProcess.parsed([content["pid"], content["identity"]])
+            services = {
+                service: ServiceProcess.parsed(content["services"][service]) for service in RigEndpoints._fields
+            }
+            rig = cls(*own, tuple(content["ports"]), content["tls"], services)
         except (ValueError, KeyError, TypeError, RecursionError):
             raise ValueError("not what `coldloop up` of this version writes") from None
-        numbers_fit = type(rig.pid) is int and 1 < rig.pid < 2**31 and len(rig.ports) == len(DEFAULT_PORTS)
-        ports_fit = all(type(port) is int and 0 < port < 0x10000 for port in rig.ports)
-        texts_fit = isinstance(rig.identity, str) and isinstance(rig.tls, str) and "\0" not in rig.tls
-        if not (numbers_fit and ports_fit and texts_fit):
-            raise ValueError("a process, a port or a folder in it is none")
+        ports_fit = len(rig.ports) == len(DEFAULT_PORTS) and all(
+            type(port) is int and 0 < port < 0x10000 for port in rig.ports
+        )
+        if not ports_fit or not isinstance(rig.tls, str) or "\0" in rig.tls:
+            raise ValueError("a port or a folder in it is none")
         return rig
 
     @property

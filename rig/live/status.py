@@ -2,6 +2,7 @@
 
 from typing import Final, NamedTuple
 
+from coldloop.operating.execution import ALL_SERVICES, Clients
 from coldloop.process.signals import L1, T5, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, Process
@@ -9,7 +10,6 @@ from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
 from coldloop.service.event_text import alarm_cause, word, word_of
-from rig.cosim.operator_client import OperatorClient
 
 QUIET: Final = (AlarmState.NORMAL, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)
 
@@ -28,26 +28,26 @@ class RigStatus(NamedTuple):
     alarms: tuple[str, ...]
 
 
-async def read_status(client: OperatorClient) -> RigStatus:
+async def read_status(clients: Clients) -> RigStatus:
     """Return the state of a rig.
 
     Raises:
         LinkError: A service does not answer.
     """
-    control = client.control
-    done = await client.optimizer.read(Identity)
+    plant, control, optimizer = (clients[service] for service in ALL_SERVICES)
+    done = await optimizer.read(Identity)
     update = None
     if done.heartbeat:
-        (update,) = await client.optimizer.read_rows(Optimization, (done.heartbeat - 1) % HISTORY_ROWS, 1)
+        (update,) = await optimizer.read_rows(Optimization, (done.heartbeat - 1) % HISTORY_ROWS, 1)
     rows = await control.read_rows(Alarm, 0, len(AlarmKind))
     alarms = tuple(_alarm(kind, row) for kind, row in zip(AlarmKind, rows, strict=True) if row.state not in QUIET)
     return RigStatus(
-        plant=await client.plant.read(Identity),
-        pace=await client.plant.read(SessionPace),
+        plant=await plant.read(Identity),
+        pace=await plant.read(SessionPace),
         ladder=await control.read(LadderStatus),
         operator=await control.read(Operator),
         process=await control.read(Process),
-        load=await client.plant.read(LoadStatus),
+        load=await plant.read(LoadStatus),
         update=update,
         alarms=alarms,
     )

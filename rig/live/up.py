@@ -54,23 +54,30 @@ class UpRig:
             page = PageProcess(self._settings.hmi, services.endpoints, self.folder) if self._page else None
             try:
                 async with page or nullcontext():
-                    await services.during(self._begin(rig, page, announce=announce))
+                    await services.during(self._begin(services, rig, page, announce=announce))
                     await self._keep(services, rig, page)
             finally:
                 rig.close()
                 (self.folder / STATE_FILE).unlink(missing_ok=True)
 
-    async def _begin(self, rig: SessionClient, page: PageProcess | None, *, announce: bool) -> None:
+    async def _begin(
+        self, services: LocalServices, rig: SessionClient, page: PageProcess | None, *, announce: bool
+    ) -> None:
         await rig.connect(START_PATIENCE_S)
         await rig.start(self._scenario)
-        tls = "" if self._tls is None else str(self._tls.resolve())
         if page is not None:
             await page.is_served()
         if announce:
             sys.stdout.write(whereabouts(self._settings, self._ports, self.folder))
             sys.stdout.write(page.whereabouts if page is not None else "")
             sys.stdout.flush()
-        RunningRig.of_this_process(self._ports, tls).write()
+        self._write_state(services)
+
+    def _write_state(self, services: LocalServices) -> None:
+        """Write which processes there are, for the commands that ask for them."""
+        tls = "" if self._tls is None else str(self._tls.resolve())
+        pids = {service: process.pid for service, process in services.processes.items()}
+        RunningRig.of_this_process(self._ports, tls, pids).write()
 
     async def _keep(self, services: LocalServices, rig: SessionClient, page: PageProcess | None) -> None:
         work = [self._hold(rig), *(self._keep_service(services, service, rig) for service in SERVICES)]
@@ -91,7 +98,8 @@ class UpRig:
             await asyncio.sleep(LOOK_S)
 
     async def _keep_service(self, services: LocalServices, service: str, rig: SessionClient) -> None:
-        async def has_a_session() -> None:
+        async def restarted() -> None:
+            self._write_state(services)
             if service not in RETAINING:  # the optimiser learns it from the control PLC
                 return
             with suppress(LinkError):  # it has ended again
@@ -100,7 +108,7 @@ class UpRig:
                     session = await rig.start(self._scenario)
                     say(f"session {session} has begun: the {service} service had no state to go on with")
 
-        await keep_up(KeptService(services, service), has_a_session)
+        await keep_up(KeptService(services, service), restarted)
 
 
 async def _keep_page(page: PageProcess) -> None:

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from coldloop.errors import UsageError
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from plant.load import named_families
-from plant.program import LoadProfile
 from rig.settings import Settings
 
 FOLDER: Final = "inputs"

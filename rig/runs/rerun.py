@@ -41,6 +41,8 @@ def repeat(folder: Path, out: Path | None, *, force: bool) -> tuple[bool, str]:
         raise UsageError(
             f"{folder}: a run with faults, which depend on the machine; `coldloop chaos` runs the plan again"
         )
+    if manifest["way"] == Way.RECORDED:
+        raise UsageError(f"{folder}: a session under way was recorded, from its middle on: it cannot be repeated")
     if not manifest["recorded_ticks"]:
         raise UsageError(f"{folder}: the run has no ticks: {manifest['reason']}")
     changed = changed_inputs(manifest, folder)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from enum import StrEnum
 from typing import Any, Final, Protocol, Self, TypeVar
 
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load
 from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.optimizer_plc import Optimization
@@ -22,7 +23,6 @@ from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.rules import make_rule
 from plant.kinds import plant_maker
 from plant.own_model import own_header
-from plant.program import LoadProfile
 from rig.cosim.compiled.stretches import CompiledStretches
 from rig.cosim.one_process import Programs, load_table
 from rig.cosim.scenario import Scenario

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
 from coldloop.errors import UsageError
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import L1, OUTPUT_NAMES, STATION_SIGNAL_NAMES, T5, TICK_S
 from optimizer_plc.solvers import make_solver
-from plant.program import LoadProfile
 from rig.cosim.ideal_loop import run_ideal_loop
 from rig.cosim.local_services import run_on_localhost
 from rig.cosim.one_process import OneProcessRig

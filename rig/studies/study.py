@@ -6,10 +6,10 @@ from typing import Protocol
 
 from matplotlib.figure import Figure
 
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from plant.load import find_load, named_families
-from plant.program import LoadProfile
 from rig.cosim.scenario import natural_ticks
 from rig.studies.request import Outcome, Procedure, RunRequest
 

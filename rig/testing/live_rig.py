@@ -15,9 +15,9 @@ from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import CONTROL_MAP, Grant
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import PLANT_MAP, SensorFault, Surroundings
+from coldloop.registers.control_plc import Grant
+from coldloop.registers.maps import MAPS
+from coldloop.registers.plant import SensorFault, Surroundings
 from rig.chaos.faults import AnyFault, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
@@ -39,7 +39,6 @@ END_S: Final = 1.0
 """How long the end of a process may take to be known after its connections were closed."""
 FEED_S: Final = 0.5
 """Between two looks at the load that the plant knows of, in a session in real time."""
-_MAPS: Final = (PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP)
 _FAULT: Final[TypeAdapter[AnyFault]] = TypeAdapter(AnyFault)
 
 
@@ -63,11 +62,11 @@ class LiveRig:
         self._driver = SessionClient(self.endpoints, settings)
         self._clients = {
             service: RegisterClient.at(register_map, endpoint)
-            for service, register_map, endpoint in zip(SERVICES, _MAPS, self.endpoints, strict=True)
+            for service, register_map, endpoint in zip(SERVICES, MAPS.values(), self.endpoints, strict=True)
         }
         self.plant, self.control_plc, self.optimizer_plc = (
             NamedRegisters(register_map, endpoint, self._clients[service], self._call)
-            for service, register_map, endpoint in zip(SERVICES, _MAPS, self.endpoints, strict=True)
+            for service, register_map, endpoint in zip(SERVICES, MAPS.values(), self.endpoints, strict=True)
         )
         self._injector = Injector(self._proxied.services, self._proxied.proxies, self, folder)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from coldloop.errors import ConfigurationError
 from coldloop.process.limits import InputLimits
+from coldloop.process.load_profile import MAX_LOAD_W
 from coldloop.process.model_file import ModelHeader
 from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.audit import EventKind
@@ -28,7 +29,7 @@ from coldloop.registers.control_plc import (
     Update,
     Verdict,
 )
-from coldloop.registers.plant import MAX_LOAD_W, MAX_STATE, Actuators, Measurement
+from coldloop.registers.plant import MAX_STATE, Actuators, Measurement
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.safety.sequence import InputSequence
 from coldloop.safety.watchdog import Watchdog

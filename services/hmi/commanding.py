@@ -5,9 +5,9 @@ from typing import Any, Final
 from aiohttp import web
 
 from coldloop.errors import LinkError, UsageError
+from coldloop.operating.commands import read_command
 from hmi.access import LoginSession
 from hmi.audit import Audit
-from hmi.commands import read_command
 from hmi.documents import encoded
 from hmi.guard import Guard, cookie_name, refusal
 from hmi.operator_desk import OperatorDesk

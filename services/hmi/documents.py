@@ -12,6 +12,7 @@ from coldloop import __version__
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode, OperatorMode
+from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import BANDED_OUTPUTS, INPUT_SAMPLES, PREDICTED_SAMPLES, Optimization, Prediction
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.event_text import alarm_cause, word
@@ -19,7 +20,7 @@ from hmi.compression_station import plant_document
 from hmi.explanation import explain
 from hmi.process_image import Model, Told
 from hmi.sentences import sentence
-from hmi.signals import MAPS, signals_of
+from hmi.signals import signals_of
 from hmi.trends import NAMES, Gap, mode_name, rounded, thin
 
 Document = dict[str, Any]

@@ -3,28 +3,40 @@
 import asyncio
 import secrets
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
-from coldloop.errors import BUSY, LinkError, RequestRefusedError, UsageError
+from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.endpoints import Endpoint
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, TICK_S
+from coldloop.operating.commands import (
+    Command,
+    FaultSensor,
+    PlayLoad,
+    SetLoad,
+    SetSetpoint,
+    TreatAlarm,
+    clock_text,
+    duration_text,
+)
+from coldloop.operating.execution import (
+    WORK,
+    CommandClient,
+    NotTakenError,
+    check_bounds,
+    check_manual,
+    clients_of,
+    connected,
+    reason_of,
+)
+from coldloop.process.signals import INPUT_NAMES, TICK_S
 from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import AlarmAction
-from hmi.command_work import WORK, CommandClient, NotTakenError, check_manual
-from hmi.commands import Command, FaultSensor, PlayLoad, SetLoad, SetSetpoint, TreatAlarm, clock_text, duration_text
 from hmi.process_image import Model
-from hmi.signals import MAPS
 
 CONFIRM_WITHIN_S: Final = 60.0
 MOST_PREPARED: Final = 100
 TIMEOUT_S: Final = 3.0
-HINTS: Final = {
-    1: "the page's certificate or address has not the role of an operator",
-    3: "the value is not possible now",
-    BUSY: "somebody else is its writer",
-}
 
 
 class Prepared(NamedTuple):
@@ -87,17 +99,12 @@ class OperatorDesk:
         if isinstance(command, FaultSensor) and not self._training:
             raise UsageError("sensor faults are offered only where hmi.training is switched on")
         if isinstance(command, SetSetpoint):
-            place = INPUT_NAMES.index(command.input)
-            low, high = self._model.limits.input_low[place], self._model.limits.input_high[place]
-            if high > low and not low <= command.value <= high:
-                unit = INPUT_UNITS[place]
-                raise UsageError(f"{command.input} = {command.value:g} {unit} is not from {low:g} to {high:g} {unit}")
-            client = self._client("control_plc")
-            try:
-                await client.connect(0.0)
-                await check_manual(client)
-            finally:
-                client.close()
+            place, limits = INPUT_NAMES.index(command.input), self._model.limits
+            low, high = limits.input_low[place], limits.input_high[place]
+            if high > low:  # they are known
+                check_bounds(command, low, high)
+            async with connected(self._clients(["control_plc"])) as clients:
+                await check_manual(clients["control_plc"])
 
     def _consequences(self, command: Command) -> str:
         """Return what a command means at present, beyond its own words."""
@@ -140,23 +147,19 @@ class OperatorDesk:
 
     async def _carry_out(self, command: Command, asked: str) -> Outcome:
         services, work = WORK[type(command)]
-        clients = {service: self._client(service) for service in services}
+        clients = self._clients(services)
         try:
-            for client in clients.values():  # all are there before one is written to
-                await client.connect(0.0)
-            return Outcome(asked, applied=await work(clients, command))
+            async with connected(clients):
+                return Outcome(asked, applied=await work(clients, command))
         except NotTakenError as error:
             return Outcome(asked, refused_because=str(error))
         except (LinkError, UsageError) as error:
-            hint = HINTS.get(error.exception_code) if isinstance(error, RequestRefusedError) else None
-            reason = f"{error}: {hint}" if hint else str(error)
             if any(client.has_written for client in clients.values()):
-                return Outcome(asked, uncertain_because=f"{reason}; look what has become of it before asking again")
-            return Outcome(asked, refused_because=reason)
-        finally:
-            for client in clients.values():
-                client.close()
+                reason = f"{reason_of(error)}; look what has become of it before asking again"
+                return Outcome(asked, uncertain_because=reason)
+            return Outcome(asked, refused_because=reason_of(error))
 
-    def _client(self, service: str) -> CommandClient:
-        endpoint = self._endpoints[service].model_copy(update={"timeout_s": TIMEOUT_S})
-        return CommandClient.at(MAPS[service], endpoint)
+    def _clients(self, services: Iterable[str]) -> dict[str, CommandClient]:
+        return clients_of(
+            {service: self._endpoints[service].model_copy(update={"timeout_s": TIMEOUT_S}) for service in services}
+        )

@@ -3,11 +3,11 @@
 from collections.abc import Iterator
 
 from coldloop.registers.declaration import fields_of
+from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.service.event_text import word
 from coldloop.service.metrics import Family, Sample, block_families, build_family
 from hmi.process_image import Model
-from hmi.signals import MAPS
 
 
 def page_families(model: Model, browsers: int) -> Iterator[Family]:

@@ -12,12 +12,13 @@ from coldloop.registers.audit import EVENT_ROWS, Event, JournalPage
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
 from coldloop.registers.control_plc import LadderStatus, Operator, PlantLinkStatus, Process, Status
+from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import HISTORY_ROWS, ControlLinkStatus, Optimization, Prediction
 from coldloop.registers.plant import LoadStatus, StationStatus
 from coldloop.registers.safety import Alarm, AlarmKind
 from hmi.compression_station import KIND, REFRIGERATOR
 from hmi.process_image import Model, Told
-from hmi.signals import MAPS, shown_blocks
+from hmi.signals import shown_blocks
 
 log = logging.getLogger("coldloop.hmi")
 

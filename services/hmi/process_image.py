@@ -12,11 +12,12 @@ from coldloop.process.signals import OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import Event
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Mode, Process
+from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
 from coldloop.registers.plant import StationStatus
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.service.event_text import EventText, describe, utc_text
-from hmi.signals import MAPS, values_of
+from hmi.signals import values_of
 from hmi.trends import NO_STATION, TrendStore, station_values
 
 R = TypeVar("R", bound=tuple[Any, ...])

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from coldloop.process.signals import STATION_VALVE_NAMES, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Process
+from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, UpdatingRuleStatus
 from coldloop.registers.plant import LoadStatus, StationSample, StationStatus
 from coldloop.registers.safety import Alarm
@@ -20,7 +21,6 @@ from hmi.guard import refusal
 from hmi.page_server import Exhibit, PageServer
 from hmi.process_image import Model, Told
 from hmi.settings import HmiSection
-from hmi.signals import MAPS
 from hmi.trends import NO_STATION, station_values
 
 STEP_S: Final = 0.1

@@ -5,12 +5,12 @@ import logging
 import time
 
 from coldloop.modbus.endpoints import Endpoint
+from coldloop.registers.maps import MAPS
 from hmi.operator_desk import OperatorDesk
 from hmi.page_server import Exhibit, PageServer
 from hmi.polling import Poller
 from hmi.process_image import Model
 from hmi.settings import HmiSection, HmiSettings
-from hmi.signals import MAPS
 
 log = logging.getLogger("coldloop.hmi")
 

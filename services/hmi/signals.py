@@ -4,17 +4,13 @@ A signal is a register of a block with one row; its name is `service.block.regis
 """
 
 import re
-from collections.abc import Mapping
 from functools import cache
 from typing import Any, Final, NamedTuple
 
-from coldloop.registers.control_plc import CONTROL_MAP
 from coldloop.registers.declaration import Block, Kind, RegisterMap, fields_of
-from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
-from coldloop.registers.plant import PLANT_MAP
+from coldloop.registers.maps import MAPS
 from coldloop.registers.text import from_words
 
-MAPS: Final[Mapping[str, RegisterMap]] = {one.service: one for one in (PLANT_MAP, CONTROL_MAP, OPTIMIZER_MAP)}
 DECIMALS: Final = {
     "%": 2,
     "K": 3,

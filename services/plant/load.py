@@ -1,20 +1,17 @@
-"""Heat loads: named scenarios and CSV files.
+"""Heat loads by name: hours of the paper's kind, and where the name is a file, its load.
 
 The paper does not print its load profiles. The six hours a to f are random telegraphs about the load of the operating
 point, each of another family; `docs/science.md` says how they were chosen. `a@2` is a second
 draw of the family of hour a.
 """
 
-import csv
-import math
 import random
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.errors import LoadFileError
-from coldloop.process.signals import LAST_TICK, TICK_S
-from coldloop.registers.plant import MAX_LOAD_W, LoadStep
-from plant.program import LoadProfile
+from coldloop.process.load_profile import LoadProfile, read_load_file
+from coldloop.process.signals import TICK_S
 
 HOUR_TICKS: Final = int(3600 / TICK_S)
 
@@ -124,57 +121,3 @@ def find_load(name: str, mean_w: float) -> LoadProfile:
     if not path.exists():
         raise LoadFileError(f"load {name}: neither a file nor one of {', '.join(NAMED)}")
     return read_load_file(path)
-
-
-def read_load_file(path: Path) -> LoadProfile:
-    """Return the load of a CSV file with the columns time_s and load_w, steps held.
-
-    Raises:
-        LoadFileError: One line that names file, line and remedy.
-    """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise LoadFileError(f"{path}: not UTF-8 text (byte {error.start}); save it as UTF-8") from None
-    except OSError as error:
-        raise LoadFileError(f"{path}: {error.strerror}; name a readable CSV file") from None
-    reader = csv.DictReader(text.splitlines())
-    try:
-        missing = {"time_s", "load_w"} - set(reader.fieldnames or ())
-        if missing:
-            raise LoadFileError(f"{path}: no column {' and '.join(sorted(missing))}; the first line is time_s,load_w")
-        steps: list[LoadStep] = []
-        for row in reader:
-            steps.append(_step(row, steps, f"{path}, line {reader.line_num}"))
-    except csv.Error as error:
-        raise LoadFileError(f"{path}, line {reader.line_num + 1}: {error}; write two numbers a line") from None
-    if not steps:
-        raise LoadFileError(f"{path}: no steps; add a line such as 0,385")
-    return LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
-
-
-def _step(row: dict[str, str | None], before: list[LoadStep], where: str) -> LoadStep:
-    """Return the step that a line tells, if it may follow those before."""
-    time, load = (_number(row[column], f"{where}, {column}") for column in ("time_s", "load_w"))
-    if not 0 <= time < LAST_TICK * TICK_S:
-        raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * TICK_S:g} s")
-    if not 0 <= load <= MAX_LOAD_W:
-        raise LoadFileError(f"{where}: {load:g} W is outside 0 to {MAX_LOAD_W:g} W; loads are heat into the bath")
-    tick = round(time / TICK_S)
-    if abs(tick * TICK_S - time) > 1e-6:
-        raise LoadFileError(f"{where}: {time:g} s is not a multiple of {TICK_S} s")
-    if not before and tick != 0:
-        raise LoadFileError(f"{where}: the first step is at {time:g} s; begin at 0 s")
-    if before and tick <= before[-1].tick:
-        raise LoadFileError(f"{where}: {time:g} s does not come after {before[-1].tick * TICK_S:g} s; sort by time_s")
-    return LoadStep(tick, load)
-
-
-def _number(text: str | None, where: str) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise LoadFileError(f"{where}: {text!r} is not a finite number")
-    return value

@@ -1,6 +1,5 @@
 """The plant as a program: inputs in, one tick forward, measurements out. No sockets, no clock."""
 
-from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -9,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from coldloop.process.signals import INPUT_NAMES, LAST_TICK, OUTPUT_NAMES, STATE_NAMES
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.plant import StationSample, StationStatus, Surroundings
 from plant.cold_box.physics import ColdBox, outputs
 from plant.helium.properties import load_helium
@@ -22,35 +21,6 @@ class HeatLoad(Protocol):
 
     def value(self, tick: int) -> float:
         """Return the load (W) that is held from `tick` to the next one."""
-
-
-@dataclass(frozen=True)
-class LoadProfile:
-    """The heat load over time, in steps that are held.
-
-    Raises:
-        ValueError: times do not start at 0, do not increase or are after the last tick of a session, lengths differ, or
-            a load is negative or not finite.
-    """
-
-    times: tuple[int, ...]
-    """Ticks at which the load changes, from 0."""
-    watts: tuple[float, ...]
-    """The load from each of these ticks on, W."""
-
-    def __post_init__(self) -> None:
-        if not self.times or self.times[0] != 0 or len(self.times) != len(self.watts):
-            raise ValueError("a load profile needs a load for each time, the first at tick 0")
-        if any(later <= earlier for earlier, later in zip(self.times, self.times[1:], strict=False)):
-            raise ValueError("the times of a load profile must increase")
-        if self.times[-1] > LAST_TICK:
-            raise ValueError(f"tick {self.times[-1]} is after the last one of a session, {LAST_TICK}")
-        if not all(0.0 <= load < inf for load in self.watts):
-            raise ValueError("loads are finite and not negative")
-
-    def value(self, tick: int) -> float:
-        """Return the load (W) that is held from `tick` (0 or later) to the next."""
-        return self.watts[bisect_right(self.times, tick) - 1]
 
 
 @dataclass(frozen=True)

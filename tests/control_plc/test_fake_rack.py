@@ -15,6 +15,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from coldloop.errors import DamagedAnswerError, LinkError, PeerUnreachableError, RequestRefusedError
 from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.signals import TICK_S
@@ -42,7 +43,6 @@ from control_plc.rack_clock import PHASE, RackClock
 from control_plc.retained_state import Memory, RetainedState
 from control_plc.scan_cycle import ScanCycle
 from control_plc.settings import ControlSection
-from plant.program import LoadProfile
 from plant.rack.rack import Rack, Session
 from plant.settings import SafeAction, WatchdogSettings
 

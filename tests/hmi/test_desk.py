@@ -6,6 +6,17 @@ from typing import Any, TypeVar
 import pytest
 
 from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError, UsageError
+from coldloop.operating.commands import (
+    Command,
+    PlayLoad,
+    SetFactor,
+    SetLoad,
+    SetMode,
+    TreatAlarm,
+    clock_text,
+    duration_text,
+)
+from coldloop.operating.execution import lead_ticks
 from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
@@ -13,8 +24,6 @@ from coldloop.registers.plant import LoadAhead, LoadStatus
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
-from hmi.command_work import lead_ticks
-from hmi.commands import Command, PlayLoad, SetFactor, SetLoad, SetMode, TreatAlarm, clock_text, duration_text
 from hmi.operator_desk import CONFIRM_WITHIN_S, OperatorDesk, Outcome
 from hmi.process_image import Model
 
@@ -85,7 +94,7 @@ class Desk:
         self.optimizer = Peer(Identity(session=1))
         self.desk = OperatorDesk({}, self.model, self.clock, training=False)
         peers = {"plant": self.plant, "control_plc": self.control, "optimizer_plc": self.optimizer}
-        monkeypatch.setattr(self.desk, "_client", lambda service: peers[service])
+        monkeypatch.setattr(self.desk, "_clients", lambda services: {service: peers[service] for service in services})
 
     async def asked(self, command: Command) -> str:
         return (await self.desk.prepare(command, "anna"))[1]
@@ -97,7 +106,7 @@ class Desk:
 
 @pytest.fixture
 def desk(monkeypatch: pytest.MonkeyPatch) -> Desk:
-    monkeypatch.setattr("hmi.command_work.EFFECT_S", 0.2)
+    monkeypatch.setattr("coldloop.operating.execution.EFFECT_S", 0.2)
     return Desk(monkeypatch)
 
 
@@ -108,7 +117,9 @@ def alarm(
 
 
 def load_file(steps: Sequence[tuple[float, float]]) -> PlayLoad:
-    return PlayLoad(kind="load_file", content="\n".join(f"{time},{watts}" for time, watts in steps))
+    return PlayLoad(
+        kind="load_file", content="\n".join(["time_s,load_w", *(f"{time},{watts}" for time, watts in steps)])
+    )
 
 
 # -- what is not known -------------------------------------------------------------------------------------------------
@@ -152,7 +163,7 @@ async def test_a_load_file_whose_later_part_is_refused_says_what_the_plant_has_t
     outcome = await desk.outcome(load_file([(float(i), 400.0 + i) for i in range(60)]))
     taken = [record for record in desk.plant.written if isinstance(record, LoadAhead)]
     assert sum(part.length for part in taken) == 24
-    assert "of 60 steps the plant has taken the first 24, and holds 423 W from 0:04:35 on" in outcome.uncertain_because
+    assert "of 60 steps the plant has taken the first 24, and holds 423 W from 275 s on" in outcome.uncertain_because
 
 
 async def test_a_load_file_whose_first_part_is_refused_changes_nothing_and_says_so(desk: Desk) -> None:
@@ -171,7 +182,7 @@ async def test_a_step_that_is_longer_than_one_request_can_say_begins_another_one
 
 @pytest.mark.parametrize(
     ("pace", "ticks"),
-    [(SessionPace(1, 1, 1.0, 0), 8), (SessionPace(1, 1, 200.0, 0), 400), (SessionPace(1, 0, 0.0, 0), 8)],
+    [(SessionPace(1, 1, 1.0, 0), 8), (SessionPace(1, 1, 200.0, 0), 1600), (SessionPace(1, 0, 0.0, 0), 8)],
     ids=["factor 1", "factor 200", "lock-step"],
 )
 def test_a_load_begins_late_enough_to_be_there_in_time(pace: SessionPace, ticks: int) -> None:

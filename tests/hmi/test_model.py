@@ -14,18 +14,18 @@ from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalPage
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import LadderStatus, Mode, Process
+from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.metrics import exposition
 from hmi.access import Party
 from hmi.broadcast import WAITING, Broadcast
-from hmi.commands import read_load
 from hmi.documents import alarms_document, encoded, state_document, trend_document
 from hmi.page_metrics import page_families
 from hmi.polling import Poller
 from hmi.process_image import STALE_S, Model, Told
 from hmi.reading import safe_cell
-from hmi.signals import MAPS, signals_of, words_in
+from hmi.signals import signals_of, words_in
 from hmi.trends import MOST_ROWS, TrendStore, thin
 
 
@@ -301,18 +301,6 @@ def test_a_stream_gives_way_to_who_has_logged_in_and_to_who_has_fewer() -> None:
     assert broadcast.begin(anna) is None, "she has three, and nobody has more"
     assert broadcast.begin(lena) is not None
     assert len(broadcast) == 4
-
-
-def test_load_files_are_read_or_refused_with_the_row() -> None:
-    assert read_load("time_s,load_w\n0,400\n10.25,500\n") == [(0, 400.0), (41, 500.0)]
-    for content, part in (
-        ("", "no rows"),
-        ("0,400\n0,300\n", "row 2"),
-        ("0,-1\n", "row 1"),
-        ("0\n", "not time_s,load_w"),
-    ):
-        with pytest.raises(ValueError, match=part):
-            read_load(content)
 
 
 def test_cells_of_a_table_are_no_formulas() -> None:

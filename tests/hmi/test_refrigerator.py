@@ -10,11 +10,12 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES, STATION_VALVE_NAMES
+from coldloop.registers.maps import MAPS
 from coldloop.registers.plant import StationAlarm, StationStatus
 from hmi.compression_station import plant_document
 from hmi.process_image import Model
 from hmi.reading import STATIC
-from hmi.signals import MAPS, signals_of
+from hmi.signals import signals_of
 from tests.hmi.conftest import Served, Site, eventually, opened, read_registers, record, write_registers
 
 if TYPE_CHECKING:

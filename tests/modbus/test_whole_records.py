@@ -20,9 +20,9 @@ from coldloop.registers.bank import BusyError, Caller, IllegalValueError, Regist
 from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.control_plc import CONTROL_MAP, Heartbeat
 from coldloop.registers.declaration import Block, Field, Kind, Register, RegisterMap, fields_of
+from coldloop.registers.maps import MAPS
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement, PlantSession
 from coldloop.registers.seal import Seal, seal_of, sealed
-from rig.cli.register_listing import MAPS
 
 if TYPE_CHECKING:
     from tests.modbus.conftest import Plug, Serve

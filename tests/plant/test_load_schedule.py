@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.registers.plant import MAX_LOAD_W, LoadStep
-from plant.program import LoadProfile
+from coldloop.process.load_profile import MAX_LOAD_W, LoadProfile
+from coldloop.registers.plant import LoadStep
 from plant.rack.load_schedule import MOST_UPCOMING, LoadSchedule
 
 

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ConfigurationError
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
 from coldloop.process.signals import OUTPUT_NAMES
 from plant.kinds import plant_maker
-from plant.program import LoadProfile, MeasurementNoise, PlantProgram
+from plant.program import MeasurementNoise, PlantProgram
 from plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSettings
 
 HEADER = read_header(DEFAULT_MODEL_FILE)

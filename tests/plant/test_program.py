@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.physics import REFERENCE
-from plant.program import LoadProfile, MeasurementNoise, PlantProgram
+from plant.program import MeasurementNoise, PlantProgram
 
 LEVEL_AND_T5 = tuple(0.01 if name in ("L1", "T5") else 0.0 for name in OUTPUT_NAMES)
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.process.load_profile import MAX_LOAD_W
 from coldloop.registers.audit import EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import SessionPace
 from coldloop.registers.plant import (
     LOAD_ROWS,
-    MAX_LOAD_W,
     LoadStep,
     Measurement,
     OutputVerdict,

@@ -13,12 +13,12 @@ from pydantic import BaseModel
 import control_plc.runtime
 import optimizer_plc.runtime
 import plant.runtime
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.registers.codec import WordOrder
 from control_plc.settings import ControlSettings
 from optimizer_plc.settings import OptimizerSettings
 from plant.load import find_load
-from plant.program import LoadProfile
 from plant.settings import PlantSettings
 from rig.cosim.endpoints import RigEndpoints
 from rig.cosim.one_process import OneProcessRig

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import read_header
 from coldloop.process.signals import L1, T5, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import Verdict
 from optimizer_plc.qp.design import ControlDesign
 from plant.kinds import make_program
-from plant.program import LoadProfile
 from plant.settings import SensorSettings
 from rig.cosim.scenario import Scenario
 from rig.results.recording import Recording

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.registers.maps import MAPS
 from coldloop.session.settings import TimeMode
 from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.settings import SolverName
@@ -14,7 +15,7 @@ from plant.load import NAMED
 from rig.chaos.plan import shipped_plans
 from rig.cli import COMMANDS, make_parser
 from rig.cli.commands import choices
-from rig.cli.register_listing import FORMATS, MAPS
+from rig.cli.register_listing import FORMATS
 from rig.cli.tag_exports import EXPORTS
 from rig.studies import APART, STUDIES
 from tests.harness.processes import Ended, Processes

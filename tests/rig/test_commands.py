@@ -12,7 +12,8 @@ import pytest
 
 from coldloop.process.lti_model import load
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
-from rig.cli.register_listing import COLUMNS, MAPS
+from coldloop.registers.maps import MAPS
+from rig.cli.register_listing import COLUMNS
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop

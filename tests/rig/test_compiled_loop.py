@@ -13,9 +13,9 @@ import rig.cosim.compiled.portable  # noqa: F401 lets numba compile what is plai
 from coldloop.config import load_configuration
 from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.limits import InputLimits, RateReference
+from coldloop.process.load_profile import LoadProfile
 from control_plc.output_limits import admit, beginning, plain
 from plant.load import find_load
-from plant.program import LoadProfile
 from rig.cosim.compiled.control import guard_records
 from rig.cosim.compiled.stretches import CompiledStretches, Stretch
 from rig.cosim.one_process import OneProcessRig

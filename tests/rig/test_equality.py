@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.codec import WordOrder
 from control_plc.settings import ControlSection, ControlStrategy
 from optimizer_plc.settings import AdaptiveSettings, OptimizerSection, ProgramSettings, RuleName
 from plant.load import find_load
-from plant.program import LoadProfile
 from plant.settings import PlantSection, SensorSettings
 from rig.cosim.scenario import Scenario
 from rig.settings import Settings

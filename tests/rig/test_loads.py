@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from coldloop.errors import LoadFileError
+from coldloop.process.load_profile import LoadProfile
 from plant.load import HOUR_TICKS, NAMED, find_load
-from plant.program import LoadProfile
 
 Write = Callable[[str | bytes], Path]
 

@@ -12,13 +12,13 @@ import pytest
 import rig.cosim.session_client
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.limits import InputLimits
+from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Mode, Plan, Process, Status, Verdict
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import PLANT_MAP, LoadStep, PlantSession
 from control_plc.settings import ControlSection, LadderSettings
-from plant.program import LoadProfile
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_reader import SampleReader
 from rig.settings import Settings

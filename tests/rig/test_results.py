@@ -36,7 +36,7 @@ from rig.results.recording import LinkStatistics, Recorder, Recording
 from rig.settings import Settings
 
 if TYPE_CHECKING:
-    from plant.program import LoadProfile
+    from coldloop.process.load_profile import LoadProfile
     from tests.conftest import Coldloop
     from tests.rig.conftest import Simulate
 

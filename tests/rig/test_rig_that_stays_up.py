@@ -1,15 +1,14 @@
 """`coldloop up`, `down`, `status`, `set` and `run --attach`: a rig that stays up, and what is done with it."""
 
 import asyncio
-import contextlib
 import json
 import os
-import signal
 import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from coldloop.errors import RequestRefusedError
@@ -103,8 +102,8 @@ def test_each_command_says_what_came_back(coldloop: Coldloop, up: str) -> None:
     ("words", "part"),
     [
         (("setpoint", "cv155", "80"), "20 to 60"),
-        (("setpoint", "cv155", "45"), "first `coldloop set mode manual`"),
-        (("load", "-1"), "load -1 W"),
+        (("setpoint", "cv155", "45"), "take over in manual first"),
+        (("load", "-1"), "watts: input should be greater"),
         (("load", "absent.csv"), "neither watts nor a file"),
         (("acknowledge", "everything"), "no alarm is called"),
         (("factor", "0"), "0.01"),
@@ -168,6 +167,32 @@ def test_a_time_that_no_session_has_is_one_line(coldloop: Coldloop, time: str) -
     outcome = coldloop("set", "load", "400", "--at", time)
     assert (outcome.code, len(outcome.complaints)) == (2, 1)
     assert "not a number of seconds" in outcome.complaints[0]
+
+
+def test_a_session_under_way_is_recorded_from_now_on(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
+    until(coldloop, up, "mode", "mpc")
+    session = shown(coldloop, up)["session"].split(",")[0]
+    out = tmp_path / "session"
+    outcome = coldloop("record", "--port-base", up, "--duration", "30s", "--out", str(out))
+    assert outcome.code == 0, outcome.complaints
+    assert shown(coldloop, up)["session"].split(",")[0] == session, "nobody has begun another one"
+    manifest, summary = (json.loads((out / name).read_text()) for name in ("manifest.json", "summary.json"))
+    assert (manifest["way"], manifest["complete"], summary["ticks"]) == ("recorded", True, 120)
+    trace = pq.read_table(out / "trace.parquet").to_pydict()
+    assert trace["mode"][0] is not None, "what drove before the first tick is known"
+    assert summary["missing_ticks"] == 0
+    updates = pq.read_table(out / "updates.parquet").to_pydict()
+    assert updates["tick"]
+    assert 0 <= min(updates["tick"]) <= max(updates["tick"]) < 120
+    again = coldloop("rerun", str(out))
+    assert (again.code, len(again.complaints)) == (2, 1)
+    assert "cannot be repeated" in again.complaints[0]
+
+
+def test_a_fault_of_a_sensor_is_put_in_and_taken_out(coldloop: Coldloop, up: str) -> None:
+    for words, shown_as in (("dead", "not a number"), ("11.5", "value"), ("none", "none")):
+        outcome = coldloop("fault", "--port-base", up, "sensor", "T5", words)
+        assert (outcome.code, outcome.out) == (0, f"sensor of T5: {shown_as}\n"), outcome.complaints
 
 
 def test_a_second_rig_on_the_same_ports_is_refused_and_the_holder_named(coldloop: Coldloop, up: str) -> None:
@@ -245,7 +270,7 @@ def test_a_service_that_is_killed_is_started_again_and_the_session_goes_on(
     assert rig is not None
     log = state_folder(int(up)) / "up.log"
     before = log.read_text().count("started again")
-    os.kill(child_of(rig.pid, service), signal.SIGKILL)
+    assert coldloop("fault", "--port-base", up, "kill", service).code == 0
     deadline = time.monotonic() + PATIENCE_S
     while coldloop("status", "--port-base", up).code or log.read_text().count("started again") == before:
         assert time.monotonic() < deadline, log.read_text()
@@ -253,18 +278,10 @@ def test_a_service_that_is_killed_is_started_again_and_the_session_goes_on(
     assert "(1 of 5)" in log.read_text().splitlines()[-1]
     until(coldloop, up, "mode", "mpc")
     assert shown(coldloop, up)["session"].partition(",")[0] == session
-    assert running_rig(int(up)) == rig
-
-
-def child_of(parent: int, service: str) -> int:
-    """The process of a service that another one has started."""
-    for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            words = (folder / "cmdline").read_bytes().split(b"\0")
-            started_by = int((folder / "stat").read_bytes().rpartition(b")")[2].split()[1])
-            if started_by == parent and service.encode() in words:
-                return int(folder.name)
-    raise AssertionError(f"no process of {service}")
+    now = running_rig(int(up))
+    assert now is not None
+    assert now._replace(services=rig.services) == rig
+    assert [each for each in rig.services if now.services[each] != rig.services[each]] == [service]
 
 
 def test_ctrl_c_gives_an_attached_rig_back_too(

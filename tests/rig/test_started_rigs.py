@@ -1,11 +1,13 @@
 """What is kept of rigs that are up: in a private folder, by processes that are still the same."""
 
+import asyncio
 import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,16 +15,27 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coldloop.errors import UsageError
+from rig.cosim.endpoints import RigEndpoints
 from rig.live.private_folder import base_folder, make_private, new_own, read_own, write_own
+from rig.live.process_faults import freeze
 from rig.live.process_identity import identity_of
-from rig.live.started_rigs import LOCK_FILE, STATE_FILE, RigLock, RunningRig, rigs_up, running_rig, state_folder
+from rig.live.started_rigs import (
+    LOCK_FILE,
+    STATE_FILE,
+    RigLock,
+    RunningRig,
+    ServiceProcess,
+    rigs_up,
+    running_rig,
+    state_folder,
+)
 from tests.conftest import first_of_three_ports
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
 
 FIRST, SECOND = 23020, 23120
-COMMANDS = (("status",), ("events",), ("set", "pause"), ("page",), ("down",))
+COMMANDS = (("status",), ("events",), ("set", "pause"), ("page",), ("down",), ("fault", "kill", "plant"))
 """Commands to a rig that is up."""
 
 Process = subprocess.Popen[bytes]
@@ -53,7 +66,8 @@ def keep(first_port: int, content: object) -> Path:
 
 def state_of(process: Process, first_port: int = FIRST, **changes: object) -> dict[str, object]:
     ports = (first_port, first_port + 1, first_port + 2)
-    return RunningRig(process.pid, identity_of(process.pid) or "", ports, "")._asdict() | changes
+    services = dict.fromkeys(RigEndpoints._fields, ServiceProcess.of(process.pid))
+    return RunningRig(process.pid, identity_of(process.pid) or "", ports, "", services)._asdict() | changes
 
 
 # -- the process -------------------------------------------------------------------------------------------------------
@@ -88,6 +102,8 @@ ODD: list[Any] = [
     {"pid": -1}, {"pid": 0}, {"pid": 1}, {"pid": True}, {"pid": 2**31}, {"pid": 10**400}, {"pid": "12"}, {"pid": 1.5},
     {"pid": None}, {"ports": []}, {"ports": [1, 2]}, {"ports": [0, 1, 2]}, {"ports": [1, 2, 65536]}, {"ports": "abc"},
     {"ports": 5}, {"ports": [1, 2, "3"]}, {"tls": 5}, {"tls": "\0"}, {"identity": None}, {"identity": ["a"]},
+    {"services": None}, {"services": {}}, {"services": {"plant": [1, "a"]}}, {"services": {"plant": [5]}},
+    {"services": {service: [-1, "a"] for service in RigEndpoints._fields}},
 ]  # fmt: skip
 
 
@@ -107,6 +123,56 @@ def test_a_damaged_file_does_not_hide_a_rig_that_is_up(other: Process) -> None:
     keep(FIRST, "{")
     keep(SECOND, state_of(other, SECOND))
     assert [rig.ports[0] for rig in rigs_up()] == [SECOND]
+
+
+# -- faults of its services --------------------------------------------------------------------------------------------
+
+
+def test_a_service_is_killed(coldloop: "Coldloop", other: Process) -> None:
+    keep(FIRST, state_of(other))
+    outcome = coldloop("fault", "kill", "control_plc")
+    assert (outcome.code, other.wait(10)) == (0, -signal.SIGKILL), outcome.complaints
+    again = coldloop("fault", "kill", "control_plc")
+    assert (again.code, len(again.complaints)) == (2, 1)
+
+
+def test_no_fault_is_put_into_another_program_that_has_the_number(coldloop: "Coldloop", other: Process) -> None:
+    services = dict.fromkeys(RigEndpoints._fields, ServiceProcess(other.pid, "of a process before it"))
+    keep(FIRST, state_of(other, services=services))
+    for words in (("kill", "plant"), ("freeze", "plant", "1")):
+        outcome = coldloop("fault", *words)
+        assert (outcome.code, len(outcome.complaints)) == (2, 1)
+        assert "the plant service does not run" in outcome.complaints[0]
+    assert other.poll() is None
+
+
+async def test_a_service_that_was_frozen_runs_again_when_the_command_is_ended(other: Process) -> None:
+    def until(what: int) -> None:
+        deadline = time.monotonic() + 60
+        while os.waitid(os.P_PID, other.pid, what | os.WNOHANG) is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+
+    task = asyncio.create_task(freeze(ServiceProcess.of(other.pid), 600.0))
+    await asyncio.to_thread(until, os.WSTOPPED)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    await asyncio.to_thread(until, os.WCONTINUED)
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (("freeze", "plant", "0"), "not a number of seconds"), (("freeze", "plant", "inf"), "not a number of seconds"),
+        (("freeze", "plant", "1e9"), "not a number of seconds"), (("kill", "everything"), "invalid choice"),
+        (("sensor", "T99", "dead"), "no output is called 'T99'"), (("sensor", "T5", "broken"), "a sensor shows"),
+        (("sensor", "T5", "nan"), "finite number"), (("sensor", "T5"), "required"), ((), "required"),
+    ],
+)  # fmt: skip
+def test_a_fault_that_cannot_be_is_one_line(words: tuple[str, ...], part: str, coldloop: "Coldloop") -> None:
+    outcome = coldloop("fault", *words)
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+    assert part in outcome.complaints[0]
 
 
 # -- which rig ---------------------------------------------------------------------------------------------------------

@@ -12,9 +12,9 @@ import pytest
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import CONTROL_MAP
+from coldloop.registers.maps import MAPS
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.registers.safety import AlarmKind
-from rig.cli.register_listing import MAPS
 from rig.cli.tag_exports import exported, runs
 from tests.conftest import Coldloop
 

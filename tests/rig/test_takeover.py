@@ -9,9 +9,9 @@ import pytest
 
 from coldloop.errors import LinkError
 from coldloop.modbus.client import RegisterClient
+from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.common import Identity
 from coldloop.registers.plant import PLANT_MAP, PlantSession
-from plant.program import LoadProfile
 from rig.cosim.scenario import Scenario
 
 if TYPE_CHECKING:

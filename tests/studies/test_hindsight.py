@@ -6,11 +6,11 @@ from itertools import product
 import pytest
 
 import rig.studies.hindsight
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICK_S
 from coldloop.registers.optimizer_plc import Optimization
 from optimizer_plc.qp.design import ControlDesign
-from plant.program import LoadProfile
 from rig.cosim.scenario import Scenario
 from rig.results.indicators import StageCost
 from rig.settings import Settings

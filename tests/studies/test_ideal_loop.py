@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from optimizer_plc.qp.costs import augmented_cost
 from optimizer_plc.qp.problem import QuadraticProblem
-from plant.program import LoadProfile
 from rig.cosim.ideal_loop import Solved, run_ideal_loop
 from rig.cosim.scenario import Scenario
 from rig.results.recording import Recorder, Recording

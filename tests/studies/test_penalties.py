@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from coldloop.errors import StudyError
+from coldloop.process.load_profile import LoadProfile
 from optimizer_plc.qp.penalties import Preset
-from plant.program import LoadProfile
 from rig.results.indicators import Indicators
 from rig.studies.beyond.penalties import PenaltiesStudy, misfit
 from rig.studies.beyond.penalty_sums import Paired

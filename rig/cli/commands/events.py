@@ -85,7 +85,7 @@ def execute(options: argparse.Namespace) -> int:
 
 async def _show(options: argparse.Namespace) -> None:
     from coldloop.modbus.client import RegisterClient
-    from rig.cli.register_listing import MAPS
+    from coldloop.registers.maps import MAPS
     from rig.cosim.journal_reader import JournalReader
 
     client = RegisterClient.at(MAPS[options.service], _place(options))

@@ -19,7 +19,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Print the list."""
-    from rig.cli.register_listing import FORMATS, MAPS
+    from coldloop.registers.maps import MAPS
+    from rig.cli.register_listing import FORMATS
 
     maps = [MAPS[options.service]] if options.service else list(MAPS.values())
     if options.format in FORMATS:

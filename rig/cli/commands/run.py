@@ -1,10 +1,8 @@
 """`coldloop run`: one run of the loop, recorded, evaluated and drawn."""
 
 import argparse
-import sys
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
 from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
@@ -21,14 +19,7 @@ from rig.cli.commands.options import (
 from rig.durations import duration
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from rig.cosim.job import Job
-    from rig.figures.worker import FigureProcess
-    from rig.results.recording import Sink
-
-SHORT_RUN_TICKS: Final = 2400
-"""Ten minutes of plant time: in one process half a second at the most."""
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -69,36 +60,9 @@ def execute(options: argparse.Namespace) -> int:
 
             figure.start()  # a short run would wait for matplotlib
             load_numba_alone()
-        return _run(options, figure)
+        from rig.cli.recorded_job import record
 
-
-def _run(options: argparse.Namespace, figure: "FigureProcess") -> int:
-    from rig.results.folders import claim_folder, claim_folder_of_now
-    from rig.runs.manifest import plain_arguments
-    from rig.runs.running import run_into
-
-    job = _job(options)
-    load = Path(job.effective.settings.plant.load).stem
-    out = options.out or claim_folder_of_now(Path("runs"), load)
-    claim_folder(out, force=options.force)
-    with _progress(job) as sinks:
-        summary = run_into(out, job, plain_arguments(options), figure, sinks)
-    _tell(out, summary)
-    return 0
-
-
-@contextmanager
-def _progress(job: "Job") -> "Iterator[list[Sink]]":
-    """Show a bar while the run goes on; one that is over before it could be read has none."""
-    from rig.cosim.job import Way
-
-    if job.way is Way.IN_PROCESS and job.scenario.ticks <= SHORT_RUN_TICKS:
-        yield []
-        return
-    from rig.progress import RunProgress
-
-    with RunProgress(job.scenario.ticks) as progress:
-        yield [progress]
+        return record(_job(options), options, figure)
 
 
 def _job(options: argparse.Namespace) -> "Job":
@@ -126,16 +90,3 @@ def _job(options: argparse.Namespace) -> "Job":
         return Job(effective, scenario, Way.IN_PROCESS)
     check_certificates(settings)
     return Job(effective, scenario, Way.LOCALHOST)
-
-
-def _tell(out: Path, summary: dict[str, Any]) -> None:
-    updates = "no updates"
-    if summary["updates"]:
-        updates = f"{summary['updates']} updates, tau_u {summary['tau_u_mean']:.2f} s on average over time"
-    sys.stdout.write(
-        f"{summary['ticks']} ticks, {updates}, {summary['realtime_factor'] or 0:,.0f} x real time\n"
-        f"outside the bands: L1 {summary['L1_outside_band_pct']:.2f} %, T5 {summary['T5_outside_band_pct']:.2f} %; "
-        f"J_BF {summary['J_BF']:.4g}; deadline misses {summary['deadline_misses']}\n"
-        f"trace {summary['trace_sha256']}\n"
-        f"results in {out}\n"
-    )

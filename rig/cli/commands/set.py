@@ -5,8 +5,6 @@ Each is a Modbus request that any client with the operator's role can make; the 
 
 import argparse
 import sys
-from collections.abc import Awaitable, Callable
-from contextlib import AsyncExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -17,11 +15,11 @@ from rig.cli.commands.options import add_rig_options, operator_settings, rig_end
 from rig.durations import LONGEST_TICKS
 
 if TYPE_CHECKING:
-    from rig.cosim.operator_client import OperatorClient
+    from coldloop.process.limits import InputLimits
+    from rig.live.operator_request import Work
 
 MODES: Final = ("auto", "classical", "manual")
-INPUTS: Final = ("cv155", "ncr22", "cv156")
-Done = Awaitable[str]
+INPUTS: Final = {"cv155": "CV155", "ncr22": "NCR22_A", "cv156": "CV156"}
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -32,24 +30,26 @@ def declare(parser: argparse.ArgumentParser) -> None:
     load = what.add_parser("load", help="watts, or a CSV file time_s,load_w")
     load.add_argument("new_load", metavar="WATTS|FILE", help="watts, or a CSV file time_s,load_w that begins now")
     load.add_argument("--at", type=_seconds, metavar="SECONDS", help="plant time at which it begins (default: now)")
-    load.set_defaults(command=_load)
+    load.set_defaults(document=_load)
     mode = what.add_parser("mode", help="who drives")
-    mode.add_argument("new_mode", choices=MODES, metavar="auto|classical|manual")
-    mode.set_defaults(command=lambda client, options: client.set_mode(options.new_mode))
+    mode.add_argument("mode", choices=MODES, metavar="auto|classical|manual")
+    mode.set_defaults(document=lambda options: {"kind": "mode", "mode": options.mode})
     setpoint = what.add_parser("setpoint", help="an input in manual mode")
     setpoint.add_argument("input", choices=INPUTS, metavar="cv155|ncr22|cv156")
     setpoint.add_argument("value", type=float)
-    setpoint.set_defaults(command=lambda client, options: client.set_setpoint(options.input, options.value))
+    setpoint.set_defaults(
+        document=lambda options: {"kind": "setpoint", "input": INPUTS[options.input], "value": options.value}
+    )
     factor = what.add_parser("factor", help="seconds of plant time in a second; also changes over to real time")
-    factor.add_argument("new_factor", type=float, metavar="FACTOR")
-    factor.set_defaults(command=lambda client, options: client.set_factor(options.new_factor))
+    factor.add_argument("factor", type=float)
+    factor.set_defaults(document=lambda options: {"kind": "factor", "factor": options.factor})
     pause = what.add_parser("pause", help="pause plant time")
-    pause.set_defaults(command=lambda client, _: client.set_paused(paused=True))
+    pause.set_defaults(document=lambda _: {"kind": "pause", "paused": True})
     resume = what.add_parser("resume", help="resume plant time")
-    resume.set_defaults(command=lambda client, _: client.set_paused(paused=False))
+    resume.set_defaults(document=lambda _: {"kind": "pause", "paused": False})
     acknowledge = what.add_parser("acknowledge", help="an alarm, or all")
     acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as t5-band (default: all)")
-    acknowledge.set_defaults(command=lambda client, options: client.acknowledge(options.alarm))
+    acknowledge.set_defaults(document=_acknowledgement)
     for subcommand in what.choices.values():  # options are taken before and behind what is to be done
         add_configuration_options(subcommand, again=True)
         add_rig_options(subcommand, again=True)
@@ -74,30 +74,68 @@ def execute(options: argparse.Namespace) -> int:
 
 
 async def _do(options: argparse.Namespace) -> None:
-    from rig.cosim.answer_time import answered_in_time
-    from rig.cosim.operator_client import OperatorClient
+    from rig.live.operator_request import ask
 
     settings = operator_settings(options)
-    command: Callable[[OperatorClient, argparse.Namespace], Done] = options.command
-    client = OperatorClient(rig_endpoints(options, settings), settings.limits)
-    async with AsyncExitStack() as stack:
-        async with answered_in_time("to connect"):
-            await stack.enter_async_context(client)
-        async with nullcontext() if options.command is _load else answered_in_time("the command"):
-            text = await command(client, options)
+    services, work = _stream(options) if _is_stream(options) else _command(options, settings.limits)
+    text = await ask(rig_endpoints(options, settings), services, work, limited=not _is_stream(options))
     sys.stdout.write(f"{text}\n")
 
 
-def _load(client: "OperatorClient", options: argparse.Namespace) -> Done:
-    try:
-        watts = float(options.new_load)
-    except ValueError:
-        if not Path(options.new_load).is_file():
-            raise UsageError(f"load '{options.new_load}': neither watts nor a file") from None
-        from plant.load import read_load_file
+def _command(options: argparse.Namespace, limits: "InputLimits") -> tuple[tuple[str, ...], "Work"]:
+    """Return the services that a command concerns, and what is done with them.
 
-        return client.stream_load(read_load_file(Path(options.new_load)), options.at, _say)
-    return client.set_load(watts, options.at)
+    Raises:
+        UsageError: There is no such command.
+    """
+    from coldloop.operating.commands import SetSetpoint, read_command
+    from coldloop.operating.execution import WORK, check_bounds
+
+    command = read_command(options.document(options))
+    if isinstance(command, SetSetpoint):
+        place = list(INPUTS.values()).index(command.input)
+        check_bounds(command, limits.low[place], limits.high[place])
+    services, work = WORK[type(command)]
+    return services, lambda clients: work(clients, command)
+
+
+def _stream(options: argparse.Namespace) -> tuple[tuple[str, ...], "Work"]:
+    from coldloop.operating.execution import stream_load
+    from coldloop.process.load_profile import read_load_file
+
+    if not Path(options.new_load).is_file():
+        raise UsageError(f"load '{options.new_load}': neither watts nor a file")
+    load = read_load_file(Path(options.new_load))
+    return ("plant",), lambda clients: stream_load(clients, load, _tick(options), _say)
+
+
+def _is_stream(options: argparse.Namespace) -> bool:
+    """Tell whether a load file is to be written, of any length: it takes as long as it takes."""
+    if options.document is not _load:
+        return False
+    try:
+        float(options.new_load)
+    except ValueError:
+        return True
+    return False
+
+
+def _load(options: argparse.Namespace) -> dict[str, object]:
+    return {"kind": "load", "watts": float(options.new_load), "tick": _tick(options)}
+
+
+def _tick(options: argparse.Namespace) -> int:
+    return 0 if options.at is None else round(options.at / TICK_S)
+
+
+def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
+    from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
+
+    kinds = {kind.name.lower().replace("_", "-"): int(kind) for kind in AlarmKind}
+    if options.alarm is not None and options.alarm not in kinds:
+        raise UsageError(f"no alarm is called '{options.alarm}'; there are {', '.join(kinds)}")
+    alarm = ALL_ALARMS if options.alarm is None else kinds[options.alarm]
+    return {"kind": "alarm", "alarm": alarm, "action": int(AlarmAction.ACKNOWLEDGE)}
 
 
 def _say(text: str) -> None:

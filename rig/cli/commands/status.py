@@ -29,19 +29,18 @@ def execute(options: argparse.Namespace) -> int:
 
 
 async def _show(options: argparse.Namespace) -> None:
+    from coldloop.operating.execution import clients_of, connected
     from rig.cosim.answer_time import answered_in_time
-    from rig.cosim.operator_client import OperatorClient
     from rig.live.status import line, page, read_status
 
-    settings = operator_settings(options)
-    client = OperatorClient(rig_endpoints(options, settings), settings.limits)
+    clients = clients_of(rig_endpoints(options, operator_settings(options))._asdict())
     async with AsyncExitStack() as stack:
         async with answered_in_time("to read the status"):
-            await stack.enter_async_context(client)
-            status = await read_status(client)
+            await stack.enter_async_context(connected(clients))
+            status = await read_status(clients)
         sys.stdout.write(f"{line(status)}\n" if options.follow else page(status))
         while options.follow:
             sys.stdout.flush()
             await asyncio.sleep(LOOK_S)
             async with answered_in_time("to read the status"):
-                sys.stdout.write(f"{line(await read_status(client))}\n")
+                sys.stdout.write(f"{line(await read_status(clients))}\n")

@@ -4,11 +4,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from coldloop.process.load_profile import MAX_LOAD_W, LoadProfile
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import MAX_LOAD_W
 from control_plc.program import ControlProgram
 from optimizer_plc.program import OptimizerProgram
-from plant.program import LoadProfile, PlantProgram
+from plant.program import PlantProgram
 from rig.cosim.compiled import control, loops, optimizer, plants
 from rig.cosim.compiled.records import BLOCK_TICKS, PlantState, World, empty_reports, empty_trace
 from rig.results.recorded import NO_STATION, STATION_COLUMNS, SampleBlock

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
-from coldloop.registers.plant import LOAD_ROWS, MAX_LOAD_W, LoadStatus, LoadStep
-from plant.program import LoadProfile
+from coldloop.process.load_profile import MAX_LOAD_W, LoadProfile
+from coldloop.registers.plant import LOAD_ROWS, LoadStatus, LoadStep
 
 MOST_UPCOMING: Final = 2 * LOAD_ROWS
 """Steps to come that are kept."""

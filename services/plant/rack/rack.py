@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.signals import INPUT_NAMES, LAST_TICK, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
@@ -30,7 +31,7 @@ from coldloop.registers.plant import (
 from coldloop.safety.watchdog import Watchdog
 from coldloop.service.journal import Journal
 from coldloop.session.pace import Pace
-from plant.program import HeatLoad, LoadProfile, PlantProgram
+from plant.program import HeatLoad, PlantProgram
 from plant.rack.faults import SensorFaults
 from plant.rack.load_schedule import LoadSchedule
 from plant.rack.outputs import AppliedOutputs, Inputs, next_generation

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 from coldloop.config import selected
+from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_file import ModelHeader
 from coldloop.process.signals import OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind, JournalQuery
@@ -37,7 +38,6 @@ from coldloop.service.journal import Journal, JournalPublication
 from coldloop.session.pace import Pace
 from coldloop.session.settings import TimeMode
 from plant.load import find_load
-from plant.program import LoadProfile
 from plant.rack.faults import HEALTHY
 from plant.rack.outputs import next_generation
 from plant.rack.rack import APPLIED, MakePlant, Rack, Session

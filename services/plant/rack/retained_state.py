@@ -6,10 +6,10 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from coldloop.process.load_profile import MAX_LOAD_W
 from coldloop.process.signals import LAST_TICK
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
-from coldloop.registers.plant import MAX_LOAD_W
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.session.pace import Pace
 

@@ -3,6 +3,7 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
+from coldloop.process.load_profile import MAX_LOAD_W
 from coldloop.process.signals import (
     INPUT_NAMES,
     INPUT_UNITS,
@@ -17,7 +18,7 @@ from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswe
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
-from coldloop.registers.plant import MAX_INPUT, MAX_LOAD_W, MAX_STATE
+from coldloop.registers.plant import MAX_INPUT, MAX_STATE
 from coldloop.registers.safety import Alarm, AlarmCommand, AlarmKind, LeaseStatus, WatchdogStatus, WatchdogTime
 
 SEQUENCE_ROWS: Final = 240

@@ -5,6 +5,7 @@ from enum import IntEnum, IntFlag
 from itertools import accumulate, pairwise
 from typing import Annotated, Final, NamedTuple
 
+from coldloop.process.load_profile import MAX_LOAD_W
 from coldloop.process.signals import (
     INPUT_NAMES,
     INPUT_UNITS,
@@ -26,7 +27,6 @@ from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 HISTORY_ROWS: Final = 256
 STATION_ROWS: Final = 128
 LOAD_ROWS: Final = 2048
-MAX_LOAD_W: Final = 10_000.0
 MAX_INPUT: Final = 1000.0
 """No input, in % or W, is larger."""
 MAX_STATE: Final = 1e9

@@ -1,15 +1,13 @@
-"""What operators can ask for, as the page sends it: checked here, described in words, and carried out elsewhere."""
+"""What operators can ask for: checked here, described in words, and carried out elsewhere."""
 
-import csv
-import io
-from collections.abc import Iterator
 from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
-from coldloop.errors import UsageError
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
-from coldloop.registers.plant import MAX_LOAD_W, SensorFaultKind
+from coldloop.errors import LoadFileError, UsageError
+from coldloop.process.load_profile import MAX_LOAD_W, LoadProfile, load_profile_of
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, LAST_TICK, OUTPUT_NAMES, TICK_S
+from coldloop.registers.plant import SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
 from coldloop.service.event_text import word
 
@@ -68,15 +66,18 @@ class SetSetpoint(_Command):
 
 
 class SetLoad(_Command):
-    """The heat load from now on."""
+    """The heat load from a tick on."""
 
     kind: Literal["load"]
     watts: Annotated[float, Field(ge=0, le=MAX_LOAD_W)]
+    tick: Annotated[int, Field(ge=0, le=LAST_TICK)] = 0
+    """0 is the next one."""
 
     @property
     def text(self) -> str:
         """The command in words."""
-        return f"Change the heat load to {self.watts:g} W from the next tick on"
+        begin = clock_text(self.tick * TICK_S) if self.tick else "the next tick"
+        return f"Change the heat load to {self.watts:g} W from {begin} on"
 
 
 class PlayLoad(_Command):
@@ -88,15 +89,25 @@ class PlayLoad(_Command):
     @field_validator("content")
     @classmethod
     def _readable(cls, content: str) -> str:
-        read_load(content)
+        try:
+            steps = len(load_profile_of(content, "load file").times)
+        except LoadFileError as error:
+            raise ValueError(str(error)) from None
+        if steps > MOST_STEPS:
+            raise ValueError(f"the load file has {steps} steps, more than {MOST_STEPS}: use `coldloop set load FILE`")
         return content
+
+    @property
+    def profile(self) -> LoadProfile:
+        """The load that the file tells."""
+        return load_profile_of(self.content, "load file")
 
     @property
     def text(self) -> str:
         """The command in words."""
-        steps = read_load(self.content)
+        times = self.profile.times
         return (
-            f"Play a load of {len(steps)} steps, {duration_text(steps[-1][0] * TICK_S)} long, from now on; its last "
+            f"Play a load of {len(times)} steps, {duration_text(times[-1] * TICK_S)} long, from now on; its last "
             "value is held"
         )
 
@@ -191,39 +202,3 @@ def read_command(document: object) -> Command:
         place = ".".join(str(part) for part in first["loc"][1:]) or "command"
         message = first["msg"].removeprefix("Value error, ")
         raise UsageError(f"{place}: {message[0].lower()}{message[1:]}") from None
-
-
-def _rows(content: str) -> Iterator[list[str]]:
-    try:
-        yield from csv.reader(io.StringIO(content, newline=None))
-    except csv.Error as error:
-        raise ValueError(f"not a table of comma-separated values: {error}") from None
-
-
-def read_load(content: str) -> list[tuple[int, float]]:
-    """Return the steps of a load file as (ticks since its beginning, W).
-
-    Raises:
-        ValueError: One line that names the row.
-    """
-    steps: list[tuple[int, float]] = []
-    for number, row in enumerate(_rows(content), 1):
-        if not row or (number == 1 and row[0].strip() == "time_s"):
-            continue
-        try:
-            time_s, watts = float(row[0]), float(row[1])
-        except (ValueError, IndexError):
-            raise ValueError(f"row {number}: not time_s,load_w") from None
-        if not 0 <= watts <= MAX_LOAD_W:
-            raise ValueError(f"row {number}: load {watts:g} W is not from 0 to {MAX_LOAD_W:g} W")
-        if not 0 <= time_s < 1e8 or time_s % TICK_S:
-            raise ValueError(f"row {number}: time {time_s:g} s is not a multiple of {TICK_S} s from 0 on")
-        tick = round(time_s / TICK_S)
-        if steps and tick <= steps[-1][0]:
-            raise ValueError(f"row {number}: time {time_s:g} s does not follow the row before")
-        steps.append((tick, watts))
-    if not steps:
-        raise ValueError("the load file has no rows")
-    if len(steps) > MOST_STEPS:
-        raise ValueError(f"the load file has {len(steps)} steps, more than {MOST_STEPS}: use `coldloop set load FILE`")
-    return steps

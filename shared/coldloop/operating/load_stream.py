@@ -1,15 +1,14 @@
 """A load of any length, written to the plant ahead of its clock."""
 
 from bisect import bisect_right
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from coldloop.errors import LinkError, RequestRefusedError, UsageError
+from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.client import RegisterClient
+from coldloop.process.load_profile import LoadProfile
+from coldloop.process.signals import TICK_S
 from coldloop.registers.plant import AHEAD_STEPS, LOAD_ROWS, LoadAhead, LoadStatus, LoadStep
 from coldloop.registers.seal import sealed
-
-if TYPE_CHECKING:  # the simulation behind it takes a second
-    from plant.program import LoadProfile
 
 LAST_TICK: Final = 2**32 - 1
 KEPT_AHEAD: Final = LOAD_ROWS
@@ -35,7 +34,7 @@ class LoadStream:
         self,
         plant: RegisterClient,
         session: int,
-        load: "LoadProfile",
+        load: LoadProfile,
         *,
         sent: int = 0,
         begin: int = 0,
@@ -69,16 +68,19 @@ class LoadStream:
         """Write what the plant should know at `tick`.
 
         Raises:
-            LinkError: The plant does not answer, or the steps have come too late.
+            LinkError: The plant does not answer; or it refuses steps, because they come too late or the session is
+                another one.
         """
         while not self.done and self._sent - bisect_right(self._times, tick) < self._ahead:
             record = self._next()
             try:
                 await self._plant.write(sealed(record))
-            except RequestRefusedError as error:
+            except LinkError as error:
+                if not self._sent:
+                    raise
                 raise LinkError(
-                    f"{error}: the load from tick {record.tick} on was not taken: it came too late, or the session is "
-                    "another one"
+                    f"{error}; of {self.steps} steps the plant has taken the first {self._sent}, and holds "
+                    f"{self._watts[self._sent - 1]:g} W from {self._times[self._sent - 1] * TICK_S:g} s on"
                 ) from None
             self._sent += record.length
 
@@ -93,7 +95,7 @@ class LoadStream:
         return status.last_tick != last
 
 
-async def write_table(plant: RegisterClient, load: "LoadProfile") -> int:
+async def write_table(plant: RegisterClient, load: LoadProfile) -> int:
     """Write the load table of a session that is to begin; return the steps that are in it.
 
     Raises:

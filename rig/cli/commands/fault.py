@@ -1,0 +1,96 @@
+"""`coldloop fault`: a fault on purpose in a rig that is up, to see what ladder, alarms and page make of it.
+
+A service that is killed is started again by `coldloop up`. For links there are `coldloop proxy` and `coldloop chaos`.
+"""
+
+import argparse
+import sys
+from typing import Final
+
+from coldloop.errors import UsageError
+from coldloop.process.signals import OUTPUT_NAMES
+from coldloop.service.command_line import add_configuration_options
+from rig.cli.commands.options import add_rig_options, first_port_here, operator_settings, rig_endpoints
+
+SERVICES: Final = ("plant", "control_plc", "optimizer_plc")
+LONGEST_S: Final = 3600.0
+SENSOR_FAULTS: Final = {"none": 0, "dead": 1, "stuck": 2}
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_configuration_options(parser)
+    add_rig_options(parser)
+    what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
+    kill = what.add_parser("kill", help="end a service at once, as by SIGKILL; `coldloop up` starts it again")
+    kill.add_argument("service", choices=SERVICES, metavar="|".join(SERVICES))
+    kill.set_defaults(fault=_kill)
+    freeze = what.add_parser("freeze", help="let a service stand still for a while")
+    freeze.add_argument("service", choices=SERVICES, metavar="|".join(SERVICES))
+    freeze.add_argument("seconds", type=_seconds, help="how long, by the clock")
+    freeze.set_defaults(fault=_freeze)
+    sensor = what.add_parser("sensor", help="what a sensor shows: nothing, always the same, or a value")
+    sensor.add_argument("output", metavar="OUTPUT", help="such as T5")
+    sensor.add_argument("shows", metavar="dead|stuck|VALUE|none", help="none ends the fault")
+    sensor.set_defaults(fault=_sensor)
+    for subcommand in what.choices.values():  # options are taken before and behind what is to be done
+        add_configuration_options(subcommand, again=True)
+        add_rig_options(subcommand, again=True)
+    parser.set_defaults(execute=execute)
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds <= LONGEST_S:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds up to {LONGEST_S:g}")
+    return seconds
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Do it, and say what was done."""
+    from rig.until_interrupted import run_until_interrupted
+
+    return 130 if run_until_interrupted(lambda: options.fault(options)) else 0
+
+
+async def _kill(options: argparse.Namespace) -> None:
+    from rig.live.process_faults import kill, process_of
+
+    kill(process_of(first_port_here(options), options.service))
+    sys.stdout.write(f"killed the {options.service} service; `coldloop up` starts it again\n")
+
+
+async def _freeze(options: argparse.Namespace) -> None:
+    from rig.live.process_faults import freeze, process_of
+
+    process = process_of(first_port_here(options), options.service)
+    sys.stdout.write(f"the {options.service} service stands still for {options.seconds:g} s (Ctrl-C ends it)\n")
+    sys.stdout.flush()
+    await freeze(process, options.seconds)
+    sys.stdout.write(f"the {options.service} service runs again\n")
+
+
+async def _sensor(options: argparse.Namespace) -> None:
+    from coldloop.operating.commands import read_command
+    from coldloop.operating.execution import WORK
+    from rig.live.operator_request import ask
+
+    if options.output not in OUTPUT_NAMES:
+        raise UsageError(f"no output is called '{options.output}'; there are {', '.join(OUTPUT_NAMES)}")
+    command = read_command({"kind": "sensor_fault", "output": options.output, **_shown(options.shows)})
+    services, work = WORK[type(command)]
+    rig = rig_endpoints(options, operator_settings(options))
+    text = await ask(rig, services, lambda clients: work(clients, command))
+    sys.stdout.write(f"{text}\n")
+
+
+def _shown(text: str) -> dict[str, float]:
+    if text in SENSOR_FAULTS:
+        return {"fault": SENSOR_FAULTS[text]}
+    try:
+        return {"fault": 3, "value": float(text)}
+    except ValueError:
+        raise UsageError(f"'{text}': a sensor shows {', '.join(SENSOR_FAULTS)}, or a value") from None

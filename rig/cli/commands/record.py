@@ -1,0 +1,49 @@
+"""`coldloop record`: a session that is under way, recorded from now on by somebody who only looks.
+
+It leaves the folder that a run leaves; `coldloop page FOLDER` replays it.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coldloop.service.command_line import add_configuration_options
+from rig.cli.commands.choices import FIGURE_FORMATS
+from rig.cli.commands.options import add_rig_options, configuration, rig_endpoints
+from rig.durations import duration
+
+if TYPE_CHECKING:
+    from rig.cosim.job import Job
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_configuration_options(parser)
+    add_rig_options(parser)
+    parser.add_argument("--duration", type=duration, default=duration("1h"),
+                        help="plant time, such as 2h or 90s (default: 1h; Ctrl-C ends it before)")  # fmt: skip
+    parser.add_argument("--out", type=Path, help="folder for the results (default: runs/session-<time>)")
+    parser.add_argument("--force", action="store_true", help="replace the run in a folder that is not empty")
+    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
+                        help="png, pdf, svg (default: png)")  # fmt: skip
+    parser.set_defaults(execute=execute)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Record, and write the results."""
+    from rig.cli.recorded_job import record
+    from rig.figures.worker import FigureProcess
+
+    with FigureProcess(options.figures) as figure:
+        return record(_job(options), options, figure)
+
+
+def _job(options: argparse.Namespace) -> "Job":
+    """Return the recording that the options ask for."""
+    from rig.cosim.job import Job, Way
+    from rig.cosim.networked_run import as_attached, session_under_way
+
+    effective = configuration(options)
+    ends = tuple(rig_endpoints(options, effective.settings))
+    effective = as_attached(effective, ends)
+    return Job(effective, session_under_way(effective, ends).scenario(options.duration), Way.RECORDED, ends)

@@ -1,0 +1,58 @@
+"""A job as commands do it: its folder is claimed, a bar goes on, and what came out is told in a few lines."""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from rig.cosim.job import Job, Way
+from rig.figures.worker import FigureProcess
+from rig.results.folders import claim_folder, claim_folder_of_now
+from rig.results.recording import Sink
+from rig.runs.manifest import plain_arguments
+from rig.runs.running import run_into
+
+SHORT_RUN_TICKS: Final = 2400
+"""Ten minutes of plant time: in one process half a second at the most."""
+
+
+def record(job: Job, options: argparse.Namespace, figure: FigureProcess) -> int:
+    """Do a job with the options --out and --force; return the exit code.
+
+    Raises:
+        ColdloopError: It is not complete; what was recorded is in the folder.
+    """
+    name = "session" if job.way is Way.RECORDED else Path(job.effective.settings.plant.load).stem
+    out = options.out or claim_folder_of_now(Path("runs"), name)
+    claim_folder(out, force=options.force)
+    with _progress(job) as sinks:
+        summary = run_into(out, job, plain_arguments(options), figure, sinks)
+    _tell(out, summary)
+    return 0
+
+
+@contextmanager
+def _progress(job: Job) -> Iterator[list[Sink]]:
+    """Show a bar while the run goes on; one that is over before it could be read has none."""
+    if job.way is Way.IN_PROCESS and job.scenario.ticks <= SHORT_RUN_TICKS:
+        yield []
+        return
+    from rig.progress import RunProgress  # noqa: PLC0415 a short run starts without it
+
+    with RunProgress(job.scenario.ticks) as progress:
+        yield [progress]
+
+
+def _tell(out: Path, summary: dict[str, Any]) -> None:
+    updates = "no updates"
+    if summary["updates"]:
+        updates = f"{summary['updates']} updates, tau_u {summary['tau_u_mean']:.2f} s on average over time"
+    sys.stdout.write(
+        f"{summary['ticks']} ticks, {updates}, {summary['realtime_factor'] or 0:,.0f} x real time\n"
+        f"outside the bands: L1 {summary['L1_outside_band_pct']:.2f} %, T5 {summary['T5_outside_band_pct']:.2f} %; "
+        f"J_BF {summary['J_BF']:.4g}; deadline misses {summary['deadline_misses']}\n"
+        f"trace {summary['trace_sha256']}\n"
+        f"results in {out}\n"
+    )

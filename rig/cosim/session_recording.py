@@ -1,0 +1,157 @@
+"""A session under way, recorded by somebody who only looks: what a run leaves, from now on, and nothing is changed."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Iterable
+from typing import Final, NamedTuple
+
+from coldloop.errors import LinkError, UsageError
+from coldloop.process.load_profile import LoadProfile
+from coldloop.process.signals import TICK_S
+from coldloop.registers.audit import Event, EventKind
+from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.control_plc import Status
+from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
+from coldloop.registers.plant import LoadStatus, PlantSample, StationSample
+from rig.cosim.journal_reader import JournalReader
+from rig.cosim.scenario import Scenario
+from rig.cosim.session_client import LAST_LOOK_S, QUIET_S, SessionClient
+from rig.cosim.session_events import SessionEvents
+from rig.cosim.session_reader import SampleReader, UpdateReader
+from rig.results.driving import CONTROL, PLANT
+from rig.results.recording import LinkStatistics, Recorder
+
+LONGEST_PAUSE_S: Final = 0.2
+SHORTEST_PAUSE_S: Final = 0.002
+ALARMS: Final = frozenset(kind for kind in EventKind if kind.name.startswith("ALARM_"))
+HELD: Final = (frozenset({EventKind.MODE}), ALARMS, frozenset({EventKind.SENSOR}), frozenset({EventKind.SENSOR_FAULT}))
+"""Kinds of events that say how something is from then on: the ladder, an alarm, a sensor."""
+
+
+class SessionUnderWay(NamedTuple):
+    """What is found at a rig."""
+
+    identity: Identity
+    pace: SessionPace
+    load: float
+    """At present, W."""
+
+    def scenario(self, ticks: int) -> Scenario:
+        """Return what is recorded of it in so many ticks; what its load will be is not known."""
+        load = LoadProfile((0,), (self.load,))
+        return Scenario(ticks, load, updating_period_s=0.0, seed=0, realtime=bool(self.pace.realtime),
+                        factor=self.pace.factor)  # fmt: skip
+
+
+async def find_session(rig: SessionClient) -> SessionUnderWay:
+    """Return the session of a rig.
+
+    Raises:
+        UsageError: It has none.
+        LinkError: The plant does not answer.
+    """
+    identity, pace = await rig.plant.read(Identity), await rig.plant.read(SessionPace)
+    if not identity.session:
+        raise UsageError(f"{rig.plant.peer} has no session: there is nothing to record")
+    return SessionUnderWay(identity, pace, (await rig.plant.read(LoadStatus)).watts)
+
+
+class _FromNow:
+    """Passes on to a recorder what is read, with ticks and updates counted from now on."""
+
+    def __init__(self, recorder: Recorder, first_tick: int, first_update: int) -> None:
+        self._recorder, self._tick, self._update = recorder, first_tick, first_update
+
+    @property
+    def next_tick(self) -> int:
+        return self._tick + self._recorder.next_tick
+
+    def sample(self, sample: PlantSample) -> None:
+        self._recorder.sample(sample._replace(tick=sample.tick - self._tick))
+
+    def station(self, sample: StationSample) -> None:
+        self._recorder.station(sample._replace(tick=sample.tick - self._tick))
+
+    def update(self, update: Optimization) -> None:
+        if update.tick >= self._tick and update.update >= self._update:
+            self._recorder.update(update._replace(tick=update.tick - self._tick, update=update.update - self._update))
+
+    def event(self, event: Event, service: str = CONTROL) -> None:
+        self._recorder.event(event._replace(tick=max(0, event.tick - self._tick)), service)
+
+
+async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recorder) -> None:
+    """Record a session from now on.
+
+    Args:
+        rig: Connected, and tolerant: services may come and go meanwhile.
+        scenario: What is recorded.
+        recorder: Takes it; its first tick is the present one.
+
+    Raises:
+        UsageError: The rig has no session.
+        LinkError: The plant does not answer for long, or is in another session.
+    """
+    session = await find_session(rig)
+    first_update = await _next_update(rig)
+    from_now = _FromNow(recorder, session.identity.tick, first_update)
+    readers = {service: JournalReader(rig.clients[service]) for service in (CONTROL, PLANT)}
+    for service, reader in readers.items():
+        for event in state_of(await reader.read_on()):
+            from_now.event(event, service)
+    events = SessionEvents(readers, from_now)
+    number, end = session.identity.session, session.identity.tick + scenario.ticks
+    samples = SampleReader(
+        rig.plant, from_now, number, end, first=session.identity.tick, tolerant=True, realtime=scenario.realtime
+    )
+    updates = UpdateReader(rig.optimizer, from_now, number, first=first_update, tolerant=True)
+    late_before = await rig.control.read(Status)
+    recorder.begin()
+    heard_at = time.monotonic()
+    try:
+        while from_now.next_tick < end:
+            if await rig.contact(samples.read()) is not None:
+                heard_at = time.monotonic()
+            elif time.monotonic() - heard_at > QUIET_S:
+                raise LinkError(f"{rig.plant.peer} has not answered for {QUIET_S:g} s")
+            await rig.contact(updates.read())
+            await rig.contact(events.look(CONTROL, PLANT))
+            pause_s = TICK_S / scenario.factor if scenario.realtime else SHORTEST_PAUSE_S
+            await asyncio.sleep(min(max(pause_s, SHORTEST_PAUSE_S), LONGEST_PAUSE_S))
+    finally:  # what ended the recording is reported, not that the last of it cannot be read
+        with contextlib.suppress(LinkError, TimeoutError):
+            async with asyncio.timeout(LAST_LOOK_S):
+                await updates.read()
+                await events.read(CONTROL)
+                await events.read(PLANT)
+                recorder.link = _late(late_before, await rig.control.read(Status))
+
+
+async def _next_update(rig: SessionClient) -> int:
+    """Return the number of the update that the optimiser does next."""
+    done = (await rig.optimizer.read(Identity)).heartbeat
+    if not done:
+        return 0
+    (last,) = await rig.optimizer.read_rows(Optimization, (done - 1) % HISTORY_ROWS, 1)
+    return last.update + 1
+
+
+def state_of(events: Iterable[Event]) -> list[Event]:
+    """Return, of what has been noted in a session so far, the events that say how everything is now."""
+    last: dict[tuple[int, int], Event] = {}
+    for event in events:
+        if event.kind == EventKind.SESSION:
+            last.clear()
+        for group, kinds in enumerate(HELD):
+            if event.kind in kinds:
+                last[group, event.subject if group else 0] = event
+    return sorted(last.values())
+
+
+def _late(before: Status, after: Status) -> LinkStatistics:
+    """Return what was late between two looks; the largest lateness is that of the session."""
+    return LinkStatistics(
+        max(0, after.deadline_misses - before.deadline_misses), max(0, after.overruns - before.overruns),
+        after.lateness_max, after.lateness_p99,
+    )  # fmt: skip

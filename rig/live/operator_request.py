@@ -1,0 +1,35 @@
+"""What commands ask of a rig that is up, with the role of an operator."""
+
+from collections.abc import Awaitable, Callable, Iterable
+from contextlib import AsyncExitStack, nullcontext
+
+from coldloop.errors import LinkError, RequestRefusedError
+from coldloop.operating.execution import Clients, clients_of, connected, reason_of
+from rig.cosim.answer_time import answered_in_time
+from rig.cosim.endpoints import RigEndpoints
+
+Work = Callable[[Clients], Awaitable[str]]
+
+
+async def ask(rig: RigEndpoints, services: Iterable[str], work: Work, *, limited: bool = True) -> str:
+    """Connect to the services that something concerns, do it, and return what came back.
+
+    Args:
+        rig: Where it is.
+        services: Which ones.
+        work: Is given their clients, connected.
+        limited: It may not take longer than a rig takes to answer.
+
+    Raises:
+        LinkError: A service is not there, refuses, or answers too late.
+        UsageError: It is not possible now.
+    """
+    clients = clients_of({service: getattr(rig, service) for service in services})
+    async with AsyncExitStack() as stack:
+        async with answered_in_time("to connect"):
+            await stack.enter_async_context(connected(clients))
+        async with answered_in_time("the command") if limited else nullcontext():
+            try:
+                return await work(clients)
+            except RequestRefusedError as error:
+                raise LinkError(reason_of(error)) from None

@@ -1,0 +1,51 @@
+"""Faults of the processes of a rig that was started on this machine."""
+
+import asyncio
+import os
+import signal
+from contextlib import suppress
+
+from coldloop.errors import UsageError
+from rig.live.process_identity import identity_of
+from rig.live.started_rigs import ServiceProcess, find_rig
+
+
+def process_of(first_port: int | None, service: str) -> ServiceProcess:
+    """Return the process of a service of the rig on these ports, or of the only one.
+
+    Raises:
+        UsageError: No rig was started here, or the service does not run at present.
+    """
+    rig = find_rig(first_port)
+    if rig is None:
+        where = "" if first_port is None else f" on port {first_port}"
+        raise UsageError(f"no rig that was started here is up{where}: `coldloop up` starts one")
+    process = rig.services[service]
+    if not _runs(process):
+        raise UsageError(f"the {service} service does not run: `coldloop up` starts it again, or has given it up")
+    return process
+
+
+def kill(process: ServiceProcess) -> None:
+    """End a process at once."""
+    _signal(process, signal.SIGKILL)
+
+
+async def freeze(process: ServiceProcess, seconds: float) -> None:
+    """Let a process stand still for a while; it runs again when this ends, however it ends."""
+    _signal(process, signal.SIGSTOP)
+    try:
+        await asyncio.sleep(seconds)
+    finally:
+        _signal(process, signal.SIGCONT)
+
+
+def _runs(process: ServiceProcess) -> bool:
+    return process.identity == identity_of(process.pid)
+
+
+def _signal(process: ServiceProcess, number: signal.Signals) -> None:
+    """Send a signal, unless the process has ended meanwhile and another one may have its number."""
+    if _runs(process):
+        with suppress(ProcessLookupError):
+            os.kill(process.pid, number)

@@ -1,0 +1,398 @@
+"""Commands carried out: what is written for each, and what is read back of it. Connections are given."""
+
+import asyncio
+import math
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from typing import Any, Final
+
+from coldloop.errors import BUSY, LinkError, RequestRefusedError, UsageError
+from coldloop.modbus.client import RegisterClient
+from coldloop.modbus.endpoints import Endpoint
+from coldloop.operating.commands import (
+    Command,
+    FaultSensor,
+    PlayLoad,
+    SetFactor,
+    SetLoad,
+    SetMode,
+    SetPaused,
+    SetSetpoint,
+    TreatAlarm,
+    clock_text,
+)
+from coldloop.operating.load_stream import LoadStream
+from coldloop.process.load_profile import LoadProfile
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
+from coldloop.registers.common import Identity, SessionPace
+from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
+from coldloop.registers.maps import MAPS
+from coldloop.registers.plant import AHEAD_STEPS, LiveLoad, LoadStatus, SensorFault, SensorFaultKind
+from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
+from coldloop.registers.seal import sealed
+from coldloop.service.event_text import word
+
+EFFECT_S: Final = 2.0
+"""How long the effect of a command is waited for."""
+LOOK_S: Final = 0.1
+LEAD_TICKS: Final = 8
+"""A load that is to begin now begins so many ticks later, so that it is there in time, ..."""
+LEAD_S: Final = 2.0
+"""... and not sooner than this by the clock: at a high factor ticks pass quickly."""
+MOST_NAMES: Final = 6
+"""Alarms that are named; more are counted."""
+WAITING: Final = frozenset({AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED})
+HINTS: Final = {
+    1: "the certificate or the address of this client has not the role of an operator",
+    3: "the value is not possible now",
+    BUSY: "another client is its writer",
+}
+
+
+class NotTakenError(UsageError):
+    """A command was written, and what was read back says that it was not carried out."""
+
+
+class CommandClient(RegisterClient):
+    """A client that knows whether something it has written may count."""
+
+    has_written = False
+
+    async def write_rows(self, records: Sequence[tuple[Any, ...]], start: int = 0) -> None:
+        """Write rows; only a refusal says that they do not count."""
+        before, self.has_written = self.has_written, True
+        try:
+            await super().write_rows(records, start)
+        except RequestRefusedError:
+            self.has_written = before
+            raise
+
+
+Clients = Mapping[str, CommandClient]
+"""One for each service that a command concerns; connected."""
+
+
+def clients_of(endpoints: Mapping[str, Endpoint]) -> dict[str, CommandClient]:
+    """Return clients of services, not connected yet."""
+    return {service: CommandClient.at(MAPS[service], endpoint) for service, endpoint in endpoints.items()}
+
+
+@asynccontextmanager
+async def connected(clients: Clients) -> AsyncIterator[Clients]:
+    """Connect clients, all before one is written to, and close them at the end.
+
+    Raises:
+        PeerUnreachableError: A service is not there.
+    """
+    try:
+        for client in clients.values():
+            await client.connect(0.0)
+        yield clients
+    finally:
+        for client in clients.values():
+            client.close()
+
+
+def reason_of(error: Exception) -> str:
+    """Return why a command came to nothing; a refusal is put into words."""
+    hint = HINTS.get(error.exception_code) if isinstance(error, RequestRefusedError) else None
+    return f"{error}: {hint}" if hint else str(error)
+
+
+async def set_mode(clients: Clients, command: SetMode) -> str:
+    """Write who drives; wait until the control PLC follows."""
+    client = clients["control_plc"]
+    mode = OperatorMode[command.mode.upper()]
+    operator = await client.read(Operator)
+    await client.write(operator._replace(mode=mode))
+    expected = {OperatorMode.MANUAL: {Mode.MANUAL}, OperatorMode.CLASSICAL: {Mode.CLASSICAL}}.get(
+        mode, {Mode.MPC, Mode.REST}
+    )
+    ladder = await client.read(LadderStatus)
+    for _ in range(round(EFFECT_S / LOOK_S)):
+        if ladder.mode in expected:
+            break
+        await asyncio.sleep(LOOK_S)
+        ladder = await client.read(LadderStatus)
+    back = OperatorMode((await client.read(Operator)).mode)
+    return (
+        f"operator's mode {word(back)}; the control PLC is in {word(Mode(ladder.mode))} ({word(Cause(ladder.cause))})"
+    )
+
+
+def check_bounds(command: SetSetpoint, low: float, high: float) -> None:
+    """Check a setpoint against the bounds of its input.
+
+    Raises:
+        UsageError: It is beyond them.
+    """
+    unit = INPUT_UNITS[INPUT_NAMES.index(command.input)]
+    if not low <= command.value <= high:
+        raise UsageError(f"{command.input} = {command.value:g} {unit} is not from {low:g} to {high:g} {unit}")
+
+
+async def check_manual(client: RegisterClient) -> Operator:
+    """Return what the operator has written, if manual drives.
+
+    Raises:
+        UsageError: It does not.
+    """
+    operator = await client.read(Operator)
+    if operator.mode != OperatorMode.MANUAL:
+        raise UsageError("setpoints count in manual mode: take over in manual first")
+    return operator
+
+
+async def set_setpoint(clients: Clients, command: SetSetpoint) -> str:
+    """Write one setpoint; the others stay as they are."""
+    client, place = clients["control_plc"], INPUT_NAMES.index(command.input)
+    operator = await check_manual(client)
+    values = [command.value if i == place else present for i, present in enumerate(operator[1:])]
+    await client.write(Operator(operator.mode, *values))
+    back, unit = await client.read(Operator), INPUT_UNITS[place]
+    was = f"was {operator[1 + place]:g} {unit}"
+    return f"setpoint of {command.input} {back[1 + place]:g} {unit} ({was}); approached within the rate limit"
+
+
+async def set_load(clients: Clients, command: SetLoad) -> str:
+    """Write the load; wait until the plant has it, where it is to have it at once.
+
+    Raises:
+        UsageError: It is to begin at a tick that has passed.
+    """
+    client = clients["plant"]
+    before, now = await client.read(LoadStatus), (await client.read(Identity)).tick
+    if 0 < command.tick <= now:
+        raise UsageError(f"plant time is {now * TICK_S:g} s already: name a later one")
+    await client.write(sealed(LiveLoad(command.tick, command.watts)))
+    status = await client.read(LoadStatus)
+    for _ in range(0 if command.tick else round(EFFECT_S / LOOK_S)):
+        if abs(status.watts - command.watts) <= 1e-3 * max(1.0, command.watts):
+            break
+        await asyncio.sleep(LOOK_S)
+        status = await client.read(LoadStatus)
+    return f"{_load_text(command, status)} (was {before.watts:g} W)"
+
+
+def _load_text(command: SetLoad, status: LoadStatus) -> str:
+    """Return what the plant knows of a load that was written.
+
+    Raises:
+        LinkError: It knows another one.
+    """
+    if not status.upcoming:
+        return f"load {status.watts:g} W now"
+    if command.tick and status.last_tick != command.tick:
+        raise LinkError(
+            f"the load from {command.tick * TICK_S:g} s on is another one: somebody else has written it meanwhile"
+        )
+    text = f"load {command.watts:g} W from {status.last_tick * TICK_S:g} s on"
+    if status.next_tick == status.last_tick:
+        return text
+    return f"{text}, before it {status.next_watts:g} W from {status.next_tick * TICK_S:g} s on"
+
+
+async def play_load(clients: Clients, command: PlayLoad) -> str:
+    """Write a load file at once."""
+    stream, begin = await _stream(clients["plant"], command.profile, 0, ahead=len(command.profile.times))
+    await stream.feed(begin)
+    return await _streamed(clients["plant"], stream, begin)
+
+
+async def stream_load(clients: Clients, load: LoadProfile, tick: int, say: Callable[[str], None]) -> str:
+    """Write a load of any length from a tick on (0 is now), as fast as the plant can store it.
+
+    Raises:
+        UsageError: It is to begin at a tick that has passed, or the plant has no session.
+    """
+    plant = clients["plant"]
+    free = (await plant.read(LoadStatus)).free
+    stream, begin = await _stream(plant, load, tick, ahead=max(0, free - AHEAD_STEPS))
+    said = False
+    while True:
+        await stream.feed((await plant.read(Identity)).tick)
+        if stream.done:
+            return await _streamed(plant, stream, begin)
+        if await stream.was_replaced():
+            raise LinkError("somebody else has written the load meanwhile: the rest of the file is not written")
+        if not said:
+            said = True
+            say(f"the plant keeps {free} steps of {stream.steps}: this goes on until it has all of them")
+        await asyncio.sleep(LOOK_S)
+
+
+async def _stream(plant: RegisterClient, load: LoadProfile, tick: int, *, ahead: int) -> tuple[LoadStream, int]:
+    """Return what feeds the plant with a load, and the tick at which it begins."""
+    identity = await plant.read(Identity)
+    if not identity.session:
+        raise UsageError("the plant has no session")
+    if 0 < tick <= identity.tick:
+        raise UsageError(f"plant time is {identity.tick * TICK_S:g} s already: name a later one")
+    begin = tick or identity.tick + lead_ticks(await plant.read(SessionPace))
+    return LoadStream(plant, identity.session, load, begin=begin, ahead=ahead), begin
+
+
+async def _streamed(plant: RegisterClient, stream: LoadStream, begin: int) -> str:
+    status = await plant.read(LoadStatus)
+    times = f"{begin * TICK_S:g} s to {status.last_tick * TICK_S:g} s"
+    return f"load of {stream.steps} steps from {times}; its last value is held"
+
+
+def lead_ticks(pace: SessionPace) -> int:
+    """Return how many ticks ahead of now a load is to begin."""
+    return max(LEAD_TICKS, math.ceil(LEAD_S * pace.factor / TICK_S)) if pace.realtime else LEAD_TICKS
+
+
+async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
+    """Write what is done with alarms; wait until their states say that it was."""
+    client, action = clients["control_plc"], AlarmAction(command.action)
+    kinds = list(AlarmKind) if command.alarm == ALL_ALARMS else [AlarmKind(command.alarm)]
+    raised_again: list[AlarmKind] = []
+    before = await client.read_rows(Alarm, 0, len(AlarmKind))
+    if command.seen is None:
+        await client.write(AlarmCommand(command.alarm, action, command.time_s))
+        if action is AlarmAction.ACKNOWLEDGE:
+            kinds = [kind for kind in kinds if before[kind].state in WAITING]
+            if not kinds:
+                return "no alarm waits to be acknowledged"
+    else:
+        kinds, raised_again = _seen(before, kinds, command.seen)
+        for kind in kinds:
+            await client.write(AlarmCommand(kind, action, command.time_s))
+    rows = await client.read_rows(Alarm, 0, len(AlarmKind))
+    for _ in range(round(EFFECT_S / LOOK_S)):
+        if all(_is_done(action, rows[kind].state) for kind in kinds):
+            break
+        await asyncio.sleep(LOOK_S)
+        rows = await client.read_rows(Alarm, 0, len(AlarmKind))
+    return _treated(action, rows, kinds, raised_again)
+
+
+def _seen(
+    rows: Sequence[Alarm], kinds: Sequence[AlarmKind], seen: Mapping[str, int]
+) -> tuple[list[AlarmKind], list[AlarmKind]]:
+    """Return the alarms that are as the operator has seen them, and those that were raised again since.
+
+    Raises:
+        UsageError: None is as it was seen.
+    """
+    waiting = [kind for kind in kinds if word(kind) in seen or rows[kind].state in WAITING]
+    same = [kind for kind in waiting if seen.get(word(kind)) == rows[kind].times]
+    again = [kind for kind in waiting if kind not in same]
+    if not waiting:
+        raise UsageError("no alarm waits for an acknowledgement any more")
+    if not same:
+        raise UsageError(f"raised again since it was shown: {_names(again)}; look at it first")
+    return same, again
+
+
+def _is_done(action: AlarmAction, state: int) -> bool:
+    if action is AlarmAction.ACKNOWLEDGE:
+        return state not in WAITING
+    if action in (AlarmAction.SHELVE, AlarmAction.OUT_OF_SERVICE):
+        return state == {AlarmAction.SHELVE: AlarmState.SHELVED}.get(action, AlarmState.OUT_OF_SERVICE)
+    return state != {AlarmAction.UNSHELVE: AlarmState.SHELVED}.get(action, AlarmState.OUT_OF_SERVICE)
+
+
+def _treated(
+    action: AlarmAction, rows: Sequence[Alarm], kinds: Sequence[AlarmKind], raised_again: Sequence[AlarmKind]
+) -> str:
+    """Return what has become of alarms.
+
+    Raises:
+        NotTakenError: Nothing of what was asked for.
+    """
+    left = [kind for kind in kinds if not _is_done(action, rows[kind].state)]
+    if len(left) == len(kinds):
+        states = ", ".join(sorted({word(AlarmState(rows[kind].state)) for kind in left}))
+        raise NotTakenError(f"{_names(left)}: {states}; the control PLC did not take it")
+    done = [kind for kind in kinds if kind not in left]
+    if len(kinds) == 1:
+        row = rows[kinds[0]]
+        until = f" until {clock_text(row.shelved_until * TICK_S)}" if row.state == AlarmState.SHELVED else ""
+        over = action is AlarmAction.ACKNOWLEDGE and row.state == AlarmState.NORMAL
+        text = f"alarm {word(kinds[0])}: {'acknowledged, now ' if over else ''}{word(AlarmState(row.state))}{until}"
+    elif len(kinds) <= MOST_NAMES:
+        states = "; ".join(f"now {word(state)}: {_names(each)}" for state, each in _by_state(rows, done))
+        text = f"acknowledged; {states}" if action is AlarmAction.ACKNOWLEDGE else states
+    else:
+        counted = ", ".join(f"{len(each)} {word(state)}" for state, each in _by_state(rows, done))
+        text = f"of {len(kinds)} alarms {counted}"
+    if left:
+        text += f"; not {_names(left)}"
+    if raised_again:
+        text += f"; raised again since they were shown, and left: {_names(raised_again)}"
+    return text
+
+
+def _by_state(rows: Sequence[Alarm], kinds: Sequence[AlarmKind]) -> list[tuple[AlarmState, list[AlarmKind]]]:
+    """Return the states in which alarms are, and which ones are in each."""
+    sorted_out = [(state, [kind for kind in kinds if rows[kind].state == state]) for state in AlarmState]
+    return [(state, each) for state, each in sorted_out if each]
+
+
+def _names(kinds: Sequence[AlarmKind]) -> str:
+    return ", ".join(word(kind) for kind in kinds)
+
+
+async def fault_sensor(clients: Clients, command: FaultSensor) -> str:
+    """Put a fault into a sensor."""
+    client, row = clients["plant"], OUTPUT_NAMES.index(command.output)
+    await client.write_rows([SensorFault(command.fault, command.value)], row)
+    (back,) = await client.read_rows(SensorFault, row, 1)
+    return f"sensor of {command.output}: {word(SensorFaultKind(back.kind))}"
+
+
+async def set_factor(clients: Clients, command: SetFactor) -> str:
+    """Write how fast plant time goes."""
+    return await _set_pace(clients, lambda pace: pace._replace(realtime=1, factor=command.factor))
+
+
+async def set_paused(clients: Clients, command: SetPaused) -> str:
+    """Let plant time stand still, or go on."""
+    return await _set_pace(clients, lambda pace: pace._replace(paused=int(command.paused)))
+
+
+async def _set_pace(clients: Clients, change: Callable[[SessionPace], SessionPace]) -> str:
+    """Write the time base of the session under way."""
+    plant = clients["plant"]
+    present = await plant.read(SessionPace)
+    pace = change(present)
+    if not pace.realtime:
+        raise UsageError("the session is in lock-step: it goes as far as it is granted")
+    await write_pace(clients.values(), pace)
+    back, tick = await plant.read(SessionPace), (await plant.read(Identity)).tick
+    return f"{'paused' if back.paused else 'running'} at {tick * TICK_S:g} s, factor {back.factor:g}"
+
+
+async def write_pace(clients: Iterable[RegisterClient], pace: SessionPace) -> None:
+    """Write the time base of a session: the plant first, then those who follow it. An optimiser may be in none yet.
+
+    Args:
+        clients: The plant's, then the others'.
+        pace: To be written.
+
+    Raises:
+        LinkError: One refuses, or does not answer.
+    """
+    session = None
+    for client in clients:
+        found = (await client.read(Identity)).session
+        session = found if session is None else session
+        if found == session:
+            await client.write(pace)
+
+
+Work = Callable[[Clients, Any], Awaitable[str]]
+ALL_SERVICES: Final = tuple(MAPS)
+WORK: Final[Mapping[type[Command], tuple[tuple[str, ...], Work]]] = {
+    SetMode: (("control_plc",), set_mode),
+    SetSetpoint: (("control_plc",), set_setpoint),
+    SetLoad: (("plant",), set_load),
+    PlayLoad: (("plant",), play_load),
+    TreatAlarm: (("control_plc",), treat_alarm),
+    FaultSensor: (("plant",), fault_sensor),
+    SetFactor: (ALL_SERVICES, set_factor),
+    SetPaused: (ALL_SERVICES, set_paused),
+}
+"""Who is written to, and how; in the case of a time base the plant first."""

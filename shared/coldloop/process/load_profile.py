@@ -1,0 +1,109 @@
+"""The heat load over time, and the CSV files that hold it."""
+
+import csv
+import math
+from bisect import bisect_right
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from coldloop.errors import LoadFileError
+from coldloop.process.signals import LAST_TICK, TICK_S
+
+MAX_LOAD_W: Final = 10_000.0
+COLUMNS: Final = ("time_s", "load_w")
+
+
+@dataclass(frozen=True)
+class LoadProfile:
+    """The heat load over time, in steps that are held.
+
+    Raises:
+        ValueError: times do not start at 0, do not increase or are after the last tick of a session, lengths differ, or
+            a load is negative or not finite.
+    """
+
+    times: tuple[int, ...]
+    """Ticks at which the load changes, from 0."""
+    watts: tuple[float, ...]
+    """The load from each of these ticks on, W."""
+
+    def __post_init__(self) -> None:
+        if not self.times or self.times[0] != 0 or len(self.times) != len(self.watts):
+            raise ValueError("a load profile needs a load for each time, the first at tick 0")
+        if any(later <= earlier for earlier, later in zip(self.times, self.times[1:], strict=False)):
+            raise ValueError("the times of a load profile must increase")
+        if self.times[-1] > LAST_TICK:
+            raise ValueError(f"tick {self.times[-1]} is after the last one of a session, {LAST_TICK}")
+        if not all(0.0 <= load < math.inf for load in self.watts):
+            raise ValueError("loads are finite and not negative")
+
+    def value(self, tick: int) -> float:
+        """Return the load (W) that is held from `tick` (0 or later) to the next."""
+        return self.watts[bisect_right(self.times, tick) - 1]
+
+
+def read_load_file(path: Path) -> LoadProfile:
+    """Return the load of a CSV file with the columns time_s and load_w, steps held.
+
+    Raises:
+        LoadFileError: One line that names file, line and remedy.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise LoadFileError(f"{path}: not UTF-8 text (byte {error.start}); save it as UTF-8") from None
+    except OSError as error:
+        raise LoadFileError(f"{path}: {error.strerror}; name a readable CSV file") from None
+    return load_profile_of(text, str(path))
+
+
+def load_profile_of(text: str, where: str) -> LoadProfile:
+    """Return the load that a CSV text tells; `where` names it in messages.
+
+    Raises:
+        LoadFileError: One line that names place, line and remedy.
+    """
+    reader = csv.DictReader(text.splitlines())
+    try:
+        missing = set(COLUMNS) - set(reader.fieldnames or ())
+        if missing:
+            raise LoadFileError(f"{where}: no column {' and '.join(sorted(missing))}; the first line is time_s,load_w")
+        times: list[int] = []
+        watts: list[float] = []
+        for row in reader:
+            tick, load = _step(row, times, f"{where}, line {reader.line_num}")
+            times.append(tick)
+            watts.append(load)
+    except csv.Error as error:
+        raise LoadFileError(f"{where}, line {reader.line_num + 1}: {error}; write two numbers a line") from None
+    if not times:
+        raise LoadFileError(f"{where}: no steps; add a line such as 0,385")
+    return LoadProfile(tuple(times), tuple(watts))
+
+
+def _step(row: dict[str, str | None], before: list[int], where: str) -> tuple[int, float]:
+    """Return the step (tick, W) that a line tells, if it may follow those before."""
+    time, load = (_number(row[column], f"{where}, {column}") for column in COLUMNS)
+    if not 0 <= time < LAST_TICK * TICK_S:
+        raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * TICK_S:g} s")
+    if not 0 <= load <= MAX_LOAD_W:
+        raise LoadFileError(f"{where}: {load:g} W is outside 0 to {MAX_LOAD_W:g} W; loads are heat into the bath")
+    tick = round(time / TICK_S)
+    if abs(tick * TICK_S - time) > 1e-6:
+        raise LoadFileError(f"{where}: {time:g} s is not a multiple of {TICK_S} s")
+    if not before and tick != 0:
+        raise LoadFileError(f"{where}: the first step is at {time:g} s; begin at 0 s")
+    if before and tick <= before[-1]:
+        raise LoadFileError(f"{where}: {time:g} s does not come after {before[-1] * TICK_S:g} s; sort by time_s")
+    return tick, load
+
+
+def _number(text: str | None, where: str) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise LoadFileError(f"{where}: {text!r} is not a finite number")
+    return value

@@ -1,0 +1,23 @@
+"""What is known of a session before its recording begins: how everything is, from what was noted last."""
+
+from coldloop.registers.audit import Event, EventKind
+from rig.cosim.session_recording import state_of
+
+
+def noted(number: int, kind: EventKind, subject: int = 0, cause: int = 0) -> Event:
+    return Event(number=number, tick=10 * number, kind=kind, subject=subject, cause=cause)
+
+
+def test_the_last_mode_and_the_last_of_each_alarm_and_sensor_count() -> None:
+    events = [
+        noted(1, EventKind.MODE, 1), noted(2, EventKind.ALARM_RAISED, 5), noted(3, EventKind.ALARM_RAISED, 6),
+        noted(4, EventKind.SENSOR_FAULT, 2, 1), noted(5, EventKind.SENSOR, 2, 1), noted(6, EventKind.ALARM_RETURNED, 5),
+        noted(7, EventKind.MODE, 2), noted(8, EventKind.OPERATOR_MODE, 1), noted(9, EventKind.SENSOR_FAULT, 3, 2),
+    ]  # fmt: skip
+    assert [event.number for event in state_of(events)] == [3, 4, 5, 6, 7, 9]
+
+
+def test_what_was_noted_in_a_session_before_does_not_count() -> None:
+    events = [noted(1, EventKind.SENSOR_FAULT, 2, 1), noted(2, EventKind.SESSION), noted(3, EventKind.MODE, 1)]
+    assert [event.number for event in state_of(events)] == [3]
+    assert state_of([]) == []
