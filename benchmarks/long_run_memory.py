@@ -16,10 +16,11 @@ from coldloop.config import load_configuration
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICK_S
 from plant.load import HOUR_TICKS, HOURS, concatenated, telegraph
-from rig.cosim.job import Job, Way
+from rig.cosim.job import Job
 from rig.figures.worker import FigureProcess
 from rig.results.folders import claim_folder
 from rig.results.recording import SampleBlock, Sink
+from rig.results.way import Way
 from rig.runs.running import make_scenario, run_into
 from rig.settings import Settings
 

@@ -46,7 +46,7 @@ class Mangler:
     """
 
     def __init__(self, direction: Direction, seed: str) -> None:
-        self._direction = direction
+        self.direction = direction
         self._draw = random.Random(seed)  # noqa: S311 not for secrets
         self._held = b""
         self.hold_s: float | None = None
@@ -56,7 +56,7 @@ class Mangler:
         """Return what becomes of a frame under the faults that are on."""
         pieces, delay_s, overtaken = [frame], 0.0, self.release()
         for fault in faults:
-            if fault.direction not in {Direction.BOTH, self._direction}:
+            if fault.direction not in {Direction.BOTH, self.direction}:
                 continue
             if isinstance(fault, Delay):
                 delay_s += max(0.0, fault.delay_ms + fault.jitter_ms * self._draw.uniform(-1, 1)) / 1000

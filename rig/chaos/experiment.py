@@ -12,11 +12,12 @@ from rig.chaos.plan import Plan
 from rig.chaos.runner import conduct
 from rig.chaos.sequencer import Progress
 from rig.chaos.trace import ChaosTrace
-from rig.cosim.job import Job, Way
+from rig.cosim.job import Job
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
 from rig.figures.worker import FigureProcess
 from rig.results.recording import Recorder, Recording
+from rig.results.way import Way
 from rig.runs.running import run_into
 from rig.settings import Settings
 

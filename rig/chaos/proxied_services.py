@@ -9,10 +9,47 @@ from typing import Self
 from coldloop.config import PREFIX
 from rig.chaos.faults import Link
 from rig.chaos.proxy import LinkProxy
+from rig.cosim.endpoints import RigEndpoints
 from rig.cosim.local_services import LocalServices
 from rig.cosim.ports import ReservedPorts
 from rig.cosim.wiring import Detours
 from rig.settings import Settings
+
+
+class LinkProxies:
+    """A proxy in each of the two links; a context that has their ports.
+
+    Args:
+        seed: Decides which frames a fault of a link hits.
+    """
+
+    def __init__(self, seed: str) -> None:
+        self._seed = seed
+        self._reserved = ReservedPorts(len(Detours._fields))
+        self.detours = Detours(*self._reserved.numbers)
+        self.by_link: Mapping[Link, LinkProxy] = {}
+
+    def put_before(self, ends: RigEndpoints) -> None:
+        """Make them, for these servers."""
+        self.by_link = {
+            Link.PLANT: LinkProxy(self.detours.plant, ends.plant, f"{self._seed}/plant"),
+            Link.OPTIMIZER: LinkProxy(self.detours.control_plc, ends.control_plc, f"{self._seed}/optimizer"),
+        }
+
+    async def connect(self) -> None:
+        """Start them: until then no client reaches a server."""
+        for proxy in self.by_link.values():
+            await proxy.start()
+
+    async def __aenter__(self) -> Self:
+        """Return them, not started yet."""
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Close them."""
+        for proxy in self.by_link.values():
+            await proxy.close()
+        self._reserved.release()
 
 
 class ProxiedServices:
@@ -27,33 +64,29 @@ class ProxiedServices:
     """
 
     def __init__(self, settings: Settings, folder: Path, seed: str) -> None:
-        self._reserved = ReservedPorts(len(Detours._fields))
-        detours = Detours(*self._reserved.numbers)
-        self.services = LocalServices(settings, folder / "logs", detours=detours, environment=_retained(folder))
-        ends = self.services.endpoints
-        self.proxies: Mapping[Link, LinkProxy] = {
-            Link.PLANT: LinkProxy(detours.plant, ends.plant, f"{seed}/plant"),
-            Link.OPTIMIZER: LinkProxy(detours.control_plc, ends.control_plc, f"{seed}/optimizer"),
-        }
+        self._proxies = LinkProxies(seed)
+        self.services = LocalServices(
+            settings, folder / "logs", detours=self._proxies.detours, environment=_retained(folder)
+        )
+        self._proxies.put_before(self.services.endpoints)
+        self.proxies = self._proxies.by_link
         self._stack = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
         """Start the services."""
-        self._stack.enter_context(self._reserved)
+        await self._stack.enter_async_context(self._proxies)
         await self._stack.enter_async_context(self.services)
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End proxies and services."""
+        """End services and proxies."""
         await self._stack.__aexit__(kind, error, trace)
 
     async def connect_links(self) -> None:
         """Start the proxies: until then no service reaches another one."""
-        for proxy in self.proxies.values():
-            await proxy.start()
-            self._stack.push_async_callback(proxy.close)
+        await self._proxies.connect()
 
 
 def _retained(folder: Path) -> dict[str, str]:

@@ -68,7 +68,7 @@ class LinkProxy:
             self._flowing.clear()
         elif isinstance(fault, Reset):
             for writer in tuple(self._open):
-                _reset(writer)
+                reset(writer)
 
     def end(self, fault: LinkFault) -> None:
         """Stop disturbing it."""
@@ -84,14 +84,14 @@ class LinkProxy:
         ends = [writer]
         try:
             if any(isinstance(fault, Reset) for fault in self._faults):
-                _reset(writer)
+                reset(writer)
                 return
             far_reader, far_writer = await asyncio.open_connection(self._target.host, self._target.port)
             ends.append(far_writer)
             self._open.update(ends)
             await self._pass_both_ways((reader, writer), (far_reader, far_writer))
         except OSError as error:
-            _reset(writer)  # nobody listens behind the proxy: as if nobody listened here
+            reset(writer)  # nobody listens behind the proxy: as if nobody listened here
             if self._tell is not None:
                 self._tell(f"{self._target.host}:{self._target.port}: {error.strerror or error}")
         except asyncio.CancelledError:  # the proxy is being closed: what is not sent yet is not waited for
@@ -146,14 +146,14 @@ class LinkProxy:
             await asyncio.sleep(outcome.delay_s)
         await self._flowing.wait()
         if outcome.reset:
-            _reset(writer)
+            reset(writer)
             return False
         writer.write(outcome.data)
         await writer.drain()
         return not outcome.close
 
 
-def _reset(writer: asyncio.StreamWriter) -> None:
+def reset(writer: asyncio.StreamWriter) -> None:
     """Close with RST: nothing is sent any more, and the peer knows at once."""
     connection = writer.get_extra_info("socket")
     if connection is not None and not writer.is_closing():

@@ -7,10 +7,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from rig.cosim.job import Job, Way
+from rig.cosim.job import Job
 from rig.figures.worker import FigureProcess
 from rig.results.folders import claim_folder, claim_folder_of_now
 from rig.results.recording import Sink
+from rig.results.way import Way
 from rig.runs.manifest import plain_arguments
 from rig.runs.running import run_into
 

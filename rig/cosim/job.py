@@ -3,7 +3,6 @@
 import signal
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 
 from coldloop.config import Configuration
@@ -11,20 +10,8 @@ from coldloop.errors import RunInterruptedError
 from coldloop.modbus.endpoints import Endpoint
 from rig.cosim.scenario import Scenario
 from rig.results.recording import Recorder
+from rig.results.way import Way
 from rig.settings import Settings
-
-
-class Way(StrEnum):
-    """How the three programs are connected."""
-
-    IN_PROCESS = "in-process"
-    LOCALHOST = "localhost"
-    ATTACHED = "attached"
-    RECORDED = "recorded"
-    """Nothing was driven: a session of others was looked at."""
-    CHAOS = "chaos"
-    """On localhost, with faults on purpose."""
-
 
 Conduct = Callable[[Recorder, Path], Awaitable[None]]
 """Does a run: takes its recorder and the folder of its results."""

@@ -11,13 +11,14 @@ from coldloop.service.start import run_event_loop
 from rig.cosim.answer_time import answered_in_time
 from rig.cosim.endpoints import RigEndpoints
 from rig.cosim.handing_back import give_back, look_around
-from rig.cosim.job import Job, StopRequest, Way
+from rig.cosim.job import Job, StopRequest
 from rig.cosim.local_services import run_on_localhost
 from rig.cosim.rig_configuration import attached, running_configuration
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
 from rig.cosim.session_recording import SessionUnderWay, find_session, record_session
 from rig.results.recording import Recorder
+from rig.results.way import Way
 from rig.settings import Settings
 
 ATTACH_PATIENCE_S: Final = 5.0

@@ -7,12 +7,14 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from coldloop.process.signals import INPUT_NAMES
 from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run
 from rig.results.columns import STATION_FILE
 from rig.results.folders import whole_file
-from rig.results.run_folder import RunFolder
+from rig.results.run_folder import Curves, RunFolder
+from rig.results.way import Way
 
 DPI: Final = 130
 
@@ -47,35 +49,37 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 def curves_of(run: RunFolder) -> RunCurves:
     """Return what is drawn of a run."""
-    pressures = _pressures(run)
+    pressures = pressure_limits(run.configuration) if (run.path / STATION_FILE).exists() else {}
     series = run.series(DRAWN)
     if pressures:
-        station = run.series(list(pressures), file_name=STATION_FILE)
-        series |= {name: np.interp(series["time_s"], station["time_s"], station[name]) for name in pressures}
+        series |= at_times(run.series(list(pressures), file_name=STATION_FILE), series["time_s"])
     return RunCurves(
         series,
         run.events(),
         Bounds.of(run.configuration),
-        title_of(run.configuration),
+        title_of(run.configuration, run.manifest["way"]),
         identity_of(run.manifest),
         pressures,
     )
 
 
-def _pressures(run: RunFolder) -> dict[str, tuple[float, float]]:
-    """Return the pressures of a station with the limits of their alarms, bar; none where there is no station."""
-    if not (run.path / STATION_FILE).exists():
-        return {}
+def pressure_limits(configuration: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """Return the pressures of a station with the limits of their alarms, bar."""
     alarms = {
-        key: float(run.configuration[f"plant.station.alarms.{key}_bar"])
+        key: float(configuration[f"plant.station.alarms.{key}_bar"])
         for key in ("hp_low", "hp_high", "lp_low", "lp_high")
     }
     return {"P12": (alarms["hp_low"], alarms["hp_high"]), "P11": (alarms["lp_low"], alarms["lp_high"])}
 
 
-def title_of(configuration: Mapping[str, Any]) -> str:
-    """Return what a run was, in a few words."""
-    load = f"load {Path(configuration['plant.load']).name}"
+def at_times(series: Curves, times_s: NDArray[np.float64]) -> Curves:
+    """Return the curves of a file at the times of another one."""
+    return {name: np.interp(times_s, series["time_s"], curve) for name, curve in series.items() if name != "time_s"}
+
+
+def title_of(configuration: Mapping[str, Any], way: str = "") -> str:
+    """Return what a run was, in a few words; of a session that was recorded, the load is not known by name."""
+    load = "session under way" if way == Way.RECORDED else f"load {Path(configuration['plant.load']).name}"
     if configuration["control_plc.driver"] == "classical":
         return f"{load}, classical loops"
     period = configuration["optimizer_plc.program.updating_period_s"]

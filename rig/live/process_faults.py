@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from coldloop.errors import UsageError
 from rig.live.process_identity import identity_of
-from rig.live.started_rigs import ServiceProcess, find_rig
+from rig.live.started_rigs import ServiceProcess, find_rig, no_rig
 
 
 def process_of(first_port: int | None, service: str) -> ServiceProcess:
@@ -18,8 +18,7 @@ def process_of(first_port: int | None, service: str) -> ServiceProcess:
     """
     rig = find_rig(first_port)
     if rig is None:
-        where = "" if first_port is None else f" on port {first_port}"
-        raise UsageError(f"no rig that was started here is up{where}: `coldloop up` starts one")
+        raise no_rig(first_port)
     process = rig.services[service]
     if not _runs(process):
         raise UsageError(f"the {service} service does not run: `coldloop up` starts it again, or has given it up")

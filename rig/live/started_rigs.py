@@ -65,12 +65,14 @@ class RunningRig(NamedTuple):
     tls: str
     """Folder of certificates that it was started with; empty when none."""
     services: dict[str, ServiceProcess]
+    cuttable: bool
+    """Whether its links can be cut; see `rig.live.link_cuts`."""
 
     @classmethod
-    def of_this_process(cls, ports: Sequence[int], tls: str, services: Mapping[str, int]) -> Self:
+    def of_this_process(cls, ports: Sequence[int], tls: str, services: Mapping[str, int], *, cuttable: bool) -> Self:
         """Return the rig that this process keeps up, with the processes of its services."""
         processes = {service: ServiceProcess.of(pid) for service, pid in services.items()}
-        return cls(*ServiceProcess.of(os.getpid()), tuple(ports), tls, processes)
+        return cls(*ServiceProcess.of(os.getpid()), tuple(ports), tls, processes, cuttable)
 
     def write(self) -> None:
         """Write the state file, from which commands know of this rig."""
@@ -89,7 +91,7 @@ class RunningRig(NamedTuple):
             services = {
                 service: ServiceProcess.parsed(content["services"][service]) for service in RigEndpoints._fields
             }
-            rig = cls(*own, tuple(content["ports"]), content["tls"], services)
+            rig = cls(*own, tuple(content["ports"]), content["tls"], services, content["cuttable"] is True)
         except (ValueError, KeyError, TypeError, RecursionError):
             raise ValueError("not what `coldloop up` of this version writes") from None
         ports_fit = len(rig.ports) == len(DEFAULT_PORTS) and all(
@@ -174,6 +176,12 @@ def find_rig(first_port: int | None) -> RunningRig | None:
     if len(found) > 1:
         raise UsageError(f"{len(found)} rigs are up: choose one of {', '.join(rig.place for rig in found)}")
     return found[0] if found else None
+
+
+def no_rig(first_port: int | None) -> UsageError:
+    """Return what is said when `find_rig` finds none."""
+    where = "" if first_port is None else f" on port {first_port}"
+    return UsageError(f"no rig that was started here is up{where}: `coldloop up` starts one")
 
 
 class RigLock:
@@ -297,8 +305,7 @@ def take_down(first_port: int | None, patience_s: float) -> int:
     """
     rig = find_rig(first_port)
     if rig is None:
-        where = "" if first_port is None else f" on port {first_port}"
-        raise UsageError(f"no rig that was started here is up{where}: `coldloop up` starts one")
+        raise no_rig(first_port)
     with suppress(ProcessLookupError):
         os.kill(rig.pid, signal.SIGTERM)
     deadline = time.monotonic() + patience_s

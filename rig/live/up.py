@@ -14,6 +14,7 @@ from rig.cosim.kept_up import keep_up, say
 from rig.cosim.local_services import KeptService, LocalServices
 from rig.cosim.session_client import SessionClient
 from rig.cosim.wiring import SERVICES, START_PATIENCE_S
+from rig.live.link_cuts import CuttableLinks
 from rig.live.page_process import PageProcess
 from rig.live.private_folder import make_own_folder, make_private
 from rig.live.started_rigs import DEFAULT_PORTS, STATE_FILE, RunningRig
@@ -34,13 +35,16 @@ class UpRig:
     A service or page that ends is started again (`rig.cosim.kept_up`), and goes on with the state that it has retained.
     """
 
-    def __init__(self, settings: Settings, ports: Sequence[int], tls: Path | None, *, page: bool = False) -> None:
+    def __init__(
+        self, settings: Settings, ports: Sequence[int], tls: Path | None, *, page: bool = False, cuttable: bool = False
+    ) -> None:
         self.folder = make_own_folder(str(ports[0]))
         self._settings = _retaining(settings, self.folder)
         self._scenario = make_scenario(settings)
         self._page = page
         self._ports = tuple(ports)
         self._tls = tls
+        self._links = CuttableLinks(self.folder) if cuttable else None
 
     async def run(self, *, announce: bool) -> None:
         """Run until cancelled; load steps beyond what the plant holds are written as time goes on.
@@ -48,8 +52,17 @@ class UpRig:
         Raises:
             ColdloopError: The session could not begin, or a service has ended again and again.
         """
-        services = LocalServices(self._settings, make_private(self.folder / "logs"), ports=self._ports)
-        async with services:
+        links = self._links
+        services = LocalServices(
+            self._settings,
+            make_private(self.folder / "logs"),
+            ports=self._ports,
+            detours=None if links is None else links.detours,
+        )
+        async with links or nullcontext(), services:
+            if links is not None:
+                links.put_before(services.endpoints)
+                await links.connect()
             rig = SessionClient(services.endpoints, self._settings)
             page = PageProcess(self._settings.hmi, services.endpoints, self.folder) if self._page else None
             try:
@@ -77,12 +90,14 @@ class UpRig:
         """Write which processes there are, for the commands that ask for them."""
         tls = "" if self._tls is None else str(self._tls.resolve())
         pids = {service: process.pid for service, process in services.processes.items()}
-        RunningRig.of_this_process(self._ports, tls, pids).write()
+        RunningRig.of_this_process(self._ports, tls, pids, cuttable=self._links is not None).write()
 
     async def _keep(self, services: LocalServices, rig: SessionClient, page: PageProcess | None) -> None:
         work = [self._hold(rig), *(self._keep_service(services, service, rig) for service in SERVICES)]
         if page is not None:
             work.append(_keep_page(page))
+        if self._links is not None:
+            work.append(self._links.keep())
         tasks = [asyncio.create_task(one) for one in work]
         try:
             await asyncio.gather(*tasks)

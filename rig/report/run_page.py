@@ -51,7 +51,7 @@ def run_page(folder: Path) -> str:
     )
     environment.filters["shown"] = _shown
     return environment.get_template("run.html.j2").render(
-        title=f"Coldloop: {title_of(run.configuration)}",
+        title=f"Coldloop: {title_of(run.configuration, manifest['way'])}",
         identity=identity_of(manifest),
         manifest=manifest,
         summary=run.summary,

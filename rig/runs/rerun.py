@@ -12,7 +12,7 @@ from coldloop import __version__
 from coldloop.config import Configuration, load_configuration
 from coldloop.errors import UsageError
 from coldloop.process.lti_model import load as load_model
-from rig.cosim.job import Job, Way
+from rig.cosim.job import Job
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
 from rig.figures.worker import FigureProcess
@@ -21,6 +21,7 @@ from rig.results.folders import claim_folder, installed_version
 from rig.results.indicators import RunEvaluation
 from rig.results.recording import Recorder
 from rig.results.run_folder import RunFolder
+from rig.results.way import Way
 from rig.runs.inputs import changed_inputs, profile_digest
 from rig.runs.manifest import DEPENDENCIES
 from rig.runs.running import make_scenario, run_into

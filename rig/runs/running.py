@@ -8,12 +8,13 @@ from coldloop.errors import UsageError
 from coldloop.process.lti_model import load as load_model
 from coldloop.session.settings import TimeMode
 from plant.load import find_load
-from rig.cosim.job import Job, StopRequest, Way
+from rig.cosim.job import Job, StopRequest
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario, natural_ticks
 from rig.figures.worker import FigureProcess
 from rig.interruption import INTERRUPTION
 from rig.results.recording import Recorder, Sink
+from rig.results.way import Way
 from rig.runs.run_files import RunFiles
 from rig.settings import Settings
 

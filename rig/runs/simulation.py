@@ -27,13 +27,13 @@ from coldloop.registers.audit import Event
 from rig.cosim.one_process import OneProcessRig
 from rig.durations import duration
 from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run
-from rig.figures.run_plot import save_figure, title_of
+from rig.figures.run_plot import at_times, pressure_limits, save_figure, title_of
 from rig.python_settings import Period, configured
 from rig.results.driving import DrivingHistory
 from rig.results.indicators import RunEvaluation, StageCost
 from rig.results.recording import MemorySink, Recorder, Recording
 from rig.results.run_folder import batch_series
-from rig.results.tables import events_table, trace_table, updates_table
+from rig.results.tables import events_table, station_table, trace_table, updates_table
 from rig.runs.run_files import summary_of
 from rig.runs.running import make_scenario
 from rig.settings import Settings
@@ -110,12 +110,18 @@ class Simulation:
     def plot(self, path: str | Path | None = None) -> Figure:
         """Return the figure of the run; with a path it is written there too, as .png, .pdf or .svg."""
         (batch,) = self.trace.arrow.select(["time_s", *DRAWN]).to_batches()
+        series, block = batch_series(batch), self.recording.block
+        pressures = pressure_limits(self.configuration) if block.station.size else {}
+        if pressures:
+            (station,) = station_table(block).select(["time_s", *pressures]).to_batches()
+            series |= at_times(batch_series(station), series["time_s"])
         curves = RunCurves(
-            batch_series(batch),
+            series,
             self.events.arrow.to_pylist(),
             Bounds.of(self.configuration),
             title_of(self.configuration),
             f"trace {self.summary['trace_sha256'][:12]}  ·  coldloop {__version__}  ·  in-process",
+            pressures,
         )
         figure = draw_run(curves)
         if path is not None:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import time
 from collections import deque
 from collections.abc import Callable
@@ -148,9 +149,7 @@ class Audit:
                 log.error("audit not written", extra={"file": str(self._file), "reason": error.strerror})  # noqa: TRY400
 
     def _append(self, file: Path, text: str) -> None:
-        with file.open("a", encoding="utf-8", errors="backslashreplace") as lines:
-            if not lines.tell():
-                file.chmod(0o600)
+        with open(file, "a", encoding="utf-8", errors="backslashreplace", opener=_private) as lines:
             lines.write(text)
             is_full = lines.tell() > LARGEST_FILE
         if is_full:
@@ -158,6 +157,10 @@ class Audit:
                 older = file if number == 1 else _set_aside(file, number - 1)
                 if older.exists():
                     older.replace(_set_aside(file, number))
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags, mode=0o600)
 
 
 def _set_aside(file: Path, number: int) -> Path:

@@ -48,7 +48,7 @@ IN_ONE_PROCESS = {r"^coldloop run(?!.*--(in-process|attach|mode|config))": "cold
 IN_ORDER = {"tutorial.md"}
 """Pages whose blocks need what the blocks before them have left."""
 
-NEEDS_A_RIG = re.compile(r"127\.0\.0\.1:502|coldloop (status|set|events)|mbpoll")
+NEEDS_A_RIG = re.compile(r"127\.0\.0\.1:502|coldloop (status|set|events|fault|record)|mbpoll")
 STARTS_A_RIG = re.compile(r"^(coldloop |scripts/)up\b", re.MULTILINE)
 BY_THE_CLOCK = re.compile(r"realtime|(coldloop |scripts/)up\b")
 
@@ -236,7 +236,7 @@ def _on_ports(command: str, base: int | None) -> str:
         return command
     for place in range(3):
         command = re.sub(rf"(127\.0\.0\.1:|-p )502{place}\b", rf"\g<1>{base + place}", command)
-    return re.sub(r"^coldloop (status|set|events(?= --| *$))", rf"coldloop \1 --port-base {base}", command)
+    return re.sub(r"^coldloop (status|set|fault|record|events(?= --| *$))", rf"coldloop \1 --port-base {base}", command)
 
 
 def wait_until_up(rig: Process, base: int) -> None:

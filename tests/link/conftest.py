@@ -2,13 +2,11 @@
 
 import asyncio
 import contextlib
-import socket
 import struct
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AbstractAsyncContextManager
-from enum import Enum
 from itertools import pairwise
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple
 
 import pytest
 
@@ -31,8 +29,8 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.declaration import RegisterMap
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, LoadStep, Measurement, PlantSample, PlantSession
 from coldloop.registers.safety import Alarm, AlarmKind, LeaseState, LeaseStatus, WatchdogTime
-from rig.chaos.disturbance import take_frames
 from tests.harness.processes import Process, Processes
+from tests.harness.treated_link import TreatedLink
 
 HOST: Final = "127.0.0.1"
 HEADER: Final = read_header(DEFAULT_MODEL_FILE)
@@ -105,81 +103,6 @@ WireTo = Callable[..., AbstractAsyncContextManager[Wire]]
 @pytest.fixture(scope="session")
 def wire() -> WireTo:
     return wire_to
-
-
-# -- the link ----------------------------------------------------------------------------------------------------------
-
-
-class Way(Enum):
-    REQUEST = "request"
-    ANSWER = "answer"
-
-
-Treatment = Callable[[Way, bytes], bytes | None]
-"""Takes a frame; returns what goes on of it. None resets the connection."""
-
-
-def untouched(_way: Way, frame: bytes) -> bytes:
-    return frame
-
-
-class Link:
-    """A TCP proxy in front of a server."""
-
-    def __init__(self, target: int) -> None:
-        self._target = target
-        self._tasks: set[asyncio.Task[None]] = set()
-        self.treat: Treatment = untouched
-        self.port = 0
-
-    async def __aenter__(self) -> Self:
-        self._listener = await asyncio.start_server(self._serve, HOST, 0)
-        self.port = self._listener.sockets[0].getsockname()[1]
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        self._listener.close()
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        with contextlib.suppress(OSError, asyncio.CancelledError):
-            far_reader, far_writer = await asyncio.open_connection(HOST, self._target)
-            pumps = (
-                asyncio.create_task(self._pump(reader, far_writer, Way.REQUEST)),
-                asyncio.create_task(self._pump(far_reader, writer, Way.ANSWER)),
-            )
-            try:
-                await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
-            finally:
-                for pump in pumps:
-                    pump.cancel()
-                await asyncio.gather(*pumps, return_exceptions=True)
-                far_writer.close()
-        reset(writer)
-
-    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, way: Way) -> None:
-        buffer = bytearray()
-        while data := await reader.read(4096):
-            buffer += data
-            for frame in take_frames(buffer):
-                treated = self.treat(way, frame)
-                if treated is None:
-                    return
-                writer.write(treated)
-
-
-def reset(writer: asyncio.StreamWriter) -> None:
-    """Close with RST."""
-    connection = writer.get_extra_info("socket")
-    if connection is not None and not writer.is_closing():
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-    writer.transport.abort()
 
 
 # -- what is there to be seen ------------------------------------------------------------------------------------------
@@ -318,7 +241,7 @@ def control_at() -> Callable[[Process], Control]:
 class Field:
     """A rack, a link to it that can be disturbed, and control PLCs behind the link."""
 
-    def __init__(self, processes: Processes, port: int, link: Link) -> None:
+    def __init__(self, processes: Processes, port: int, link: TreatedLink) -> None:
         self.processes = processes
         self.rack = Rack(port)
         self.link = link
@@ -372,7 +295,7 @@ def field(processes: Processes, shared_rack: Process, realtime: None) -> FieldAt
 
     @contextlib.asynccontextmanager
     async def made(at: Process = shared_rack) -> AsyncIterator[Field]:
-        async with Link(at.port) as link:
+        async with TreatedLink(at.port) as link:
             field = Field(processes, at.port, link)
             try:
                 yield field

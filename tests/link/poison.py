@@ -1,12 +1,16 @@
 """Answers and requests that say nonsense, their seals intact: what a confused peer sends."""
 
 import math
+import random
+import struct
+from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 from coldloop.registers.codec import RecordCodec, codec_of
 from coldloop.registers.declaration import Block, Field, Kind, RegisterMap, fields_of
 from coldloop.registers.seal import Seal, seal_of, sealed_bytes
+from rig.chaos.faults import Direction
 
 READS: Final = (3, 23)
 HEAD: Final = 9
@@ -62,3 +66,49 @@ def _setting(place: int, field: Field, value: float) -> Change:
 def sealed_blocks(register_map: RegisterMap) -> list[Block]:
     """Return the blocks of a map that are sealed and read."""
     return [block for block in register_map.blocks if block.sealed and block.writer is None]
+
+
+class PoisonedReads:
+    """Changes, in a share of a server's answers, one field of one record that is in them; seals are made to fit.
+
+    Args:
+        register_map: Of the server.
+        seed: Decides which answers, records and fields, and what they say then.
+    """
+
+    def __init__(self, register_map: RegisterMap, seed: str) -> None:
+        self.share = 0.0
+        self.made: Counter[str] = Counter()
+        """How often a record was changed, by its name."""
+        self._map = register_map
+        self._draw = random.Random(seed)  # noqa: S311 not for secrets
+        self._asked: dict[bytes, tuple[int, int]] = {}
+
+    def __call__(self, way: Direction, frame: bytes) -> bytes:
+        """Return a frame, or another one in its place."""
+        if way is Direction.REQUESTS:
+            if frame[7] in READS:
+                self._asked[frame[:2]] = struct.unpack_from(">HH", frame, 8)
+            return frame
+        first, count = self._asked.pop(frame[:2], (0, 0))
+        if frame[7] not in READS or len(frame) != HEAD + 2 * count or self._draw.random() >= self.share:
+            return frame
+        rows = list(self._rows(first, count))
+        return self._poisoned(frame, *self._draw.choice(rows)) if rows else frame
+
+    def _rows(self, first: int, count: int) -> Iterator[tuple[Block, int]]:
+        """Yield which rows are wholly in the answer to a read, with the byte at which they begin."""
+        for block in self._map.blocks:
+            begin = max(0, -(-(first - block.address) // block.row_words))
+            end = min(block.rows, (first + count - block.address) // block.row_words)
+            for row in range(begin, end):
+                yield block, HEAD + 2 * (block.address + row * block.row_words - first)
+
+    def _poisoned(self, frame: bytes, block: Block, begin: int) -> bytes:
+        codec, fields = codec_of(block), fields_of(block.record)
+        name = self._draw.choice([name for name in fields if name != "crc"])
+        change = _setting(list(fields).index(name), fields[name], self._draw.choice(values_of(fields[name])))
+        record = change(codec.decode(frame, begin))
+        self.made[f"{block.name}.{name}"] += 1
+        data = sealed_bytes(codec, record) if block.sealed else codec.encode(record)
+        return frame[:begin] + data + frame[begin + codec.size :]

@@ -9,9 +9,10 @@ import pytest
 from coldloop.registers.audit import EventKind
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import LinkCause
+from rig.chaos.faults import Direction
 
 if TYPE_CHECKING:
-    from tests.link.conftest import Control, Field, FieldAt, Way
+    from tests.link.conftest import Control, Field, FieldAt
 
 HEAD_BYTES = 9
 """Of an answer to a read: MBAP header, function, count of bytes."""
@@ -25,15 +26,15 @@ def flipped(frame: bytes, bit: int) -> bytes:
     return bytes(damaged)
 
 
-def reset_and_then_flip_a_bit_of_an_answer(bit: int) -> "Callable[[Way, bytes], bytes | None]":
+def reset_and_then_flip_a_bit_of_an_answer(bit: int) -> "Callable[[Direction, bytes], bytes | None]":
     """Reset the connection at the next frame, and flip a bit of the first answer that is long enough to have it."""
     done: list[str] = []
 
-    def treat(way: "Way", frame: bytes) -> bytes | None:
+    def treat(way: Direction, frame: bytes) -> bytes | None:
         if not done:
             done.append("reset")
             return None
-        if len(done) == 1 and way.name == "ANSWER" and bit < 8 * len(frame):
+        if len(done) == 1 and way is Direction.ANSWERS and bit < 8 * len(frame):
             done.append("flipped")
             return flipped(frame, bit)
         return frame
@@ -68,8 +69,8 @@ async def test_a_flipped_bit_in_the_tick_of_a_measurement_is_noticed_and_not_fol
         control = await site.joined()
         flips: list[bytes] = []
 
-        def treat(way: "Way", frame: bytes) -> bytes:
-            if way.name == "ANSWER" and len(frame) > 200 and len(flips) < 3:
+        def treat(way: Direction, frame: bytes) -> bytes:
+            if way is Direction.ANSWERS and len(frame) > 200 and len(flips) < 3:
                 flips.append(frame)
                 return flipped(frame, 8 * HEAD_BYTES + 2)  # tick + 2^26 or so
             return frame
@@ -87,7 +88,7 @@ async def test_a_link_that_loses_cuts_and_damages_frames_both_ways_moves_no_outp
 ) -> None:
     draw = random.Random(SEED)  # noqa: S311 - not for secrets
 
-    def treat(_way: "Way", frame: bytes) -> bytes | None:
+    def treat(_way: Direction, frame: bytes) -> bytes | None:
         if draw.random() >= 0.02:
             return frame
         return draw.choice((None, b"", frame[: len(frame) // 2], flipped(frame, draw.randrange(8 * len(frame)))))

@@ -11,10 +11,11 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import LinkCause, PlantLinkState
 from coldloop.registers.plant import PLANT_MAP, Actuators
 from coldloop.registers.safety import AlarmKind, WatchdogTime
+from rig.chaos.faults import Direction
 
 if TYPE_CHECKING:
     from tests.harness.processes import Process
-    from tests.link.conftest import FieldAt, Way, WireTo
+    from tests.link.conftest import FieldAt, WireTo
 
 PATIENCE_S = 100.0
 POLL_S = 0.02
@@ -24,11 +25,11 @@ MOVED = (25.0, 20.0, 30.0)
 """Where a simple client brings the outputs, in one step."""
 
 
-def reset_once() -> "Callable[[Way, bytes], bytes | None]":
+def reset_once() -> "Callable[[Direction, bytes], bytes | None]":
     """Reset the connection at the next frame, and let all others pass."""
     frames: list[bytes] = []
 
-    def treat(_way: "Way", frame: bytes) -> bytes | None:
+    def treat(_way: Direction, frame: bytes) -> bytes | None:
         frames.append(frame)
         return None if len(frames) == 1 else frame
 

@@ -9,10 +9,11 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import LinkCause
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.registers.safety import AlarmKind
+from rig.chaos.faults import Direction
 from tests.link.poison import Change, changed, poisons
 
 if TYPE_CHECKING:
-    from tests.link.conftest import Control, Field, FieldAt, Way
+    from tests.link.conftest import Control, Field, FieldAt
 
 BLOCK = PLANT_MAP.block_of(Measurement)
 SETPOINTS = (46.0, 100.0, 36.9)
@@ -27,8 +28,8 @@ class Poisoner:
         self.always: Change | None = None
         self.requests = 0
 
-    def __call__(self, way: "Way", frame: bytes) -> bytes:
-        if way.value == "request":
+    def __call__(self, way: Direction, frame: bytes) -> bytes:
+        if way is Direction.REQUESTS:
             self.requests += 1
             return frame
         change = self.always or (self.changes.pop(0) if self.changes else None)

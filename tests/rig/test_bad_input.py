@@ -128,6 +128,35 @@ def test_a_bad_load_is_told_before_anything_is_made(coldloop: "Coldloop", result
     assert not results.exists()
 
 
+@pytest.mark.parametrize(
+    ("command", "part"),
+    [
+        ("fault melt plant", "melt"), ("fault kill boiler", "optimizer_plc"), ("fault freeze plant nan", "nan"),
+        ("fault cut broker 1", "broker"), ("fault cut plant 1e9", "3600"), ("fault sensor T99 stuck", "T10"),
+        ("fault sensor T5 warm", "dead"), ("fault sensor T5 nan", "finite"),
+        ("fault kill plant --rig far:1 far:2 far:3", "their own machine"), ("record --duration 0", "not positive"),
+        ("record --figures bmp", "png"), ("set load nan", "finite"), ("set load 1e9", "10000"),
+        ("set load absent.csv", "neither watts nor a file"), ("set load 400 --at -5", "0.25"),
+        ("set setpoint cv999 4", "cv155"), ("set factor 0", "0.01"), ("set volume 11", "acknowledge"),
+        ("proxy absent.toml --listen 1502 --to a:1", "absent.toml"), ("proxy f.toml --listen 99999 --to a:1", "99999"),
+        ("chaos absent", "--list"), ("study nothing", "--list"), ("compare absent absent2", "manifest.json"),
+        ("rerun absent.json", "absent.json"), ("page absent", "manifest.json"), ("up --port-base 65535", "65533"),
+        ("up --tls absent", "certificates"), ("events --kind party", "alarm-raised"),
+        ("budget --power nan", "positive"),
+        ("model --set model.file=absent.json", "absent.json"), ("completion cmd", "zsh"),
+        ("run --seed 4294967296", "4294967296"), ("run --duration 1e99h", "2h"), ("run --load zz", "2h"),
+        ("run --set =1", "no such key"), ("run --set plant.seed=1e400", "finite"),
+    ],
+)  # fmt: skip
+def test_what_each_command_cannot_do_is_one_line(
+    command: str, part: str, coldloop: "Coldloop", tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = coldloop(*command.split())
+    assert_refused(outcome, FAILURE if command.startswith("model") else USAGE, part)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name", ["file", "file/results"])
 def test_a_place_where_no_results_can_be_written_is_told(name: str, coldloop: "Coldloop", tmp_path: Path) -> None:
     (tmp_path / "file").write_text("precious")

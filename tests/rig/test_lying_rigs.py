@@ -191,7 +191,7 @@ def test_any_text_as_a_configuration_is_one_line(
 COMMANDS = (
     ("status",), ("set", "load", "400"), ("set", "load", "400", "--at", "3600"), ("set", "mode", "manual"),
     ("set", "setpoint", "cv155", "45"), ("set", "factor", "2"), ("set", "pause"), ("set", "acknowledge"),
-    ("events",), ("events", "--service", "plant"),
+    ("events",), ("events", "--service", "plant"), ("fault", "sensor", "T5", "stuck"),
 )  # fmt: skip
 
 

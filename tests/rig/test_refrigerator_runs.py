@@ -63,5 +63,7 @@ def test_the_optimiser_runs_with_a_model_that_knows_the_pressures() -> None:
     plant = {"kind": "refrigerator"}
     known = simulate("e", duration_s=300, plant=plant, model={"file": "refrigerator"})
     unknown = simulate("e", duration_s=300, plant=plant)
+    labels = [axes.get_ylabel() for axes in known.plot().axes]
+    assert sum("bar" in label for label in labels) == 2, "high and low pressure are drawn as those of a run's folder"
     assert known.summary["trace_sha256"] != unknown.summary["trace_sha256"]
     assert known.summary["L1_outside_band_pct"] == known.summary["T5_outside_band_pct"] == 0.0

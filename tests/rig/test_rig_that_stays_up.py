@@ -15,6 +15,7 @@ from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
 from rig import cli
+from rig.live.link_cuts import CUT_FILE, CuttableLinks
 from rig.live.started_rigs import running_rig, state_folder
 from tests.conftest import Coldloop, first_of_three_ports
 from tests.harness.processes import Processes
@@ -30,7 +31,18 @@ def up(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) ->
     """The first port of a rig that is up."""
     os.environ["XDG_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
     base = str(first_of_three_ports())
-    words = ("up", "--port-base", base, "--load", "e", "--factor", FACTOR, "--set", "plant.sensors.level=0.01")
+    words = (
+        "up",
+        "--port-base",
+        base,
+        "--load",
+        "e",
+        "--factor",
+        FACTOR,
+        "--set",
+        "plant.sensors.level=0.01",
+        "--cuttable",
+    )
     try:
         assert shared_processes.coldloop(*words, "--detach").popen.wait(PATIENCE_S) == 0
         yield base
@@ -193,6 +205,34 @@ def test_a_fault_of_a_sensor_is_put_in_and_taken_out(coldloop: Coldloop, up: str
     for words, shown_as in (("dead", "not a number"), ("11.5", "value"), ("none", "none")):
         outcome = coldloop("fault", "--port-base", up, "sensor", "T5", words)
         assert (outcome.code, outcome.out) == (0, f"sensor of T5: {shown_as}\n"), outcome.complaints
+
+
+@pytest.mark.parametrize(("link", "alarm"), [("plant", "plant lost"), ("optimizer", "optimizer lost")])
+def test_a_link_is_cut_for_a_while_and_the_rig_finds_back(coldloop: Coldloop, up: str, link: str, alarm: str) -> None:
+    until(coldloop, up, "mode", "mpc")
+    assert coldloop("set", "--port-base", up, "acknowledge").code == 0
+    outcome = coldloop("fault", "--port-base", up, "cut", link, "6")
+    assert outcome.out == f"the {link} link is cut for 6 s\n", outcome
+    until(coldloop, up, "alarms", alarm)
+    log, deadline = state_folder(int(up)) / "up.log", time.monotonic() + PATIENCE_S
+    while f"the {link} link is whole again" not in log.read_text():
+        assert time.monotonic() < deadline, log.read_text()
+    until(coldloop, up, "mode", "mpc")
+
+
+@pytest.mark.parametrize("text", ["", "[]", '["plant", NaN]', '["plant", 1e9]', '["pipe", 1]', "[" * 9000])
+def test_a_cut_that_makes_no_sense_is_taken_away(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    async def looked() -> None:
+        async with CuttableLinks(tmp_path) as links:
+            (tmp_path / CUT_FILE).write_text(text)
+            keeping = asyncio.create_task(links.keep())
+            while (tmp_path / CUT_FILE).exists():  # noqa: ASYNC110 it is a file
+                await asyncio.sleep(0)
+            assert not keeping.done()
+            keeping.cancel()
+
+    asyncio.run(looked())
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_a_second_rig_on_the_same_ports_is_refused_and_the_holder_named(coldloop: Coldloop, up: str) -> None:

@@ -67,7 +67,9 @@ def keep(first_port: int, content: object) -> Path:
 def state_of(process: Process, first_port: int = FIRST, **changes: object) -> dict[str, object]:
     ports = (first_port, first_port + 1, first_port + 2)
     services = dict.fromkeys(RigEndpoints._fields, ServiceProcess.of(process.pid))
-    return RunningRig(process.pid, identity_of(process.pid) or "", ports, "", services)._asdict() | changes
+    return (
+        RunningRig(process.pid, identity_of(process.pid) or "", ports, "", services, cuttable=False)._asdict() | changes
+    )
 
 
 # -- the process -------------------------------------------------------------------------------------------------------
@@ -206,7 +208,7 @@ def test_every_command_takes_the_same_options(coldloop: "Coldloop", other: Proce
         assert (outcome.code, len(outcome.complaints)) == (2, 1)
         assert "--rig and --port-base" in outcome.complaints[0]
     outcome = coldloop("down", "--rig", "elsewhere:23020", "elsewhere:23021", "elsewhere:23022")
-    assert "on its own machine" in outcome.complaints[0]
+    assert "on their own machine" in outcome.complaints[0]
     assert other.poll() is None
     keep(FIRST, state_of(other, identity="another"))
     assert "no rig" in coldloop("down", "--rig", *(f"127.0.0.1:{FIRST + place}" for place in range(3))).complaints[0]

@@ -1,6 +1,6 @@
 """`coldloop fault`: a fault on purpose in a rig that is up, to see what ladder, alarms and page make of it.
 
-A service that is killed is started again by `coldloop up`. For links there are `coldloop proxy` and `coldloop chaos`.
+A service that is killed is started again by `coldloop up`. More can happen to links by `coldloop proxy` and `chaos`.
 """
 
 import argparse
@@ -13,6 +13,7 @@ from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.options import add_rig_options, first_port_here, operator_settings, rig_endpoints
 
 SERVICES: Final = ("plant", "control_plc", "optimizer_plc")
+LINKS: Final = ("plant", "optimizer")
 LONGEST_S: Final = 3600.0
 SENSOR_FAULTS: Final = {"none": 0, "dead": 1, "stuck": 2}
 
@@ -29,6 +30,10 @@ def declare(parser: argparse.ArgumentParser) -> None:
     freeze.add_argument("service", choices=SERVICES, metavar="|".join(SERVICES))
     freeze.add_argument("seconds", type=_seconds, help="how long, by the clock")
     freeze.set_defaults(fault=_freeze)
+    cut = what.add_parser("cut", help="let nothing pass a link for a while; the rig was started with `up --cuttable`")
+    cut.add_argument("link", choices=LINKS, metavar="|".join(LINKS), help="control PLC to plant, or optimiser to it")
+    cut.add_argument("seconds", type=_seconds, help="how long, by the clock")
+    cut.set_defaults(fault=_cut)
     sensor = what.add_parser("sensor", help="what a sensor shows: nothing, always the same, or a value")
     sensor.add_argument("output", metavar="OUTPUT", help="such as T5")
     sensor.add_argument("shows", metavar="dead|stuck|VALUE|none", help="none ends the fault")
@@ -71,6 +76,14 @@ async def _freeze(options: argparse.Namespace) -> None:
     sys.stdout.flush()
     await freeze(process, options.seconds)
     sys.stdout.write(f"the {options.service} service runs again\n")
+
+
+async def _cut(options: argparse.Namespace) -> None:
+    from rig.chaos.faults import Link
+    from rig.live.link_cuts import cut
+
+    cut(first_port_here(options), Link(options.link), options.seconds)
+    sys.stdout.write(f"the {options.link} link is cut for {options.seconds:g} s\n")
 
 
 async def _sensor(options: argparse.Namespace) -> None:

@@ -40,8 +40,9 @@ def execute(options: argparse.Namespace) -> int:
 
 def _job(options: argparse.Namespace) -> "Job":
     """Return the recording that the options ask for."""
-    from rig.cosim.job import Job, Way
+    from rig.cosim.job import Job
     from rig.cosim.networked_run import as_attached, session_under_way
+    from rig.results.way import Way
 
     effective = configuration(options)
     ends = tuple(rig_endpoints(options, effective.settings))

@@ -68,7 +68,8 @@ def execute(options: argparse.Namespace) -> int:
 def _job(options: argparse.Namespace) -> "Job":
     """Return the run that the options and the configuration ask for."""
     from coldloop.modbus.endpoints import Endpoint
-    from rig.cosim.job import Job, Way
+    from rig.cosim.job import Job
+    from rig.results.way import Way
     from rig.runs.running import check_certificates, make_scenario
 
     effective = configuration(options)

@@ -27,6 +27,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         help="first of three ports in a row (default: 5020)")  # fmt: skip
     parser.add_argument("--page", action="store_true", help="serve the operator's page, too")
     parser.add_argument("--page-port", type=int, metavar="PORT", help="its port (default: 8020); implies --page")
+    parser.add_argument("--cuttable", action="store_true",
+                        help="have a proxy in each link, for `coldloop fault cut`")  # fmt: skip
     parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")
     parser.add_argument("--quiet", action="store_true", help="do not say where everything is")
     parser.add_argument("--locked", type=int, help=argparse.SUPPRESS)  # what --detach has locked for this process
@@ -58,6 +60,6 @@ def execute(options: argparse.Namespace) -> int:
     from rig.live.up import UpRig
     from rig.until_interrupted import run_until_interrupted
 
-    rig = UpRig(effective.settings, ports, options.tls, page=page)
+    rig = UpRig(effective.settings, ports, options.tls, page=page, cuttable=options.cuttable)
     run_until_interrupted(lambda: rig.run(announce=not options.quiet))
     return 0

@@ -13,6 +13,7 @@ Processes that need the same kernel at once compile it once: one does, the other
 import contextlib
 import hashlib
 import os
+import stat
 import tempfile
 import zlib
 from collections.abc import Callable
@@ -25,6 +26,7 @@ import numpy as np
 from numba.core.caching import FunctionCache
 from numpy.typing import NDArray
 
+from coldloop.errors import ConfigurationError
 from coldloop.kernels.first_use import needs_compiling
 
 try:
@@ -151,17 +153,48 @@ def _keep(path: Path, found: NDArray[np.float64]) -> None:
 
 
 def _cache_directory() -> Path:
+    """Return a folder for the cache that nobody else can write to: what is in it is loaded as code.
+
+    Raises:
+        ConfigurationError: Others can write to the one that the environment names.
+    """
     chosen = os.environ.get("COLDLOOP_CACHE_DIR")
     home_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coldloop"
-    for root in [Path(chosen)] if chosen else [home_cache, Path(tempfile.gettempdir()) / "coldloop-cache"]:
+    for root in [Path(chosen)] if chosen else [home_cache, Path(tempfile.gettempdir()) / f"coldloop-cache-{_user()}"]:
         folder = root / f"kernels-{_sources_digest()}"
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            root.mkdir(mode=0o755, parents=True, exist_ok=True)
+            folder.mkdir(mode=0o755, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
+            closed = _is_closed(root, sticky=True) and _is_closed(folder)
         except OSError:
             continue
-        return folder
+        if closed:
+            return folder
+        if chosen:
+            raise ConfigurationError(
+                f"COLDLOOP_CACHE_DIR={chosen}: others can write to {folder}, and kernels are loaded as code: name a "
+                "folder of your own, or take the permission away (chmod -R go-w)"
+            )
     return Path(tempfile.mkdtemp(prefix="coldloop-kernels-"))
+
+
+def _user() -> int:
+    return os.getuid() if hasattr(os, "getuid") else 0
+
+
+def _is_closed(folder: Path, *, sticky: bool = False) -> bool:
+    """Tell whether only this user and an administrator can write to a folder; the user's own group is left alone.
+
+    Args:
+        folder: Which one.
+        sticky: Others may write to it if they cannot replace what this user has in it, as in /tmp.
+    """
+    if not hasattr(os, "getuid"):  # Windows has no such modes
+        return True
+    status = folder.stat()
+    by_others = status.st_mode & stat.S_IWOTH or (status.st_mode & stat.S_IWGRP and status.st_gid != os.getgid())
+    return status.st_uid in (0, os.getuid()) and not (by_others and not (sticky and status.st_mode & stat.S_ISVTX))
 
 
 def _file_of_locks(folder: Path) -> int | None:
