@@ -7,6 +7,7 @@ from typing import Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
+from coldloop.process.limits import LEVEL_BAND, T5_BAND
 from coldloop.process.signals import TICK_S
 from coldloop.registers.safety import AlarmKind, AlarmPriority
 
@@ -101,9 +102,9 @@ class AlarmSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    level_band: tuple[FiniteFloat, FiniteFloat] = (59.0, 61.0)
+    level_band: tuple[FiniteFloat, FiniteFloat] = LEVEL_BAND
     """L1, %."""
-    t5_band: tuple[FiniteFloat, FiniteFloat] = (9.0, 16.0)
+    t5_band: tuple[FiniteFloat, FiniteFloat] = T5_BAND
     """T5, K."""
     band_delay_s: Delay = 5.0
     """On-delay of the two band alarms: how long an output must be outside, plant time."""

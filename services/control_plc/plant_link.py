@@ -8,11 +8,11 @@
     FOREIGN     it is in another session, or somebody else drives it
     FROZEN      it answers, and its clock does not move
 
-One rule decides: *no output is written unless what the rack applies was read back since the last break: sealed, finite,
-of this session, at a known tick, and either what we had made it apply or read twice.* Only IN_STEP writes, and only a
-reading that `read_back` accepts leads there; every doubt leads out of it. A single answer that lies about the outputs
-thus moves nothing, even where it is the first after a break. The rack holds its side of the rule: it takes no outputs
-that name another generation than the one that was read back. Pure: no sockets, no clock.
+One rule decides: *no output is written unless what the rack applies was read twice since the last break: sealed,
+finite, of this session, the same both times, and at ticks as far apart as the readings.* Only IN_STEP writes, and only
+a reading that `read_back` accepts leads there; every doubt leads out of it. A single answer that lies, about outputs,
+session or time, thus moves nothing, even where it is the first after a break. The rack holds its side of the rule: it
+takes no outputs that name another generation than the one that was read back. Pure: no sockets, no clock.
 """
 
 import math
@@ -73,15 +73,22 @@ class PlantLink:
         """How long the rack's tick may stand, in ticks of our clock."""
         self.generation = 0
         """Generation of the rack's outputs that was read back; 0 is none."""
-        self._ours: tuple[tuple[float, ...], ...] = ()
-        """Outputs that the rack applies in that generation: those taken last, and those sent since."""
-        self._read: tuple[float, ...] = ()
-        """Session, generation and outputs of the last reading that asks to be confirmed."""
+        self._read: tuple[Measurement, float | None] | None = None
+        """The last reading, and when it was made: the next one is to confirm it."""
+        self.is_confirmed = False
+        """The last reading said what the one before had said."""
+        self._known_place: float | None = None
+        """Where the rack was, in ticks of the session, when it was last in step."""
+        self._old_since: float | None = None
+        """Since when readings are of a time before that."""
         self.session = 0
         """That of the rack when it last answered; so the tick."""
         self.tick = 0
         self._moved_at: float | None = None
-        self._refused = 0
+        self.refused = 0
+        """How often the rack has refused outputs, as far as is known."""
+        self._has_refused_more = False
+        """The last answer said so."""
 
     @property
     def in_step(self) -> bool:
@@ -97,7 +104,7 @@ class PlantLink:
 
     def begin(self) -> None:
         """Begin a session: read back first. What the rack applied in the one before does not matter."""
-        self.generation, self._read = 0, ()
+        self.generation, self._read, self._known_place = 0, None, None
         self._enter(PlantLinkState.JOINING, LinkCause.STARTED)
 
     def starting(self) -> None:
@@ -105,8 +112,9 @@ class PlantLink:
         self._enter(PlantLinkState.SEARCHING, LinkCause.STARTED)
 
     def end(self) -> None:
-        """There is no session: nothing is written."""
+        """There is no session: nothing is written, and nothing is wrong with the rack."""
         self._enter(PlantLinkState.IDLE, LinkCause.NONE)
+        self._return_alarms()
 
     def unanswered(self, cause: LinkCause) -> None:
         """Note that a request came to nothing: what it has done to the rack is not known."""
@@ -130,33 +138,51 @@ class PlantLink:
         if self.in_step:
             self._enter(PlantLinkState.JOINING, LinkCause.PACE)
 
-    def read_back(self, reading: Measurement, session: int, now: float | None) -> bool:
-        """Judge a reading that was asked for without writing; tell whether outputs may be written from it on.
+    def compare(self, reading: Measurement, session: int, now: float | None) -> None:
+        """Note whether a reading that was asked for without writing confirms the one before.
 
         Args:
             reading: What the rack answered, its seal intact.
-            session: Ours.
+            session: Ours; in another one the rack may have another time base, and its ticks say nothing.
             now: Real time, in ticks from any beginning; None in lock-step.
         """
-        changed = reading.generation != self.generation
+        before, self._read = self._read, (reading, now)
+        if before is None:
+            self.is_confirmed = False
+            return
+        earlier, at = before
+        same = all(getattr(reading, name) == getattr(earlier, name) for name in ("session", "generation", "u"))
+        if now is None or at is None:
+            in_time = reading.tick == earlier.tick
+        else:
+            moved = reading.tick + reading.age - earlier.tick - earlier.age
+            waits = reading.tick == earlier.tick == 0  # for the first outputs
+            in_time = waits or 0 < moved <= now - at + self.frozen_ticks  # an old answer that is repeated stands still
+        in_time = in_time and not self._is_old(reading, now)
+        self.is_confirmed = same and (in_time or reading.session != session)
+
+    def read_back(self, reading: Measurement, session: int, now: float | None) -> bool:
+        """Judge a reading that was compared; tell whether outputs may be written from it on."""
         stopped = self._clock_stopped(reading, now)
-        self._refused = reading.refused
-        if reading.session != session or not session:
-            self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
-        elif not all(map(math.isfinite, reading.u)):
+        self.refused = reading.refused
+        if not all(map(math.isfinite, reading.u)):
             self._enter(PlantLinkState.JOINING, LinkCause.IMPLAUSIBLE)
         elif stopped:
             self._enter(PlantLinkState.FROZEN, LinkCause.STOPPED)
-        elif self._is_certain(reading, changed=changed):
-            if changed and self.generation:  # somebody else, or its watchdog, has moved the outputs
+        elif not self.is_confirmed:
+            return False
+        elif reading.session != session or not session:
+            self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
+        else:
+            if self.generation not in (0, reading.generation):  # somebody else, or its watchdog, has moved the outputs
                 self._alarms.raised(AlarmKind.PLANT_LOST, LinkCause.CHANGED)
-            self.generation, self._ours, self._read = reading.generation, (tuple(reading.u),), ()
+            self.generation, self._read = reading.generation, None
+            self._known_place = reading.tick + reading.age
             return True
         return False
 
     def addressed(self, outputs: Actuators) -> Actuators:
-        """Return outputs as they are sent: from us, to the generation that was read back. The rack may apply them."""
-        self._ours = (*self._ours[-1:], outputs[1:4])
+        """Return outputs as they are sent: from us, to the generation that was read back."""
         return outputs._replace(holder=self.holder, generation=self.generation)
 
     def joined(self) -> None:
@@ -181,6 +207,7 @@ class PlantLink:
         elif abs(answer.tick - sent.tick) > (now is not None):
             self._enter(PlantLinkState.JOINING, LinkCause.LEAPT)
         else:
+            self._known_place = answer.tick + answer.age
             return True
         return False
 
@@ -188,21 +215,27 @@ class PlantLink:
         """Note a scan that was taken: what was wrong with the rack is over."""
         if self._noted is not PlantLinkState.IN_STEP:
             self._note(PlantLinkState.IN_STEP)
-        for alarm in ALARMS.values():
-            self._alarms.returned(alarm)
+        self._return_alarms()
 
     # -- inside --------------------------------------------------------------------------------------------------------
 
-    def _is_certain(self, reading: Measurement, *, changed: bool) -> bool:
-        """Tell whether the outputs of a reading are ours, or those that the reading before showed too."""
-        outputs, before = tuple(reading.u), self._read
-        self._read = (reading.session, reading.generation, *outputs)
-        return self._read == before or (not changed and outputs in self._ours)
+    def _is_old(self, reading: Measurement, now: float | None) -> bool:
+        """Tell whether a reading is of a time before what is known, as from a gateway that is behind.
+
+        A rack that was started again may be back in time: it is believed when it has been seen there for long enough.
+        """
+        if now is None or self._known_place is None or reading.tick + reading.age > self._known_place:
+            self._old_since = None
+            return False
+        if self._old_since is None:
+            self._old_since = now
+        return reading.tick > 0 and now - self._old_since < self.frozen_ticks
 
     def _watch_others(self, answer: Measurement) -> None:
-        """Raise the alarm when the rack has refused somebody else's outputs."""
-        if answer.refused != self._refused:
-            self._refused = answer.refused
+        """Raise the alarm when two answers say that the rack has refused somebody else's outputs."""
+        before, self._has_refused_more = self._has_refused_more, answer.refused != self.refused
+        if before and self._has_refused_more:
+            self.refused, self._has_refused_more = answer.refused, False
             self._alarms.happened(AlarmKind.SECOND_WRITER, SECOND_MASTER)
 
     def _clock_stopped(self, reading: Measurement, now: float | None) -> bool:
@@ -227,6 +260,10 @@ class PlantLink:
             self.breaks += self._noted is PlantLinkState.IN_STEP
             self._note(state)
         self._alarm(state, cause)
+
+    def _return_alarms(self) -> None:
+        for alarm in ALARMS.values():
+            self._alarms.returned(alarm)
 
     def _note(self, state: PlantLinkState) -> None:
         self._noted = state

@@ -95,16 +95,20 @@ class RackFinder:
         """
         if self._link.state is PlantLinkState.SEARCHING or not self._rack.connected:
             await self._rack.connect(SEARCH_S)
-        held = self._link.cause is LinkCause.SECOND_MASTER and await self._is_held_by_another()
+        lease = await self._rack.read(LeaseStatus) if self._link.cause is LinkCause.SECOND_MASTER else None
         asked_at = time.monotonic()
         reading = await self._rack.read(Measurement)
+        held = lease is not None and self._is_held_by_another(lease, reading)
         return None if held else reading, (asked_at + time.monotonic()) / 2
 
-    async def _is_held_by_another(self) -> bool:
-        """Tell whether the control PLC that we were refused for still holds the lease of the rack."""
-        lease = await self._rack.read(LeaseStatus)
-        ours = lease.holder == self._link.holder
-        return lease.state == LeaseState.HELD or (lease.state == LeaseState.LINGERING and not ours)
+    def _is_held_by_another(self, lease: LeaseStatus, reading: Measurement) -> bool:
+        """Tell whether the control PLC that we were refused for still holds the lease of the rack.
+
+        One that has our number is another one if the rack has counted that it refused us.
+        """
+        if lease.holder == self._link.holder:
+            return lease.state == LeaseState.HELD and reading.refused != self._link.refused
+        return lease.state in (LeaseState.HELD, LeaseState.LINGERING)
 
     def _take(self, reading: Measurement, at: float, *, realtime: bool) -> None:
         """Go on from a reading, where that may be done; `at` is when the rack was read, s."""

@@ -18,7 +18,7 @@ from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process.model_file import read_header
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import LAST_TICK, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.common import SessionPace
@@ -299,12 +299,12 @@ class ControlPlc:
         realtime = self.sessions.pace.realtime
         answered = await self._finder.look(self.clients.changed, self._patience_s if realtime else None)
         if not self._link.in_step:
-            if answered and not self.sessions.rack_answered():
+            if answered and self._link.is_confirmed and not self.sessions.rack_answered():
                 self.bank.put(self._program.operator)
                 self._link.end()
             if realtime:
                 now = self._clock.tick_at(time.monotonic())
-                self._program.alarms.now = max(self._program.tick, now)
+                self._program.alarms.now = min(max(self._program.tick, now), LAST_TICK)
                 self._program.alarms.pass_by()
         self._publish()
 

@@ -7,6 +7,7 @@ that has a rack of its own. Time is the rack's: after a break the program goes o
 from collections.abc import Callable
 
 from coldloop.errors import BUSY, DamagedAnswerError, ImplausibleAnswerError, LinkError, RequestRefusedError
+from coldloop.process.signals import LAST_TICK
 from coldloop.registers.control_plc import LinkCause, Update
 from coldloop.registers.plant import Actuators, Measurement
 from control_plc.plant_link import PlantLink
@@ -82,11 +83,14 @@ class ScanCycle:
 
     def _read_back(self, reading: Measurement, now: float | None) -> None:
         program, link = self._program, self._link
-        if reading.session != program.session and self._adopt(reading):
+        link.compare(reading, program.session, now)
+        if reading.session != program.session and link.is_confirmed and self._adopt(reading):
             link.begin()
+            link.compare(reading, program.session, now)
         if not link.read_back(reading, program.session, now):
             return
-        program.rejoin(reading.tick + (reading.age >= PHASE), reading.u, self._passed(now))
+        begun = now is not None and reading.age >= PHASE  # in lock-step a tick lasts until the scan was made
+        program.rejoin(min(reading.tick + begun, LAST_TICK), reading.u, self._passed(now))
         self._scanned_at = now
         link.joined()
 

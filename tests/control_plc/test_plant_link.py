@@ -26,8 +26,13 @@ def reading(tick: int = 5, **changed: object) -> Measurement:
     return shown._replace(**changed)  # type: ignore[arg-type]
 
 
+def read_back(link: PlantLink, shown: Measurement, now: float | None = None, session: int = 1) -> bool:
+    link.compare(shown, session, now)
+    return link.read_back(shown, session, now)
+
+
 def read_twice(link: PlantLink, shown: Measurement, now: float | None = None) -> bool:
-    return not link.read_back(shown, 1, now) and link.read_back(shown, 1, now)
+    return not read_back(link, shown, now) and read_back(link, shown, now)
 
 
 def outputs(tick: int = 5) -> Actuators:
@@ -94,41 +99,68 @@ def test_a_request_that_comes_to_nothing_leads_out_of_step(
         (reading(u=(43.0, math.inf, 36.0)), S.JOINING, C.IMPLAUSIBLE),
     ],
 )
-def test_only_a_finite_reading_of_this_session_leads_back(
+def test_only_finite_readings_of_this_session_lead_back(
     link: PlantLink, shown: Measurement, state: PlantLinkState, cause: LinkCause
 ) -> None:
     link.unanswered(LinkCause.NO_ANSWER)
-    assert not link.read_back(shown, 1, None)
+    for _ in range(3):
+        assert not read_back(link, shown)
     assert (link.state, link.cause) == (state, cause)
-    assert link.read_back(reading(), 1, None)
+    assert read_twice(link, reading())
 
 
-def test_outputs_that_one_reading_shows_and_nobody_has_written_are_not_gone_on_from(link: PlantLink) -> None:
-    """A single lie, the first answer after a break: from 0 % the valve would be opened by what a tick allows."""
-    link.unanswered(LinkCause.NO_ANSWER)
-    for lie in (reading(u=(0.0, 75.0, 36.0)), reading(u=(50.0, 75.0, 36.0), generation=4), reading(generation=9)):
-        assert not link.read_back(lie, 1, None)
-        assert not link.in_step
-    assert link.read_back(reading(), 1, None), "as we had left it"
+@pytest.mark.parametrize(
+    "lie",
+    [
+        {"u": (0.0, 75.0, 36.0)},  # from 0 % the valve would be opened by what a tick allows
+        {"u": (42.5, 75.0, 36.0)},  # what it was a scan ago: the way back would be twice as long
+        {"u": (43.5, 75.0, 36.0)},  # what was sent last and did not arrive
+        {"generation": 9}, {"session": 2}, {"session": 0}, {"tick": 4}, {"tick": 6}, {"tick": 10**6},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_one_reading_says_is_not_gone_on_from(link: PlantLink, lie: dict[str, object]) -> None:
+    """In lock-step, where no time passes: the lie comes first, or between two that are true, and nobody is alarmed."""
+    link.addressed(outputs()._replace(cv155=43.5))
+    link.overslept()
+    for shown in (reading(**lie), reading(), reading(**lie), reading()):
+        assert not read_back(link, shown)
+    assert link.state is S.JOINING
+    assert read_back(link, reading()), "as we had left it"
 
 
-def test_outputs_whose_answer_was_lost_are_ours_and_go_on_at_once(link: PlantLink) -> None:
-    sent = link.addressed(outputs()._replace(cv155=43.5))
-    assert (sent.holder, sent.generation) == (HOLDER, 3)
-    link.unanswered(LinkCause.NO_ANSWER)
-    assert link.read_back(reading(u=sent[1:4]), 1, None)
+@pytest.mark.parametrize("leap", [-1e6, -20.0, 20.0, 1e6])
+def test_time_that_leaps_in_one_reading_is_not_gone_on_from(link: PlantLink, leap: float) -> None:
+    link.overslept()
+    at = 1e6 + 100.0
+    assert not read_back(link, reading(tick=2_000_000), at)
+    assert not read_back(link, reading(tick=2_000_000 + int(leap)), at + 0.01)
+    assert not read_back(link, reading(tick=2_000_000, age=0.52), at + 0.02)
+    assert read_back(link, reading(tick=2_000_003), at + 3.0)
 
 
-def test_outputs_before_the_last_that_were_taken_are_no_longer_ours(link: PlantLink) -> None:
-    for cv155 in (43.5, 44.0):
-        link.addressed(outputs()._replace(cv155=cv155))
-    link.unanswered(LinkCause.NO_ANSWER)
-    assert not link.read_back(reading(), 1, None)
+def test_a_reading_before_the_break_confirms_none_after_it(link: PlantLink) -> None:
+    link.overslept()
+    assert read_twice(link, reading())
+    link.joined()
+    link.overslept()
+    assert not read_back(link, reading())
+
+
+def test_a_gateway_that_is_behind_is_not_gone_on_from_but_a_rack_that_went_back_is(link: PlantLink) -> None:
+    assert link.exchanged(outputs(100), reading(tick=100), 200.0)
+    link.overslept()
+    for late in range(4):
+        assert not read_back(link, reading(tick=97 + late), 201.0 + late), "of before the break"
+    assert read_back(link, reading(tick=101), 205.0)
+    link.overslept()
+    assert [read_back(link, reading(tick=50 + later), 206.0 + later) for later in range(6)] == [False] * 5 + [True]
 
 
 def test_session_0_is_none_and_cannot_be_joined(link: PlantLink) -> None:
     link.unanswered(LinkCause.NO_ANSWER)
-    assert not link.read_back(reading(session=0), 0, None)
+    for _ in range(3):
+        assert not read_back(link, reading(session=0), session=0)
 
 
 def test_in_real_time_the_rack_may_be_a_tick_away_and_no_more(link: PlantLink) -> None:
@@ -141,15 +173,15 @@ def test_in_real_time_the_rack_may_be_a_tick_away_and_no_more(link: PlantLink) -
 def test_a_rack_whose_clock_stands_is_found_frozen_and_rejoined_when_it_moves(link: PlantLink) -> None:
     assert link.exchanged(outputs(5), reading(tick=6), 0.0)
     link.overslept()
-    assert link.read_back(reading(tick=6), 1, FROZEN_TICKS - 0.5)
-    assert not link.read_back(reading(tick=6), 1, FROZEN_TICKS)
+    for now in (1.0, FROZEN_TICKS - 0.5, FROZEN_TICKS):
+        assert not read_back(link, reading(tick=6), now), "what is repeated says nothing new"
     assert link.state is S.FROZEN
-    assert link.read_back(reading(tick=7), 1, FROZEN_TICKS + 9.0)
+    assert read_back(link, reading(tick=7), FROZEN_TICKS + 9.0)
 
 
 def test_at_tick_0_the_rack_waits_for_outputs_and_is_not_frozen(link: PlantLink) -> None:
     for now in range(3 * FROZEN_TICKS):
-        assert link.read_back(reading(tick=0), 1, float(now))
+        assert read_twice(link, reading(tick=0), float(now))
 
 
 def test_alarms_tell_what_is_wrong_and_return_when_a_scan_is_taken() -> None:
@@ -193,6 +225,8 @@ def test_outputs_that_somebody_else_has_moved_during_a_break_raise_the_alarm(lin
 
 
 def test_a_second_master_that_the_rack_has_refused_is_alarmed(link: PlantLink) -> None:
-    assert link.exchanged(outputs(), reading(refused=1), None)
-    row = link._alarms.rows[AlarmKind.SECOND_WRITER]  # noqa: SLF001
-    assert (row.times, row.cause) == (1, 2)
+    row = link._alarms.rows  # noqa: SLF001
+    for refused, times in ((1, 0), (0, 0), (1, 0), (2, 1), (2, 1)):  # one answer may lie
+        assert link.exchanged(outputs(), reading(refused=refused), None)
+        assert row[AlarmKind.SECOND_WRITER].times == times
+    assert row[AlarmKind.SECOND_WRITER].cause == 2

@@ -38,6 +38,9 @@ HEADER: Final = read_header(DEFAULT_MODEL_FILE)
 RATE: Final = InputLimits().rate
 MANY: Final = int(os.environ.get("POISON_EXAMPLES", "60"))
 TICKS: Final = 12
+TURNS: Final = 3
+"""Ticks after which an operator has changed his mind."""
+SETPOINTS: Final = ((47.0, 120.0, 37.0), (20.0, 20.0, 30.0))
 BACK_IN_STEP: Final = 40
 """Ticks after the last poison."""
 CODEC: Final = codec_of(PLANT_MAP.block_of(Measurement))
@@ -90,16 +93,18 @@ class Site:
         self.link = PlantLink(program.alarms, Journal(), 77)
         self.cycle = ScanCycle(program, self.link, lambda _: False)
         cv155, ncr22, cv156 = as_transmitted(Operator(0, *HEADER.u0))[1:]
-        self.outputs = AppliedOutputs((cv155, ncr22, cv156), rate=RATE)
+        self.outputs = AppliedOutputs((cv155, ncr22, cv156))  # it does not limit: what is sent is what moves
         self.tick = 0
         self.applied = [self.outputs.u]
         self.told: list[bytes] = []
+        self.lie: tuple[float, ...] | None = None
         program.restart(1)
-        program.operate(Operator(OperatorMode.MANUAL, 47.0, 120.0, 37.0))
         self.link.begin()
 
     def scan(self, poison: Poison | None = None) -> None:
         """Do what the control PLC does in one tick of the rack."""
+        high = self.tick // TURNS % 2
+        self.program.operate(Operator(OperatorMode.MANUAL, *(SETPOINTS[high])))
         asked = self.cycle.begin()
         if asked is not None:
             self.outputs.offer(as_transmitted(sealed(asked)), ANYBODY, session=1, tick=self.tick, realtime=True)
@@ -112,10 +117,16 @@ class Site:
             self.cycle.failed(ImplausibleAnswerError(str(error)))
         else:
             assert isinstance(answer, Measurement)
-            self.cycle.answered(answer, self.tick + 0.5)
+            self.cycle.answered(self.measurement() if self.lies_again(answer) else answer, self.tick + 0.5)
         self.applied.append(self.outputs.u)
         self.tick += 1
         self.outputs.begin_tick()
+
+    def lies_again(self, told: Measurement) -> bool:
+        """Tell whether outputs are told again that are not applied: two lies that agree are believed."""
+        lie = None if told.u == self.outputs.u else told.u
+        again, self.lie = lie is not None and lie == self.lie, lie
+        return again
 
     def measurement(self) -> Measurement:
         y = tuple(value + 1e-3 * (self.tick % 7) for value in HEADER.y0)

@@ -8,6 +8,8 @@ from typing import Annotated, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveFloat, model_validator
 
+from coldloop.process.limits import LEVEL_BAND, T5_BAND
+
 N_INPUTS = 3
 N_SLACKS = 4
 """Slack inputs of the paper: L1 low, L1 high, T5 low, T5 high."""
@@ -32,9 +34,9 @@ class ControlDesign(BaseModel):
 
     decision_instants: Instants = (1, 2, 4, 8, 16, 50, 100)
     constraint_instants: Instants = (1, 2, 3, 4, 6, 8, 16, 24, 32, 48, 60, 72, 84, 100)
-    output_low: Pair = (59.0, 9.0)
+    output_low: Pair = (LEVEL_BAND[0], T5_BAND[0])
     """Bands of L1 (%) and T5 (K)."""
-    output_high: Pair = (61.0, 16.0)
+    output_high: Pair = (LEVEL_BAND[1], T5_BAND[1])
     input_scale: Triple = (10.0, 50.0, 10.0)
     input_weight: Triple = (1e-2, 4e-4, 1e-2)
     """Diagonal of R, on deviations from the operating point."""

@@ -1,13 +1,18 @@
 """What the actuators allow: one setting that the QP, its solvers and the control PLC's guard share."""
 
 from enum import StrEnum
-from typing import Annotated, Self
+from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 
 Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+LEVEL_BAND: Final = (59.0, 61.0)
+"""Where L1 is to be, % (paper, section IV)."""
+T5_BAND: Final = (9.0, 16.0)
+"""Where T5 is to be, K (paper, section IV)."""
 
 
 class RateReference(StrEnum):
