@@ -1,4 +1,4 @@
-"""What the actuators allow: one setting that the QP, its solvers and the control PLC's guard share."""
+"""What the actuators allow, one setting that the QP, its solvers and the control PLC's guard share; and the bands."""
 
 from enum import StrEnum
 from typing import Annotated, Final, Self
