@@ -1,4 +1,4 @@
-"""What Ctrl-C and SIGTERM do to a command.
+"""What Ctrl-C, SIGTERM and the end of the terminal (SIGHUP) do to a command.
 
 A run takes them as a request to stop and writes what it has (`INTERRUPTION.passed_to`). Anything else ends at once:
 no exception is raised inside an import or a compiled kernel, where it would surface as a traceback.
@@ -12,13 +12,15 @@ from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Final, NoReturn, Self
 
-SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+SIGNALS: Final = tuple(
+    signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__
+)
 SHOW_CURSOR: Final = b"\r\033[?25h\n"
 """A progress bar on a terminal hides the cursor."""
 
 
 class Interruption:
-    """The handler of both signals, within the context."""
+    """The handler of these signals, within the context."""
 
     def __init__(self) -> None:
         self._request: Callable[[signal.Signals], None] | None = None
@@ -28,6 +30,8 @@ class Interruption:
         """Install the handler; outside the main thread nothing is changed."""
         with contextlib.suppress(ValueError):
             for number in SIGNALS:
+                if number.name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN:  # `nohup`
+                    continue
                 self._before[number] = signal.signal(number, self._received)
         return self
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.process.limits import LEVEL_BAND, T5_BAND
 from coldloop.process.signals import L1, T5, TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
@@ -20,8 +21,8 @@ Pair = tuple[float, float]
 class Bands(NamedTuple):
     """Where the constrained outputs are to stay, (L1 %, T5 K)."""
 
-    low: Pair = (59.0, 9.0)
-    high: Pair = (61.0, 16.0)
+    low: Pair = (LEVEL_BAND[0], T5_BAND[0])
+    high: Pair = (LEVEL_BAND[1], T5_BAND[1])
 
 
 class RaisedAlarm(NamedTuple):

@@ -13,6 +13,8 @@ from rig.chaos.faults import Direction, FrameFault, Freeze, LinkFault, Reset
 
 HOST: Final = "127.0.0.1"
 CHUNK: Final = 4096
+MOST_FROZEN: Final = 64
+"""Connections that are kept while nothing passes: those who try again and again would take up all files."""
 _LINGER_NOT: Final = struct.pack("ii", 1, 0)
 
 
@@ -43,7 +45,8 @@ class LinkProxy:
         self._flowing.set()
         self._number = 0
         self._open: set[asyncio.StreamWriter] = set()
-        self._serving: set[asyncio.Task[None]] = set()
+        self._serving: dict[asyncio.Task[None], None] = {}
+        """What serves each connection, the oldest one first."""
         self._listener: asyncio.Server | None = None
 
     async def start(self) -> None:
@@ -79,8 +82,11 @@ class LinkProxy:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         if task is not None:
-            self._serving.add(task)
-            task.add_done_callback(self._serving.discard)
+            self._serving[task] = None
+            task.add_done_callback(self._serving.pop)
+            if not self._flowing.is_set():
+                for one in list(self._serving)[:-MOST_FROZEN]:
+                    one.cancel()
         ends = [writer]
         try:
             if any(isinstance(fault, Reset) for fault in self._faults):
@@ -129,6 +135,8 @@ class LinkProxy:
                     async with asyncio.timeout(mangler.hold_s):
                         data = await reader.read(CHUNK)
                 except TimeoutError:
+                    if mangler.hold_s is None:  # the network's own: the connection has gone
+                        return
                     writer.write(mangler.release())
                     continue
                 await self._flowing.wait()

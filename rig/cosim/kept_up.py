@@ -10,7 +10,7 @@ from coldloop.errors import LinkError
 
 PAUSES_S: Final = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Before each further start; after the last one the service is given up."""
-STEADY_S: Final = 600.0
+STEADY_S: Final = 60.0
 """After so long without an end the pauses begin anew."""
 
 
@@ -35,7 +35,7 @@ async def keep_up(
 
     Args:
         process: Which one.
-        restarted: Called after each start.
+        restarted: Work after each start, given up when the process ends again.
         pauses_s: Before each start in a row.
 
     Raises:
@@ -43,8 +43,9 @@ async def keep_up(
     """
     loop = asyncio.get_running_loop()
     restarts, since = 0, loop.time()
+    work: Callable[[], Awaitable[None]] = _nothing
     while True:
-        how = await process.ended()
+        how = await _ended_beside(process, work)
         if loop.time() - since > STEADY_S:
             restarts = 0
         if restarts == len(pauses_s):
@@ -55,8 +56,25 @@ async def keep_up(
         await asyncio.sleep(pause)
         since = loop.time()
         await process.restart()
-        if restarted is not None:
-            await restarted()
+        work = restarted or _nothing
+
+
+async def _nothing() -> None:
+    """Do nothing after a start."""
+
+
+async def _ended_beside(process: Restartable, work: Callable[[], Awaitable[None]]) -> str:
+    """Wait until a process has ended, with work beside, which may fail and ends with it; return how it has ended."""
+    ended, beside = asyncio.ensure_future(process.ended()), asyncio.ensure_future(work())
+    try:
+        await asyncio.wait({ended, beside}, return_when=asyncio.FIRST_COMPLETED)
+        if not ended.done():
+            await beside
+        return await ended
+    finally:
+        ended.cancel()
+        beside.cancel()
+        await asyncio.gather(ended, beside, return_exceptions=True)
 
 
 def end_of(code: int, last_words: str) -> str:

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import os
 import signal
-import sys
 from collections.abc import Awaitable, Mapping, Sequence
 from pathlib import Path
 from typing import Self, TypeVar
@@ -17,6 +16,7 @@ from rig.cosim.ports import ReservedPorts
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
 from rig.cosim.wiring import SERVICES, START_PATIENCE_S, Detours, endpoints_on, wired
+from rig.interpreter import PYTHON
 from rig.results.recording import Recorder
 from rig.settings import Settings
 
@@ -94,7 +94,7 @@ class LocalServices:
         # A session of their own: a Ctrl-C is the rig's to answer, in good order.
         with self.log(service).open("ab") as log:
             process = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", service, "--with-parent",
+                *PYTHON, "-m", service, "--with-parent",
                 env={**self._environment, **(environment or {})}, start_new_session=True,
                 stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
             )  # fmt: skip

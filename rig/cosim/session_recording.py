@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Iterable
+from functools import partial
 from typing import Final, NamedTuple
 
 from coldloop.errors import LinkError, UsageError
@@ -16,7 +17,7 @@ from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
 from coldloop.registers.plant import LoadStatus, PlantSample, StationSample
 from rig.cosim.journal_reader import JournalReader
 from rig.cosim.scenario import Scenario
-from rig.cosim.session_client import LAST_LOOK_S, QUIET_S, SessionClient
+from rig.cosim.session_client import QUIET_S, SessionClient
 from rig.cosim.session_events import SessionEvents
 from rig.cosim.session_reader import SampleReader, UpdateReader
 from rig.results.driving import CONTROL, PLANT
@@ -106,7 +107,7 @@ async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recor
         rig.plant, from_now, number, end, first=session.identity.tick, tolerant=True, realtime=scenario.realtime
     )
     updates = UpdateReader(rig.optimizer, from_now, number, first=first_update, tolerant=True)
-    late_before = await rig.control.read(Status)
+    late = Lateness(await rig.control.read(Status))
     recorder.begin()
     heard_at = time.monotonic()
     try:
@@ -117,15 +118,15 @@ async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recor
                 raise LinkError(f"{rig.plant.peer} has not answered for {QUIET_S:g} s")
             await rig.contact(updates.read())
             await rig.contact(events.look(CONTROL, PLANT))
+            recorder.link = late.after(await rig.contact(rig.control.read(Status)))
             pause_s = TICK_S / scenario.factor if scenario.realtime else SHORTEST_PAUSE_S
             await asyncio.sleep(min(max(pause_s, SHORTEST_PAUSE_S), LONGEST_PAUSE_S))
     finally:  # what ended the recording is reported, not that the last of it cannot be read
-        with contextlib.suppress(LinkError, TimeoutError):
-            async with asyncio.timeout(LAST_LOOK_S):
-                await updates.read()
-                await events.read(CONTROL)
-                await events.read(PLANT)
-                recorder.link = _late(late_before, await rig.control.read(Status))
+        for read in (updates.read, partial(events.read, CONTROL), partial(events.read, PLANT)):
+            with contextlib.suppress(LinkError):
+                await rig.contact(read())
+        with contextlib.suppress(LinkError):
+            recorder.link = late.after(await rig.contact(rig.control.read(Status)))
 
 
 async def _next_update(rig: SessionClient) -> int:
@@ -149,9 +150,24 @@ def state_of(events: Iterable[Event]) -> list[Event]:
     return sorted(last.values())
 
 
-def _late(before: Status, after: Status) -> LinkStatistics:
-    """Return what was late between two looks; the largest lateness is that of the session."""
-    return LinkStatistics(
-        max(0, after.deadline_misses - before.deadline_misses), max(0, after.overruns - before.overruns),
-        after.lateness_max, after.lateness_p99,
-    )  # fmt: skip
+class Lateness:
+    """Counts what was late since a first look, also where the control PLC has been started again and counts anew."""
+
+    def __init__(self, first: Status) -> None:
+        self._before = first
+        self._late = LinkStatistics(0, 0, first.lateness_max, first.lateness_p99)
+
+    def after(self, status: Status | None) -> LinkStatistics:
+        """Return what was late up to a look, None where nobody answered; the largest lateness is of the session."""
+        if status is not None:
+            before, self._before, late = self._before, status, self._late
+            self._late = LinkStatistics(
+                late.deadline_misses + _gained(before.deadline_misses, status.deadline_misses),
+                late.overruns + _gained(before.overruns, status.overruns),
+                max(late.lateness_max_ms, status.lateness_max), status.lateness_p99,
+            )  # fmt: skip
+        return self._late
+
+
+def _gained(before: int, now: int) -> int:
+    return now - before if now >= before else now

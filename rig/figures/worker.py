@@ -15,8 +15,9 @@ from types import TracebackType
 from typing import Final, Self
 
 from coldloop.errors import ColdloopError, ResultsError
+from rig.interpreter import PYTHON
 
-COMMAND: Final = (sys.executable, "-m", "rig.figures.worker")
+COMMAND: Final = (*PYTHON, "-m", "rig.figures.worker")
 
 
 class FigureProcess:

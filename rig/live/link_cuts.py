@@ -1,12 +1,14 @@
 """Links of a rig that is up which can be cut for a while: `coldloop fault cut`.
 
 `coldloop up --cuttable` has a proxy in each link, in its own process. Who wants a cut leaves a file in the rig's
-private folder, which that process takes away when it cuts.
+private folder, each its own, which that process takes away when it cuts.
 """
 
 import asyncio
 import json
+import secrets
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple, Self
@@ -18,7 +20,7 @@ from rig.cosim.kept_up import say
 from rig.live.private_folder import read_own, write_own
 from rig.live.started_rigs import find_rig, no_rig, state_folder
 
-CUT_FILE: Final = "cut.json"
+CUT_FILES: Final = "cut-*.json"
 LOOK_S: Final = 0.2
 """Between two looks for a cut that is wanted, and for one that is taken."""
 TAKEN_S: Final = 10.0
@@ -55,8 +57,9 @@ class CuttableLinks(LinkProxies):
 
     def __init__(self, folder: Path) -> None:
         super().__init__("up")
-        self._file = folder / CUT_FILE
-        self._file.unlink(missing_ok=True)
+        self._folder = folder
+        for file in folder.glob(CUT_FILES):
+            file.unlink(missing_ok=True)
 
     async def keep(self) -> None:
         """Cut what is wanted, until cancelled."""
@@ -64,8 +67,7 @@ class CuttableLinks(LinkProxies):
         try:
             while True:
                 await asyncio.sleep(LOOK_S)
-                cut = self._wanted()
-                if cut is not None:
+                for cut in self._wanted():
                     task = asyncio.create_task(self._cut(cut))
                     cuts.add(task)
                     task.add_done_callback(cuts.discard)
@@ -73,21 +75,15 @@ class CuttableLinks(LinkProxies):
             for task in cuts:
                 task.cancel()
 
-    def _wanted(self) -> Cut | None:
-        try:
-            text = read_own(self._file)
-        except FileNotFoundError:
-            return None
-        except (OSError, ValueError) as error:
-            say(f"{self._file}: {error}")
-            text = ""
-        with suppress(OSError):
-            self._file.unlink()
-        try:
-            return Cut.parsed(text)
-        except ValueError as error:
-            say(f"{self._file}: {error}")
-            return None
+    def _wanted(self) -> Iterator[Cut]:
+        """Take the cuts that are wanted; one that cannot be read is left, and its command says that it was not cut."""
+        for file in self._folder.glob(CUT_FILES):
+            with suppress(OSError):
+                try:
+                    yield Cut.parsed(read_own(file))
+                except ValueError as error:
+                    say(f"{file}: {error}")
+                file.unlink(missing_ok=True)
 
     async def _cut(self, cut: Cut) -> None:
         proxy = self.by_link[cut.link]
@@ -99,7 +95,7 @@ class CuttableLinks(LinkProxies):
         say(f"the {cut.link} link is whole again")
 
 
-def cut(first_port: int | None, link: Link, seconds: float) -> None:
+async def cut(first_port: int | None, link: Link, seconds: float) -> None:
     """Cut a link of the rig that was started here on these ports, or of the only one; return when it is cut.
 
     Raises:
@@ -111,11 +107,13 @@ def cut(first_port: int | None, link: Link, seconds: float) -> None:
         raise no_rig(first_port)
     if not rig.cuttable:
         raise UsageError("the links of this rig cannot be cut: start it with `coldloop up --cuttable`")
-    file = state_folder(rig.ports[0]) / CUT_FILE
+    file = state_folder(rig.ports[0]) / CUT_FILES.replace("*", secrets.token_hex(8))
     write_own(file, json.dumps([link, seconds]))
     deadline = time.monotonic() + TAKEN_S
-    while file.exists():
-        if time.monotonic() > deadline:
-            file.unlink(missing_ok=True)
-            raise ColdloopError(f"the rig (process {rig.pid}) has not cut the link within {TAKEN_S:g} s")
-        time.sleep(LOOK_S)
+    try:
+        while file.exists():
+            if time.monotonic() > deadline:
+                raise ColdloopError(f"the rig (process {rig.pid}) has not cut the link within {TAKEN_S:g} s")
+            await asyncio.sleep(LOOK_S)
+    finally:
+        file.unlink(missing_ok=True)

@@ -5,7 +5,6 @@ import os
 import secrets
 import signal
 import socket
-import sys
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +18,7 @@ from hmi.users import PageRole, write_user
 from rig.cosim.endpoints import RigEndpoints
 from rig.cosim.kept_up import end_of
 from rig.cosim.local_services import last_line
+from rig.interpreter import PYTHON
 from rig.live.private_folder import new_own
 
 GRACE_S: Final = 5.0
@@ -138,7 +138,7 @@ class PageProcess:
         self._log.parent.mkdir(parents=True, exist_ok=True)
         with new_own(self._log) as log:
             self._process = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "hmi", "--with-parent", env=environment, start_new_session=True,
+                *PYTHON, "-m", "hmi", "--with-parent", env=environment, start_new_session=True,
                 stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
             )  # fmt: skip
 

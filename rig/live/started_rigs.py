@@ -16,6 +16,8 @@ from typing import Any, Final, NamedTuple, Self
 from coldloop.errors import ColdloopError, UsageError
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
 from rig.cosim.endpoints import RigEndpoints
+from rig.interpreter import PYTHON
+from rig.interruption import INTERRUPTION
 from rig.live.private_folder import base_folder, is_private, make_own_folder, new_own, read_own, write_own
 from rig.live.process_identity import identity_of
 
@@ -199,6 +201,7 @@ class RigLock:
         folder = make_own_folder(str(first_port))
         if inherited is not None:
             self.descriptor = inherited
+            self._sign()
             return
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         try:
@@ -209,11 +212,24 @@ class RigLock:
             fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(self.descriptor)
-            rig = running_rig(first_port)
-            state = "is being started here" if rig is None else f"is up here (process {rig.pid})"
-            raise UsageError(
-                f"port {first_port}: a rig {state}: end it with `coldloop down`, or give another --port-base"
-            ) from None
+            raise UsageError(f"port {first_port}: {self._holder(first_port)}, or give another --port-base") from None
+        self._sign()
+
+    def _sign(self) -> None:
+        """Leave our number, for those who come later."""
+        os.ftruncate(self.descriptor, 0)
+        os.pwrite(self.descriptor, str(os.getpid()).encode(), 0)
+
+    @staticmethod
+    def _holder(first_port: int) -> str:
+        rig = running_rig(first_port)
+        if rig is not None:
+            return f"a rig is up here (process {rig.pid}): end it with `coldloop down`"
+        try:
+            number = int(read_own(state_folder(first_port) / LOCK_FILE))
+        except (OSError, ValueError):
+            return "a rig is being started here: wait for it"
+        return f"a rig is being started here: wait for it, or end it (process {number})"
 
 
 # -- ports -------------------------------------------------------------------------------------------------------------
@@ -262,7 +278,7 @@ def require_listener(port: int) -> None:
 
 
 def detached(ports: Sequence[int], lock: RigLock) -> int:
-    """Start the same command in a process of its own; return its exit code, or 0 when the rig is up.
+    """Start the same command in a process of its own; return 0 when the rig is up, 130 when Ctrl-C has ended it.
 
     Args:
         ports: Of the rig.
@@ -272,15 +288,19 @@ def detached(ports: Sequence[int], lock: RigLock) -> int:
         ColdloopError: It has ended.
     """
     folder = state_folder(ports[0])
-    words = [word for word in sys.argv[1:] if word != "--detach"]
     output = folder / "up.log"
-    with new_own(output) as log:
+    ended_by: list[signal.Signals] = []
+    with new_own(output) as log, INTERRUPTION.passed_to(ended_by.append):
         process = subprocess.Popen(  # noqa: S603 our own command
-            [sys.executable, "-m", "rig", *words, "--locked", str(lock.descriptor)],
+            [*PYTHON, "-m", "rig", *sys.argv[1:], "--locked", str(lock.descriptor)],
             stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, pass_fds=[lock.descriptor],
         )  # fmt: skip
-    while process.poll() is None and not _is_up(ports[0], process.pid):
-        time.sleep(LOOK_UP_S)
+        while process.poll() is None and not (ended_by or _is_up(ports[0], process.pid)):
+            time.sleep(LOOK_UP_S)
+        if ended_by:
+            process.terminate()
+            process.wait()
+            return 128 + ended_by[0]
     if process.poll() is not None:
         lines = output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         raise ColdloopError((lines or ["the rig has ended"])[-1].removeprefix("coldloop: "))

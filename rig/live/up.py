@@ -7,8 +7,10 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Final
 
-from coldloop.errors import LinkError
+from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
 from coldloop.safety.retained import RetainSettings
 from rig.cosim.kept_up import keep_up, say
 from rig.cosim.local_services import KeptService, LocalServices
@@ -22,9 +24,9 @@ from rig.runs.running import make_scenario
 from rig.settings import Settings
 
 LOOK_S: Final = 0.5
-"""Between two looks at the load that the plant knows of."""
-
-
+"""Between two looks at the load that the plant knows of, and at a service that was started again."""
+LOOKING: Final = (PlantLinkState.SEARCHING, PlantLinkState.JOINING)
+"""A control PLC without a session is looking for the one that it has retained."""
 RETAINING: Final = ("plant", "control_plc")
 """Services that go on after a restart where they were, with a file for their state."""
 
@@ -108,8 +110,13 @@ class UpRig:
 
     async def _hold(self, rig: SessionClient) -> None:
         while True:
-            with suppress(LinkError):  # the plant is being started again
+            try:
                 await rig.hold(LOOK_S)
+            except PeerUnreachableError:
+                pass  # the plant is being started again
+            except LinkError as error:
+                rig.load = None
+                say(f"no more steps of the load are written: {error}")
             await asyncio.sleep(LOOK_S)
 
     async def _keep_service(self, services: LocalServices, service: str, rig: SessionClient) -> None:
@@ -117,13 +124,24 @@ class UpRig:
             self._write_state(services)
             if service not in RETAINING:  # the optimiser learns it from the control PLC
                 return
+            client = rig.clients[service]
             with suppress(LinkError):  # it has ended again
-                await rig.clients[service].connect(START_PATIENCE_S)
-                if not (await rig.clients[service].read(Identity)).session:
+                await client.connect(START_PATIENCE_S)
+                if service == "control_plc":
+                    await _has_looked(client)
+                if not (await client.read(Identity)).session:
                     session = await rig.start(self._scenario)
                     say(f"session {session} has begun: the {service} service had no state to go on with")
 
         await keep_up(KeptService(services, service), restarted)
+
+
+async def _has_looked(control: RegisterClient) -> None:
+    """Wait until a control PLC that was started again has found the session it has retained, or has given that up."""
+    while (await control.read(PlantLinkStatus)).state in LOOKING:
+        if (await control.read(Identity)).session:
+            return
+        await asyncio.sleep(LOOK_S)
 
 
 async def _keep_page(page: PageProcess) -> None:

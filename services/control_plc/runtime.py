@@ -93,6 +93,8 @@ class ControlPlc:
         self.bank.put(program.operator)
         self.bank.put(WatchdogTime(program.watchdog.time))
         program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._memory.refused))
+        if self.sessions.kept is not None:
+            self._link.starting()  # nobody is to take us for one that has no session
         if self._memory.refused:
             program.alarms.raised(AlarmKind.STATE_NOT_RETAINED, STATE_REFUSED)
         self._publish()

@@ -20,6 +20,9 @@ ADOPT_AFTER_S: Final = 1.0
 """An operator who begins a session writes to one PLC after the other: one that the rack has begun is ours by
 `session.autostart` when it has not been asked for here meanwhile."""
 
+SEEN_FOR_S: Final = 10.0
+"""A session in which the rack has not been found for so long counts as found for the first time."""
+
 
 class Sessions:
     """Puts the program into sessions.
@@ -39,8 +42,8 @@ class Sessions:
         """Time base of the present session."""
         self.running = False
         """A session is under way."""
-        self._other = (0, 0.0)
-        """Another session that the rack was found in while ours ran, and since when (s)."""
+        self._other = (0, 0.0, 0.0)
+        """Another session that the rack was found in while ours ran, since when, and when it was seen there last (s)"""
 
     @property
     def _configured_pace(self) -> Pace:
@@ -101,10 +104,12 @@ class Sessions:
         if not session or not self.running:
             return session > 0
         now = time.monotonic()
-        if self._other[0] != session:
-            self._other = session, now
-        return now - self._other[1] >= ADOPT_AFTER_S
+        seen_in, since, last = self._other
+        if seen_in != session or now - last > SEEN_FOR_S:
+            since = now
+        self._other = session, since, now
+        return now - since >= ADOPT_AFTER_S
 
     def _begin(self) -> None:
-        self._other = (0, 0.0)
+        self._other = (0, 0.0, 0.0)
         self.running = True

@@ -3,7 +3,7 @@
 import sys
 
 from coldloop.kernels.lean_numba import load_numba_alone
-from coldloop.service.start import main
+from coldloop.service.start import in_one_line, main
 
 
 def start() -> int:
@@ -16,4 +16,4 @@ def start() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(start())
+    sys.exit(in_one_line("optimizer_plc", start))

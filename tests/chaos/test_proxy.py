@@ -17,7 +17,7 @@ from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, Grant
 from coldloop.registers.declaration import Block
 from rig.chaos.faults import Delay, Direction, Drop, Duplicate, Freeze, Reset, Truncate
-from rig.chaos.proxy import LinkProxy
+from rig.chaos.proxy import MOST_FROZEN, LinkProxy
 
 COMMON = {"link": "optimizer", "duration_s": 1.0}
 READ_THREE = bytes.fromhex("0001 0000 0006 ff 03 0000 0003")
@@ -118,6 +118,21 @@ async def test_a_lost_answer_is_a_time_out_and_a_lost_request_is_never_served() 
             async with asyncio.timeout(60.0):  # the client may have given up before a busy server has come to it
                 while it.grants != served:  # noqa: ASYNC110 nothing tells
                     await asyncio.sleep(0.01)
+
+
+async def test_who_tries_again_and_again_while_nothing_passes_does_not_use_up_all_files() -> None:
+    async with line() as it, asyncio.timeout(60.0):
+        fault = Freeze(kind="freeze", **COMMON)
+        it.proxy.begin(fault)
+        calls = [await raw(it.proxy) for _ in range(MOST_FROZEN + 40)]
+        for reader, _ in calls[:40]:
+            with contextlib.suppress(ConnectionError):
+                assert await reader.read() == b"", "the oldest are let go"
+        calls[-1][1].write(READ_THREE)
+        it.proxy.end(fault)
+        assert len(await calls[-1][0].readexactly(9 + 6)) == 15
+        for _, writer in calls:
+            writer.close()
 
 
 async def test_a_client_takes_the_answer_to_its_request_though_all_arrive_twice() -> None:

@@ -58,6 +58,30 @@ async def test_each_start_is_followed_up() -> None:
     assert told == [1, 2]
 
 
+async def test_what_ends_again_while_its_start_is_followed_up_is_started_again() -> None:
+    """A service that ends at each start, before anybody has reached it, is given up as any other."""
+    given_up: list[int] = []
+    process = Mortal()
+
+    async def restarted() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            given_up.append(process.starts)
+
+    with pytest.raises(LinkError, match="it is given up"):
+        await asyncio.wait_for(keep_up(process, restarted, NONE), 60.0)
+    assert given_up == [1, 2, 3, 4, 5]
+
+
+async def test_what_goes_wrong_after_a_start_is_not_lost() -> None:
+    async def restarted() -> None:
+        raise LinkError("the session could not begin")
+
+    with pytest.raises(LinkError, match="could not begin"):
+        await asyncio.wait_for(keep_up(Mortal(lives=1), restarted, NONE), 60.0)
+
+
 def test_the_pauses_grow() -> None:
     assert len(PAUSES_S) == 5
     assert list(PAUSES_S) == sorted(PAUSES_S)

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import signal
 import socket
 import time
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from coldloop.errors import RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
 from rig import cli
-from rig.live.link_cuts import CUT_FILE, CuttableLinks
+from rig.live.link_cuts import CUT_FILES, CuttableLinks
 from rig.live.started_rigs import running_rig, state_folder
 from tests.conftest import Coldloop, first_of_three_ports
 from tests.harness.processes import Processes
@@ -224,15 +225,26 @@ def test_a_link_is_cut_for_a_while_and_the_rig_finds_back(coldloop: Coldloop, up
 def test_a_cut_that_makes_no_sense_is_taken_away(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     async def looked() -> None:
         async with CuttableLinks(tmp_path) as links:
-            (tmp_path / CUT_FILE).write_text(text)
+            file = tmp_path / CUT_FILES.replace("*", "1")
+            file.write_text(text)
             keeping = asyncio.create_task(links.keep())
-            while (tmp_path / CUT_FILE).exists():  # noqa: ASYNC110 it is a file
+            while file.exists():  # noqa: ASYNC110 it is a file
                 await asyncio.sleep(0)
             assert not keeping.done()
             keeping.cancel()
 
     asyncio.run(looked())
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_two_cuts_at_once_are_both_made(coldloop: Coldloop, up: str, processes: Processes) -> None:
+    until(coldloop, up, "mode", "mpc")
+    log = state_folder(int(up)) / "up.log"
+    links = ("plant", "optimizer")
+    before = [log.read_text().count(f"the {link} link is cut") for link in links]
+    asked = [processes.coldloop("fault", "--port-base", up, "cut", link, "1") for link in links]
+    assert [each.popen.wait(PATIENCE_S) for each in asked] == [0, 0]
+    assert [log.read_text().count(f"the {link} link is cut") for link in links] == [1 + count for count in before]
 
 
 def test_a_second_rig_on_the_same_ports_is_refused_and_the_holder_named(coldloop: Coldloop, up: str) -> None:
@@ -315,13 +327,46 @@ def test_a_service_that_is_killed_is_started_again_and_the_session_goes_on(
     while coldloop("status", "--port-base", up).code or log.read_text().count("started again") == before:
         assert time.monotonic() < deadline, log.read_text()
     assert f"the {service} service was ended by SIGKILL" in log.read_text().splitlines()[-1]
-    assert "(1 of 5)" in log.read_text().splitlines()[-1]
+    assert " of 5)" in log.read_text().splitlines()[-1]
     until(coldloop, up, "mode", "mpc")
     assert shown(coldloop, up)["session"].partition(",")[0] == session
     now = running_rig(int(up))
     assert now is not None
     assert now._replace(services=rig.services) == rig
     assert [each for each in rig.services if now.services[each] != rig.services[each]] == [service]
+
+
+def test_a_control_plc_that_comes_back_before_its_rack_can_be_reached_keeps_its_session(
+    coldloop: Coldloop, up: str
+) -> None:
+    """It shows no session until it has found the rack in the one that it has retained: nobody begins another one."""
+    until(coldloop, up, "mode", "mpc")
+    session = shown(coldloop, up)["session"].partition(",")[0]
+    log = state_folder(int(up)) / "up.log"
+    restarts, whole = (log.read_text().count(words) for words in ("started again", "link is whole again"))
+    assert coldloop("fault", "--port-base", up, "cut", "plant", "15").code == 0
+    assert coldloop("fault", "--port-base", up, "kill", "control_plc").code == 0
+    deadline = time.monotonic() + PATIENCE_S
+    while log.read_text().count("started again") == restarts or log.read_text().count("link is whole again") == whole:
+        assert time.monotonic() < deadline, log.read_text()
+    until(coldloop, up, "mode", "mpc")
+    assert shown(coldloop, up)["session"].partition(",")[0] == session
+    assert "had no state to go on with" not in log.read_text()
+
+
+def test_a_service_that_stands_still_runs_again_when_the_terminal_is_closed(
+    coldloop: Coldloop, up: str, processes: Processes
+) -> None:
+    rig = running_rig(int(up))
+    assert rig is not None
+    state = Path(f"/proc/{rig.services['optimizer_plc'].pid}/stat")
+    freezing = processes.coldloop("fault", "--port-base", up, "freeze", "optimizer_plc", "3600")
+    deadline = time.monotonic() + PATIENCE_S
+    while state.read_text().rpartition(")")[2].split()[0] != "T":
+        assert time.monotonic() < deadline
+    assert freezing.interrupt(signal.SIGHUP) == 130
+    assert state.read_text().rpartition(")")[2].split()[0] != "T"
+    until(coldloop, up, "mode", "mpc")
 
 
 def test_ctrl_c_gives_an_attached_rig_back_too(

@@ -1,7 +1,9 @@
 """What is known of a session before its recording begins: how everything is, from what was noted last."""
 
 from coldloop.registers.audit import Event, EventKind
-from rig.cosim.session_recording import state_of
+from coldloop.registers.control_plc import Status
+from rig.cosim.session_recording import Lateness, state_of
+from rig.results.recorded import LinkStatistics
 
 
 def noted(number: int, kind: EventKind, subject: int = 0, cause: int = 0) -> Event:
@@ -21,3 +23,14 @@ def test_what_was_noted_in_a_session_before_does_not_count() -> None:
     events = [noted(1, EventKind.SENSOR_FAULT, 2, 1), noted(2, EventKind.SESSION), noted(3, EventKind.MODE, 1)]
     assert [event.number for event in state_of(events)] == [3]
     assert state_of([]) == []
+
+
+def counted(misses: int, overruns: int, lateness_ms: float) -> Status:
+    return Status(0, 0, 0, 0, 0, 0, 0, misses, overruns, lateness_ms, lateness_ms / 2)
+
+
+def test_what_was_late_is_counted_over_a_restart_of_the_control_plc() -> None:
+    late = Lateness(counted(100, 50, 3.0))
+    assert late.after(counted(103, 50, 3.0)) == LinkStatistics(3, 0, 3.0, 1.5)
+    assert late.after(None) == LinkStatistics(3, 0, 3.0, 1.5), "it is away"
+    assert late.after(counted(2, 1, 1.0)) == LinkStatistics(5, 1, 3.0, 0.5), "and has counted from 0 again"

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,7 @@ from tests.conftest import first_of_three_ports
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
+    from tests.harness.processes import Processes
 
 FIRST, SECOND = 23020, 23120
 COMMANDS = (("status",), ("events",), ("set", "pause"), ("page",), ("down",), ("fault", "kill", "plant"))
@@ -304,9 +306,24 @@ def test_a_second_rig_that_is_started_at_the_same_time_is_refused(coldloop: "Col
     for words in (("--detach",), ()):
         outcome = coldloop("up", "--port-base", str(FIRST), *words)
         assert (outcome.code, len(outcome.complaints)) == (2, 1)
-        assert "is being started here" in outcome.complaints[0]
+        assert f"is being started here: wait for it, or end it (process {os.getpid()})" in outcome.complaints[0]
     os.close(first.descriptor)
     os.close(RigLock(FIRST).descriptor)
+
+
+@pytest.mark.usefixtures("realtime")
+def test_ctrl_c_while_a_detached_rig_starts_ends_that(processes: "Processes") -> None:
+    base = str(first_of_three_ports())
+    starting = processes.coldloop("up", "--det", "--port-base", base, "--load", "e")  # an abbreviation is taken, too
+    lock, deadline = state_folder(int(base)) / LOCK_FILE, time.monotonic() + 120.0
+    number = 0
+    while number in (0, starting.popen.pid):  # it is locked by the command, and then by the process of the rig
+        assert time.monotonic() < deadline
+        with suppress(OSError, ValueError):
+            number = int(lock.read_text())
+    assert starting.interrupt() == 130
+    assert identity_of(number) is None
+    assert rigs_up() == []
 
 
 @pytest.mark.usefixtures("processes", "realtime")

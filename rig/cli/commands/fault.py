@@ -82,7 +82,7 @@ async def _cut(options: argparse.Namespace) -> None:
     from rig.chaos.faults import Link
     from rig.live.link_cuts import cut
 
-    cut(first_port_here(options), Link(options.link), options.seconds)
+    await cut(first_port_here(options), Link(options.link), options.seconds)
     sys.stdout.write(f"the {options.link} link is cut for {options.seconds:g} s\n")
 
 

@@ -55,7 +55,7 @@ def execute(options: argparse.Namespace) -> int:
         from rig.live.page_process import check_page
 
         check_page(effective.settings.hmi)
-    if options.detach:
+    if options.detach and options.locked is None:
         return detached(ports, lock)
     from rig.live.up import UpRig
     from rig.until_interrupted import run_until_interrupted

@@ -14,6 +14,7 @@ import contextlib
 import hashlib
 import os
 import stat
+import sys
 import tempfile
 import zlib
 from collections.abc import Callable
@@ -159,15 +160,20 @@ def _cache_directory() -> Path:
         ConfigurationError: Others can write to the one that the environment names.
     """
     chosen = os.environ.get("COLDLOOP_CACHE_DIR")
-    home_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coldloop"
-    for root in [Path(chosen)] if chosen else [home_cache, Path(tempfile.gettempdir()) / f"coldloop-cache-{_user()}"]:
+    for root in [Path(chosen)] if chosen else _usual_roots():
         folder = root / f"kernels-{_sources_digest()}"
         try:
             root.mkdir(mode=0o755, parents=True, exist_ok=True)
             folder.mkdir(mode=0o755, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
             closed = _is_closed(root, sticky=True) and _is_closed(folder)
-        except OSError:
+            if closed and _lets_others_write():  # to what numba makes in it
+                folder.chmod(0o700)
+        except OSError as error:
+            if chosen:
+                sys.stderr.write(
+                    f"COLDLOOP_CACHE_DIR={chosen}: {error.strerror}; kernels are compiled for this process alone\n"
+                )
             continue
         if closed:
             return folder
@@ -177,6 +183,20 @@ def _cache_directory() -> Path:
                 "folder of your own, or take the permission away (chmod -R go-w)"
             )
     return Path(tempfile.mkdtemp(prefix="coldloop-kernels-"))
+
+
+def _usual_roots() -> list[Path]:
+    roots = [Path(tempfile.gettempdir()) / f"coldloop-cache-{_user()}"]
+    with contextlib.suppress(RuntimeError):  # a user without a home
+        roots.insert(0, Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coldloop")
+    return roots
+
+
+def _lets_others_write() -> bool:
+    """Tell whether new files of this process can be written by everybody."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return not mask & stat.S_IWOTH
 
 
 def _user() -> int:

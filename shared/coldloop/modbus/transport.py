@@ -69,7 +69,7 @@ class Transport:
         """Connect.
 
         Raises:
-            PeerUnreachableError: Nobody listens, or not with TLS.
+            PeerUnreachableError: Nobody listens, nobody answers in time, or not with TLS.
             UntrustedPeerError: The certificate of the peer does not hold.
         """
         loop = asyncio.get_running_loop()
@@ -82,6 +82,10 @@ class Transport:
             ) from None
         except UnicodeError:
             raise PeerUnreachableError(f"{self.peer}: the host name is none") from None
+        except TimeoutError:
+            raise PeerUnreachableError(
+                f"{self.peer} did not answer in time when it was called: check host, port and the network between"
+            ) from None
         except OSError as error:
             if self._tls is not None and isinstance(
                 error, ssl.SSLError | ConnectionResetError | ConnectionAbortedError

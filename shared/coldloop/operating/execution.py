@@ -27,7 +27,7 @@ from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TIC
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.registers.maps import MAPS
-from coldloop.registers.plant import AHEAD_STEPS, LiveLoad, LoadStatus, SensorFault, SensorFaultKind
+from coldloop.registers.plant import LiveLoad, LoadStatus, SensorFault, SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.registers.seal import sealed
 from coldloop.service.event_text import word
@@ -193,9 +193,15 @@ def _load_text(command: SetLoad, status: LoadStatus) -> str:
 
 
 async def play_load(clients: Clients, command: PlayLoad) -> str:
-    """Write a load file at once."""
-    stream, begin = await _stream(clients["plant"], command.profile, 0, ahead=len(command.profile.times))
-    await stream.feed(begin)
+    """Write a load file at once.
+
+    Raises:
+        LinkError: The plant has no room for all of it.
+    """
+    stream, begin = await _stream(clients["plant"], command.profile, 0)
+    taken = await stream.fill()
+    if not stream.done:
+        raise LinkError(f"the plant has room for {taken} steps of {stream.steps}: it holds the last of them")
     return await _streamed(clients["plant"], stream, begin)
 
 
@@ -206,22 +212,19 @@ async def stream_load(clients: Clients, load: LoadProfile, tick: int, say: Calla
         UsageError: It is to begin at a tick that has passed, or the plant has no session.
     """
     plant = clients["plant"]
-    free = (await plant.read(LoadStatus)).free
-    stream, begin = await _stream(plant, load, tick, ahead=max(0, free - AHEAD_STEPS))
-    said = False
-    while True:
-        await stream.feed((await plant.read(Identity)).tick)
-        if stream.done:
-            return await _streamed(plant, stream, begin)
+    stream, begin = await _stream(plant, load, tick)
+    taken = await stream.fill()
+    if not stream.done:
+        say(f"the plant has taken {taken} steps of {stream.steps}: this goes on until it has all of them")
+    while not stream.done:
+        await asyncio.sleep(LOOK_S)
         if await stream.was_replaced():
             raise LinkError("somebody else has written the load meanwhile: the rest of the file is not written")
-        if not said:
-            said = True
-            say(f"the plant keeps {free} steps of {stream.steps}: this goes on until it has all of them")
-        await asyncio.sleep(LOOK_S)
+        await stream.fill()
+    return await _streamed(plant, stream, begin)
 
 
-async def _stream(plant: RegisterClient, load: LoadProfile, tick: int, *, ahead: int) -> tuple[LoadStream, int]:
+async def _stream(plant: RegisterClient, load: LoadProfile, tick: int) -> tuple[LoadStream, int]:
     """Return what feeds the plant with a load, and the tick at which it begins."""
     identity = await plant.read(Identity)
     if not identity.session:
@@ -229,7 +232,7 @@ async def _stream(plant: RegisterClient, load: LoadProfile, tick: int, *, ahead:
     if 0 < tick <= identity.tick:
         raise UsageError(f"plant time is {identity.tick * TICK_S:g} s already: name a later one")
     begin = tick or identity.tick + lead_ticks(await plant.read(SessionPace))
-    return LoadStream(plant, identity.session, load, begin=begin, ahead=ahead), begin
+    return LoadStream(plant, identity.session, load, begin=begin), begin
 
 
 async def _streamed(plant: RegisterClient, stream: LoadStream, begin: int) -> str:

@@ -3,7 +3,7 @@
 from bisect import bisect_right
 from typing import Final
 
-from coldloop.errors import LinkError, UsageError
+from coldloop.errors import LinkError, PeerUnreachableError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.signals import TICK_S
@@ -24,21 +24,13 @@ class LoadStream:
         load: All of it.
         sent: Steps that the plant has already.
         begin: Tick of the session at which the load begins.
-        ahead: Steps that the plant is to know in advance.
 
     Raises:
         UsageError: A step is beyond the last tick of a session.
     """
 
     def __init__(
-        self,
-        plant: RegisterClient,
-        session: int,
-        load: LoadProfile,
-        *,
-        sent: int = 0,
-        begin: int = 0,
-        ahead: int = KEPT_AHEAD,
+        self, plant: RegisterClient, session: int, load: LoadProfile, *, sent: int = 0, begin: int = 0
     ) -> None:
         self._plant = plant
         self._session = session
@@ -47,7 +39,6 @@ class LoadStream:
             raise UsageError(f"a load with a step at tick {self._times[-1]}: the last tick of a session is {LAST_TICK}")
         self._watts = load.watts
         self._sent = sent
-        self._ahead = ahead
 
     @property
     def steps(self) -> int:
@@ -71,22 +62,40 @@ class LoadStream:
             LinkError: The plant does not answer; or it refuses steps, because they come too late or the session is
                 another one.
         """
-        while not self.done and self._sent - bisect_right(self._times, tick) < self._ahead:
-            record = self._next()
-            try:
-                await self._plant.write(sealed(record))
-            except LinkError as error:
-                if not self._sent:
-                    raise
-                raise LinkError(
-                    f"{error}; of {self.steps} steps the plant has taken the first {self._sent}, and holds "
-                    f"{self._watts[self._sent - 1]:g} W from {self._times[self._sent - 1] * TICK_S:g} s on"
-                ) from None
-            self._sent += record.length
+        while not self.done and self._sent - bisect_right(self._times, tick) < KEPT_AHEAD:
+            await self._send()
 
-    def _next(self) -> LoadAhead:
+    async def fill(self) -> int:
+        """Write as much as the plant has room for; return how many steps it has by now.
+
+        The first steps replace what it knew from there on, and so make room for themselves.
+
+        Raises:
+            LinkError: As `feed`.
+        """
+        if not self._sent:
+            await self._send()
+        free = (await self._plant.read(LoadStatus)).free
+        while not self.done and free >= AHEAD_STEPS:
+            free -= await self._send()
+        return self._sent
+
+    async def _send(self) -> int:
+        """Write the next steps; return how many."""
         some = slice(self._sent, self._sent + AHEAD_STEPS)
-        return LoadAhead.first_of(self._session, self._times[some], self._watts[some])
+        record = LoadAhead.first_of(self._session, self._times[some], self._watts[some])
+        try:
+            await self._plant.write(sealed(record))
+        except LinkError as error:
+            if not self._sent:
+                raise
+            kind = PeerUnreachableError if isinstance(error, PeerUnreachableError) else LinkError
+            raise kind(
+                f"{error}; of {self.steps} steps the plant has taken the first {self._sent}, and holds "
+                f"{self._watts[self._sent - 1]:g} W from {self._times[self._sent - 1] * TICK_S:g} s on"
+            ) from None
+        self._sent += record.length
+        return record.length
 
     async def was_replaced(self) -> bool:
         """Return whether another client has written the load since: the last step known is not the last one sent."""

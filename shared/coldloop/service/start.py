@@ -58,6 +58,15 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
     return code
 
 
+def in_one_line(name: str, start: Callable[[], int]) -> int:
+    """Return what `start` returns, which imports a service and runs it; what is wrong with that is told in one line."""
+    try:
+        return start()
+    except ColdloopError as error:
+        sys.stderr.write(f"{name}: {error}\n")
+        return error.exit_code
+
+
 def _log_kernels(kernels: Kernels) -> None:
     log.info(COMPILING, extra={"kernels": kernels.owner, "about_s": kernels.about_s})
 

@@ -1,0 +1,65 @@
+"""A load of any length on its way to a plant that keeps so many steps, and knows another load already."""
+
+from typing import Any, cast
+
+import pytest
+
+from coldloop.errors import LinkError
+from coldloop.modbus.client import RegisterClient
+from coldloop.operating.load_stream import LoadStream
+from coldloop.process.load_profile import LoadProfile
+from coldloop.registers.plant import LoadAhead, LoadStatus
+from plant.rack.load_schedule import MOST_UPCOMING, LoadSchedule
+
+
+class FakePlant:
+    """The plant's load behind a client; it refuses as the plant does."""
+
+    def __init__(self) -> None:
+        self.load = LoadSchedule(LoadProfile((0,), (400.0,)))
+        self.tick = 0
+
+    async def write(self, record: LoadAhead) -> None:
+        try:
+            self.load.check(record.steps, self.tick)
+        except ValueError as error:
+            raise LinkError(str(error)) from None
+        self.load.put(record.steps, self.tick)
+
+    async def read(self, record: type[Any]) -> LoadStatus:
+        assert record is LoadStatus
+        return self.load.status(self.tick)
+
+    def stream(self, steps: int, begin: int, watts: float) -> LoadStream:
+        load = LoadProfile(tuple(range(steps)), tuple(watts + 0.5 * (step % 2) for step in range(steps)))
+        return LoadStream(cast("RegisterClient", self), 1, load, begin=begin)
+
+
+async def test_a_second_load_replaces_one_that_has_filled_the_plant() -> None:
+    plant = FakePlant()
+    first = plant.stream(6000, begin=8, watts=300.0)
+    assert MOST_UPCOMING - 24 < await first.fill() <= MOST_UPCOMING
+    assert not first.done
+    second = plant.stream(5000, begin=16, watts=500.0)
+    assert await second.fill() > MOST_UPCOMING - 48
+    assert not await second.was_replaced()
+    assert await first.was_replaced(), "who wrote the first one is told"
+    assert plant.load.value(15) == 300.5
+    assert plant.load.value(16) == 500.0
+
+
+async def test_all_of_it_arrives_as_time_goes_on() -> None:
+    plant = FakePlant()
+    stream = plant.stream(12_000, begin=8, watts=300.0)
+    while not stream.done:
+        await stream.fill()
+        plant.tick += 500
+        assert plant.load.value(plant.tick) >= 300.0
+    assert plant.load.value(12_007) == 300.5
+
+
+async def test_a_load_beyond_a_plant_that_is_full_is_refused_in_words() -> None:
+    plant = FakePlant()
+    await plant.stream(6000, begin=8, watts=300.0).fill()
+    with pytest.raises(LinkError, match="write these later"):
+        await plant.stream(100, begin=90_000, watts=500.0).fill()
