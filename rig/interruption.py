@@ -59,9 +59,10 @@ class Interruption:
 
 def end_at_once(number: int) -> NoReturn:
     """End the process with the exit code of a signal; its services end with their standard input."""
-    if sys.stderr is not None and sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
-        os.write(2, SHOW_CURSOR)
-    os.write(2, b"coldloop: interrupted\n")
+    with contextlib.suppress(OSError):  # the terminal may have gone
+        if sys.stderr is not None and sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
+            os.write(2, SHOW_CURSOR)
+        os.write(2, b"coldloop: interrupted\n")
     os._exit(128 + number)
 
 

@@ -65,7 +65,7 @@ async def give_back(rig: SessionClient, found: Found | None, session: int) -> No
         identity = await rig.plant.read(Identity)
         if identity.session != session:
             return
-        await write_pace((rig.plant, rig.control, rig.optimizer), found.pace._replace(session=0))
+        await write_pace(rig.clients, found.pace._replace(session=0))
         if found.operator.mode != OperatorMode.AUTO:
             await rig.control.write(found.operator)
         tick = (await rig.plant.read(Identity)).tick

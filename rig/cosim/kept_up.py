@@ -4,6 +4,7 @@ import asyncio
 import signal
 import sys
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from typing import Final, Protocol
 
 from coldloop.errors import LinkError
@@ -88,6 +89,7 @@ def end_of(code: int, last_words: str) -> str:
 
 
 def say(text: str) -> None:
-    """Tell who keeps the rig up, or its log."""
-    sys.stderr.write(f"coldloop: {text}\n")
-    sys.stderr.flush()
+    """Tell who keeps the rig up, or its log, if it can be told."""
+    with suppress(OSError):  # the disk may be full, the terminal closed
+        sys.stderr.write(f"coldloop: {text}\n")
+        sys.stderr.flush()

@@ -152,18 +152,31 @@ class SessionClient:
         A load that somebody else writes replaces all of it, as it replaces what the plant knows of later ticks.
 
         Raises:
-            LinkError: The plant does not answer.
+            PeerUnreachableError: The plant does not answer.
+            LinkError: It refuses the load, which is not written any more.
         """
         while True:
             identity = await self.plant.read(Identity)
             if identity.session != self.session:  # somebody has begun another one
                 self.load = None
             elif self.load is not None and not self.load.done:
-                if await self.load.was_replaced():
-                    self.load = None
-                else:
-                    await self.load.feed(identity.tick)
+                await self._supply(self.load, identity.tick)
             await asyncio.sleep(look_s)
+
+    async def _supply(self, load: LoadStream, tick: int) -> None:
+        replaced = False
+        try:
+            replaced = await load.was_replaced()
+            if not replaced:
+                await load.feed(tick)
+        except PeerUnreachableError:
+            raise
+        except LinkError:
+            replaced = True
+            raise
+        finally:
+            if replaced and self.load is load:  # not that of a session that has begun meanwhile
+                self.load = None
 
     async def conclude(self) -> None:
         """Read what was still under way when the last tick was done.

@@ -45,7 +45,7 @@ class Cut(NamedTuple):
         try:
             link, seconds = json.loads(text)
             cut = cls(Link(link), float(seconds))
-        except (ValueError, TypeError, RecursionError):
+        except (ValueError, TypeError, OverflowError, RecursionError):
             raise ValueError("not what `coldloop fault cut` writes") from None
         if not 0 < cut.seconds <= LONGEST_S:
             raise ValueError(f"not a number of seconds up to {LONGEST_S:g}")
@@ -90,8 +90,10 @@ class CuttableLinks(LinkProxies):
         fault = Freeze(kind="freeze", link=cut.link, at_s=0.0, duration_s=cut.seconds)
         proxy.begin(fault)
         say(f"the {cut.link} link is cut for {cut.seconds:g} s")
-        await asyncio.sleep(cut.seconds)
-        proxy.end(fault)
+        try:
+            await asyncio.sleep(cut.seconds)
+        finally:
+            proxy.end(fault)
         say(f"the {cut.link} link is whole again")
 
 

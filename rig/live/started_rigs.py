@@ -217,8 +217,9 @@ class RigLock:
 
     def _sign(self) -> None:
         """Leave our number, for those who come later."""
-        os.ftruncate(self.descriptor, 0)
-        os.pwrite(self.descriptor, str(os.getpid()).encode(), 0)
+        with suppress(OSError):  # the disk may be full
+            os.ftruncate(self.descriptor, 0)
+            os.pwrite(self.descriptor, str(os.getpid()).encode(), 0)
 
     @staticmethod
     def _holder(first_port: int) -> str:

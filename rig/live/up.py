@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import LinkError, PeerUnreachableError
-from coldloop.modbus.client import RegisterClient
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
 from coldloop.safety.retained import RetainSettings
@@ -47,6 +46,8 @@ class UpRig:
         self._ports = tuple(ports)
         self._tls = tls
         self._links = CuttableLinks(self.folder) if cuttable else None
+        self._sessions = asyncio.Lock()
+        """One session is begun at a time."""
 
     async def run(self, *, announce: bool) -> None:
         """Run until cancelled; load steps beyond what the plant holds are written as time goes on.
@@ -115,33 +116,36 @@ class UpRig:
             except PeerUnreachableError:
                 pass  # the plant is being started again
             except LinkError as error:
-                rig.load = None
                 say(f"no more steps of the load are written: {error}")
             await asyncio.sleep(LOOK_S)
 
     async def _keep_service(self, services: LocalServices, service: str, rig: SessionClient) -> None:
         async def restarted() -> None:
             self._write_state(services)
-            if service not in RETAINING:  # the optimiser learns it from the control PLC
-                return
-            client = rig.clients[service]
-            with suppress(LinkError):  # it has ended again
-                await client.connect(START_PATIENCE_S)
-                if service == "control_plc":
-                    await _has_looked(client)
-                if not (await client.read(Identity)).session:
-                    session = await rig.start(self._scenario)
-                    say(f"session {session} has begun: the {service} service had no state to go on with")
+            while service in RETAINING:  # the optimiser learns it from the control PLC
+                with suppress(LinkError):  # another one has ended, too
+                    await rig.clients[service].connect(START_PATIENCE_S)
+                    if await self._goes_on(service, rig):
+                        return
+                await asyncio.sleep(LOOK_S)
 
         await keep_up(KeptService(services, service), restarted)
 
+    async def _goes_on(self, service: str, rig: SessionClient) -> bool:
+        """Tell whether the session goes on after a service was started again, or another one has begun in its place.
 
-async def _has_looked(control: RegisterClient) -> None:
-    """Wait until a control PLC that was started again has found the session it has retained, or has given that up."""
-    while (await control.read(PlantLinkStatus)).state in LOOKING:
-        if (await control.read(Identity)).session:
-            return
-        await asyncio.sleep(LOOK_S)
+        Not yet, while the control PLC is looking for the one that it has retained.
+        """
+        async with self._sessions:
+            looking = (await rig.control.read(PlantLinkStatus)).state in LOOKING
+            plant, control = (await rig.plant.read(Identity)).session, (await rig.control.read(Identity)).session
+            if plant == control != 0:
+                return True
+            if plant and looking:
+                return False
+            session = await rig.start(self._scenario)
+            say(f"session {session} has begun: the {service} service had no state to go on with")
+            return True
 
 
 async def _keep_page(page: PageProcess) -> None:

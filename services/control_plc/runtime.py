@@ -116,7 +116,7 @@ class ControlPlc:
                 self._change_pace(self.clients.asked_pace)
             elif not self.sessions.expected:
                 await self._stand_by()
-            elif self.sessions.pace.paused:
+            elif self.sessions.pace.paused and self.sessions.kept is None:
                 await self._while_paused()
             elif not self._link.in_step:
                 await self._look()

@@ -4,7 +4,7 @@ from typing import Any, cast
 
 import pytest
 
-from coldloop.errors import LinkError
+from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
 from coldloop.operating.load_stream import LoadStream
 from coldloop.process.load_profile import LoadProfile
@@ -18,6 +18,7 @@ class FakePlant:
     def __init__(self) -> None:
         self.load = LoadSchedule(LoadProfile((0,), (400.0,)))
         self.tick = 0
+        self.loses_answers = False
 
     async def write(self, record: LoadAhead) -> None:
         try:
@@ -25,6 +26,8 @@ class FakePlant:
         except ValueError as error:
             raise LinkError(str(error)) from None
         self.load.put(record.steps, self.tick)
+        if self.loses_answers:
+            raise PeerUnreachableError("plant did not answer in time")
 
     async def read(self, record: type[Any]) -> LoadStatus:
         assert record is LoadStatus
@@ -56,6 +59,22 @@ async def test_all_of_it_arrives_as_time_goes_on() -> None:
         plant.tick += 500
         assert plant.load.value(plant.tick) >= 300.0
     assert plant.load.value(12_007) == 300.5
+
+
+async def test_steps_whose_answer_was_lost_are_not_taken_for_somebody_elses() -> None:
+    plant = FakePlant()
+    stream = plant.stream(3000, begin=8, watts=300.0)
+    await stream.feed(0)
+    plant.tick, plant.loses_answers = 1000, True
+    with pytest.raises(PeerUnreachableError):
+        await stream.feed(plant.tick)
+    plant.loses_answers = False
+    assert not await stream.was_replaced()
+    await stream.feed(plant.tick)
+    assert stream.done
+    assert plant.load.value(3007) == 300.5
+    await plant.write(LoadAhead.first_of(1, [2000], [444.0]))
+    assert await stream.was_replaced()
 
 
 async def test_a_load_beyond_a_plant_that_is_full_is_refused_in_words() -> None:

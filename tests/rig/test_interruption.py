@@ -102,6 +102,11 @@ def test_ctrl_c_before_there_is_anything_to_record_leaves_nothing(
         assert ended.code == -signal.SIGINT or "KeyboardInterrupt" in ended.err, ended
 
 
+def test_a_command_ends_though_nobody_can_be_told(processes: Processes) -> None:
+    program = "import os; from rig.interruption import end_at_once; os.close(2); end_at_once(1)"
+    assert processes.python("-c", program).ended(PATIENCE_S).code == 129
+
+
 def fail_after(ticks: int, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the recorder of the next run raise an error in the middle, when it has taken so many ticks."""
     take = Recorder.stretch

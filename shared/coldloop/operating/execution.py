@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from typing import Any, Final
 
@@ -363,26 +363,29 @@ async def _set_pace(clients: Clients, change: Callable[[SessionPace], SessionPac
     pace = change(present)
     if not pace.realtime:
         raise UsageError("the session is in lock-step: it goes as far as it is granted")
-    await write_pace(clients.values(), pace)
+    await write_pace(clients, pace)
     back, tick = await plant.read(SessionPace), (await plant.read(Identity)).tick
     return f"{'paused' if back.paused else 'running'} at {tick * TICK_S:g} s, factor {back.factor:g}"
 
 
-async def write_pace(clients: Iterable[RegisterClient], pace: SessionPace) -> None:
+async def write_pace(clients: Mapping[str, RegisterClient], pace: SessionPace) -> None:
     """Write the time base of a session: the plant first, then those who follow it. An optimiser may be in none yet.
 
     Args:
-        clients: The plant's, then the others'.
+        clients: By service, the plant's first.
         pace: To be written.
 
     Raises:
-        LinkError: One refuses, or does not answer.
+        LinkError: One refuses, or does not answer; or the control PLC is not in the session of the plant.
     """
-    session = None
-    for client in clients:
-        found = (await client.read(Identity)).session
-        session = found if session is None else session
-        if found == session:
+    sessions = {service: (await client.read(Identity)).session for service, client in clients.items()}
+    if sessions["control_plc"] != sessions["plant"]:
+        raise LinkError(
+            f"{clients['control_plc'].peer} is in session {sessions['control_plc']}, the plant in {sessions['plant']}: "
+            "try again when it has found the plant"
+        )
+    for service, client in clients.items():
+        if sessions[service] == sessions["plant"]:
             await client.write(pace)
 
 

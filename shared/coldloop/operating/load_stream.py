@@ -39,6 +39,8 @@ class LoadStream:
             raise UsageError(f"a load with a step at tick {self._times[-1]}: the last tick of a session is {LAST_TICK}")
         self._watts = load.watts
         self._sent = sent
+        self._unanswered = 0
+        """Steps behind those of which it is not known whether the plant has them."""
 
     @property
     def steps(self) -> int:
@@ -84,6 +86,7 @@ class LoadStream:
         """Write the next steps; return how many."""
         some = slice(self._sent, self._sent + AHEAD_STEPS)
         record = LoadAhead.first_of(self._session, self._times[some], self._watts[some])
+        self._unanswered = record.length
         try:
             await self._plant.write(sealed(record))
         except LinkError as error:
@@ -91,15 +94,18 @@ class LoadStream:
                 raise
             kind = PeerUnreachableError if isinstance(error, PeerUnreachableError) else LinkError
             raise kind(
-                f"{error}; of {self.steps} steps the plant has taken the first {self._sent}, and holds "
+                f"{error}; of {self.steps} steps the plant has taken at least the first {self._sent}, and holds "
                 f"{self._watts[self._sent - 1]:g} W from {self._times[self._sent - 1] * TICK_S:g} s on"
             ) from None
-        self._sent += record.length
+        self._sent, self._unanswered = self._sent + record.length, 0
         return record.length
 
     async def was_replaced(self) -> bool:
         """Return whether another client has written the load since: the last step known is not the last one sent."""
         status = await self._plant.read(LoadStatus)
+        if self._unanswered and status.last_tick == self._times[self._sent + self._unanswered - 1]:
+            self._sent += self._unanswered  # the answer was lost, the request was not
+        self._unanswered = 0
         last = self._times[self._sent - 1] if self._sent else 0
         return status.last_tick != last
 
