@@ -163,7 +163,10 @@ async def test_a_load_file_whose_later_part_is_refused_says_what_the_plant_has_t
     outcome = await desk.outcome(load_file([(float(i), 400.0 + i) for i in range(60)]))
     taken = [record for record in desk.plant.written if isinstance(record, LoadAhead)]
     assert sum(part.length for part in taken) == 24
-    assert "of 60 steps the plant has taken at least the first 24, and holds 423 W from 275 s on" in outcome.uncertain_because
+    assert (
+        "of 60 steps the plant has taken at least the first 24, and holds 423 W from 275 s on"
+        in outcome.uncertain_because
+    )
 
 
 async def test_a_load_file_whose_first_part_is_refused_changes_nothing_and_says_so(desk: Desk) -> None:
