@@ -5,6 +5,7 @@ import contextlib
 import time
 from collections.abc import Iterable
 from functools import partial
+from itertools import chain
 from typing import Final, NamedTuple
 
 from coldloop.errors import LinkError, UsageError
@@ -25,9 +26,16 @@ from rig.results.recording import LinkStatistics, Recorder
 
 LONGEST_PAUSE_S: Final = 0.2
 SHORTEST_PAUSE_S: Final = 0.002
-ALARMS: Final = frozenset(kind for kind in EventKind if kind.name.startswith("ALARM_"))
-HELD: Final = (frozenset({EventKind.MODE}), ALARMS, frozenset({EventKind.SENSOR}), frozenset({EventKind.SENSOR_FAULT}))
-"""Kinds of events that say how something is from then on: the ladder, an alarm, a sensor."""
+PASSING: Final = frozenset({EventKind.ALARM_RAISED, EventKind.ALARM_RETURNED, EventKind.ALARM_ACKNOWLEDGED})
+"""Of these, what has happened to an alarm since it was raised last says how it is."""
+HELD: Final = (
+    frozenset({EventKind.MODE}),
+    frozenset({EventKind.ALARM_SHELVED, EventKind.ALARM_UNSHELVED}),
+    frozenset({EventKind.ALARM_OUT_OF_SERVICE, EventKind.ALARM_IN_SERVICE}),
+    frozenset({EventKind.SENSOR}),
+    frozenset({EventKind.SENSOR_FAULT}),
+)
+"""Kinds of events of which the last says how something is from then on: the ladder, an alarm, a sensor."""
 
 
 class SessionUnderWay(NamedTuple):
@@ -141,13 +149,18 @@ async def _next_update(rig: SessionClient) -> int:
 def state_of(events: Iterable[Event]) -> list[Event]:
     """Return, of what has been noted in a session so far, the events that say how everything is now."""
     last: dict[tuple[int, int], Event] = {}
+    alarms: dict[int, list[Event]] = {}
     for event in events:
         if event.kind == EventKind.SESSION:
             last.clear()
+            alarms.clear()
+        if event.kind in PASSING:
+            before = [] if event.kind == EventKind.ALARM_RAISED else alarms.get(event.subject, [])
+            alarms[event.subject] = [*before, event]
         for group, kinds in enumerate(HELD):
             if event.kind in kinds:
                 last[group, event.subject if group else 0] = event
-    return sorted(last.values())
+    return sorted([*last.values(), *chain.from_iterable(alarms.values())])
 
 
 class Lateness:

@@ -1,5 +1,6 @@
 """A run folder as the operator's page replays it."""
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from typing import Any, Final
@@ -101,9 +102,11 @@ class RecordedPage:
         design, limits = self._settings.optimizer_plc.program.design, self._settings.limits
         return OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
 
-    def frame(self, tick: int) -> Frame:
-        """Return one tick."""
+    def frame(self, tick: int) -> Frame | None:
+        """Return one tick; None if it is missing in the recording."""
         load, *values = self._values[tick].tolist()
+        if math.isnan(load):
+            return None
         u, y = tuple(values[: len(INPUT_NAMES)]), tuple(values[len(INPUT_NAMES) :])
         mode = _MODES.get(self._modes[tick], int(Mode.MPC))
         cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
@@ -118,6 +121,8 @@ class RecordedPage:
         if self._station is None or tick >= len(self._station):
             return None
         *signals, mode, alarms = self._station[tick].tolist()
+        if math.isnan(mode):
+            return None
         return StationSample(tick, tuple(signals), int(mode), int(alarms))
 
 

@@ -121,7 +121,10 @@ class Commanding:
             self._refuse(request, str(error))
             return refusal(409, str(error))
         word = "refused" if outcome.refused_because else "uncertain" if outcome.uncertain_because else "done"
-        self._note(request, "command", word, f"{outcome.asked}: {' '.join(filter(None, outcome[1:]))}")
+        detail = f"{outcome.asked}: {' '.join(filter(None, outcome[1:]))}"
+        self._audit.note(  # by name: the login may have ended meanwhile
+            "command", who=operator.user.name, address=request.remote or "", outcome=word, detail=detail
+        )
         return json_answer(encoded(outcome._asdict()))
 
     def _operator(self, request: web.Request) -> LoginSession | web.Response:

@@ -34,6 +34,7 @@ MARKED: Final = {
     word(EventKind.SENSOR_FAULT): "fault",
 }
 """Kinds of events that are marked on the trends, and what as."""
+BEGUN: Final = word(EventKind.SESSION)
 MOST_MARKS: Final = 200
 EARLIER_PREDICTIONS: Final = 12
 
@@ -276,7 +277,12 @@ def _some(predictions: list[Prediction]) -> list[Prediction]:
 
 
 def _marks(model: Model, start: int, end: int) -> list[Document]:
-    found = [told for told in model.events if told.text.kind in MARKED and start <= told.tick <= end]
+    begun = max((told.utc for told in model.events if told.service == "plant" and told.text.kind == BEGUN), default="")
+    found = [
+        told
+        for told in model.events
+        if told.text.kind in MARKED and start <= told.tick <= end and told.utc >= begun  # not of a session before
+    ]
     return [
         {"time": told.tick * TICK_S, "kind": MARKED[told.text.kind], "text": told.text.sentence}
         for told in found[-MOST_MARKS:]

@@ -99,7 +99,7 @@ class Guard:
         self.logins = RateLimit(time.monotonic, LOGINS_A_MINUTE / 60, LOGIN_BURST)
         self._requests = RateLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
         self._files = RateLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
-        self._hosts = LOCAL_NAMES | {settings.host, *settings.allowed_hosts}
+        self._hosts = LOCAL_NAMES | {settings.host, *map(str.lower, settings.allowed_hosts)}
 
     def session(self, request: web.Request) -> LoginSession | None:
         """Return the session of a request."""

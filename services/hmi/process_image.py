@@ -114,10 +114,13 @@ class Model:
             self.trends.add(record, self.mode, self.bad_sensors, values, is_after_gap=is_after_gap)
         elif isinstance(record, Prediction):
             self._predicted(record)
+        elif isinstance(record, SessionPace):  # ticks go on from now by another clock
+            for each in self.sources.values():
+                each.moved = self.now()
 
     def _identity(self, service: str, identity: Identity) -> None:
         source = self.sources[service]
-        if service == "control_plc":
+        if service == "control_plc" and identity.session:  # one that was started again looks for its session first
             if identity.session != self._session or identity.tick + STEP_BACK < self.trends.last_tick:
                 self._session = identity.session
                 self._begin()
@@ -172,7 +175,8 @@ class Model:
 
     def silent(self, service: str, reason: str) -> None:
         """Note that a service does not answer."""
-        self.sources[service].reason = reason
+        source = self.sources[service]
+        source.reason, source.was_silent = reason, True
         self.on_change()
 
     # -- what pages read -----------------------------------------------------------------------------------------------

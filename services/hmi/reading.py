@@ -138,7 +138,7 @@ class Reading:
     async def trend(self, request: web.Request) -> web.Response:
         """Answer with what is drawn in a window; browsers that ask for the same share one answer."""
         names, start, end, points = self._window(request.query)
-        key = (*names, start, end, points, len(self._model.updates), self._model.events_told)
+        key = (*names, start, end, points, len(self._model.updates), self._model.events_told, self._model.is_planned)
         if key not in self._trends:
             async with self._turn(request):
                 document = encoded(trend_document(self._model, names, start, end, points))

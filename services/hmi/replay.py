@@ -78,8 +78,8 @@ class RecordedRun(Protocol):
     def configuration(self) -> Mapping[str, Any]:
         """What it was run with, by dotted key."""
 
-    def frame(self, tick: int) -> Frame:
-        """Return one tick."""
+    def frame(self, tick: int) -> Frame | None:
+        """Return one tick; None if it is missing in the recording."""
 
     def alarms(self, events: Sequence[Told]) -> list[Alarm]:
         """Return the alarms after these events, by number."""
@@ -111,8 +111,10 @@ class Replay:
         self._playing = False
         self._speed = 20.0
         self._tick = -1
+        self._in_gap = False
+        """What was read last is missing in the recording."""
         self._begin()
-        self._go_to(0)
+        self.go_to(0)
 
     def routes(self) -> tuple[web.AbstractRouteDef, ...]:
         """Return what is served."""
@@ -132,11 +134,11 @@ class Replay:
         if wish.speed is not None:
             self._speed = wish.speed
         if wish.tick is not None:
-            self._go_to(min(wish.tick, self._run.ticks - 1))
+            self.go_to(min(wish.tick, self._run.ticks - 1))
         if wish.playing is not None:
             self._playing = wish.playing
             if self._playing and self._tick >= self._run.ticks - 1:
-                self._go_to(0)
+                self.go_to(0)
         self._show()
         return web.json_response(self._model.replay)
 
@@ -164,12 +166,13 @@ class Replay:
         model.put("optimizer_plc", self._run.rule)
         model.put("optimizer_plc", self._run.limits)
 
-    def _go_to(self, tick: int) -> None:
+    def go_to(self, tick: int) -> None:
         """Show the run up to a tick as if it had just been played until there."""
         model = self._model
         model.trends.clear()
         model.updates.clear()
         model.events.clear()
+        self._in_gap = False
         self._tick = max(0, tick - self._kept_ticks) - 1
         started = self._tick
         updates, events = self._run.updates, self._run.events
@@ -182,14 +185,18 @@ class Replay:
             return
         run, model, before = self._run, self._model, self._tick
         every = max(1, math.ceil((tick - before) / points))
-        for each in range(before + 1, tick, every):
+        newest = None
+        for each in (*range(before + 1, tick, every), tick):
             frame = run.frame(each)
-            model.trends.add(frame.process, frame.mode, frame.bad_sensors, frame.pressures)
+            if frame is not None:
+                model.trends.add(
+                    frame.process, frame.mode, frame.bad_sensors, frame.pressures, is_after_gap=self._in_gap
+                )
+                newest = frame
+            self._in_gap = frame is None
         self._tick = tick
-        newest = run.frame(tick)
-        # after a step back the newest record may be the one known
-        model.trends.add(newest.process, newest.mode, newest.bad_sensors, newest.pressures)
-        self._put(newest)
+        if newest is not None:  # after a step back it may be the one known
+            self._put(newest)
         updates, events = run.updates, run.events
         first, last = (bisect_right(updates, one, key=lambda update: update.tick) for one in (before, tick))
         model.put_updates(updates[first:last])

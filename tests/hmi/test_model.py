@@ -113,6 +113,48 @@ def test_another_session_begins_with_empty_trends(model: Model) -> None:
     assert len(model.trends) == 0
 
 
+def test_a_control_plc_that_was_started_again_and_looks_for_its_session_empties_nothing(model: Model) -> None:
+    for tick in range(10, 60):
+        model.put("control_plc", process(tick))
+    model.put("control_plc", Identity(session=0, tick=0))
+    model.put("control_plc", Identity(session=1, tick=60))
+    assert len(model.trends) == 51
+
+
+def test_marks_are_of_the_session_that_is_shown(model: Model) -> None:
+    def told(utc: str, service: str, kind: EventKind) -> Told:
+        return Told.of(service, Event(tick=400, kind=kind))._replace(utc=utc)
+
+    raised = EventKind.ALARM_RAISED
+    model.put_events([told("10:00", "control_plc", raised), told("10:05", "plant", EventKind.SESSION)])
+    assert trend_document(model, ["L1"], 0, 900, 20)["marks"] == []
+    model.put_events([told("10:06", "control_plc", raised)])
+    assert len(trend_document(model, ["L1"], 0, 900, 20)["marks"]) == 1
+
+
+def test_time_that_goes_on_after_a_pause_is_neither_old_nor_a_gap(model: Model, clock: Clock) -> None:
+    pace = SessionPace(session=1, realtime=1, factor=10.0, paused=0)
+    model.put("plant", pace)
+    model.put("control_plc", process(5))
+    model.put("plant", pace._replace(paused=1))
+    for _ in range(40):
+        clock.time += 1.0
+        for service in MAPS:
+            model.heard(service)
+    model.put("plant", pace)
+    assert "control_plc.process." not in model.stale_prefixes()
+    model.put("control_plc", process(12))
+    assert model.trends.gaps(0, 100) == []
+
+
+def test_a_service_that_did_not_answer_once_leaves_a_gap_however_short(model: Model) -> None:
+    model.put("control_plc", process(5))
+    model.silent("control_plc", "no answer")
+    model.heard("control_plc")
+    model.put("control_plc", process(305))
+    assert model.trends.gaps(0, 400) == [(5, 305)]
+
+
 def test_a_service_that_counts_its_events_anew_loses_none(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     class Service:
         """Answers with its journal; its requests are numbered by the start that it is in."""

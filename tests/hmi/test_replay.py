@@ -2,15 +2,20 @@
 
 import json
 import re
+import shutil
 import subprocess
+import time
 import urllib.request
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from coldloop.process.signals import OUTPUT_NAMES
 from hmi.explanation import Branch
+from hmi.process_image import Model
+from hmi.replay import Replay
 from rig.live.recorded_page import RecordedPage, _bits
 from rig.results.run_folder import RunFolder
 from tests.conftest import Coldloop, first_of_three_ports
@@ -37,6 +42,21 @@ def test_the_replay_goes_on_at_its_speed_and_ends_at_the_end(served: Served) -> 
     served.ask("/api/replay", {"tick": 0, "speed": 200.0, "playing": True})
     eventually(lambda: not served.ask("/api/replay")["playing"], "it ends")
     assert served.ask("/api/replay")["tick"] == 4 * RECORDED_S - 1
+
+
+def test_ticks_that_are_missing_in_a_recording_are_a_gap_and_end_nothing(recorded_run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(recorded_run, folder)
+    table = pq.read_table(folder / "trace.parquet")
+    rows = table.to_pandas()
+    rows.loc[100:160, [name for name in rows.select_dtypes("float") if name != "time_s"]] = float("nan")
+    pq.write_table(pa.Table.from_pandas(rows, preserve_index=False).cast(table.schema), folder / "trace.parquet")
+    model, run = Model(time.monotonic, 3600.0), RecordedPage(RunFolder(folder))
+    assert run.frame(120) is None
+    replay = Replay(run, model, 3600.0)
+    for tick, gaps in ((120, []), (161, [(99, 161)]), (239, [(99, 161)])):
+        replay.go_to(tick)
+        assert model.trends.gaps(0, 1000) == gaps
 
 
 def test_updates_of_a_run_are_explained(served: Served, recorded_run: Path) -> None:

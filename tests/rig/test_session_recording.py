@@ -2,8 +2,11 @@
 
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Status
+from coldloop.registers.safety import AlarmState
+from hmi.process_image import Told
 from rig.cosim.session_recording import Lateness, state_of
 from rig.results.recorded import LinkStatistics
+from rig.results.recorded_alarms import alarms_after
 
 
 def noted(number: int, kind: EventKind, subject: int = 0, cause: int = 0) -> Event:
@@ -16,7 +19,19 @@ def test_the_last_mode_and_the_last_of_each_alarm_and_sensor_count() -> None:
         noted(4, EventKind.SENSOR_FAULT, 2, 1), noted(5, EventKind.SENSOR, 2, 1), noted(6, EventKind.ALARM_RETURNED, 5),
         noted(7, EventKind.MODE, 2), noted(8, EventKind.OPERATOR_MODE, 1), noted(9, EventKind.SENSOR_FAULT, 3, 2),
     ]  # fmt: skip
-    assert [event.number for event in state_of(events)] == [3, 4, 5, 6, 7, 9]
+    assert [event.number for event in state_of(events)] == [2, 3, 4, 5, 6, 7, 9]
+
+
+def test_an_alarm_is_as_it_was_when_the_recording_begins() -> None:
+    raised, returned, acknowledged = EventKind.ALARM_RAISED, EventKind.ALARM_RETURNED, EventKind.ALARM_ACKNOWLEDGED
+    events = [
+        noted(1, EventKind.ALARM_SHELVED, 5), noted(2, raised, 5), noted(3, returned, 5), noted(4, raised, 5),
+        noted(5, acknowledged, 5), noted(6, raised, 7), noted(7, returned, 7), noted(8, EventKind.ALARM_UNSHELVED, 5),
+    ]  # fmt: skip
+    told = [Told.of("control_plc", event) for event in state_of(events)]
+    rows = alarms_after(told)
+    assert (rows[5].state, rows[5].active, rows[5].raised) == (AlarmState.ACKNOWLEDGED, 1, 40)
+    assert (rows[7].state, rows[7].active) == (AlarmState.RETURNED, 0)
 
 
 def test_what_was_noted_in_a_session_before_does_not_count() -> None:

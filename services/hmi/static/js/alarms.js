@@ -20,7 +20,7 @@ function line() {
   const waiting = told.filter((one) => WAITING.includes(one.state)).length;
   const hidden = state.alarms.filter((one) => ["shelved", "out of service"].includes(one.state)).length;
   const parts = told.slice(0, 4).map((one) => element("a", { class: `alarm ${WAITING.includes(one.state) ? "unacknowledged" : ""}`, href: "#alarms" }, badge(one), element("span", { text: `${one.name}${one.cause ? ` (${one.cause})` : ""}, ${STATES[one.state]}` })));
-  for (const name of state.plant.alarms || []) parts.push(element("a", { class: "alarm", href: "#alarms" }, badge({ state: "acknowledged", priority: 3 }), element("span", { text: `station: ${name}` })));
+  for (const name of state.plant.alarms || []) parts.push(element("a", { class: "alarm of-station", href: "#alarms" }, badge({ state: "acknowledged", priority: 3 }), element("span", { text: `station: ${name}` })));
   if (!parts.length) parts.push(element("span", { class: "minor", text: "No alarms" }));
   const station = (state.plant.alarms || []).length;
   const counts = `${told.length} alarm${told.length === 1 ? "" : "s"}, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}${station ? `, ${station} of the station` : ""}`;
@@ -109,6 +109,7 @@ export function initAlarms() {
     if (alarms || names === null || station !== shownStation) { shownStation = station; line(); table(); stationNote(); }
     shelvingNote();
     byId("alarm-line").classList.toggle("stale", isStale("control_plc."));
+    for (const one of document.querySelectorAll(".of-station")) one.classList.toggle("stale", isStale("plant.station."));
     byId("alarm-table").classList.toggle("stale", isStale("control_plc."));
   });
   setInterval(history, 1500);

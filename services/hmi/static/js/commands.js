@@ -35,7 +35,8 @@ let current = null, closed = -Infinity;
 const waiting = [];
 export function command(body, atOnce = false) {
   const text = JSON.stringify(body);
-  if (performance.now() < closed + TOO_SOON_MS || text === current || waiting.some((one) => one.text === text) || waiting.length >= MOST_WAITING) return Promise.resolve();
+  if (performance.now() < closed + TOO_SOON_MS || text === current || waiting.some((one) => one.text === text)) return Promise.resolve();
+  if (waiting.length >= MOST_WAITING) { say("refused", kindOf(body), `${MOST_WAITING} commands wait already; this one is not sent`); return Promise.resolve(); }
   return new Promise((resolve) => {
     waiting.push({ body, atOnce, text, resolve });
     if (current === null) takeTurns(); else say("waiting", kindOf(body), "waits until the command before it is over");
@@ -57,7 +58,7 @@ const kindOf = (body) => body.kind.replaceAll("_", " ");
 async function oneCommand(body, atOnce) {
   let prepared;
   try { prepared = await send("api/commands", body); } catch (error) { await failed(body.kind, error, "refused"); return; }
-  if (!atOnce && !(await confirmed(prepared.text))) return;
+  if (!atOnce && !(await confirmed(prepared.text))) { say("cancelled", prepared.text, "not confirmed; nothing was done"); return; }
   try {
     const { asked, applied, refused_because: refused, uncertain_because: uncertain } = await send(`api/commands/${prepared.token}`, {});
     note(asked, uncertain ? "uncertain" : refused ? "refused" : "applied", uncertain || refused || applied);
@@ -98,7 +99,7 @@ function follow(field, name, others = []) {
     const text = String(Number(value.toFixed(signal(name).decimals)));
     for (const one of [field, ...others]) if (one.value !== text && one !== document.activeElement) one.value = text;
   });
-  return () => { touched = false; };
+  return (sent) => { if (Number(field.value) === sent) touched = false; };
 }
 
 async function playFile() {
@@ -157,9 +158,9 @@ export function initCommands(userChanged) {
   slider.addEventListener("input", () => { number.value = slider.value; });
   number.addEventListener("input", () => { slider.value = number.value; });
   const followLoad = follow(number, "plant.load status.watts", [slider]), followFactor = follow(byId("factor"), "plant.pace.factor");
-  byId("load-set").addEventListener("click", () => numberIn(number, (watts) => command({ kind: "load", watts }).then(followLoad)));
+  byId("load-set").addEventListener("click", () => numberIn(number, (watts) => command({ kind: "load", watts }).then(() => followLoad(watts))));
   byId("load-play").addEventListener("click", playFile);
-  byId("factor-set").addEventListener("click", () => numberIn(byId("factor"), (factor) => command({ kind: "factor", factor }).then(followFactor)));
+  byId("factor-set").addEventListener("click", () => numberIn(byId("factor"), (factor) => command({ kind: "factor", factor }).then(() => followFactor(factor))));
   byId("training").hidden = !state.catalog.training;
   for (const output of state.catalog.outputs) byId("fault-output").append(element("option", { text: output }));
   byId("fault-set").addEventListener("click", () => numberIn(byId("fault-value"), (value) => command({ kind: "sensor_fault", output: byId("fault-output").value, fault: Number(byId("fault-kind").value), value })));

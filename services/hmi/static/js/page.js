@@ -42,7 +42,7 @@ function links() {
       if (!live) dead.push(`${one.dataset.service} is silent (${about.reason || "no answer"})`);
     }
     const banner = byId("banner");
-    const text = silent ? "The page's own server does not answer: nothing here is current. Trying again." : dead.join("; ");
+    const text = !silent ? dead.join("; ") : `${state.refused || "The page's own server does not answer"}: nothing here is current. Trying again.`;
     banner.hidden = !text;
     if (banner.textContent !== text) banner.textContent = text;
   });
@@ -61,7 +61,7 @@ function overview() {
     const note = byId("tau-u-note"), inUse = !state.stale.includes("update");
     note.hidden = inUse;
     if (!inUse) note.textContent = "Of the last update: MPC does not drive now.";
-    const rows = [["expected next", upcoming ? `${values["plant.load status.next_watts"]?.toFixed(1)} W in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
+    const rows = [["expected next", state.replay ? "–" : upcoming ? `${values["plant.load status.next_watts"]?.toFixed(1)} W in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
       ["estimated mismatch", state.update ? `${state.update.update.load_mismatch.toFixed(1)} W` : "–", "optimizer_plc.", "update"]];
     const text = JSON.stringify(rows);
     if (facts.dataset.text !== text) { facts.dataset.text = text; facts.replaceChildren(...rows.flatMap(([name, value, ...sources]) => [element("dt", { text: name }), element("dd", { class: "value", text: value, "data-sources": sources.join(" ") })])); }

@@ -1,6 +1,6 @@
 // What the server has sent, the clock that tells how old it is, and who wants to know of changes.
 
-export const state = { catalog: null, me: null, values: {}, services: {}, stale: [], alarms: [], update: null, plant: { kind: "" }, tick: 0, heard: 0 };
+export const state = { catalog: null, me: null, values: {}, services: {}, stale: [], alarms: [], update: null, plant: { kind: "" }, tick: 0, heard: 0, refused: "" };
 const listeners = [];
 const SILENT_MS = 1500, GIVEN_UP_MS = 5000, SEND_MS = 20000;
 
@@ -43,6 +43,12 @@ export function isStale(name) {
 
 export function signal(name) { return state.catalog.signals[name] || null; }
 
+// Why there is no stream: an answer that says so is the server's, such as that nobody is logged in any more.
+async function why() {
+  state.refused = "";
+  try { await ask("api/state"); } catch (error) { if (error.status) state.refused = `The page's own server refuses: ${error.message}`; }
+}
+
 // A connection on which nothing comes any more, as after a server's loss of power, tells no error: it is given up.
 export function connect() {
   let source = null, begun = 0;
@@ -51,7 +57,7 @@ export function connect() {
     source = new EventSource("api/stream");
     const own = source, again = () => { own.close(); if (own === source) { source = null; setTimeout(open, 500); } };
     own.onmessage = (event) => take(JSON.parse(event.data));
-    own.onerror = again;
+    own.onerror = () => { again(); why(); };
     own.giveUp = again;
   };
   open();
@@ -91,7 +97,7 @@ function paceText(factor) {
 export async function ask(path) {
   const answer = await fetch(path);
   const document_ = await answer.json();
-  if (!answer.ok) throw new Error(document_.error || answer.statusText);
+  if (!answer.ok) throw Object.assign(new Error(document_.error || answer.statusText), { status: answer.status });
   return document_;
 }
 

@@ -74,14 +74,15 @@ async function refresh() {
   if (document.getElementById("trends").hidden) return;
   const end = zoom ? Math.min(zoom[1], state.tick * state.catalog.tick_s) : null;
   const span = zoom ? Math.max(1, end - zoom[0]) : seconds;
-  if (held && newest && !zoom) return;
-  const query = `names=${names()}&seconds=${span}&points=900${zoom ? `&end=${end}` : ""}`;
-  try { newest = await ask(`api/trend?${query}`); } catch { return; }
+  const query = `names=${names()}&seconds=${span}&points=900`;
+  if (!(held && newest && !zoom)) {
+    try { newest = await ask(`api/trend?${query}${zoom ? `&end=${end}` : ""}`); } catch { return; }
+  } else if (charts) return;
   if (!charts) build();
   charts.forEach(show);
   document.getElementById("charts").dataset.now = newest.now_s;
   document.getElementById("trend-legend").replaceChildren(...legendOf(newest, { predictions: true }), element("span", { text: "Drag to zoom." }));
-  document.getElementById("export-csv").href = `api/trend.csv?${query}`;
+  document.getElementById("export-csv").href = `api/trend.csv?${query}&end=${zoom ? end : newest.now_s}`;
 }
 
 export function initTrends(pick) {

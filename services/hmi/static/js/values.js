@@ -121,6 +121,7 @@ function bindBar(bar) {
 function drawStation() {
   for (const one of document.querySelectorAll("[data-station]")) { const text = `${one.dataset.station}${state.plant.mode || ""}`; if (one.textContent !== text) one.textContent = text; }
   for (const one of document.querySelectorAll("[data-alarm-of]")) one.classList.toggle("tripped", (state.plant.alarms || []).includes(one.dataset.alarmOf));
+  for (const one of document.querySelectorAll("[data-station], [data-alarm-of]")) one.classList.toggle("stale", isStale("plant.station."));
 }
 
 onChange(({ names }) => {
