@@ -1,18 +1,28 @@
 """The command `coldloop`, and `python -m rig`: interrupts end it in good order also while its modules are imported."""
 
 import gc
+import os
 import sys
+from pathlib import Path
 
 from rig.interruption import INTERRUPTION
 
 
 def main() -> int:
     """Run the command line; return its exit code."""
+    _open_closed_streams()
     with INTERRUPTION:
         from rig.cli import main as run  # noqa: PLC0415 this takes time
     code = run()
     gc.freeze()  # the interpreter would look for cycles in all modules before it ends, which takes 0.15 s
     return code
+
+
+def _open_closed_streams() -> None:
+    """Open what the caller has closed (`>&-`): the next file would take its number. What is written there is lost."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115 as long as the process
 
 
 if __name__ == "__main__":

@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         except OSError as error:  # commands report errors of their own files: what is left is standard output
             _discard_output()
-            sys.stderr.write(f"coldloop: {error.filename or 'standard output'}: {error.strerror}\n")
+            sys.stderr.write(f"coldloop: {error.filename or 'standard output'}: {error.strerror or error}\n")
             return 1
         return code
 

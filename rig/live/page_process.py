@@ -30,8 +30,10 @@ def check_page(section: HmiSection) -> None:
     """Refuse a page that cannot be served, before anything that takes time.
 
     Raises:
-        UsageError: Its extra is not installed, or its port is in use.
+        UsageError: It has no port, its extra is not installed, or its port is in use.
     """
+    if not section.port:
+        raise UsageError("the page of a rig that is up has a port of its own: give one with --page-port")
     if find_spec("aiohttp") is None:
         raise UsageError("--page needs aiohttp: pip install 'coldloop[hmi]'")
     with socket.socket(socket.AF_INET6 if ":" in section.host else socket.AF_INET) as one:

@@ -98,9 +98,12 @@ def write_own(file: Path, text: str) -> None:
         OSError: It cannot be written.
     """
     draft = file.with_name(f".{file.name}.draft")
-    with new_own(draft) as content:
-        content.write(text.encode())
-    draft.replace(file)
+    try:
+        with new_own(draft) as content:
+            content.write(text.encode())
+        draft.replace(file)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(file)) from None
 
 
 def _not_following(path: str, flags: int) -> int:

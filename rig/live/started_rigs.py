@@ -328,7 +328,8 @@ def take_down(first_port: int | None, patience_s: float) -> int:
     if rig is None:
         raise no_rig(first_port)
     with suppress(ProcessLookupError):
-        os.kill(rig.pid, signal.SIGTERM)
+        for number in (signal.SIGTERM, signal.SIGCONT):  # one that is stopped could not end
+            os.kill(rig.pid, number)
     deadline = time.monotonic() + patience_s
     while rig.alive:
         if time.monotonic() > deadline:

@@ -121,7 +121,10 @@ class UpRig:
 
     async def _keep_service(self, services: LocalServices, service: str, rig: SessionClient) -> None:
         async def restarted() -> None:
-            self._write_state(services)
+            try:
+                self._write_state(services)
+            except OSError as error:  # commands do not know its process; the rig goes on
+                say(f"{error.filename}: {error.strerror}")
             while service in RETAINING:  # the optimiser learns it from the control PLC
                 with suppress(LinkError):  # another one has ended, too
                     await rig.clients[service].connect(START_PATIENCE_S)

@@ -22,6 +22,8 @@ def claim_folder(folder: Path, *, force: bool) -> None:
     Raises:
         UsageError: It has files in it, or it cannot be written to.
     """
+    if not str(folder).isprintable():
+        raise UsageError(f"{str(folder)!a}: a name that cannot be printed; choose another --out")
     try:
         taken = not force and folder.is_dir() and any(folder.iterdir())
     except OSError as error:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coldloop.config import Configuration
-from coldloop.errors import ColdloopError, ResultsError
+from coldloop.errors import ColdloopError, ResultsError, UsageError
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICK_S
 from plant.settings import PlantKind
@@ -44,7 +44,7 @@ class RunFiles:
         sinks: Further sinks of the recorder.
 
     Raises:
-        UsageError: The disk is nearly full.
+        UsageError: The disk is nearly full, or what is to be run lies in the folder.
         OSError: A file cannot be made.
     """
 
@@ -53,6 +53,9 @@ class RunFiles:
         arguments: Mapping[str, Any], sinks: Sequence[Sink],
     ) -> None:  # fmt: skip
         settings = effective.settings
+        for file in (settings.model.file, Path(settings.plant.load)):
+            if file.is_file() and file.resolve().is_relative_to((folder / INPUTS).resolve()):
+                raise UsageError(f"{file}: the run replaces what is in {folder}; name another --out")
         model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
         self.folder = folder
         self._evaluation = RunEvaluation(model, design)

@@ -72,7 +72,8 @@ class Audit:
         if file is not None:
             try:
                 self._append(file, "")
-                file.chmod(0o600)
+                if file.is_file():  # and no device, which is everybody's
+                    file.chmod(0o600)
             except OSError as error:
                 raise ConfigurationError(
                     f"hmi.audit: {file}: {error.strerror}; name a file in a folder that can be written"

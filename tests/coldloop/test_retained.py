@@ -198,3 +198,19 @@ def test_a_foreign_file_is_refused_and_a_folder_that_is_not_there_is_told(tmp_pa
         kept(path).load()
     with pytest.raises(RetainedStateError, match="No such file"):
         kept(tmp_path / "missing" / "state").save(OLD)
+
+
+def test_a_device_is_neither_read_nor_replaced(tmp_path: Path) -> None:
+    """An administrator, as in a container, could replace /dev/null for everybody."""
+    place = tmp_path / "null"
+    try:
+        os.mknod(place, stat.S_IFCHR | 0o666, os.makedev(1, 3))
+    except PermissionError:
+        pytest.skip("only an administrator makes devices")
+    file = kept(place)
+    with pytest.raises(RetainedStateError):
+        file.load()
+    assert file.set_aside() == "left where it is: a device"
+    with pytest.raises(RetainedStateError, match=r"a device; name another file in retain\.file"):
+        file.save(NEW)
+    assert stat.S_ISCHR(place.lstat().st_mode)

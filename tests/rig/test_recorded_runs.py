@@ -169,6 +169,18 @@ def test_a_run_is_repeated_from_its_folder_alone(
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_a_repetition_does_not_replace_what_it_repeats(coldloop: "Coldloop", mpc: Path) -> None:
+    before = {file: file.read_bytes() for file in mpc.rglob("*") if file.is_file()}
+    for words in (
+        ("rerun", mpc, "--out", mpc, "--force"),
+        ("run", "--in-process", "--load", mpc / "inputs" / "load.csv", "--duration", "10s", "--out", mpc, "--force"),
+    ):
+        outcome = coldloop(*words)
+        assert (outcome.code, len(outcome.complaints)) == (2, 1)
+        assert "the run replaces what is in" in outcome.complaints[0]
+    assert {file: file.read_bytes() for file in mpc.rglob("*") if file.is_file()} == before
+
+
 def test_a_repetition_can_be_kept(coldloop: "Coldloop", mpc: Path, results: Path) -> None:
     assert coldloop("rerun", mpc, "--out", results).code == 0
     assert RunFolder(results).summary["trace_sha256"] == RunFolder(mpc).summary["trace_sha256"]

@@ -103,6 +103,8 @@ class RetainedFile:
         Raises:
             RetainedStateError: The file cannot be written.
         """
+        if _is_device(self.path):
+            raise RetainedStateError(f"{self.path}: a device; name another file in retain.file")
         try:
             _replace(self.path, encoded(state, self._owner, self._digest), synced=synced)
         except OSError as error:
@@ -125,12 +127,23 @@ class RetainedFile:
 
     def set_aside(self) -> str:
         """Give a file that cannot be used another name, so that it is not overwritten; return words for it."""
+        if _is_device(self.path):
+            return "left where it is: a device"
         aside = self.path.with_name(f"{self.path.name}.refused")
         try:
             self.path.replace(aside)
         except OSError as error:
             return f"left where it is: {error.strerror}"
         return f"set aside as {aside.name}"
+
+
+def _is_device(path: Path) -> bool:
+    """Tell whether a path is a device, such as /dev/null, which an administrator could replace for everybody."""
+    try:
+        mode = path.lstat().st_mode
+    except OSError:
+        return False
+    return stat.S_ISCHR(mode) or stat.S_ISBLK(mode)
 
 
 def _read(path: Path) -> bytes:
