@@ -30,13 +30,14 @@ def kill(process: ServiceProcess) -> None:
     _signal(process, signal.SIGKILL)
 
 
-async def freeze(process: ServiceProcess, seconds: float) -> None:
-    """Let a process stand still for a while; it runs again when this ends, however it ends."""
+async def freeze(process: ServiceProcess, seconds: float) -> bool:
+    """Let a process stand still for a while; it runs again when this ends, however it ends. Tell whether it does."""
     _signal(process, signal.SIGSTOP)
     try:
         await asyncio.sleep(seconds)
     finally:
         _signal(process, signal.SIGCONT)
+    return _runs(process)
 
 
 def _runs(process: ServiceProcess) -> bool:

@@ -42,13 +42,13 @@ class RecordedPage:
     def __init__(self, folder: RunFolder) -> None:
         self._folder = folder
         self.name = folder.path.resolve().name
-        with folder.file("trace.parquet") as file:
+        with folder.reading("trace.parquet") as file:
             table = file.read(columns=[*PROCESS, "mode", "cause", "bad_sensors"])
-        self._values = np.column_stack([table[name].to_numpy() for name in PROCESS]).astype(np.float32)
-        self._modes = table["mode"].to_pylist()
-        self._causes = table["cause"].to_pylist()
+            self._values = np.column_stack([table[name].to_numpy() for name in PROCESS]).astype(np.float32)
+            self._modes = table["mode"].to_pylist()
+            self._causes = table["cause"].to_pylist()
+            self._bad_sensors = [_bits(names or "") for names in table["bad_sensors"].to_pylist()]
         self._since = _beginnings(self._modes)
-        self._bad_sensors = [_bits(names) for names in table["bad_sensors"].to_pylist()]
         self._settings = self._read_settings()
         self._station = self._read_station()
 
@@ -61,7 +61,7 @@ class RecordedPage:
         """Return signals, mode and alarms of the station, a row a tick; None of a cold box alone."""
         if not (self._folder.path / STATION_FILE).exists():
             return None
-        with self._folder.file(STATION_FILE) as file:
+        with self._folder.reading(STATION_FILE) as file:
             table = file.read(columns=[*STATION_SIGNAL_NAMES, "mode", "alarms"])
         return np.column_stack([column.to_numpy() for column in table.columns]).astype(np.float32)
 
@@ -79,9 +79,8 @@ class RecordedPage:
     @cached_property
     def updates(self) -> list[Optimization]:
         """Updates whose sequence was played."""
-        with self._folder.file("updates.parquet") as file:
-            rows = file.read().to_pylist()
-        return [_optimization(row) for row in rows]
+        with self._folder.reading("updates.parquet") as file:
+            return [_optimization(row) for row in file.read().to_pylist()]
 
     @cached_property
     def events(self) -> list[Told]:

@@ -75,14 +75,15 @@ def _tau_u(status: RigStatus) -> str:
 def page(status: RigStatus) -> str:
     """Return the state as a page."""
     ladder, load, y = status.ladder, status.load, status.process.y
+    known = any(y)  # a control PLC that was started again shows nothing before its first scan
     following = f", {load.next_watts:g} W from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
     rows = [
         ("session", f"{status.plant.session}, {_pace(status)}, {status.plant.tick * TICK_S:.2f} s"),
         ("mode", f"{word_of(Mode, ladder.mode)} ({word_of(Cause, ladder.cause)}) since {ladder.since * TICK_S:g} s"),
         ("operator", word_of(OperatorMode, status.operator.mode)),
         ("load", f"{load.watts:g} W{following}"),
-        ("L1", f"{y[L1]:.3f} %"),
-        ("T5", f"{y[T5]:.3f} K"),
+        ("L1", f"{y[L1]:.3f} %" if known else "-"),
+        ("T5", f"{y[T5]:.3f} K" if known else "-"),
         ("tau_u", _tau_u(status)),
         ("alarms", "; ".join(status.alarms) or "none"),
     ]  # fmt: skip

@@ -38,6 +38,8 @@ def export(run: Path, kind: str, out: Path, *, force: bool) -> list[Path]:
             whole_file(path, write)
         except OSError as error:
             raise ResultsError(f"{path}: {error.strerror or error}; choose another --out") from None
+        except (pa.ArrowException, KeyError) as error:
+            raise UsageError(f"{folder.path}: a damaged file: {str(error).splitlines()[0]}") from None
     return list(paths)
 
 

@@ -11,9 +11,14 @@ from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from coldloop.errors import UsageError
+
+try:
+    import fcntl
+except ImportError:  # Windows: two runs may share a folder
+    fcntl = None  # type: ignore[assignment]
 
 
 def claim_folder(folder: Path, *, force: bool) -> None:
@@ -31,6 +36,36 @@ def claim_folder(folder: Path, *, force: bool) -> None:
     if taken:
         raise UsageError(f"{folder}: the folder is not empty; name another one with --out, or overwrite with --force")
     prepare_folder(folder)
+    _lock(folder)
+
+
+_LOCKED: Final[dict[tuple[int, int], int]] = {}
+"""Descriptors of the folders that this process has claimed, by device and inode; they are held to its end."""
+
+
+def _lock(folder: Path) -> None:
+    """Keep other processes from claiming a folder while this one lives.
+
+    Raises:
+        UsageError: Another one has claimed it.
+    """
+    if fcntl is None:
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    status = os.fstat(descriptor)
+    key = status.st_dev, status.st_ino
+    if key in _LOCKED:
+        os.close(descriptor)
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise UsageError(f"{folder}: another run is being written there; name another folder with --out") from None
+    except OSError:  # a file system without locks
+        os.close(descriptor)
+        return
+    _LOCKED[key] = descriptor
 
 
 def claim_folder_of_now(parent: Path, name: str) -> Path:

@@ -2,7 +2,8 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coldloop.errors import UsageError
 from rig.results.arrow_arrays import numbers_of
@@ -20,6 +22,34 @@ Curves = dict[str, NDArray[np.float64]]
 
 DRAWN_TICKS: Final = 60_000
 """A longer trace is drawn by the least and the largest value of many ticks."""
+
+
+class _Hashes(BaseModel):
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    configuration_sha256: str
+    model_sha256: str
+    trace_sha256: str | None
+
+
+class _Manifest(BaseModel):
+    """What all who read a manifest count on."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    complete: bool
+    reason: str | None
+    started_utc: str
+    coldloop: str
+    python: str
+    platform: str
+    dependencies: dict[str, str]
+    way: str
+    ticks: int
+    recorded_ticks: int
+    configuration: dict[str, Any]
+    inputs: dict[str, dict[str, Any]]
+    hashes: _Hashes
 
 
 class RunFolder:
@@ -34,6 +64,12 @@ class RunFolder:
         self.manifest = self._document("manifest.json")
         if self.manifest.get("format") != FORMAT:
             raise UsageError(f"{path}: results of another version of Coldloop; this one reads format {FORMAT}")
+        try:
+            _Manifest.model_validate(self.manifest)
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(map(str, first["loc"]))
+            raise UsageError(f"{path / 'manifest.json'}: {place}: {first['msg']}; it has been changed") from None
 
     def _document(self, name: str) -> dict[str, Any]:
         try:
@@ -67,6 +103,20 @@ class RunFolder:
         except (OSError, pa.ArrowException) as error:
             raise UsageError(f"{self.path / name}: {str(error).splitlines()[0]}") from None
 
+    @contextmanager
+    def reading(self, name: str) -> Iterator[pq.ParquetFile]:
+        """Have a Parquet file of the run open, and be told in a line if it is damaged.
+
+        Raises:
+            UsageError: It cannot be read, or has other columns.
+        """
+        try:
+            with self.file(name) as file:
+                yield file
+        except (OSError, pa.ArrowException, KeyError) as error:
+            reason = (str(error) or type(error).__name__).splitlines()[0]
+            raise UsageError(f"{self.path / name}: damaged, or of something else: {reason}") from None
+
     def series(self, columns: Sequence[str], longest: int = DRAWN_TICKS, file_name: str = "trace.parquet") -> Curves:
         """Return columns of the trace, or of another file with a row a tick, for drawing: `time_s` and these.
 
@@ -75,15 +125,15 @@ class RunFolder:
         A trace of more than `longest` ticks is reduced to two points for each of `longest / 2` intervals.
         """
         names = ["time_s", *columns]
-        with self.file(file_name) as file:
+        with self.reading(file_name) as file:
             every = max(1, math.ceil(file.metadata.num_rows / (longest / 2))) if file.metadata.num_rows > longest else 1
             batches = file.iter_batches(batch_size=every * 4096, columns=names)
             parts = [_reduced(batch_series(batch), every) for batch in batches]
-        return {name: np.concatenate([part[name] for part in parts] or [np.empty(0)]) for name in names}
+            return {name: np.concatenate([part[name] for part in parts] or [np.empty(0)]) for name in names}
 
     def events(self) -> list[dict[str, Any]]:
         """Return the events."""
-        with self.file("events.parquet") as file:
+        with self.reading("events.parquet") as file:
             rows: list[dict[str, Any]] = file.read().to_pylist()
         return rows
 

@@ -28,8 +28,9 @@ from rig.settings import Settings
 NAMES: Final = (
     "manifest.json", "summary.json", "schema.json", *ALL_FILES, "run.png", "run.pdf", "run.svg",
     "chaos.json", "chaos.md", "chaos.png",
+    "report.html", "run.mat", "run.h5", *(f"{Path(name).stem}.csv" for name in ALL_FILES),
 )  # fmt: skip
-"""Files of an earlier run that a new one in the same folder replaces."""
+"""Files of an earlier run, and what was made of them, which a new one in the same folder replaces."""
 
 
 class RunFiles:

@@ -242,7 +242,9 @@ class Model:
         `update` is the newest updating period: it has no say while something else than MPC drives.
         """
         stale = [f"{service}." for service in MAPS if not self.is_live(service)]
-        if self.is_live("control_plc") and self.stands_still("control_plc"):
+        identity = self.record("control_plc", Identity)
+        is_looking = identity is not None and not identity.session  # for its session: nothing is measured
+        if self.is_live("control_plc") and (is_looking or self.stands_still("control_plc")):
             stale.append("control_plc.process.")
         if self.is_live("plant") and self.stands_still("plant"):
             stale += ["plant.measurement.", "plant.station."]

@@ -4,6 +4,9 @@ import csv
 import json
 import re
 import shutil
+import subprocess
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +19,7 @@ from scipy.io import loadmat
 from rig import cli
 from rig.results.run_folder import RunFolder
 from tests.conftest import draw_nothing
+from tests.harness.processes import Processes
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -179,6 +183,56 @@ def test_a_repetition_does_not_replace_what_it_repeats(coldloop: "Coldloop", mpc
         assert (outcome.code, len(outcome.complaints)) == (2, 1)
         assert "the run replaces what is in" in outcome.complaints[0]
     assert {file: file.read_bytes() for file in mpc.rglob("*") if file.is_file()} == before
+
+
+def test_two_runs_at_once_do_not_share_a_folder(processes: Processes, tmp_path: Path) -> None:
+    words = ("run", "--load", "a", "--duration", "100h", "--out", tmp_path / "run")
+    first = processes.coldloop(*words)
+    deadline = time.monotonic() + 300.0
+    while not (tmp_path / "run" / "manifest.json").exists():
+        assert time.monotonic() < deadline, first.said
+        assert first.alive, first.said
+    second = processes.coldloop(*words, "--force", stderr=subprocess.PIPE).ended()
+    assert (second.code, len(second.err.splitlines())) == (2, 1)
+    assert "another run is being written there" in second.err
+    assert first.interrupt() == 130
+
+
+DAMAGED: dict[str, Callable[[dict[str, Any]], object]] = {
+    "no way": lambda manifest: manifest.pop("way"),
+    "no configuration": lambda manifest: manifest.pop("configuration"),
+    "a configuration of another kind": lambda manifest: manifest.update(configuration=[1]),
+    "no hashes": lambda manifest: manifest["hashes"].clear(),
+    "inputs of another kind": lambda manifest: manifest.update(inputs={"load": 3}),
+}
+
+
+@pytest.mark.parametrize("command", ["page", "plot", "report", "rerun", "export --csv"])
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_a_manifest_that_was_changed_is_one_line(command: str, damage: str, coldloop: "Coldloop", mpc: Path) -> None:
+    manifest = json.loads((mpc / "manifest.json").read_text())
+    DAMAGED[damage](manifest)
+    (mpc / "manifest.json").write_text(json.dumps(manifest))
+    outcome = coldloop(*command.split(), mpc)
+    assert (outcome.code, len(outcome.complaints)) == (2, 1)
+    assert "manifest.json" in outcome.complaints[0]
+
+
+@pytest.mark.parametrize("command", ["page", "plot", "report", "export --csv"])
+@pytest.mark.parametrize("damage", ["bytes", "columns"])
+def test_a_trace_that_is_damaged_is_one_line(command: str, damage: str, coldloop: "Coldloop", mpc: Path) -> None:
+    trace = mpc / "trace.parquet"
+    if damage == "bytes":
+        content = bytearray(trace.read_bytes())
+        content[200:-2000] = bytes(len(content) - 2200)
+        trace.write_bytes(content)
+    else:
+        shutil.copy(mpc / "updates.parquet", trace)
+    outcome = coldloop(*command.split(), mpc)
+    if (command, damage) == ("export --csv", "columns"):  # it has its own columns
+        return
+    assert (outcome.code, len(outcome.complaints)) == (2, 1), outcome
+    assert "damaged" in outcome.complaints[0]
 
 
 def test_a_repetition_can_be_kept(coldloop: "Coldloop", mpc: Path, results: Path) -> None:

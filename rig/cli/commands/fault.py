@@ -5,6 +5,7 @@ A service that is killed is started again by `coldloop up`. More can happen to l
 
 import argparse
 import sys
+from contextlib import suppress
 from typing import Final
 
 from coldloop.errors import UsageError
@@ -58,6 +59,7 @@ def execute(options: argparse.Namespace) -> int:
     """Do it, and say what was done."""
     from rig.until_interrupted import run_until_interrupted
 
+    operator_settings(options)  # a configuration that cannot be read is told, whether the fault needs it or not
     return 130 if run_until_interrupted(lambda: options.fault(options)) else 0
 
 
@@ -72,10 +74,11 @@ async def _freeze(options: argparse.Namespace) -> None:
     from rig.live.process_faults import freeze, process_of
 
     process = process_of(first_port_here(options), options.service)
-    sys.stdout.write(f"the {options.service} service stands still for {options.seconds:g} s (Ctrl-C ends it)\n")
-    sys.stdout.flush()
-    await freeze(process, options.seconds)
-    sys.stdout.write(f"the {options.service} service runs again\n")
+    with suppress(BrokenPipeError):  # nobody listens: it is done all the same
+        sys.stdout.write(f"the {options.service} service stands still for {options.seconds:g} s (Ctrl-C ends it)\n")
+        sys.stdout.flush()
+    runs = await freeze(process, options.seconds)
+    sys.stdout.write(f"the {options.service} service {'runs again' if runs else 'has ended meanwhile'}\n")
 
 
 async def _cut(options: argparse.Namespace) -> None:

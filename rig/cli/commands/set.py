@@ -5,6 +5,7 @@ Each is a Modbus request that any client with the operator's role can make; the 
 
 import argparse
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -139,5 +140,6 @@ def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
 
 
 def _say(text: str) -> None:
-    sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()
+    with suppress(BrokenPipeError):  # nobody listens: it is done all the same
+        sys.stdout.write(f"{text}\n")
+        sys.stdout.flush()
