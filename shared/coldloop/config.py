@@ -26,6 +26,8 @@ DEFAULT = "default"
 DERIVED = "follows from other settings"
 MOST_LEVELS: Final = 32
 """Tables and arrays within one another that a TOML text may have."""
+MOST_BYTES: Final = 1_000_000
+"""Size of a configuration file, at most."""
 MOST_SHOWN: Final = 200
 """Characters of a wrong value that a message shows."""
 
@@ -128,6 +130,8 @@ def load_configuration(
     for key, value in flattened(settings.model_dump()).items():
         if not _is_finite(value):
             raise ConfigurationError(f"{_where(key, layers.sources)}: input should be finite (got {value!r})")
+        if _has_nul(value):
+            raise ConfigurationError(f"{_where(key, layers.sources)}: there is a NUL character in it; leave it out")
         if value == Path():  # an empty text
             raise ConfigurationError(f"{_where(key, layers.sources)}: names no file; leave the key out, or name one")
     return Configuration(settings, layers.sources)
@@ -151,6 +155,13 @@ def _is_finite(value: object) -> bool:
     if isinstance(value, list | tuple):
         return all(map(_is_finite, value))
     return not isinstance(value, float) or isfinite(value)
+
+
+def _has_nul(value: object) -> bool:
+    """Tell whether a text or a path has a character in it that no file's name can have."""
+    if isinstance(value, Mapping | list | tuple):
+        return any(map(_has_nul, value.values() if isinstance(value, Mapping) else value))
+    return isinstance(value, str | Path) and "\0" in str(value)
 
 
 Entry = tuple[str, object, str]
@@ -222,7 +233,11 @@ def _parts(value: object) -> Iterable[object]:
 
 def _read_toml(file: Path) -> dict[str, Any]:
     try:
-        return parsed_toml(file.read_text(encoding="utf-8"))
+        with file.open("rb") as content:  # a pipe will do, a device without an end will not
+            data = content.read(MOST_BYTES + 1)
+        if len(data) > MOST_BYTES:
+            raise ConfigurationError(f"{file}: more than {MOST_BYTES} bytes are no configuration")
+        return parsed_toml(data.decode("utf-8"))
     except OSError as error:
         raise ConfigurationError(f"{file}: {error.strerror}; name a readable TOML file with --config") from None
     except UnicodeDecodeError:

@@ -11,6 +11,7 @@ from coldloop.config import DEFAULT, Configuration, load_configuration, to_envir
 from coldloop.errors import ConfigurationError, UsageError
 from control_plc.settings import ControlSettings
 from optimizer_plc.settings import OptimizerSettings
+from rig.settings import Settings
 
 Write = Callable[[str], Path]
 
@@ -272,3 +273,18 @@ def test_whatever_stands_before_the_equals_sign_is_a_key_or_a_refusal_in_one_lin
     reason = refusal(f"{key}=3")
     assert "\n" not in reason
     assert reason.startswith("--set ")
+
+
+@pytest.mark.parametrize("key", ["plant.load", "model.file", "plant.retain.file"])
+def test_a_text_with_a_nul_is_no_name_of_a_file(key: str, tmp_path: Path) -> None:
+    file = tmp_path / "nul.toml"
+    file.write_text(f'{key} = "a\\u0000b"\n')
+    with pytest.raises(ConfigurationError, match="NUL character in it; leave it out") as failure:
+        load_configuration(Settings, file=file, environment={})
+    assert key in str(failure.value)
+    assert "\n" not in str(failure.value)
+
+
+def test_a_device_without_an_end_is_no_configuration() -> None:
+    with pytest.raises(ConfigurationError, match="more than 1000000 bytes"):
+        load_configuration(Settings, file=Path("/dev/zero"), environment={})
