@@ -164,18 +164,16 @@ class SessionClient:
             await asyncio.sleep(look_s)
 
     async def _supply(self, load: LoadStream, tick: int) -> None:
-        replaced = False
+        is_over = False
         try:
-            replaced = await load.was_replaced()
-            if not replaced:
+            is_over = await load.was_replaced()
+            if not is_over:
                 await load.feed(tick)
-        except PeerUnreachableError:
-            raise
-        except LinkError:
-            replaced = True
+        except LinkError as error:
+            is_over = not isinstance(error, PeerUnreachableError)
             raise
         finally:
-            if replaced and self.load is load:  # not that of a session that has begun meanwhile
+            if is_over and self.load is load:  # not that of a session that has begun meanwhile
                 self.load = None
 
     async def conclude(self) -> None:

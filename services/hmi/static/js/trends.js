@@ -75,9 +75,9 @@ async function refresh() {
   const end = zoom ? Math.min(zoom[1], state.tick * state.catalog.tick_s) : null;
   const span = zoom ? Math.max(1, end - zoom[0]) : seconds;
   const query = `names=${names()}&seconds=${span}&points=900`;
-  if (!(held && newest && !zoom)) {
-    try { newest = await ask(`api/trend?${query}${zoom ? `&end=${end}` : ""}`); } catch { return; }
-  } else if (charts) return;
+  const isHeld = held && newest && !zoom;  // what was asked for last stays, also where it is drawn anew
+  if (isHeld && charts) return;
+  if (!isHeld) try { newest = await ask(`api/trend?${query}${zoom ? `&end=${end}` : ""}`); } catch { return; }
   if (!charts) build();
   charts.forEach(show);
   document.getElementById("charts").dataset.now = newest.now_s;
