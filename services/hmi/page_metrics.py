@@ -2,28 +2,29 @@
 
 from collections.abc import Iterator
 
+from prometheus_client.core import Metric
+
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.service.event_text import word
-from coldloop.service.metrics import Family, Sample, block_families, build_family
+from coldloop.service.metrics import block_families, build_family, gauge
 from hmi.process_image import Model
 
 
-def page_families(model: Model, browsers: int) -> Iterator[Family]:
+def page_families(model: Model, browsers: int) -> Iterator[Metric]:
     """Yield everything; of a service that is silent only that it is."""
     yield build_family()
     live = [service for service in MAPS if model.is_live(service)]
-    yield Family(
-        "coldloop_up", "1 while a service answers the page",
-        tuple(Sample(float(service in live), (("service", service),)) for service in MAPS),
-    )  # fmt: skip
-    ages = [(service, model.age_s(service)) for service in MAPS]
-    yield Family(
-        "coldloop_age_seconds", "Time since a service answered last",
-        tuple(Sample(age, (("service", service),)) for service, age in ages if age is not None),
-    )  # fmt: skip
-    yield Family("coldloop_page_browsers", "Streams to browsers", (Sample(float(browsers)),))
+    yield gauge(
+        "coldloop_up",
+        "1 while a service answers the page",
+        {service: service in live for service in MAPS},
+        label="service",
+    )
+    ages = {service: age for service in MAPS if (age := model.age_s(service)) is not None}
+    yield gauge("coldloop_age_seconds", "Time since a service answered last", ages, label="service")
+    yield gauge("coldloop_page_browsers", "Streams to browsers", browsers)
     for service in live:
         for block in MAPS[service].blocks:
             record = model.sources[service].records.get(block.name)
@@ -35,7 +36,7 @@ def page_families(model: Model, browsers: int) -> Iterator[Family]:
         yield from _update(model.updates[-1])
 
 
-def _alarms(model: Model) -> Iterator[Family]:
+def _alarms(model: Model) -> Iterator[Metric]:
     rows = [(word(kind), alarm) for kind, alarm in model.alarm_rows()]
     for name, description, values in (
         ("coldloop_alarm_active", "1 while the condition of an alarm holds", [row.active for _, row in rows]),
@@ -44,13 +45,10 @@ def _alarms(model: Model) -> Iterator[Family]:
          [row.state for _, row in rows]),
         ("coldloop_alarm_raised", "Times that an alarm was raised", [row.times for _, row in rows]),
     ):  # fmt: skip
-        samples = tuple(
-            Sample(float(value), (("alarm", alarm),)) for (alarm, _), value in zip(rows, values, strict=True)
-        )
-        yield Family(name, description, samples)
+        yield gauge(name, description, dict(zip([alarm for alarm, _ in rows], values, strict=True)), label="alarm")
 
 
-def _update(update: Optimization) -> Iterator[Family]:
+def _update(update: Optimization) -> Iterator[Metric]:
     for (name, field), value in zip(fields_of(Optimization).items(), update, strict=True):
         unit = f" ({field.unit})" if field.unit else ""
-        yield Family(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", (Sample(float(value)),))
+        yield gauge(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", value)

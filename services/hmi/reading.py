@@ -13,7 +13,8 @@ from typing import Final
 from aiohttp import BasicAuth, hdrs, web
 
 from coldloop.process.signals import TICK_S
-from coldloop.service.metrics import CONTENT_TYPE, exposition
+from coldloop.service.metrics import exposition
+from coldloop.service.metrics_server import CONTENT_TYPE
 from hmi.broadcast import Broadcast
 from hmi.documents import (
     alarms_document,
@@ -258,8 +259,8 @@ class Reading:
             user = await self._guard.log_in(auth.login, auth.password, request.remote or "")
             if isinstance(user, web.Response):
                 return user
-        text = exposition(page_families(self._model, len(self._broadcast)))
-        return web.Response(body=text.encode(), headers={hdrs.CONTENT_TYPE: CONTENT_TYPE})
+        body = exposition(page_families(self._model, len(self._broadcast)))
+        return web.Response(body=body, headers={hdrs.CONTENT_TYPE: CONTENT_TYPE})
 
 
 def safe_cell(value: object) -> object:

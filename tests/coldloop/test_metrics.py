@@ -11,7 +11,7 @@ import pytest
 from coldloop.errors import PortInUseError
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
-from coldloop.service.metrics import Family, Sample, bank_families, exposition
+from coldloop.service.metrics import bank_families, exposition, gauge
 from coldloop.service.metrics_server import MOST_OPEN, MetricsServer
 from coldloop.service.metrics_settings import MetricsSettings
 
@@ -24,26 +24,26 @@ def bank() -> RegisterBank:
 
 
 def test_each_number_is_a_gauge_with_its_description_and_unit() -> None:
-    lines = exposition(bank_families(bank())).splitlines()
-    assert 'coldloop_plant_measurement_y{element="T5"} 6' in lines
+    lines = exposition(bank_families(bank())).decode().splitlines()
+    assert 'coldloop_plant_measurement_y{element="T5"} 6.0' in lines
     assert "# TYPE coldloop_plant_measurement_load gauge" in lines
     assert "# HELP coldloop_plant_measurement_load Heat load NCR22_HL (the same heater, so it is known) (W)" in lines
-    assert "coldloop_plant_measurement_load 400" in lines
+    assert "coldloop_plant_measurement_load 400.0" in lines
     assert not [line for line in lines if "actuators" in line], "what a client writes is no state of the service"
     assert not [line for line in lines if "_who" in line], "texts are no numbers"
 
 
 def test_what_is_not_finite_and_what_has_quotes_is_written_as_the_format_asks() -> None:
-    samples = (Sample(math.nan), Sample(math.inf), Sample(-math.inf), Sample(1.0, (("a", 'say "x"\n\\'),)))
-    lines = exposition([Family("one", "two\nlines", samples)]).splitlines()
+    values = {"no": math.nan, "up": math.inf, "down": -math.inf, 'say "x"\n\\': 1.0}
+    lines = exposition([gauge("one", "two\nlines", values, label="a")]).decode().splitlines()
     assert lines[0] == r"# HELP one two\nlines"
-    assert lines[2:5] == ["one NaN", "one +Inf", "one -Inf"]
-    assert lines[5] == 'one{a="say \\"x\\"\\n\\\\"} 1'
+    assert lines[2:5] == ['one{a="no"} NaN', 'one{a="up"} +Inf', 'one{a="down"} -Inf']
+    assert lines[5] == 'one{a="say \\"x\\"\\n\\\\"} 1.0'
 
 
 @pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool of Debian's prometheus is not there")
 def test_promtool_finds_nothing_wrong() -> None:
-    text = exposition(bank_families(bank()))
+    text = exposition(bank_families(bank())).decode()
     done = subprocess.run(["promtool", "check", "metrics"], input=text, text=True, capture_output=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
@@ -66,7 +66,7 @@ async def test_the_server_answers_two_paths_and_survives_what_is_no_request(free
             except ConnectionError:
                 await asyncio.sleep(0)
         assert answer.startswith("HTTP/1.1 200 OK\r\n")
-        assert "coldloop_plant_measurement_load 400" in answer
+        assert "coldloop_plant_measurement_load 400.0" in answer
         assert "live" in await asked(free_port, b"GET /healthz?x HTTP/1.0\r\n\r\n")
         assert "404" in await asked(free_port, b"GET / HTTP/1.0\r\n\r\n")
         assert "405" in await asked(free_port, b"POST /metrics HTTP/1.0\r\n\r\n")

@@ -352,14 +352,14 @@ def test_cells_of_a_table_are_no_formulas() -> None:
 def test_metrics_of_a_silent_service_say_only_that_it_is_silent(model: Model, clock: Clock) -> None:
     model.put("control_plc", LadderStatus(1, 2, 0, 1, 0, 0))
     model.put_alarms([Alarm() for _ in AlarmKind])
-    text = exposition(page_families(model, 2))
-    assert 'coldloop_up{service="control_plc"} 1' in text
-    assert "coldloop_control_plc_ladder_mode 1" in text
-    assert 'coldloop_alarm_state{alarm="t5 band"} 0' in text
+    text = exposition(page_families(model, 2)).decode()
+    assert 'coldloop_up{service="control_plc"} 1.0' in text
+    assert "coldloop_control_plc_ladder_mode 1.0" in text
+    assert 'coldloop_alarm_state{alarm="t5 band"} 0.0' in text
     if shutil.which("promtool"):
         done = subprocess.run(["promtool", "check", "metrics"], input=text, text=True, capture_output=True, check=False)
         assert (done.returncode, done.stdout + done.stderr) == (0, "")
     clock.time += 60
-    text = exposition(page_families(model, 2))
-    assert 'coldloop_up{service="control_plc"} 0' in text
+    text = exposition(page_families(model, 2)).decode()
+    assert 'coldloop_up{service="control_plc"} 0.0' in text
     assert "coldloop_control_plc_ladder_mode" not in text

@@ -3,56 +3,48 @@
 coldloop_plant_measurement_y{element="T5"} 12.5
 """
 
-import math
 import re
-from collections.abc import Iterable, Iterator
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Final
+
+from prometheus_client import generate_latest
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
 
 from coldloop import __version__
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.declaration import Block, fields_of
 
-CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _NOT_IN_NAMES: Final = re.compile(r"[^a-zA-Z0-9_]+")
 
 
-class Sample(NamedTuple):
-    """One number, with the labels that tell it from the others of its family."""
-
-    value: float
-    labels: tuple[tuple[str, str], ...] = ()
-
-
-class Family(NamedTuple):
-    """Samples of one name."""
-
-    name: str
-    description: str
-    samples: tuple[Sample, ...]
+def gauge(name: str, description: str, values: float | Mapping[str, float], *, label: str = "") -> Metric:
+    """Return a gauge: one number, or one for each value of a label."""
+    if not isinstance(values, Mapping):
+        return GaugeMetricFamily(name, description, value=values)
+    family = GaugeMetricFamily(name, description, labels=[label])
+    for key, value in values.items():
+        family.add_metric([key], value)
+    return family
 
 
-def build_family() -> Family:
+def build_family() -> Metric:
     """Return the version of the program as a label of the number 1."""
-    return Family("coldloop_build_info", "Version of Coldloop", (Sample(1.0, (("version", __version__),)),))
+    return gauge("coldloop_build_info", "Version of Coldloop", {__version__: 1.0}, label="version")
 
 
-def block_families(service: str, block: Block, record: tuple[Any, ...]) -> Iterator[Family]:
+def block_families(service: str, block: Block, record: tuple[Any, ...]) -> Iterator[Metric]:
     """Yield the registers of a record; texts are left out."""
     for (name, field), value in zip(fields_of(block.record).items(), record, strict=True):
         if field.is_text or name == "crc":
             continue
         unit = field.unit or (field.units[0] if len(set(field.units)) == 1 else "")
         description = f"{field.description} ({unit})" if unit else field.description
-        if field.elements:
-            samples = tuple(
-                Sample(float(one), (("element", element),)) for element, one in zip(field.elements, value, strict=True)
-            )
-        else:
-            samples = (Sample(float(value)),)
-        yield Family(metric_name(service, block.name, name), description, samples)
+        values = dict(zip(field.elements, value, strict=True)) if field.elements else value
+        yield gauge(metric_name(service, block.name, name), description, values, label="element")
 
 
-def bank_families(bank: RegisterBank) -> Iterator[Family]:
+def bank_families(bank: RegisterBank) -> Iterator[Metric]:
     """Yield all registers of a service that are not rows of a table and that no client writes."""
     yield build_family()
     for block in bank.map.blocks:
@@ -65,30 +57,17 @@ def metric_name(*parts: str) -> str:
     return _NOT_IN_NAMES.sub("_", "_".join(("coldloop", *parts))).lower()
 
 
-def exposition(families: Iterable[Family]) -> str:
+class _Families(Collector):
+    """What is shown, made anew for each answer."""
+
+    def __init__(self, families: Iterable[Metric]) -> None:
+        self._families = families
+
+    def collect(self) -> Iterator[Metric]:
+        """Return it."""
+        yield from self._families
+
+
+def exposition(families: Iterable[Metric]) -> bytes:
     """Return families in Prometheus' text format."""
-    lines: list[str] = []
-    for family in families:
-        lines.append(f"# HELP {family.name} {_escaped(family.description)}")
-        lines.append(f"# TYPE {family.name} gauge")
-        lines += [f"{family.name}{_labels(sample)} {_number(sample.value)}" for sample in family.samples]
-    return "\n".join(lines) + "\n"
-
-
-def _labels(sample: Sample) -> str:
-    if not sample.labels:
-        return ""
-    return "{" + ",".join(f'{name}="{_escaped(value, quotes=True)}"' for name, value in sample.labels) + "}"
-
-
-def _escaped(text: str, *, quotes: bool = False) -> str:
-    escaped = text.replace("\\", r"\\").replace("\n", r"\n")
-    return escaped.replace('"', r"\"") if quotes else escaped
-
-
-def _number(value: float) -> str:
-    if math.isnan(value):
-        return "NaN"
-    if math.isinf(value):
-        return "+Inf" if value > 0 else "-Inf"
-    return f"{value:.9g}"
+    return generate_latest(_Families(families))

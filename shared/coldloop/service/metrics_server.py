@@ -3,15 +3,16 @@
 import asyncio
 import logging
 import time
+from collections.abc import Callable
 from typing import Final
 
 from coldloop.errors import PortInUseError
 from coldloop.registers.bank import RegisterBank
-from coldloop.service.metrics import CONTENT_TYPE, bank_families, exposition
 from coldloop.service.metrics_settings import MetricsSettings
 
 log = logging.getLogger("coldloop.service.metrics")
 
+CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 LONGEST_REQUEST: Final = 4096
 PATIENCE_S: Final = 2.0
 """Within this time a request is here, and its answer read."""
@@ -33,7 +34,8 @@ class MetricsServer:
         self._settings = settings
         self._bank = bank
         self._open: dict[asyncio.StreamWriter, None] = {}  # the oldest first
-        self._exposition = ""
+        self._show: Callable[[], bytes] = bytes
+        self._exposition = b""
         self._kept_until = 0.0
 
     async def run(self) -> None:
@@ -45,6 +47,9 @@ class MetricsServer:
         host, port = self._settings.host, self._settings.port
         if not port:
             return
+        from coldloop.service.metrics import bank_families, exposition  # noqa: PLC0415 without metrics it is not loaded
+
+        self._show = lambda: exposition(bank_families(self._bank))
         try:
             server = await asyncio.start_server(self._answer, host, port, limit=LONGEST_REQUEST, backlog=MOST_OPEN)
         except OSError as error:
@@ -75,21 +80,20 @@ class MetricsServer:
     def _response(self, line: list[str]) -> bytes:
         method, path = (line[0], line[1].partition("?")[0]) if len(line) > 1 else ("", "")
         if method != "GET":
-            return _encoded("405 Method Not Allowed", "only GET\n")
+            return _encoded("405 Method Not Allowed", b"only GET\n")
         if path == "/metrics":
             return _encoded("200 OK", self._registers())
         if path == "/healthz":
-            return _encoded("200 OK", "live\n")
-        return _encoded("404 Not Found", "there are /metrics and /healthz\n")
+            return _encoded("200 OK", b"live\n")
+        return _encoded("404 Not Found", b"there are /metrics and /healthz\n")
 
-    def _registers(self) -> str:
+    def _registers(self) -> bytes:
         now = time.monotonic()
         if now >= self._kept_until:
-            self._exposition, self._kept_until = exposition(bank_families(self._bank)), now + KEPT_S
+            self._exposition, self._kept_until = self._show(), now + KEPT_S
         return self._exposition
 
 
-def _encoded(status: str, text: str) -> bytes:
-    body = text.encode()
+def _encoded(status: str, body: bytes) -> bytes:
     lines = f"HTTP/1.1 {status}", f"Content-Type: {CONTENT_TYPE}", f"Content-Length: {len(body)}", "Connection: close"
     return "\r\n".join((*lines, "", "")).encode() + body
