@@ -1,12 +1,10 @@
 """The figure of a run, drawn by a process of its own: matplotlib is loaded while the run goes on, on another core.
 
-python -m rig.figures.worker <folder and formats as JSON on standard input> the error, if any, on standard output
+python -m rig.figures.worker < (folder and formats as JSON): an error is one line on standard error, as of any command
 """
 
-import contextlib
 import gc
 import json
-import pickle
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -14,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from coldloop.errors import ColdloopError, ResultsError
+from coldloop.errors import ColdloopError, ResultsError, UsageError
 from rig.interpreter import PYTHON
 
 COMMAND: Final = (*PYTHON, "-m", "rig.figures.worker")
@@ -52,22 +50,21 @@ class FigureProcess:
         """Draw the run of a folder, `run.png` for the format png.
 
         Raises:
-            OSError: A file cannot be written.
             UsageError: There is no run in the folder, or a file of it cannot be replaced.
-            ResultsError: The process has failed.
+            ResultsError: A file cannot be written, or the process has failed.
         """
         if self._process is None:
             self.start()
         process, self._process = self._process, None
         if process is None:
             raise RuntimeError("start makes a process")
-        answer, said = process.communicate(json.dumps([str(folder), self._formats]).encode())
-        if answer:
-            raise pickle.loads(answer)  # noqa: S301 our own process
+        _, said = process.communicate(json.dumps([str(folder), self._formats]).encode())
         if process.returncode:
-            reason = said.decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
+            lines = said.decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
+            if process.returncode == UsageError.exit_code:
+                raise UsageError(lines[-1])
             raise ResultsError(
-                f"{folder}: the figure was not drawn: {reason[-1]}; try `coldloop plot {folder}`, the rest is complete"
+                f"{folder}: the figure was not drawn: {lines[-1]}; try `coldloop plot {folder}`, the rest is complete"
             )
 
 
@@ -83,8 +80,8 @@ def main() -> None:
     try:
         plot_run(Path(folder), formats)
     except (OSError, ColdloopError) as error:
-        with contextlib.suppress(BrokenPipeError):
-            sys.stdout.buffer.write(pickle.dumps(error))
+        sys.stderr.write(f"{error}\n")
+        sys.exit(getattr(error, "exit_code", 1))
     gc.freeze()  # whoever waits for the end need not wait until all modules have been searched for cycles
 
 

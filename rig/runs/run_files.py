@@ -105,7 +105,7 @@ class RunFiles:
             write_json(self.folder / "manifest.json", manifest)
             write_json(self.folder / "summary.json", summary)
             figure.draw(self.folder)
-        except OSError as of_files:
+        except (OSError, ColdloopError) as of_files:
             error = error or of_files
         if error is not None:
             raise _told(error, self.folder, f"{recorded} of {self.recorder.ticks} ticks are recorded in {self.folder}")
