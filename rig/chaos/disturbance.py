@@ -71,6 +71,8 @@ class Mangler:
                     self._held, self.hold_s = pieces.pop(), fault.hold_ms / 1000
             elif isinstance(fault, Replacing):
                 pieces = [new for piece in pieces for new in self._instead(piece, fault)]
+            else:
+                raise TypeError(f"no frame is disturbed by {fault.kind}: add a branch")
         return Outcome(b"".join([*pieces, overtaken]), delay_s)
 
     def release(self) -> bytes:

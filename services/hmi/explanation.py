@@ -187,9 +187,11 @@ def _branch(update: Optimization, before: Optimization | None, rule: UpdatingRul
     undecided = update.efficiency == update.mismatch == update.contraction == 1.0 and update.gamma == 0.0
     if undecided and (before is None or not _was_played(update, before)):
         return _why_not_played(update, before, rule)
+    if rule.rule == UpdatingRuleKind.ALGORITHM_1:
+        return _by_sign(update.gamma)
     if rule.rule == UpdatingRuleKind.CONTRACTION:
         return Branch.CONTRACTION
-    return _by_sign(update.gamma)
+    raise ValueError(f"no words for the rule {rule.rule} of the updating period: add a branch")
 
 
 def _by_sign(gamma: float) -> Branch:

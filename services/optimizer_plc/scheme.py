@@ -17,7 +17,8 @@ from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, pred
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.qp.profile import inputs_of, shifted
-from optimizer_plc.rules.interface import Observation, UpdatingRule, assessed, decide_by
+from optimizer_plc.rules.assessment import Observation, assessed
+from optimizer_plc.rules.interface import UpdatingRule, decide_by
 from optimizer_plc.session_state import Delivery, Memory
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers.interface import Answer, Costs
@@ -229,7 +230,7 @@ def plan(
     effective = with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
     now.efficiency = now.mismatch = now.contraction = real(1.0)
     now.gamma = real(0.0)
-    if wanted == BY_THE_RULE:
+    if wanted == BY_THE_RULE:  # step (4): q(t_{k+1}) from the costs
         o = Observation(
             now.iterations, real(now.ticks) * real(TICK_S), now.effective, played.hot_start, played.last_but_one,
             played.delivered, effective,
@@ -237,6 +238,6 @@ def plan(
         a = assessed(o)
         wanted = decide_by(rule, m.rule, o, a)
         now.efficiency, now.mismatch, now.contraction, now.gamma = a.efficiency, a.mismatch, a.contraction, a.gamma
-    now.iterations = min(wanted, c.most)
+    now.iterations = min(wanted, c.most)  # step (5): the period that holds them; then step (2), what was sent is played
     now.ticks = c.fixed_ticks or min(c.periods[now.iterations] + now.allowance, MAX_PERIOD_TICKS)
     now.update, now.tick, now.load, now.effective, now.planned = update, tick, load, effective, True

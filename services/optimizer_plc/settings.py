@@ -48,7 +48,9 @@ class SolverName(StrEnum):
     DAQP = "daqp"
 
 
-SINGLE_PRECISION_SOLVERS = (SolverName.ODE, SolverName.FAST_GRADIENT, SolverName.INTERIOR_POINT, SolverName.HYBRID)
+BORROWED_SOLVERS: Final = (SolverName.QPOASES, SolverName.OSQP, SolverName.DAQP)
+"""Those of other projects, which compute in double precision."""
+SINGLE_PRECISION_SOLVERS: Final = tuple(name for name in SolverName if name not in BORROWED_SOLVERS)
 """Those that are kernels of our own."""
 
 
@@ -104,17 +106,6 @@ class AdaptiveSettings(BaseModel):
         return self
 
 
-ALPHAS: Final = (
-    "ode.alpha",
-    "qpoases.alpha",
-    "osqp.alpha",
-    "fast_gradient.alpha",
-    "interior_point.alpha",
-    "daqp.alpha",
-)
-"""The weight of broken constraints, by solver: keys of `optimizer_plc.program` that follow from the penalties."""
-
-
 class ProgramSettings(BaseModel):
     """What the optimiser's program is to do."""
 
@@ -145,11 +136,8 @@ class ProgramSettings(BaseModel):
     hybrid: HybridSettings = HybridSettings()
     daqp: DaqpSettings = DaqpSettings()
 
-    decides: ClassVar[Mapping[str, tuple[str, ...]]] = {
-        "preset": (*OF_PRESETS, *ALPHAS),
-        **dict.fromkeys(OF_ALPHA, ALPHAS),
-    }
-    """What follows from other settings, for `coldloop.config`."""
+    decides: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """What follows from other settings, for `coldloop.config`; filled in below, from the fields."""
 
     @field_validator("updating_period_s")
     @classmethod
@@ -188,6 +176,15 @@ class ProgramSettings(BaseModel):
                 f"{self.solver} computes in double precision; choose one of {', '.join(SINGLE_PRECISION_SOLVERS)}"
             )
         return self
+
+
+ALPHAS: Final = tuple(
+    f"{name}.alpha"
+    for name, field in ProgramSettings.model_fields.items()
+    if "alpha" in getattr(field.annotation, "model_fields", ())
+)
+"""The weight of broken constraints, by solver: keys of `optimizer_plc.program` that follow from the penalties."""
+ProgramSettings.decides = {"preset": (*OF_PRESETS, *ALPHAS), **dict.fromkeys(OF_ALPHA, ALPHAS)}
 
 
 class OptimizerServer(ServerSettings):

@@ -5,8 +5,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optimizer_plc.rules import Algorithm1, Assessment, ContractionRule, FixedPeriod, Observation, UpdatingRule, assess
-from optimizer_plc.rules.interface import MEMORY, assessed, decide_by
+from coldloop.registers.optimizer_plc import UpdatingRuleKind
+from optimizer_plc.budget import BudgetSettings, PlcBudget
+from optimizer_plc.rules import (
+    Algorithm1,
+    Assessment,
+    ContractionRule,
+    FixedPeriod,
+    Observation,
+    UpdatingRule,
+    assess,
+    make_rule,
+)
+from optimizer_plc.rules.assessment import assessed
+from optimizer_plc.rules.interface import MEMORY, decide_by
+from optimizer_plc.settings import ProgramSettings
 
 RULE = Algorithm1(q_first=9, q_min=2, q_max=19, delta=2)
 
@@ -222,3 +235,13 @@ def test_compiled_and_plain_a_rule_is_assessed_the_same(rule: Algorithm1, observ
     rough, exact = assessed(single), assess(Observation(single.iterations, *map(float, single[1:])))
     assert rough.contraction == pytest.approx(exact.contraction, rel=1e-6)
     assert rule.q_min <= decide_by(rule, np.zeros(MEMORY, np.float32), single, rough) <= rule.q_max
+
+
+@pytest.mark.parametrize("kind", UpdatingRuleKind)
+@given(observation=observations)
+def test_each_kind_is_decided_by_its_rule(kind: UpdatingRuleKind, observation: Observation) -> None:
+    rule = make_rule(ProgramSettings(), PlcBudget(BudgetSettings(), 0.25), 7)._replace(kind=int(kind))
+    assert rule.chosen.status.rule == kind
+    (of_all, a), (alone, _) = Deciding(rule).next(observation), Deciding(rule.chosen).next(observation)
+    assert of_all == alone
+    assert a == assess(observation)

@@ -8,7 +8,6 @@ import pytest
 
 from coldloop.config import DERIVED, as_toml, load_configuration
 from optimizer_plc.qp.penalties import OF_PRESETS, PRESETS, Preset
-from optimizer_plc.settings import ALPHAS, ProgramSettings
 from rig import simulate
 from rig.settings import Settings
 
@@ -126,12 +125,9 @@ def test_the_option_reaches_the_run(coldloop: "Coldloop", tmp_path: Path) -> Non
     assert beside != trace_of(coldloop, tmp_path / "c", "--load", "a", "--duration", "2min")
 
 
-def test_all_that_a_preset_or_a_penalty_decides_is_declared() -> None:
+def test_all_that_a_preset_decides_is_declared() -> None:
     decided = {f"{name}.{key}" for preset in PRESETS.values() for name, values in preset.items() for key in values}
     assert decided == set(OF_PRESETS)
-    sections = ProgramSettings()
-    with_alpha = {name for name in ProgramSettings.model_fields if hasattr(getattr(sections, name), "alpha")}
-    assert {f"{name}.alpha" for name in with_alpha} == set(ALPHAS)
 
 
 # -- beyond what can be read -------------------------------------------------------------------------------------------

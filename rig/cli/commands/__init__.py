@@ -1,1 +1,1 @@
-"""The subcommands of `coldloop`, one file each: `add_parser` and `execute`."""
+"""The subcommands of `coldloop`, one file each: `declare` and `execute`."""

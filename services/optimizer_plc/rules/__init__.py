@@ -6,15 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.registers.optimizer_plc import UpdatingRuleStatus
+from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.rules import algorithm_1, contraction
 from optimizer_plc.rules.algorithm_1 import Algorithm1
+from optimizer_plc.rules.assessment import Assessment, Observation, assess
 from optimizer_plc.rules.contraction import ContractionRule
 from optimizer_plc.rules.fixed_period import FixedPeriod
-from optimizer_plc.rules.interface import Assessment, Observation, UpdatingRule, assess, decides_by
-from optimizer_plc.settings import ProgramSettings, RuleName
+from optimizer_plc.rules.interface import UpdatingRule, decides_by
+from optimizer_plc.settings import ProgramSettings
 
 __all__ = [
     "Algorithm1", "Assessment", "ContractionRule", "FixedPeriod", "Observation", "Rule", "UpdatingRule", "assess",
@@ -23,17 +24,15 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-FIXED_PERIOD: Final = 0
-ALGORITHM_1: Final = 1
-CONTRACTION: Final = 2
-_BY_NAME: Final = {RuleName.ALGORITHM_1: ALGORITHM_1, RuleName.CONTRACTION: CONTRACTION}
+FIXED_PERIOD: Final = int(UpdatingRuleKind.FIXED)
+ALGORITHM_1: Final = int(UpdatingRuleKind.ALGORITHM_1)
 
 
 class Rule(NamedTuple):
-    """The rules side by side, of which one decides: what is compiled for one of them serves all."""
+    """The rules in the order of `UpdatingRuleKind`, of which one decides: what is compiled for one serves all."""
 
     kind: int
-    """FIXED_PERIOD, ALGORITHM_1 or CONTRACTION."""
+    """An `UpdatingRuleKind`."""
     fixed_period: FixedPeriod
     algorithm_1: Algorithm1
     contraction: ContractionRule
@@ -41,7 +40,8 @@ class Rule(NamedTuple):
     @property
     def chosen(self) -> UpdatingRule:
         """The rule that decides."""
-        return (self.fixed_period, self.algorithm_1, self.contraction)[self.kind]
+        rules: tuple[UpdatingRule, ...] = self[1:]
+        return rules[self.kind]
 
     @property
     def first(self) -> int:
@@ -66,11 +66,11 @@ class Rule(NamedTuple):
 @kernel
 def decide(rule: Rule, memory: Array, o: Observation, a: Assessment) -> int:
     """Return q(t_{k+1})."""
+    if rule.kind == FIXED_PERIOD:
+        return rule.fixed_period.iterations
     if rule.kind == ALGORITHM_1:
         return algorithm_1.decide(rule.algorithm_1, memory, o, a)
-    if rule.kind == CONTRACTION:
-        return contraction.decide(rule.contraction, memory, o, a)
-    return rule.fixed_period.iterations
+    return contraction.decide(rule.contraction, memory, o, a)
 
 
 def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, real: Real = DOUBLE) -> Rule:
@@ -84,7 +84,7 @@ def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, re
     """
     adaptive, own = settings.adaptive, settings.adaptive.contraction
     return Rule(
-        FIXED_PERIOD if fixed_ticks else _BY_NAME[adaptive.rule],
+        FIXED_PERIOD if fixed_ticks else UpdatingRuleKind[adaptive.rule.name],
         FixedPeriod(budget.iterations(fixed_ticks)),
         Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta),
         ContractionRule(own.q_busy, own.q_quiet, own.q_step, real(own.rate), real(own.memory), real(own.surprise)),

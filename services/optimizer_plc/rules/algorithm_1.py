@@ -1,4 +1,7 @@
-"""The paper's rule (section II), literally as printed: one step down the gradient Gamma of the response time."""
+"""The paper's rule (section II), literally as printed: one step down the gradient Gamma of the response time.
+
+Gamma, and what it is made of, is in `assessment.py`.
+"""
 
 from typing import NamedTuple
 
@@ -7,7 +10,8 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
-from optimizer_plc.rules.interface import Assessment, Observation, decides_by
+from optimizer_plc.rules.assessment import Assessment, Observation
+from optimizer_plc.rules.interface import decides_by
 
 Array = NDArray[np.float64]
 

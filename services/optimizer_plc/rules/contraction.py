@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
-from optimizer_plc.rules.interface import Assessment, Observation, decides_by
+from optimizer_plc.rules.assessment import Assessment, Observation
+from optimizer_plc.rules.interface import decides_by
 
 Array = NDArray[np.float64]
 

@@ -1,82 +1,24 @@
-"""What a rule of the updating period is told, the quantities of Algorithm 1, and the call of the right rule's kernel.
+"""What a rule of the updating period is, and the call of the right rule's kernel.
 
-A rule decides q(t_{k+1}), the number of iterations of the next period. Its file has a NamedTuple of its parameters and
-a kernel `decide` that is registered for it. It takes single and double precision alike.
+A rule decides q(t_{k+1}), the number of iterations of the next period; `PlcBudget` knows how long that takes. Its file
+has a NamedTuple of its parameters and a kernel `decide` that is registered for it. It takes single and double precision
+alike.
 """
 
-import math
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 import numpy as np
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from coldloop.kernels.compiled import kernel
 from coldloop.registers.optimizer_plc import UpdatingRuleStatus
+from optimizer_plc.rules.assessment import Assessment, Observation
 
 Array = NDArray[np.float64]
 
 MEMORY = 2
 """Numbers that a rule may remember from one period to the next, in an array that begins with zeros."""
-
-
-class Observation(NamedTuple):
-    """What is known at t_{k+1} of the period that ends there; costs are positive (Assumption 1 of the paper)."""
-
-    iterations: int
-    """q(t_k)."""
-    period_s: float
-    """t_{k+1} - t_k."""
-    effective_before: float
-    """J_k: p(t_k) at the state reached at t_k."""
-    hot_start: float
-    """J+_k: the shifted profile at the state predicted for t_{k+1}."""
-    last_but_one: float
-    """J after q - 1 iterations, at the predicted state."""
-    delivered: float
-    """Ĵ_{k+1}: after q iterations, at the predicted state."""
-    effective: float
-    """J_{k+1}: p(t_{k+1}) at the state reached at t_{k+1}."""
-
-
-class Assessment(NamedTuple):
-    """The quantities of Algorithm 1. `gamma` is the gradient whose sign decides; increments are per iteration."""
-
-    efficiency: float
-    """E^r."""
-    mismatch: float
-    """D^r."""
-    contraction: float
-    """K^r = E^r D^r."""
-    mismatch_increment: float
-    """Delta D^r / Delta q."""
-    efficiency_increment: float
-    """Delta E^r / Delta q."""
-    contraction_increment: float
-    """Delta K^r / Delta q."""
-    response_increment: float
-    """Delta t_r / Delta q; infinite at K^r = 1, where the response time is."""
-    gamma: float
-
-
-def assess(observation: Observation) -> Assessment:
-    """Compute the quantities of Algorithm 1 as printed, in the floating-point type of the costs."""
-    o = observation
-    real = type(o.effective)
-    zero, one, q = real(0.0), real(1.0), real(o.iterations)
-    E = o.delivered / o.hot_start
-    D = (o.effective * o.hot_start) / (o.delivered * o.effective_before)
-    K = E * D
-    dD = (D - one) / q
-    dE = (o.delivered - o.last_but_one) / o.hot_start
-    dK = E * dD + D * dE
-    log_K = real(math.log(K))
-    dt_r = (-log_K + q / K * dK) / (log_K * log_K) if log_K != zero else real(math.copysign(real(math.inf), dK))
-    return Assessment(E, D, K, dD, dE, dK, dt_r, dK if one <= K else dt_r)
-
-
-assessed = kernel(assess)
 
 
 class UpdatingRule(Protocol):

@@ -108,7 +108,9 @@ class UpdatingRuleKind(IntEnum):
 class UpdatingRuleStatus(NamedTuple):
     """The rule that decides the updating period in this session, and the time that the computation takes."""
 
-    rule: Annotated[int, u16("0 fixed period, 1 Algorithm 1, 2 contraction rule", high=2)] = UpdatingRuleKind.FIXED
+    rule: Annotated[int, u16("0 fixed period, 1 Algorithm 1, 2 contraction rule", values=UpdatingRuleKind)] = (
+        UpdatingRuleKind.FIXED
+    )
     q_first: Annotated[int, u16("Iterations of the first period, and of one that follows an interruption")] = 0
     q_min: Annotated[int, u16("Fewest iterations that the rule chooses")] = 0
     q_max: Annotated[int, u16("Most iterations that the rule chooses")] = 0
