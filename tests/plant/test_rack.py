@@ -347,6 +347,21 @@ def test_boots_and_events_are_numbered_over_restarts(switch_on: "SwitchOn", tmp_
     assert (event.number, event.boot, event.subject) == (3 + 3 + 1, 4, 1), "session, load and lease came between"
 
 
+def test_no_generation_comes_twice_when_the_rack_is_killed_behind_outputs_that_it_limited(
+    switch_on: "SwitchOn", tmp_path: Path
+) -> None:
+    """In the same tick, so that nothing but the outputs has changed."""
+    retained = {"retain": {"file": str(tmp_path / "plant")}, "session": REALTIME, "rate_limited": True}
+    rack = switch_on(**retained)
+    plc = rack.client("control PLC", 77)
+    plc.send(*U)
+    rack.passes(2)
+    limited = plc.send(9.0, 815.0, 65.0)
+    assert limited.verdict == OutputVerdict.LIMITED
+    again = switch_on(**retained).shown()
+    assert (again.u, again.generation) == (limited.u, limited.generation + 1)
+
+
 def test_no_generation_comes_twice_when_the_rack_is_killed_behind_an_answer(
     switch_on: "SwitchOn", tmp_path: Path
 ) -> None:

@@ -83,6 +83,7 @@ class RackRegisters:
         self._journal = JournalPublication(self.rack.journal, self.bank)
         self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed), int(self._memory.refused))
         self.lease = WriterLease("the outputs", lambda: self.rack.silence_s, self._note_lease, now)
+        self._kept_generation = 0
         self._written_row = 0
         self._outdated = True
         """The measurement in the registers is not that of now."""
@@ -336,7 +337,7 @@ class RackRegisters:
 
     def _finish(self) -> None:
         """End a request: show its events, and retain them: no generation and no event number is given out twice."""
-        if self._show_events():
+        if self._show_events() or self.rack.outputs.generation != self._kept_generation:
             self._keep()
 
     def _show_events(self) -> bool:
@@ -348,6 +349,7 @@ class RackRegisters:
         return True
 
     def _keep(self) -> None:
+        self._kept_generation = self.rack.outputs.generation
         if self._memory.active:
             self._memory.keep(self.rack.retained())
 
