@@ -53,8 +53,10 @@ SHARED: Final = (
 )
 """Fixtures that start processes for many tests: these tests run in one worker, which starts them once."""
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # whoever started the tests ignores it; what they start must not
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# Whoever started the tests may ignore these (a script in the background, nohup); what the tests start must not.
+for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, _handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -149,7 +149,7 @@ async def test_with_one_scan_in_four_ticks_a_bad_level_is_bridged_for_its_time_a
         await site.follows(control)
         (fallen,) = [event for event in await control.events(EventKind.MODE) if event.cause == Cause.SENSOR_BAD]
         assert fallen.tick - fails_after >= 36, "10 s are 40 ticks"
-        assert fallen.tick - failed_by <= 100, "40 scans are 160 ticks or more"
+        assert fallen.tick - failed_by < 160, "40 scans are 160 ticks or more"
         assert (await control.client.read(Status)).overruns - scans > 20
         assert abs(rack.applied[rack.tick - 1][CV156] - before) > 0.05
         assert rack.violations() == []
