@@ -5,6 +5,7 @@ import struct
 from pathlib import Path
 
 from coldloop.registers.common import MAGIC
+from coldloop.registers.control_plc import CONTROL_MAP, Verdict
 from coldloop.registers.safety import AlarmKind
 from coldloop.service.event_text import word
 from control_plc.alarm_settings import PASSING, AlarmSettings
@@ -21,6 +22,19 @@ def test_alarms_are_called_what_they_are_called_with_their_priorities() -> None:
     passing = re.search(r"happens at an instant \(([^)]+)\)", page)
     assert passing is not None
     assert set(re.findall(r"`([^`]+)`", passing[1])) == {word(kind) for kind in PASSING}
+
+
+def test_the_verdicts_of_the_link_page_are_those_of_the_registers() -> None:
+    page = (DOCS / "link.md").read_text(encoding="utf-8").partition("| verdict |")[2].partition("\n\n")[0]
+    rows = [(int(number), name.lower()) for number, name in re.findall(r"^\| (\d+) ([^|]+?) \|", page, re.MULTILINE)]
+    assert rows == [(verdict.value, word(verdict)) for verdict in Verdict if verdict]
+
+
+def test_the_alarms_of_the_scada_page_are_the_whole_block() -> None:
+    alarms = next(block for block in CONTROL_MAP.blocks if block.name == "alarms")
+    row = f"| alarms, {alarms.rows} rows of {alarms.row_words} words | control PLC "
+    addresses = f"| {alarms.address} to 2120, 2121 to {alarms.end - 1} |"
+    assert row + addresses in (DOCS / "scada.md").read_text(encoding="utf-8")
 
 
 def test_what_a_wrong_word_order_shows_is_what_it_shows() -> None:
