@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from qp_solvers import Recorded, record
+from qp_solvers import RecordedProblem, record
 
 from coldloop.process.lti_model import load
 from coldloop.process.signals import TICK_S
@@ -69,7 +69,7 @@ def seconds(call, *arguments) -> float:  # noqa: ANN001, ANN002 of any function
     return time.perf_counter() - start
 
 
-def floors(problems: list[Recorded], count: int) -> Floors:
+def floors(problems: list[RecordedProblem], count: int) -> Floors:
     """Return the times of the kernels; `count` calls of the plant's, and each problem ten times."""
     model, helium, flow = (
         load(Settings().model.file),

@@ -24,7 +24,7 @@ UNIT: Final = 6
 """Where a frame has its unit; the function comes next."""
 
 
-class Outcome(NamedTuple):
+class FrameAction(NamedTuple):
     """What becomes of one frame."""
 
     data: bytes
@@ -52,7 +52,7 @@ class Mangler:
         self.hold_s: float | None = None
         """While a frame is held back: how long, unless another one comes."""
 
-    def decide(self, frame: bytes, faults: Iterable[FrameFault]) -> Outcome:  # noqa: C901 a branch for each kind
+    def decide(self, frame: bytes, faults: Iterable[FrameFault]) -> FrameAction:  # noqa: C901 a branch for each kind
         """Return what becomes of a frame under the faults that are on."""
         pieces, delay_s, overtaken = [frame], 0.0, self.release()
         for fault in faults:
@@ -62,16 +62,16 @@ class Mangler:
                 delay_s += max(0.0, fault.delay_ms + fault.jitter_ms * self._draw.uniform(-1, 1)) / 1000
             elif isinstance(fault, Truncate):
                 if pieces and self._hit(fault.share):
-                    return Outcome(b"".join(pieces[:-1]) + pieces[-1][: len(pieces[-1]) // 2], delay_s, close=True)
+                    return FrameAction(b"".join(pieces[:-1]) + pieces[-1][: len(pieces[-1]) // 2], delay_s, close=True)
             elif isinstance(fault, Abort):
                 if pieces and self._hit(fault.share):
-                    return Outcome(b"", delay_s, close=True, reset=True)
+                    return FrameAction(b"", delay_s, close=True, reset=True)
             elif isinstance(fault, Reorder):
                 if pieces and not overtaken and self._hit(fault.share):
                     self._held, self.hold_s = pieces.pop(), fault.hold_ms / 1000
             elif isinstance(fault, Replacing):
                 pieces = [new for piece in pieces for new in self._instead(piece, fault)]
-        return Outcome(b"".join([*pieces, overtaken]), delay_s)
+        return FrameAction(b"".join([*pieces, overtaken]), delay_s)
 
     def release(self) -> bytes:
         """Return what is held back; it is let go."""

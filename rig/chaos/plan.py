@@ -33,7 +33,7 @@ SPREAD_S: Final = 20.0
 """Drawn faults begin up to so much after their multiple of `every_s`: anywhere in an updating period."""
 
 
-class Plan(BaseModel):
+class ChaosPlan(BaseModel):
     """A run and its faults."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -153,14 +153,14 @@ def _load(load: str | tuple[str, ...], mean_w: float) -> LoadProfile:
     return concatenated([telegraph(family, mean_w) for family in families])
 
 
-def shipped_plans() -> list[Plan]:
+def shipped_plans() -> list[ChaosPlan]:
     """Return the plans that come with Coldloop, by name."""
     entries = [entry for entry in SHIPPED.iterdir() if entry.name.endswith(".toml")]
     plans = [parse_plan(entry.read_text(encoding="utf-8"), entry.name, {}) for entry in entries]
     return sorted(plans, key=lambda plan: plan.name)
 
 
-def find_plan(name: str, changes: dict[str, Any]) -> Plan:
+def find_plan(name: str, changes: dict[str, Any]) -> ChaosPlan:
     """Return a shipped plan, or that of a file, with some of its values changed.
 
     Raises:
@@ -195,14 +195,14 @@ def _text_of(name: str) -> str:
         raise UsageError(f"{name}: {error.strerror}; name a readable TOML file") from None
 
 
-def parse_plan(text: str, source: str, changes: dict[str, Any]) -> Plan:
+def parse_plan(text: str, source: str, changes: dict[str, Any]) -> ChaosPlan:
     """Return the plan that a TOML text holds, with some of its values changed."""
     content = _content(text, source)
     if "duration_s" in changes:  # a shorter run has fewer faults
         content["faults"] = [
             fault for fault in content.get("faults", []) if _begins_before(fault, changes["duration_s"])
         ]
-    return _validated(Plan, {**content, **changes}, source)
+    return _validated(ChaosPlan, {**content, **changes}, source)
 
 
 def _content(text: str, source: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind, AlarmState
 from rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
-from rig.chaos.plan import Plan
+from rig.chaos.plan import ChaosPlan
 from rig.chaos.trace import ChaosTrace
 from rig.results.folders import whole_file, write_json
 
@@ -43,7 +43,12 @@ def as_markdown(cells: Sequence[Sequence[str]]) -> str:
 
 
 def write_report(
-    folder: Path, plan: Plan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
+    folder: Path,
+    plan: ChaosPlan,
+    trace: ChaosTrace,
+    evaluation: Evaluation,
+    hashes: dict[str, str],
+    failure: str | None,
 ) -> None:
     """Write chaos.json and chaos.md."""
     write_json(folder / "chaos.json", document(plan, trace, evaluation, hashes, failure))
@@ -52,7 +57,7 @@ def write_report(
 
 
 def document(
-    plan: Plan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
+    plan: ChaosPlan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
 ) -> dict[str, Any]:
     """Return what chaos.json holds."""
     return {
@@ -108,7 +113,7 @@ def _resource_lines(trace: ChaosTrace) -> list[str]:
     return lines
 
 
-def _page(plan: Plan, trace: ChaosTrace, evaluation: Evaluation, failure: str | None) -> str:
+def _page(plan: ChaosPlan, trace: ChaosTrace, evaluation: Evaluation, failure: str | None) -> str:
     lines = [
         f"# Chaos plan {plan.name}\n",
         f"{plan.description}\n",

@@ -13,7 +13,7 @@ from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.safety import Alarm, AlarmKind
 from rig.chaos.faults import AnyFault, ProcessFault, WrongModel
 from rig.chaos.injection import Injector
-from rig.chaos.plan import Plan
+from rig.chaos.plan import ChaosPlan
 from rig.chaos.resources import log_lines, resident_mb
 from rig.chaos.timeline import Moment, Timeline
 from rig.chaos.trace import ChaosTrace, Mark, Resources
@@ -37,7 +37,7 @@ class FaultSequencer:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: ChaosPlan,
         services: LocalServices,
         client: SessionClient,
         injector: Injector,

@@ -17,7 +17,7 @@ from coldloop.registers.plant import StationSample
 from coldloop.registers.safety import Alarm
 from coldloop.service.event_text import EventText, word
 from hmi.process_image import Told
-from hmi.replay import Frame
+from hmi.replay import ReplayFrame
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.rules import make_rule
 from optimizer_plc.settings import OptimizerSettings
@@ -101,7 +101,7 @@ class RecordedPage:
         design, limits = self._settings.optimizer_plc.program.design, self._settings.limits
         return OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
 
-    def frame(self, tick: int) -> Frame | None:
+    def frame(self, tick: int) -> ReplayFrame | None:
         """Return one tick; None if it is missing in the recording."""
         load, *values = self._values[tick].tolist()
         if math.isnan(load):
@@ -110,7 +110,7 @@ class RecordedPage:
         mode = _MODES.get(self._modes[tick], int(Mode.MPC))
         cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
         bad, station = self._bad_sensors[tick], self._station_at(tick)
-        return Frame(Process(tick, load, u, y), mode, cause, self._since[tick], bad, station)
+        return ReplayFrame(Process(tick, load, u, y), mode, cause, self._since[tick], bad, station)
 
     def alarms(self, events: Sequence[Told]) -> list[Alarm]:
         """Return the alarms after these events."""

@@ -42,7 +42,7 @@ class Objective(StrEnum):
     OPEN_LOOP = "J_open_mean"
 
 
-class Branch(Protocol):
+class SearchBranch(Protocol):
     """One way that a run may have gone so far."""
 
     @property
@@ -56,7 +56,7 @@ class Branch(Protocol):
         """Go on to the tick `until` with this choice."""
 
 
-B = TypeVar("B", bound=Branch)
+B = TypeVar("B", bound=SearchBranch)
 
 
 def beam_search(root: B, choices: int, boundaries: Sequence[int], width: int) -> tuple[tuple[int, ...], B]:
@@ -80,7 +80,7 @@ def beam_search(root: B, choices: int, boundaries: Sequence[int], width: int) ->
     return min(beam, key=_cost_and_choices)
 
 
-def _cost_and_choices(one: tuple[tuple[int, ...], Branch]) -> tuple[float, tuple[int, ...]]:
+def _cost_and_choices(one: tuple[tuple[int, ...], SearchBranch]) -> tuple[float, tuple[int, ...]]:
     return one[1].cost, one[0]
 
 

@@ -28,7 +28,7 @@ from coldloop.safety.sequence import InputSequence
 from coldloop.safety.writer_lease import LeaseEvent, WriterLease
 from coldloop.session.pace import Pace
 from control_plc.program import ControlProgram
-from control_plc.publication import Publication
+from control_plc.publication import ControlPublication
 from control_plc.sessions import Sessions
 
 LONGEST_WAIT_S: Final = 1.0
@@ -57,7 +57,7 @@ class Clients:
         program: ControlProgram,
         limits: InputLimits,
         bank: RegisterBank,
-        publication: Publication,
+        publication: ControlPublication,
         sessions: Sessions,
     ) -> None:
         self._program = program

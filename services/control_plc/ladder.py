@@ -14,7 +14,7 @@ from coldloop.registers.control_plc import Cause, Mode, OperatorMode
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
+class LadderInputs:
     """What the choice depends on."""
 
     operator: OperatorMode
@@ -32,9 +32,9 @@ class Ladder:
         self._hold_ticks = hold_ticks
         self.mode, self.cause, self.since = mode, cause, tick
 
-    def step(self, tick: int, situation: Situation) -> bool:
+    def step(self, tick: int, inputs: LadderInputs) -> bool:
         """Choose the mode of this scan; tell whether it, or its cause, has changed."""
-        mode, cause = self._chosen(tick, situation)
+        mode, cause = self._chosen(tick, inputs)
         if (mode, cause) == (self.mode, self.cause) or (mode is self.mode and mode is Mode.MPC):
             return False
         self.mode, self.cause, self.since = mode, cause, tick
@@ -44,15 +44,15 @@ class Ladder:
         """Go on at a tick before the present one."""
         self.since = min(self.since, tick)
 
-    def _chosen(self, tick: int, situation: Situation) -> tuple[Mode, Cause]:
-        if situation.operator is OperatorMode.MANUAL:
+    def _chosen(self, tick: int, inputs: LadderInputs) -> tuple[Mode, Cause]:
+        if inputs.operator is OperatorMode.MANUAL:
             return Mode.MANUAL, Cause.OPERATOR
-        if situation.operator is OperatorMode.CLASSICAL:
+        if inputs.operator is OperatorMode.CLASSICAL:
             return Mode.CLASSICAL, Cause.OPERATOR
-        if situation.sensors_unusable:
+        if inputs.sensors_unusable:
             return Mode.CLASSICAL, Cause.SENSOR_BAD
-        if situation.row:
-            return (Mode.REST, Cause.SEQUENCE_LATE) if situation.late else (Mode.MPC, Cause.SEQUENCE_BEGAN)
+        if inputs.row:
+            return (Mode.REST, Cause.SEQUENCE_LATE) if inputs.late else (Mode.MPC, Cause.SEQUENCE_BEGAN)
         return self._without_sequence(tick)
 
     def _without_sequence(self, tick: int) -> tuple[Mode, Cause]:

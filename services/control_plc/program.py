@@ -37,7 +37,7 @@ from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 from control_plc.classical import ClassicalLoops
 from control_plc.guard import OutputGuard
-from control_plc.ladder import Ladder, Situation
+from control_plc.ladder import Ladder, LadderInputs
 from control_plc.player import SequencePlayer
 from control_plc.process_alarms import ProcessAlarms
 from control_plc.sensors import SensorMonitor
@@ -232,7 +232,7 @@ class ControlProgram:
         before = self.ladder.mode
         changed = self.ladder.step(
             tick,
-            Situation(
+            LadderInputs(
                 operator=OperatorMode(self.operator.mode),
                 sensors_unusable=not self._usable,
                 row=row is not None,

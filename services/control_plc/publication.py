@@ -21,7 +21,7 @@ from control_plc.sessions import Sessions
 log = logging.getLogger("coldloop.control_plc")
 
 
-class Publication:
+class ControlPublication:
     """Puts the program's state into the registers.
 
     `keep` is called with new events, so that no number of an event is given out twice, and what an operator has said

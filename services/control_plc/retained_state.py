@@ -32,7 +32,7 @@ OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing")
 Count = Annotated[int, Field(ge=0, lt=2**32)]
 
 
-class RetainedState(BaseModel):
+class RetainedControlState(BaseModel):
     """The session, how far it has got, what is being played, what operators have said, the alarms, and who we are."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -88,7 +88,7 @@ class RetainedState(BaseModel):
         return InputSequence(header, rows) if checksum(header, rows) == header.crc else None
 
 
-class Memory:
+class ControlStateStore:
     """Keeps the state in a file, if one is configured; what cannot be trusted or written is logged once.
 
     Writing is done by a thread: a scan never waits for a disk.
@@ -103,13 +103,13 @@ class Memory:
         self.boot = 1
         self.holder = secrets.randbelow(2**32 - 1) + 1
 
-    def recall(self) -> RetainedState | None:
+    def recall(self) -> RetainedControlState | None:
         """Return the state of before, if there is one; boot and holder go on from it."""
         if self._file is None:
             return None
         try:
             content = self._file.load()
-            state = None if content is None else RetainedState.parsed(content)
+            state = None if content is None else RetainedControlState.parsed(content)
         except RetainedStateError as error:
             self.refused = True
             log.warning("retained state refused", extra={"reason": str(error), "file": self._file.set_aside()})
@@ -123,7 +123,7 @@ class Memory:
         """Why the state cannot be written at present."""
         return self._writer.failed if self._writer else None
 
-    def keep(self, program: ControlProgram, pace: Pace, pending: RetainedState | None = None) -> None:
+    def keep(self, program: ControlProgram, pace: Pace, pending: RetainedControlState | None = None) -> None:
         """Keep the state of now; of a `pending` session, which is still to be resumed, what was retained of it."""
         if self._writer is None:
             return

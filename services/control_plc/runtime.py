@@ -35,10 +35,10 @@ from control_plc.certificate_watch import CertificateWatch
 from control_plc.client_requests import Clients
 from control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
 from control_plc.program import make_program
-from control_plc.publication import Publication
+from control_plc.publication import ControlPublication
 from control_plc.rack_clock import PHASE, RackClock
 from control_plc.rack_finder import RackFinder
-from control_plc.retained_state import Memory
+from control_plc.retained_state import ControlStateStore
 from control_plc.scan_cycle import ScanCycle
 from control_plc.scan_watch import LOOK_S, ScanWatch
 from control_plc.sessions import Sessions
@@ -67,14 +67,14 @@ class ControlPlc:
         header = read_header(settings.model.file)
         section = settings.control_plc
         self._settings = settings
-        self._memory = Memory(section.retain.file, header.short_digest)
-        recalled = self._memory.recall()
+        self._store = ControlStateStore(section.retain.file, header.short_digest)
+        recalled = self._store.recall()
         self._program = program = make_program(header, section, settings.limits)
-        program.journal.continue_from(self._memory.boot, recalled.events if recalled else 0)
+        program.journal.continue_from(self._store.boot, recalled.events if recalled else 0)
         if recalled is not None:
             program.recall(recalled.operator, recalled.alarms, recalled.watchdog, recalled.tick)
         self.sessions = Sessions(program, settings.session, recalled)
-        self._link = PlantLink(program.alarms, program.journal, self._memory.holder)
+        self._link = PlantLink(program.alarms, program.journal, self._store.holder)
         self._cycle = ScanCycle(program, self._link, self._adopt)
         self._plant = RegisterClient.at(PLANT_MAP, section.plant)
         self._clock = RackClock(self.sessions.pace.factor, time.monotonic())
@@ -83,7 +83,9 @@ class ControlPlc:
         self._finder = RackFinder(self._plant, self._link, self._cycle, self._clock, power_up_s=section.power_up_s)
         self.bank = RegisterBank(CONTROL_MAP, section.word_order)
         publish_configuration(self.bank, selected(settings, SHOWN))
-        self.publication = Publication(program, self.sessions, self._link, self.bank, header.short_digest, self._keep)
+        self.publication = ControlPublication(
+            program, self.sessions, self._link, self.bank, header.short_digest, self._keep
+        )
         self.clients = Clients(program, settings.limits, self.bank, self.publication, self.sessions)
         certificates = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]
         self.certificates = CertificateWatch(certificates, program, self.publication.safety)
@@ -92,10 +94,10 @@ class ControlPlc:
         self._awaiting_since: float | None = None
         self.bank.put(program.operator)
         self.bank.put(WatchdogTime(program.watchdog.time))
-        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._memory.refused))
+        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._store.refused))
         if self.sessions.kept is not None:
             self._link.starting()  # nobody is to take us for one that has no session
-        if self._memory.refused:
+        if self._store.refused:
             program.alarms.raised(AlarmKind.STATE_NOT_RETAINED, STATE_REFUSED)
         self._publish()
 
@@ -103,7 +105,7 @@ class ControlPlc:
         """Let go of the rack, and keep what is to be kept."""
         self._plant.close()
         self._keep()
-        self._memory.close()
+        self._store.close()
 
     # -- scan cycle ----------------------------------------------------------------------------------------------------
 
@@ -251,7 +253,7 @@ class ControlPlc:
 
     def _keep(self) -> None:
         """Keep the state of now; of a session that is still to be gone on with, that of before the restart."""
-        self._memory.keep(self._program, self.sessions.pace, self.sessions.kept)
+        self._store.keep(self._program, self.sessions.pace, self.sessions.kept)
 
     def _watch_ourselves(self) -> None:
         """Raise the alarms about clock and memory, and note log lines that were lost."""
@@ -262,7 +264,7 @@ class ControlPlc:
             known = skew.error_ppm < limit / 4
             self._program.alarms.holds(AlarmKind.CLOCK_SKEW, condition=known and abs(skew.ppm) > limit)
         program, lost = self._program, dropped()
-        program.alarms.holds(AlarmKind.STATE_NOT_RETAINED, condition=self._memory.failure is not None)
+        program.alarms.holds(AlarmKind.STATE_NOT_RETAINED, condition=self._store.failure is not None)
         if lost > self._lost_lines:
             program.journal.note(program.tick, EventKind.LOST, value=lost - self._lost_lines)
             self._lost_lines = lost

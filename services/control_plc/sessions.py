@@ -12,7 +12,7 @@ from coldloop.registers.plant import Measurement
 from coldloop.session.pace import Pace
 from coldloop.session.settings import SessionSettings, TimeMode
 from control_plc.program import ControlProgram
-from control_plc.retained_state import RetainedState
+from control_plc.retained_state import RetainedControlState
 
 log = logging.getLogger("coldloop.control_plc")
 
@@ -33,7 +33,9 @@ class Sessions:
         recalled: State of before a restart.
     """
 
-    def __init__(self, program: ControlProgram, configured: SessionSettings, recalled: RetainedState | None) -> None:
+    def __init__(
+        self, program: ControlProgram, configured: SessionSettings, recalled: RetainedControlState | None
+    ) -> None:
         self._program = program
         self._configured = configured
         self.kept = recalled if recalled is not None and recalled.session else None

@@ -43,8 +43,8 @@ class LoginSession:
         return self.user.role is PageRole.OPERATE
 
 
-class Sessions:
-    """Sessions by their tokens, of which only digests are kept.
+class LoginSessions:
+    """LoginSessions by their tokens, of which only digests are kept.
 
     Args:
         now: Monotonic clock, s.
@@ -96,7 +96,7 @@ def _digest(token: str) -> str:
     return hashlib.sha256(token.encode(errors="surrogatepass")).hexdigest()
 
 
-class RateLimit:
+class ClientRateLimits:
     """A bucket of requests for each address or party.
 
     Args:

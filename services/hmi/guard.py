@@ -14,10 +14,10 @@ from hmi.access import (
     LOGINS_A_MINUTE,
     REQUEST_BURST,
     REQUESTS_A_BROWSER,
+    ClientRateLimits,
     LoginSession,
+    LoginSessions,
     Party,
-    RateLimit,
-    Sessions,
     host_of,
     is_own_origin,
     port_of,
@@ -95,10 +95,10 @@ class Guard:
         self._connections = connections
         self._checking = asyncio.Semaphore(PASSWORDS_AT_ONCE)
         login = settings.login
-        self.sessions = Sessions(time.monotonic, login.idle_minutes * 60, login.longest_minutes * 60)
-        self.logins = RateLimit(time.monotonic, LOGINS_A_MINUTE / 60, LOGIN_BURST)
-        self._requests = RateLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
-        self._files = RateLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
+        self.sessions = LoginSessions(time.monotonic, login.idle_minutes * 60, login.longest_minutes * 60)
+        self.logins = ClientRateLimits(time.monotonic, LOGINS_A_MINUTE / 60, LOGIN_BURST)
+        self._requests = ClientRateLimits(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
+        self._files = ClientRateLimits(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
         self._hosts = LOCAL_NAMES | {settings.host, *map(str.lower, settings.allowed_hosts)}
 
     def session(self, request: web.Request) -> LoginSession | None:

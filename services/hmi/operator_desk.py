@@ -48,7 +48,7 @@ class Prepared(NamedTuple):
     until: float
 
 
-class Outcome(NamedTuple):
+class CommandResult(NamedTuple):
     """What became of a command: one of the last three says it."""
 
     asked: str
@@ -130,7 +130,7 @@ class OperatorDesk:
             return ""
         return f" of plant time, {duration_text(seconds / pace.factor)} by the clock at factor {pace.factor:g}"
 
-    async def confirm(self, token: str, user: str) -> Outcome:
+    async def confirm(self, token: str, user: str) -> CommandResult:
         """Carry out a command that was prepared, once.
 
         Raises:
@@ -145,19 +145,19 @@ class OperatorDesk:
         async with self._turn:
             return await self._carry_out(prepared.command, prepared.text)
 
-    async def _carry_out(self, command: Command, asked: str) -> Outcome:
+    async def _carry_out(self, command: Command, asked: str) -> CommandResult:
         services, work = WORK[type(command)]
         clients = self._clients(services)
         try:
             async with connected(clients):
-                return Outcome(asked, applied=await work(clients, command))
+                return CommandResult(asked, applied=await work(clients, command))
         except NotTakenError as error:
-            return Outcome(asked, refused_because=str(error))
+            return CommandResult(asked, refused_because=str(error))
         except (LinkError, UsageError) as error:
             if any(client.has_written for client in clients.values()):
                 reason = f"{reason_of(error)}; look what has become of it before asking again"
-                return Outcome(asked, uncertain_because=reason)
-            return Outcome(asked, refused_because=reason_of(error))
+                return CommandResult(asked, uncertain_because=reason)
+            return CommandResult(asked, refused_because=reason_of(error))
 
     def _clients(self, services: Iterable[str]) -> dict[str, CommandClient]:
         return clients_of(

@@ -6,24 +6,24 @@ from coldloop.registers.declaration import fields_of
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.service.event_text import word
-from coldloop.service.metrics import Family, Sample, block_families, build_family
+from coldloop.service.metrics import MetricFamily, Sample, block_families, build_family
 from hmi.process_image import Model
 
 
-def page_families(model: Model, browsers: int) -> Iterator[Family]:
+def page_families(model: Model, browsers: int) -> Iterator[MetricFamily]:
     """Yield everything; of a service that is silent only that it is."""
     yield build_family()
     live = [service for service in MAPS if model.is_live(service)]
-    yield Family(
+    yield MetricFamily(
         "coldloop_up", "1 while a service answers the page",
         tuple(Sample(float(service in live), (("service", service),)) for service in MAPS),
     )  # fmt: skip
     ages = [(service, model.age_s(service)) for service in MAPS]
-    yield Family(
+    yield MetricFamily(
         "coldloop_age_seconds", "Time since a service answered last",
         tuple(Sample(age, (("service", service),)) for service, age in ages if age is not None),
     )  # fmt: skip
-    yield Family("coldloop_page_browsers", "Streams to browsers", (Sample(float(browsers)),))
+    yield MetricFamily("coldloop_page_browsers", "Streams to browsers", (Sample(float(browsers)),))
     for service in live:
         for block in MAPS[service].blocks:
             record = model.sources[service].records.get(block.name)
@@ -35,7 +35,7 @@ def page_families(model: Model, browsers: int) -> Iterator[Family]:
         yield from _update(model.updates[-1])
 
 
-def _alarms(model: Model) -> Iterator[Family]:
+def _alarms(model: Model) -> Iterator[MetricFamily]:
     rows = [(word(kind), alarm) for kind, alarm in model.alarm_rows()]
     for name, description, values in (
         ("coldloop_alarm_active", "1 while the condition of an alarm holds", [row.active for _, row in rows]),
@@ -47,10 +47,12 @@ def _alarms(model: Model) -> Iterator[Family]:
         samples = tuple(
             Sample(float(value), (("alarm", alarm),)) for (alarm, _), value in zip(rows, values, strict=True)
         )
-        yield Family(name, description, samples)
+        yield MetricFamily(name, description, samples)
 
 
-def _update(update: Optimization) -> Iterator[Family]:
+def _update(update: Optimization) -> Iterator[MetricFamily]:
     for (name, field), value in zip(fields_of(Optimization).items(), update, strict=True):
         unit = f" ({field.unit})" if field.unit else ""
-        yield Family(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", (Sample(float(value)),))
+        yield MetricFamily(
+            f"coldloop_update_{name}", f"Last update: {field.description}{unit}", (Sample(float(value)),)
+        )

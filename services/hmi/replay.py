@@ -28,7 +28,7 @@ MOST_AT_ONCE: Final = 400
 """Ticks that one step of a fast replay draws; of more some are left out."""
 
 
-class Frame(NamedTuple):
+class ReplayFrame(NamedTuple):
     """One tick of a run."""
 
     process: Process
@@ -78,7 +78,7 @@ class RecordedRun(Protocol):
     def configuration(self) -> Mapping[str, Any]:
         """What it was run with, by dotted key."""
 
-    def frame(self, tick: int) -> Frame | None:
+    def frame(self, tick: int) -> ReplayFrame | None:
         """Return one tick; None if it is missing in the recording."""
 
     def alarms(self, events: Sequence[Told]) -> list[Alarm]:
@@ -204,7 +204,7 @@ class Replay:
         model.put_events(events[first:last])
         model.put_alarms(run.alarms(events[:last]))
 
-    def _put(self, frame: Frame) -> None:
+    def _put(self, frame: ReplayFrame) -> None:
         model, process = self._model, frame.process
         model.put("control_plc", LadderStatus(frame.mode, frame.cause, frame.since, 1, frame.bad_sensors, 0))
         model.put("control_plc", process)

@@ -21,7 +21,7 @@ SPARE_ROWS: Final = 4096
 """Rows that are removed at a time, so that removing costs little."""
 
 
-class Stretch(NamedTuple):
+class ModeInterval(NamedTuple):
     """A stretch of plant time with one mode."""
 
     start: float
@@ -130,11 +130,11 @@ class TrendStore:
         edges = [gap.end * TICK_S for gap in self.gaps(start, end)]
         return thin(times, columns, points, edges)
 
-    def modes(self, start: int, end: int) -> list[Stretch]:
+    def modes(self, start: int, end: int) -> list[ModeInterval]:
         """Return the modes between two ticks, stretch by stretch."""
         rows = self.between(start, end)
         after_gap = {gap.end * TICK_S for gap in self.gaps(start, end)}
-        found: list[Stretch] = []
+        found: list[ModeInterval] = []
         for tick, value in zip(self.ticks[rows.start : rows.stop], self.column("mode", rows), strict=True):
             time, mode = tick * TICK_S, int(value)
             if found and found[-1].mode == mode and time not in after_gap:
@@ -142,7 +142,7 @@ class TrendStore:
             else:
                 if found and time not in after_gap:
                     found[-1] = found[-1]._replace(end=time)
-                found.append(Stretch(time, time, mode))
+                found.append(ModeInterval(time, time, mode))
         return found
 
     def substituted(self, start: int, end: int) -> dict[str, list[Substitution]]:

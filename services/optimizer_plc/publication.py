@@ -26,7 +26,7 @@ from optimizer_plc.control_link import ControlLink
 SHORTEST_PERIOD_TICKS: Final = 2
 
 
-class Publication:
+class OptimizerPublication:
     """Registers and journal of the optimiser PLC.
 
     Args:

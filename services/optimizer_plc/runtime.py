@@ -34,7 +34,7 @@ from coldloop.session.pace import Pace
 from coldloop.session.settings import TimeMode
 from optimizer_plc.control_client import ControlClient
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.publication import Publication
+from optimizer_plc.publication import OptimizerPublication
 from optimizer_plc.settings import SHOWN, OptimizerSettings
 
 log = logging.getLogger("coldloop.optimizer_plc")
@@ -82,7 +82,7 @@ class OptimizerPlc:
         self._settings = settings
         self._program = OptimizerProgram(load(settings.model.file), section.program, settings.limits)
         digest, holder = self._program.model_digest, 1 + secrets.randbelow(0xFFFFFFFF)
-        self.publication = Publication(
+        self.publication = OptimizerPublication(
             section.word_order, self._program.budget, self._program.operating_limits, digest, holder
         )
         publish_configuration(self.publication.bank, selected(settings, SHOWN))

@@ -4,7 +4,7 @@ import pytest
 
 from coldloop.errors import LoadFileError, UsageError
 from rig.chaos.faults import Drop, Kill, Reset
-from rig.chaos.plan import SPREAD_S, Plan, find_plan, parse_plan, shipped_plans
+from rig.chaos.plan import SPREAD_S, ChaosPlan, find_plan, parse_plan, shipped_plans
 
 KINDS = {
     "delay", "drop", "duplicate", "reorder", "reset", "freeze", "truncate", "abort", "flip",
@@ -58,8 +58,8 @@ def test_a_shorter_run_leaves_out_the_faults_behind_its_end() -> None:
     assert [fault.label for fault in plan.faults] == ["kill optimizer"]
 
 
-def drawing(seed: int) -> Plan:
-    return Plan(
+def drawing(seed: int) -> ChaosPlan:
+    return ChaosPlan(
         name="x", description="x", duration_s=3600, every_s=600, seed=seed,
         draw=(
             Kill(kind="kill", process="optimizer", duration_s=60),
@@ -78,7 +78,7 @@ def test_drawn_faults_come_every_so_often_and_follow_the_seed() -> None:
 
 
 def test_named_loads_follow_each_other_and_files_do_not() -> None:
-    plan = Plan(name="x", description="x", duration_s=7200, load=("a", "b"))
+    plan = ChaosPlan(name="x", description="x", duration_s=7200, load=("a", "b"))
     assert plan.scenario(385.0).load == plan.model_copy(update={"load": "2h"}).scenario(385.0).load
     with pytest.raises(LoadFileError, match="only named loads"):
         plan.model_copy(update={"load": ("a", "mine.csv")}).scenario(385.0)

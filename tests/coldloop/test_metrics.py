@@ -11,7 +11,7 @@ import pytest
 from coldloop.errors import PortInUseError
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.plant import PLANT_MAP, Actuators, Measurement
-from coldloop.service.metrics import Family, Sample, bank_families, exposition
+from coldloop.service.metrics import MetricFamily, Sample, bank_families, exposition
 from coldloop.service.metrics_server import MOST_OPEN, MetricsServer
 from coldloop.service.metrics_settings import MetricsSettings
 
@@ -35,7 +35,7 @@ def test_each_number_is_a_gauge_with_its_description_and_unit() -> None:
 
 def test_what_is_not_finite_and_what_has_quotes_is_written_as_the_format_asks() -> None:
     samples = (Sample(math.nan), Sample(math.inf), Sample(-math.inf), Sample(1.0, (("a", 'say "x"\n\\'),)))
-    lines = exposition([Family("one", "two\nlines", samples)]).splitlines()
+    lines = exposition([MetricFamily("one", "two\nlines", samples)]).splitlines()
     assert lines[0] == r"# HELP one two\nlines"
     assert lines[2:5] == ["one NaN", "one +Inf", "one -Inf"]
     assert lines[5] == 'one{a="say \\"x\\"\\n\\\\"} 1'

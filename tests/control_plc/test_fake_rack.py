@@ -40,7 +40,7 @@ from coldloop.session.pace import Pace
 from control_plc.plant_link import PlantLink
 from control_plc.program import make_program
 from control_plc.rack_clock import PHASE, RackClock
-from control_plc.retained_state import Memory, RetainedState
+from control_plc.retained_state import ControlStateStore, RetainedControlState
 from control_plc.scan_cycle import ScanCycle
 from control_plc.settings import ControlSection
 from plant.rack.rack import Rack, Session
@@ -224,7 +224,7 @@ class RackLink(RuleBasedStateMachine):
         if reading.session != self.session:
             return False
         self.accepted = None
-        kept = RetainedState.parsed(self.kept) if self.kept and self.kept["session"] == reading.session else None
+        kept = RetainedControlState.parsed(self.kept) if self.kept and self.kept["session"] == reading.session else None
         self.program.resume(
             reading.session, reading.tick, reading.u, updates=kept.updates if kept else 0,
             operator=kept.operator if kept else self.program.operator, playing=kept.sequence if kept else None,
@@ -264,7 +264,7 @@ class RackLink(RuleBasedStateMachine):
             self.keep()
 
     def keep(self) -> None:
-        content = Memory(None, HEADER.short_digest).content(self.program, Pace(self.realtime, 1.0))
+        content = ControlStateStore(None, HEADER.short_digest).content(self.program, Pace(self.realtime, 1.0))
         content["holder"] = self.holder
         self.kept = json.loads(json.dumps(content)) if self.remembers else None
 

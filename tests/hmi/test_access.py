@@ -14,7 +14,15 @@ from aiohttp.test_utils import make_mocked_request
 from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
-from hmi.access import REQUEST_BURST, REQUESTS_A_BROWSER, RateLimit, Sessions, host_of, is_own_origin, port_of
+from hmi.access import (
+    REQUEST_BURST,
+    REQUESTS_A_BROWSER,
+    ClientRateLimits,
+    LoginSessions,
+    host_of,
+    is_own_origin,
+    port_of,
+)
 from hmi.audit import Audit
 from hmi.connections import Connections
 from hmi.guard import Guard
@@ -201,7 +209,7 @@ class Clock:
 
 def test_a_session_ends_when_nobody_uses_it_and_after_its_longest_time() -> None:
     clock = Clock()
-    sessions = Sessions(clock, idle_s=100, longest_s=250)
+    sessions = LoginSessions(clock, idle_s=100, longest_s=250)
     token = sessions.begin(User("anna", PageRole.OPERATE, ""))
     for clock.time in (90.0, 180.0, 240.0):
         assert sessions.find(token)
@@ -223,7 +231,7 @@ def guard() -> Guard:
 
 def test_an_open_list_of_alarms_is_no_sign_of_life(guard: Guard) -> None:
     clock = Clock()
-    guard.sessions = Sessions(clock, idle_s=100, longest_s=1000)
+    guard.sessions = LoginSessions(clock, idle_s=100, longest_s=1000)
     cookie = {"Cookie": f"coldloop_session_default={guard.sessions.begin(User('anna', PageRole.OPERATE, ''))}"}
     clock.time = 90.0
     for path in ("/api/events", "/api/audit", "/run/1/api/trend"):
@@ -249,7 +257,7 @@ def test_a_page_that_wants_a_login_can_be_opened_to_log_in(guard: Guard, run: st
 def test_as_many_browsers_as_are_served_may_draw_trends_from_one_address() -> None:
     clock = Clock()
     browsers = HmiSection().browsers
-    limit = RateLimit(clock, REQUESTS_A_BROWSER * browsers, REQUEST_BURST)
+    limit = ClientRateLimits(clock, REQUESTS_A_BROWSER * browsers, REQUEST_BURST)
     for second in range(60):
         clock.time = float(second)
         assert all(limit.allows("proxy") for _ in range(2 * browsers))
@@ -257,7 +265,7 @@ def test_as_many_browsers_as_are_served_may_draw_trends_from_one_address() -> No
 
 def test_requests_of_one_address_are_limited_and_others_not() -> None:
     clock = Clock()
-    limit = RateLimit(clock, per_second=1.0, burst=3.0)
+    limit = ClientRateLimits(clock, per_second=1.0, burst=3.0)
     assert [limit.allows("here") for _ in range(5)] == [True, True, True, False, False]
     assert limit.allows("elsewhere")
     clock.time = 2.0

@@ -24,7 +24,7 @@ from coldloop.registers.plant import LoadAhead, LoadStatus
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
-from hmi.operator_desk import CONFIRM_WITHIN_S, OperatorDesk, Outcome
+from hmi.operator_desk import CONFIRM_WITHIN_S, CommandResult, OperatorDesk
 from hmi.process_image import Model
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -99,7 +99,7 @@ class Desk:
     async def asked(self, command: Command) -> str:
         return (await self.desk.prepare(command, "anna"))[1]
 
-    async def outcome(self, command: Command) -> Outcome:
+    async def outcome(self, command: Command) -> CommandResult:
         token, _ = await self.desk.prepare(command, "anna")
         return await self.desk.confirm(token, "anna")
 

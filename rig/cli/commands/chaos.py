@@ -15,7 +15,7 @@ from rig.durations import duration
 if TYPE_CHECKING:
     from coldloop.config import Configuration
     from rig.chaos.experiment import Experiment
-    from rig.chaos.plan import Plan
+    from rig.chaos.plan import ChaosPlan
     from rig.settings import Settings
 
 
@@ -97,7 +97,7 @@ def _refuse_what_has_no_effect(effective: "Configuration[Settings]") -> None:
     )
 
 
-def _report(out: Path, plan: "Plan", experiment: "Experiment") -> None:
+def _report(out: Path, plan: "ChaosPlan", experiment: "Experiment") -> None:
     from rig.chaos.report import as_text, summary_lines, table
 
     try:
@@ -120,7 +120,7 @@ def _changes(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
 
 
-def _write(out: Path, plan: "Plan", experiment: "Experiment") -> None:
+def _write(out: Path, plan: "ChaosPlan", experiment: "Experiment") -> None:
     from rig.chaos.figure import plot_chaos
     from rig.chaos.report import write_report
 

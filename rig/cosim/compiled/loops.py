@@ -16,7 +16,7 @@ from control_plc.output_limits import admit, admits, copy_state, in_range
 from control_plc.sensors import CONTROLLED, are_inside, watch_standing
 from optimizer_plc import scheme
 from optimizer_plc.scheme import BY_THE_RULE
-from optimizer_plc.session_state import Memory
+from optimizer_plc.session_state import OptimizerState
 from rig.cosim.compiled.plants import advance_plant
 from rig.cosim.compiled.records import NOT, Alarms, Array, Optimizer, PlantState, Reports, Trace, World
 
@@ -169,7 +169,7 @@ def answer(
 
 
 @kernel
-def begin_sequence(s: Any, rows: Array, m: Memory) -> None:  # noqa: ANN401
+def begin_sequence(s: Any, rows: Array, m: OptimizerState) -> None:  # noqa: ANN401
     """Let the answer be what is played."""
     scheme.begin_sent(m)
     playing = m.playing.numbers[0]
@@ -197,7 +197,7 @@ def latch(
 
 
 @kernel
-def measured(values: Array, m: Memory) -> Array:
+def measured(values: Array, m: OptimizerState) -> Array:
     """Return values in the optimiser's floating-point type."""
     result = np.empty(values.shape[0], m.u.dtype)
     for i in range(values.shape[0]):
@@ -213,7 +213,7 @@ def trigger(w: World, s: Any, tick: int) -> None:  # noqa: ANN401
 
 
 @kernel
-def report(s: Any, m: Memory, reports: Reports) -> None:  # noqa: ANN401
+def report(s: Any, m: OptimizerState, reports: Reports) -> None:  # noqa: ANN401
     """Write what was done with the update under way."""
     now, sent = m.numbers[0], m.sent.numbers[0]
     counts, values = reports.counts[s.solved], reports.values[s.solved]

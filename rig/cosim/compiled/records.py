@@ -10,7 +10,7 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS
 from control_plc.output_limits import Limits
 from optimizer_plc.rules import UpdatingRule
 from optimizer_plc.scheme import Constants
-from optimizer_plc.session_state import Memory
+from optimizer_plc.session_state import OptimizerState
 from plant.cold_box.physics import ColdBox
 from plant.helium.properties import Helium
 from plant.refrigerator.physics import Refrigerator
@@ -129,7 +129,7 @@ class Optimizer(NamedTuple):
     method: Any
     """Of a solver of our own."""
     rule: UpdatingRule
-    memory: Memory
+    memory: OptimizerState
     """Its state, which is overwritten."""
 
 

@@ -46,7 +46,7 @@ TUNING_DRAWS: Final = (11, 12)
 
 
 @dataclass(frozen=True)
-class Variant:
+class PolicyVariant:
     """Another setting in which rules and fixed periods are compared."""
 
     label: str
@@ -56,16 +56,16 @@ class Variant:
 
 
 SLOW: Final = (1.0, 2.5)
-AS_PRINTED: Final = Variant("as printed", (f"{PROGRAM}preset=as-printed",), NINE)
+AS_PRINTED: Final = PolicyVariant("as printed", (f"{PROGRAM}preset=as-printed",), NINE)
 VARIANTS: Final = (
-    Variant(
+    PolicyVariant(
         "rate limit scaled by tau_u / 5 s",
         ("limits.rate_reference=elapsed",),
         policies=(LITERAL, OWN_INTERRUPT, CONTROL),
     ),
-    Variant("measurement noise", NOISE, policies=(LITERAL, OWN_INTERRUPT, CONTROL)),
-    Variant("fast gradient", (f"{PROGRAM}solver=fast-gradient", f"{PROGRAM}fast_gradient.tau_1_s=0.25"), SLOW),
-    Variant("ODE starting slowly", (f"{PROGRAM}ode.cost_scale=1e-8", f"{PROGRAM}ode.growth=2.0"), SLOW),
+    PolicyVariant("measurement noise", NOISE, policies=(LITERAL, OWN_INTERRUPT, CONTROL)),
+    PolicyVariant("fast gradient", (f"{PROGRAM}solver=fast-gradient", f"{PROGRAM}fast_gradient.tau_1_s=0.25"), SLOW),
+    PolicyVariant("ODE starting slowly", (f"{PROGRAM}ode.cost_scale=1e-8", f"{PROGRAM}ode.growth=2.0"), SLOW),
     AS_PRINTED,
 )
 
@@ -139,7 +139,7 @@ def _periods(load: Load, options: StudyOptions) -> tuple[float, ...]:
     return (*SHORTER, *NINE) if load.draw == 1 else NINE
 
 
-def _variants(options: StudyOptions) -> tuple[Variant, ...]:
+def _variants(options: StudyOptions) -> tuple[PolicyVariant, ...]:
     return () if options.quick else VARIANTS
 
 
@@ -148,7 +148,7 @@ def _main(load: Load, options: StudyOptions) -> list[RunRequest]:
     return fixed + [load.request(policy.period_s, *policy.assignments) for policy in POLICIES]
 
 
-def _variant_runs(load: Load, variant: Variant) -> list[RunRequest]:
+def _variant_runs(load: Load, variant: PolicyVariant) -> list[RunRequest]:
     fixed = [load.request(period, *variant.assignments) for period in variant.periods]
     return fixed + [load.request(p.period_s, *variant.assignments, *p.assignments) for p in variant.policies]
 

@@ -35,7 +35,7 @@ from plant.program import HeatLoad, PlantProgram
 from plant.rack.faults import SensorFaults
 from plant.rack.load_schedule import LoadSchedule
 from plant.rack.outputs import AppliedOutputs, Inputs, next_generation
-from plant.rack.retained_state import RetainedState
+from plant.rack.retained_state import RetainedPlantState
 from plant.settings import SafeAction, WatchdogSettings
 
 MakePlant = Callable[[HeatLoad, int], PlantProgram]
@@ -134,7 +134,7 @@ class Rack:
         self.journal.note(0, EventKind.SESSION, int(pace.realtime), value=pace.factor, who=who)
         self.journal.note(0, EventKind.LOAD, value=session.load.value(0), who=who)
 
-    def resume(self, state: RetainedState) -> None:
+    def resume(self, state: RetainedPlantState) -> None:
         """Go on where a session was when the rack was ended; a new generation of outputs begins.
 
         Raises:
@@ -155,11 +155,11 @@ class Rack:
         )
         self.moving = state.pace.realtime and program.tick > 0 and not self.has_ended
 
-    def retained(self) -> RetainedState:
+    def retained(self) -> RetainedPlantState:
         """Return what `resume` needs."""
         session, outputs, journal = self.session, self.outputs, self.journal
         load = self.load.from_tick(self.tick)
-        return RetainedState.model_construct(
+        return RetainedPlantState.model_construct(
             boot=journal.boot, events=journal.count, generation=outputs.generation, holder=outputs.holder,
             session=session.number, pace=session.pace, watchdog=self.watchdog.time,
             times=load.times, watts=load.watts, seed=session.seed, program=self._program.retained(),
@@ -302,7 +302,7 @@ class Rack:
         }
 
 
-def _try_a_tick(program: PlantProgram, state: RetainedState) -> None:
+def _try_a_tick(program: PlantProgram, state: RetainedPlantState) -> None:
     """Move a plant, which is not used any further, on from a state that may be nonsense."""
     program.resume(**state.program)
     program.advance()

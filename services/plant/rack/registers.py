@@ -41,7 +41,7 @@ from plant.load import find_load
 from plant.rack.faults import HEALTHY
 from plant.rack.outputs import next_generation
 from plant.rack.rack import APPLIED, MakePlant, Rack, Session
-from plant.rack.retained_state import Memory
+from plant.rack.retained_state import PlantStateStore
 from plant.settings import SHOWN, PlantSettings
 
 log = logging.getLogger("coldloop.plant")
@@ -76,12 +76,12 @@ class RackRegisters:
         self._age = age
         self.bank = RegisterBank(PLANT_MAP, settings.plant.word_order)
         publish_configuration(self.bank, selected(settings, SHOWN))
-        self._memory = Memory(settings.plant.retain.file, header.short_digest)
+        self._store = PlantStateStore(settings.plant.retain.file, header.short_digest)
         self.rack, resumed = self._switched_on(
             settings, header, make_plant, utc, first_generation or secrets.randbelow(2**31) + 1
         )
         self._journal = JournalPublication(self.rack.journal, self.bank)
-        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed), int(self._memory.refused))
+        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed), int(self._store.refused))
         self.lease = WriterLease("the outputs", lambda: self.rack.silence_s, self._note_lease, now)
         self._written_row = 0
         self._outdated = True
@@ -109,7 +109,7 @@ class RackRegisters:
         pace = Pace(configured.mode is TimeMode.REALTIME, configured.factor)
         load = find_load(section.load, header.w0)
         session = Session(1 if configured.autostart else 0, pace, load, section.seed)
-        state = self._memory.recall()
+        state = self._store.recall()
         journal = (
             Journal(now=utc)
             if state is None
@@ -126,7 +126,7 @@ class RackRegisters:
         try:
             rack.resume(state)
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            self._memory.refuse(repr(error))
+            self._store.refuse(repr(error))
             return rack, False
         return rack, True
 
@@ -348,8 +348,8 @@ class RackRegisters:
         return True
 
     def _keep(self) -> None:
-        if self._memory.active:
-            self._memory.keep(self.rack.retained())
+        if self._store.active:
+            self._store.keep(self.rack.retained())
 
 
 def log_event(event: Event) -> None:

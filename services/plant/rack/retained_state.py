@@ -21,7 +21,7 @@ OWNER = "plant/3"
 Count = Annotated[int, Field(ge=0, lt=2**32)]
 
 
-class RetainedState(BaseModel):
+class RetainedPlantState(BaseModel):
     """The state of a rack between two ticks."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -51,7 +51,7 @@ class RetainedState(BaseModel):
         return self
 
 
-class Memory:
+class PlantStateStore:
     """Keeps the state in a file, if one is configured; what cannot be trusted or written is logged."""
 
     def __init__(self, file: Path | None, model_digest: int) -> None:
@@ -60,13 +60,13 @@ class Memory:
         self.refused = False
         """There was a state before, and it is not used."""
 
-    def recall(self) -> RetainedState | None:
+    def recall(self) -> RetainedPlantState | None:
         """Return the state of before, if there is one."""
         if self._file is None:
             return None
         try:
             content = self._file.load()
-            return None if content is None else RetainedState.model_validate(content)
+            return None if content is None else RetainedPlantState.model_validate(content)
         except RetainedStateError as error:
             self.refuse(str(error))
         except ValidationError as error:
@@ -79,7 +79,7 @@ class Memory:
         if self._file is not None:
             log.warning("retained state refused", extra={"reason": reason, "file": self._file.set_aside()})
 
-    def keep(self, state: RetainedState) -> None:
+    def keep(self, state: RetainedPlantState) -> None:
         """Keep the state of now: it is the memory of a simulation, so every tick counts and no disk is waited for."""
         if self._file is None:
             return

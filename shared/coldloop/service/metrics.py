@@ -23,7 +23,7 @@ class Sample(NamedTuple):
     labels: tuple[tuple[str, str], ...] = ()
 
 
-class Family(NamedTuple):
+class MetricFamily(NamedTuple):
     """Samples of one name."""
 
     name: str
@@ -31,12 +31,12 @@ class Family(NamedTuple):
     samples: tuple[Sample, ...]
 
 
-def build_family() -> Family:
+def build_family() -> MetricFamily:
     """Return the version of the program as a label of the number 1."""
-    return Family("coldloop_build_info", "Version of Coldloop", (Sample(1.0, (("version", __version__),)),))
+    return MetricFamily("coldloop_build_info", "Version of Coldloop", (Sample(1.0, (("version", __version__),)),))
 
 
-def block_families(service: str, block: Block, record: tuple[Any, ...]) -> Iterator[Family]:
+def block_families(service: str, block: Block, record: tuple[Any, ...]) -> Iterator[MetricFamily]:
     """Yield the registers of a record; texts are left out."""
     for (name, field), value in zip(fields_of(block.record).items(), record, strict=True):
         if field.is_text or name == "crc":
@@ -49,10 +49,10 @@ def block_families(service: str, block: Block, record: tuple[Any, ...]) -> Itera
             )
         else:
             samples = (Sample(float(value)),)
-        yield Family(metric_name(service, block.name, name), description, samples)
+        yield MetricFamily(metric_name(service, block.name, name), description, samples)
 
 
-def bank_families(bank: RegisterBank) -> Iterator[Family]:
+def bank_families(bank: RegisterBank) -> Iterator[MetricFamily]:
     """Yield all registers of a service that are not rows of a table and that no client writes."""
     yield build_family()
     for block in bank.map.blocks:
@@ -65,7 +65,7 @@ def metric_name(*parts: str) -> str:
     return _NOT_IN_NAMES.sub("_", "_".join(("coldloop", *parts))).lower()
 
 
-def exposition(families: Iterable[Family]) -> str:
+def exposition(families: Iterable[MetricFamily]) -> str:
     """Return families in Prometheus' text format."""
     lines: list[str] = []
     for family in families:
