@@ -91,7 +91,7 @@ async def crowd(options: argparse.Namespace) -> None:
 
 
 async def measure(options: argparse.Namespace, clients: int, logs: Path) -> tuple[LinkStatistics, str]:
-    """Run the loop with so many clients beside it; return how well it kept time, and what the crowd met."""
+    """Run the loop under so many clients; return its timing and the clients' results."""
     source = (OURSELVES if options.with_role else STRANGER, 0)
     ours = json.dumps([OURSELVES])
     roles = [f"control_plc.server.access.{role}={ours}" for role in ("control", "optimizer", "operator")]

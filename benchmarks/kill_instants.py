@@ -1,4 +1,4 @@
-"""What becomes of a service that is killed, or stands still, at instants drawn by a seed."""
+"""Kills or suspends a service at random instants and measures the recovery."""
 
 import argparse
 import random

@@ -40,7 +40,7 @@ class Floors(NamedTuple):
 
 @numba.njit(error_model="numpy")
 def steps(x, u, w, box, helium, first, count):  # noqa: ANN001, ANN201 compiled
-    """Go so many ticks forward; `first` evaluates the slope anew each time."""
+    """Advance so many ticks; `first` re-evaluates the slope each time."""
     slope, y = np.empty(28), np.empty(22)
     evaluate(x, u, w, box, helium, slope, y)
     for _ in range(count):

@@ -57,7 +57,7 @@ def measured(problems: int, minutes: float, repeat: int) -> tuple[float, float, 
     pairs = [(iteration_us(chosen), cholesky_us(chosen)) for _ in range(repeat)]
     iteration, cholesky = (statistics.median(each) for each in zip(*pairs, strict=True))
     if min(iteration, cholesky) < FLOOR_US:
-        raise SystemExit(f"the machine is too busy for this: {iteration:.2f} us and {cholesky:.2f} us are no times")
+        raise SystemExit(f"the machine is too busy to measure: {iteration:.2f} us and {cholesky:.2f} us are no times")
     return iteration, cholesky, len(chosen)
 
 

@@ -67,7 +67,7 @@ async def crowd(options: argparse.Namespace) -> None:
 
 
 async def measure(options: argparse.Namespace, browsers: int | None, folder: Path) -> tuple[LinkStatistics, str]:
-    """Run the loop beside so many browsers, or without the page; return how well it kept time, and what they got."""
+    """Run the loop under so many browsers, or without the page; return its timing and what they received."""
     settings = load_configuration(Settings, environment={}).settings
     ticks = round(options.seconds / TICK_S)
     scenario = Scenario(ticks, find_load("a", load_model(settings.model.file).w0), 0.0, 1, realtime=True)

@@ -1,4 +1,4 @@
-"""Work that goes on until Ctrl-C or SIGTERM: that is how it ends, and it ends in good order."""
+"""Work that runs until Ctrl-C or SIGTERM and then ends cleanly."""
 
 import asyncio
 import signal

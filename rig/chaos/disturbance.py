@@ -25,16 +25,16 @@ UNIT: Final = 6
 
 
 class FrameAction(NamedTuple):
-    """What becomes of one frame."""
+    """How one frame is forwarded."""
 
     data: bytes
-    """What goes on, with what was held back before."""
+    """Bytes to forward, with any that were held back before."""
     delay_s: float = 0.0
-    """How much later."""
+    """Delay before forwarding."""
     close: bool = False
-    """Whether the connection is closed behind it."""
+    """Whether the connection is closed afterwards."""
     reset: bool = False
-    """Whether that is a reset."""
+    """Whether it is closed by a reset (RST)."""
 
 
 class Mangler:
@@ -53,7 +53,7 @@ class Mangler:
         """While a frame is held back: how long, unless another one comes."""
 
     def decide(self, frame: bytes, faults: Iterable[FrameFault]) -> FrameAction:  # noqa: C901 a branch for each kind
-        """Return what becomes of a frame under the faults that are on."""
+        """Return how a frame is forwarded under the active faults."""
         pieces, delay_s, overtaken = [frame], 0.0, self.release()
         for fault in faults:
             if fault.direction not in {Direction.BOTH, self.direction}:
@@ -74,12 +74,12 @@ class Mangler:
         return FrameAction(b"".join([*pieces, overtaken]), delay_s)
 
     def release(self) -> bytes:
-        """Return what is held back; it is let go."""
+        """Return the held frame and clear it."""
         held, self._held, self.hold_s = self._held, b"", None
         return held
 
     def _instead(self, piece: bytes, fault: Replacing) -> list[bytes]:
-        """Return what goes on in the place of a frame."""
+        """Return the frames that replace `piece`."""
         if not self._hit(fault.share):
             return [piece]
         if isinstance(fault, Drop):

@@ -66,7 +66,7 @@ class Fault(BaseModel):
 
     @property
     def stops_time(self) -> bool:
-        """Whether plant time cannot go on under it in lock-step: the plant and the control PLC make it."""
+        """Whether it stops plant time in lock-step: plant and control PLC advance it."""
         return bool(self.processes & {"plant", "control_plc"})
 
 
@@ -133,7 +133,7 @@ class Reorder(FrameFault):
 
 
 class Reset(LinkFault):
-    """All connections are reset (RST), and new ones as long as it lasts."""
+    """All connections are reset (RST), and new ones while the fault lasts."""
 
     kind: Literal["reset"]
 
@@ -221,7 +221,7 @@ class Restart(ProcessFault):
 
 
 class Clock(Fault):
-    """A jump of the clock as all three processes see it: all are paused, and go on."""
+    """A jump of the clock as all three processes see it: all are suspended and resumed."""
 
     kind: Literal["clock"]
 
@@ -247,9 +247,9 @@ class Sensor(Fault):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.output not in OUTPUT_NAMES:
-            raise ValueError(f"there is no output '{self.output}'; take one of {', '.join(OUTPUT_NAMES)}")
+            raise ValueError(f"unknown output '{self.output}'; choose one of {', '.join(OUTPUT_NAMES)}")
         if (self.shows == "value") != (self.value is not None):
-            raise ValueError('a value goes with shows = "value", and only with that')
+            raise ValueError('give `value` with shows = "value", and only then')
         return self
 
     @property

@@ -109,11 +109,11 @@ class Injector:
             if before is not None:
                 return before
             await asyncio.sleep(0.5)
-        raise LinkError(f"the plant took no {target} = {value:g}: see its log")
+        raise LinkError(f"the plant did not accept {target} = {value:g}: see its log")
 
     async def _set_sensor(self, output: str, fault: SensorFault) -> None:
         for _ in range(ATTEMPTS):
             if await self._plant.set_sensor_fault(OUTPUT_NAMES.index(output), fault):
                 return
             await asyncio.sleep(0.5)
-        raise LinkError(f"the plant took no sensor fault for {output}: see its log")
+        raise LinkError(f"the plant did not accept a sensor fault for {output}: see its log")

@@ -1,4 +1,4 @@
-"""Plans of a proxy that stands alone: TOML files that say what goes wrong in its link, and when."""
+"""Plans of a stand-alone proxy: TOML files with the faults of its link and their times."""
 
 from typing import Annotated, Any, NamedTuple
 

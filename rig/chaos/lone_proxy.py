@@ -1,4 +1,4 @@
-"""A proxy of its own, before any Modbus/TCP server: a link that is disturbed by plan, in real time."""
+"""A stand-alone proxy in front of any Modbus/TCP server: disturbs the link by plan, in real time."""
 
 import asyncio
 from collections.abc import Callable

@@ -52,8 +52,8 @@ class ChaosPlan(BaseModel):
     updating_period_s: Annotated[float, Field(ge=0, le=5)] = 0.0
     """0 is adaptive."""
     standstill_s: Annotated[float, Field(gt=0, le=600)] = 8.0
-    """In lock-step a fault under which plant time does not go on ends after so much real time. The control PLC gives an
-    optimiser up that does not go on for `control_plc.ladder.optimizer_patience_s`, and goes on."""
+    """In lock-step a fault that stops plant time ends after this real time. The control PLC drops an
+    optimiser that is silent for `control_plc.ladder.optimizer_patience_s`, and continues."""
     faults: tuple[AnyFault, ...] = ()
     every_s: Annotated[float, Field(ge=2 * SPREAD_S)] | None = None
     """Draw a fault so often, from `draw`."""
@@ -66,19 +66,19 @@ class ChaosPlan(BaseModel):
         if any(fault.at_s is not None for fault in self.draw):
             raise ValueError("those in `draw` have no at_s: their instants are drawn")
         if (self.every_s is None) != (not self.draw):
-            raise ValueError("every_s and `draw` go together")
+            raise ValueError("give every_s and `draw` together")
         if any(fault.tick >= self.ticks for fault in self.faults):
             raise ValueError(f"a fault begins after the end of the run, {self.duration_s:g} s")
         _refuse_overlaps(self.schedule())
         if any(isinstance(fault, Given) for fault in (*self.faults, *self.draw)) and (
             self.plant is not PlantKind.REFRIGERATOR
         ):
-            raise ValueError('a fault of kind "given" is one of a refrigerator: write plant = "refrigerator"')
+            raise ValueError('a fault of kind "given" needs plant = "refrigerator"')
         return self
 
     @property
     def realtime(self) -> bool:
-        """Whether the clock makes time go on."""
+        """Whether plant time follows the clock."""
         return self.mode is TimeMode.REALTIME
 
     @property
@@ -132,7 +132,7 @@ class ChaosPlan(BaseModel):
 
 
 def _refuse_overlaps(schedule: list[AnyFault]) -> None:
-    """Refuse a process that is to be stopped while it is stopped."""
+    """Reject a second stop of a process that is already stopped."""
     for number, fault in enumerate(schedule):
         for later in schedule[number + 1 :]:
             if later.tick >= fault.end_tick:

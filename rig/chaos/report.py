@@ -95,7 +95,7 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
         lines.append(f"mode at the end: {Mode(trace.ladder.mode).name}, {trace.ladder.events} events")
     standing = [AlarmKind(i).name for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
     if standing:
-        lines.append(f"alarms that stand or wait for an operator: {', '.join(standing)}")
+        lines.append(f"alarms active or unacknowledged: {', '.join(standing)}")
     return [*lines, *_resource_lines(trace)]
 
 

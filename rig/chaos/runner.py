@@ -36,7 +36,7 @@ async def conduct(
     """Run a plan on three services started for it; `trace`, a sink of the recorder, has what there was.
 
     Raises:
-        LinkError: A service ended by itself, the rig stood still, or it all took too long.
+        LinkError: A service ended by itself, plant time stopped, or the run took too long.
     """
     if any(isinstance(fault, WrongModel) for fault in plan.schedule()):  # not while the clock is running
         await asyncio.to_thread(save_wrong_model, settings.model.file, folder / WRONG_MODEL)

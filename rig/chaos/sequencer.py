@@ -78,9 +78,9 @@ class FaultSequencer:
         return time.monotonic() - self._began
 
     async def _next_moment(self) -> Moment | None:
-        """Let the rig go on until a fault begins or ends; return None at the end of the run."""
+        """Advance the rig until a fault begins or ends; return None at the end of the run."""
         while True:
-            with contextlib.suppress(TimeoutError):  # what does not go on must not keep a fault from ending in time
+            with contextlib.suppress(TimeoutError):  # a stopped rig must not keep a fault from ending in time
                 async with asyncio.timeout(self._timeline.left_s(self._seconds)):
                     await self._look()
             moment = self._timeline.due(self.tick, self._seconds) or self._cut_short()
@@ -109,10 +109,10 @@ class FaultSequencer:
         return ladder
 
     def _cut_short(self) -> Moment | None:
-        """Return the end of a fault under which plant time does not go on.
+        """Return the end of a fault that stops plant time.
 
         Raises:
-            LinkError: It does not go on, without a fault.
+            LinkError: Plant time stopped without a fault.
         """
         standing = time.monotonic() - self._standing_since
         for end in self._timeline.on:

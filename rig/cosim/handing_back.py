@@ -1,4 +1,4 @@
-"""A rig that ran in real time before somebody attached to it runs on in real time afterwards."""
+"""Restores a rig that ran in real time before a client attached to it."""
 
 import logging
 from typing import NamedTuple
@@ -39,7 +39,7 @@ async def look_around(rig: SessionClient) -> Found | None:
 
 
 async def _load_from(rig: SessionClient, now: int) -> LoadProfile:
-    """Return the load from now on: of the session's table, unless somebody has written another one since."""
+    """Return the load from now on: of the session's table, unless another client has written one since."""
     status, asked = await rig.plant.read(LoadStatus), await rig.plant.read(PlantSession)
     steps: list[LoadStep] = []
     if status.upcoming:
@@ -50,13 +50,13 @@ async def _load_from(rig: SessionClient, now: int) -> LoadProfile:
     try:
         return LoadProfile((0, *(step.tick - now for step in coming)), (status.watts, *(step.watts for step in coming)))
     except ValueError as error:
-        raise LinkError(f"{rig.plant.peer}: its load is none: {error}") from None
+        raise LinkError(f"{rig.plant.peer}: its load is invalid: {error}") from None
 
 
 async def give_back(rig: SessionClient, found: Found | None, session: int) -> None:
-    """Let the session of our run go on as the rig was found: real time, factor, load, who drives.
+    """Restore real time, factor, load and operating mode of the rig in the session of our run.
 
-    Nothing is done where the rig was in lock-step, or where somebody else has begun another session. What cannot be
+    Nothing is done where the rig was in lock-step, or where another client has begun another session. What cannot be
     given back is logged: the run is recorded all the same.
     """
     if found is None:
@@ -73,6 +73,6 @@ async def give_back(rig: SessionClient, found: Found | None, session: int) -> No
         coming = LoadProfile(found.load.times, found.load.watts)
         await LoadStream(rig.plant, session, coming, begin=tick + lead_ticks(found.pace)).feed(tick)
     except LinkError as error:
-        log.warning("the rig does not run on as it was found: %s", error)
+        log.warning("the rig was not restored: %s", error)
     else:
-        log.info("given back at %g s", tick * TICK_S)
+        log.info("restored at %g s", tick * TICK_S)

@@ -48,7 +48,7 @@ def run_ideal_loop(
         scenario: Its updating period has no effect.
         recorder: Takes the samples; there are no updates.
         ticks: From one instant to the next, 1 to 20.
-        solved: Is told of each problem.
+        solved: Called with each problem.
     """
     header, model = own_header(settings.model.file), load(settings.model.file)
     prediction, program = PredictionModel(model), settings.optimizer_plc.program

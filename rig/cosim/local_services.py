@@ -33,7 +33,7 @@ class LocalServices:
         log_folder: Their logs go to `<folder>/<service>.log`.
         detours: Where something is between clients and servers.
         environment: Further variables for all of them.
-        ports: Where they listen; by default on ports that nobody else uses.
+        ports: Where they listen; by default on free ports.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class LocalServices:
             environment: Further variables for this time.
             may_end: Its end by itself does not end the run.
         """
-        # A session of their own: a Ctrl-C is the rig's to answer, in good order.
+        # In their own process session: Ctrl-C is handled by the rig.
         with self.log(service).open("ab") as log:
             process = await asyncio.create_subprocess_exec(
                 *PYTHON, "-m", service, "--with-parent",
@@ -121,7 +121,7 @@ class LocalServices:
         self._signal(service, signal.SIGSTOP)
 
     def resume(self, service: str) -> None:
-        """Let it go on."""
+        """Resume it."""
         self._signal(service, signal.SIGCONT)
 
     def _signal(self, service: str, number: signal.Signals) -> None:

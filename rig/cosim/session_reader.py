@@ -91,7 +91,7 @@ class SampleReader:
                 self.read_until = tick + 1
 
     async def _read_stations(self, first: int, count: int) -> None:
-        """Read what goes with ticks, if the plant is a whole refrigerator: the first row that is read tells."""
+        """Read what goes with ticks, if the plant is a whole refrigerator: the first row that is read decides."""
         if self.has_station is None:
             (station,) = await self._client.read_rows(StationSample, first % STATION_ROWS, 1)
             self.has_station = any(station.signals)

@@ -1,4 +1,4 @@
-"""The operator's page as a process beside the services of a rig that is up."""
+"""The operator's page as a process of a rig that is up."""
 
 import asyncio
 import os
@@ -33,7 +33,7 @@ def check_page(section: HmiSection) -> None:
         UsageError: It has no port, its extra is not installed, or its port is in use.
     """
     if not section.port:
-        raise UsageError("the page of a rig that is up has a port of its own: give one with --page-port")
+        raise UsageError("the page needs a fixed port: give one with --page-port")
     if find_spec("aiohttp") is None:
         raise UsageError("--page needs aiohttp: pip install 'coldloop[hmi]'")
     with socket.socket(socket.AF_INET6 if ":" in section.host else socket.AF_INET) as one:

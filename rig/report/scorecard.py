@@ -35,7 +35,7 @@ Range = Annotated[tuple[float, float], BeforeValidator(_limits)]
 
 
 class ClaimVerdict(StrEnum):
-    """What became of a claim."""
+    """Result of a claim."""
 
     REPRODUCED = "reproduced"
     PARTLY = "partly"
@@ -77,7 +77,7 @@ class Revision(BaseModel):
 
 
 class Claim(Revision):
-    """A claim of the paper, an aim of this project, or what stands beside them."""
+    """A claim of the paper, an aim of this project, a check or a variant."""
 
     study: str
     kind: ClaimKind = ClaimKind.CLAIM

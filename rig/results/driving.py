@@ -26,7 +26,7 @@ DRIVERS: Final[Mapping[int, str]] = {
     Mode.CLASSICAL: "loops",
     Mode.MANUAL: "operator",
 }
-"""Whose inputs are applied in each mode; nobody's while the last ones are held."""
+"""Source of the applied inputs in each mode; "nobody" while the last ones are held."""
 SHOWN: Final = (L1, T5)
 """Outputs of which the trace has what the sensor showed."""
 
@@ -52,7 +52,7 @@ class SensorFaultRecord(NamedTuple):
 class DrivingHistory:
     """Takes events in the order of each journal; returns the columns of ticks that do not come back.
 
-    A control PLC that was restarted may go on some ticks back: what it notes then holds from there on.
+    A restarted control PLC may resume some ticks back: its later events hold from there on.
     """
 
     def __init__(self) -> None:

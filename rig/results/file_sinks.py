@@ -1,4 +1,4 @@
-"""Sinks that write the files of a run as it goes on, row group by row group, in constant memory."""
+"""Sinks that write the files of a run while it runs, row group by row group, in constant memory."""
 
 from collections import deque
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""The files of a run while it goes on, and how they end: complete, or with the reason why not."""
+"""The files of a run: written during the run, and completed with its result or the reason of its failure."""
 
 import contextlib
 import math
@@ -45,7 +45,7 @@ class RunFiles:
         sinks: Further sinks of the recorder.
 
     Raises:
-        UsageError: The disk is nearly full, or what is to be run lies in the folder.
+        UsageError: The disk is nearly full, or an input of the run lies in the folder.
         OSError: A file cannot be made.
     """
 

@@ -62,7 +62,7 @@ class _ListeningOptimizer(OptimizerProgram):
     """Keeps parameters and profile of every problem."""
 
     def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
-        """Begin anew."""
+        """Reset."""
         self.heard: list[LoopProblem] = []
         super().restart(updating_period_s, rule)
 

@@ -47,11 +47,11 @@ TRANSITIONS: Final[Mapping[AlarmState, Mapping[EventKind, AlarmState]]] = {
         EventKind.ALARM_RAISED: AlarmState.SHELVED,  # in the journal, and not shown
         EventKind.ALARM_RETURNED: AlarmState.SHELVED,
         EventKind.ALARM_SHELVED: AlarmState.SHELVED,  # for another time
-        EventKind.ALARM_UNSHELVED: AlarmState.NORMAL,  # and raised anew when active
+        EventKind.ALARM_UNSHELVED: AlarmState.NORMAL,  # and raised again when active
         EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
     },
     AlarmState.OUT_OF_SERVICE: {
-        EventKind.ALARM_IN_SERVICE: AlarmState.NORMAL,  # and raised anew when active
+        EventKind.ALARM_IN_SERVICE: AlarmState.NORMAL,  # and raised again when active
     },
 }
 """The state after an event. What is not here does not happen: it changes nothing, and nothing is noted."""
@@ -119,7 +119,7 @@ class AlarmPanel:
             self._store(kind, shelved_until=max(tick + 1, self.rows[kind].shelved_until - back))
 
     def begin_at(self, tick: int) -> None:
-        """Go on at a tick that may lie before the present one."""
+        """Set the tick, which may lie before the present one."""
         self.now = tick
 
     def pass_by(self) -> None:
@@ -243,7 +243,7 @@ class AlarmPanel:
         """Take the alarms of before a restart; priorities are those of the configuration."""
         self.rows = [row._replace(priority=rule.priority) for row, rule in zip(rows, self._rules, strict=True)]
         self._causes = {kind: {row.cause} for kind, row in zip(AlarmKind, rows, strict=True) if row.active}
-        # Who tells of instants does not tell that they are over.
+        # An instantaneous alarm has no end.
         self._pending = {kind: _Pending(self.now, 0) for kind in PASSING if self.rows[kind].active}
         self.changes += 1
 

@@ -1,4 +1,4 @@
-"""The alarm about certificates that are to be renewed."""
+"""The alarm about certificates that must be renewed."""
 
 import asyncio
 import logging
@@ -41,7 +41,7 @@ class CertificateWatch:
         while self._certificates:
             try:
                 days = await asyncio.to_thread(self._days_of_those_to_renew)  # no scan waits for a disk
-            except ConfigurationError as error:  # somebody is renewing them, perhaps; what was read at the start serves
+            except ConfigurationError as error:  # they may be being renewed: keep what was read at the start
                 log.warning("certificates unreadable", extra={"reason": str(error)})
                 self._program.alarms.raised(AlarmKind.CERTIFICATE, UNREADABLE)
             else:

@@ -99,7 +99,7 @@ class Clients:
             self._program.alarms.happened(AlarmKind.SECOND_WRITER, SECOND_OPTIMIZER)
             raise
         if isinstance(record, Plan) and not record.crc:
-            raise IllegalValueError("a plan without CRC: it decides when inputs change, so it is sealed")
+            raise IllegalValueError("a plan needs a CRC: it decides when inputs change")
 
     def _judge_operator(self, record: Operator, _row: int, _caller: Caller) -> None:
         for name, value, low, high in zip(INPUT_NAMES, record[1:], self._limits.low, self._limits.high, strict=True):
@@ -255,7 +255,7 @@ class Clients:
             self._waits -= 1
 
     def on_departure(self, role: Role) -> None:
-        """Nobody of this role is connected any more: an optimiser is not waited for."""
+        """The last client of this role has disconnected: do not wait for an optimiser."""
         if role is Role.OPTIMIZER:
             self._program.optimizer_lost()
             self._publication.safety()
@@ -266,6 +266,6 @@ class Clients:
         self.lease.closed(caller)
 
     def on_refusal(self, kind: str) -> None:
-        """A server has refused something to somebody."""
+        """A server has refused a client's request."""
         if kind == "access_refused":
             self._program.alarms.happened(AlarmKind.ACCESS_REFUSED)

@@ -35,13 +35,13 @@ class OutputGuard:
         """The last tick, and by how much our time is behind it."""
 
     def begin_at(self, tick: int, applied: SequenceRow, passed: int | None = None) -> None:
-        """Go on from what is applied at `tick`, wherever that is; it counts as having moved just then.
+        """Restart from the outputs applied at `tick`; they count as having moved just then.
 
         A window that is open stays open: breaks that follow one another would else give a full rate each. A value that
         is not finite is not taken over: the last finite one stays.
 
         Args:
-            tick: Where to go on.
+            tick: Tick of the restart.
             applied: What is applied there.
             passed: Ticks that have passed since the last scan by another clock; None where there is none.
         """

@@ -15,14 +15,14 @@ from coldloop.registers.control_plc import Cause, Mode, OperatorMode
 
 @dataclass(frozen=True, slots=True)
 class LadderInputs:
-    """What the choice depends on."""
+    """Inputs of the choice of mode."""
 
     operator: OperatorMode
     sensors_unusable: bool
     row: bool
-    """There is a row to be played."""
+    """A sequence has a row for this tick."""
     late: bool
-    """It is the rest of a sequence whose successor is late, or will not come: the optimiser is lost."""
+    """The next sequence is late, or the optimiser is lost: this is the rest of the last one."""
 
 
 class Ladder:
@@ -41,7 +41,7 @@ class Ladder:
         return True
 
     def set_back(self, tick: int) -> None:
-        """Go on at a tick before the present one."""
+        """Set the time back to a tick before the present one."""
         self.since = min(self.since, tick)
 
     def _chosen(self, tick: int, inputs: LadderInputs) -> tuple[Mode, Cause]:

@@ -73,7 +73,7 @@ class GuardState:
 
 
 def beginning(limits: Limits, applied: Numbers) -> GuardState:
-    """Return the state in which `applied` has stood for ever."""
+    """Return the state after `applied` has been constant for ever."""
     slots = range(limits.slew_ticks)
     return GuardState(list(applied), list(applied), [NEVER for _ in slots], [list(applied) for _ in slots])
 
@@ -96,7 +96,7 @@ def rate_share(limits: Limits, elapsed_ticks: int) -> float:
 
 
 def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update: bool) -> None:  # noqa: FBT001 compiled
-    """Apply `wanted` (3) at `tick` as far as it may be; `update` tells that a sequence begins there."""
+    """Apply `wanted` (3) at `tick` as far as the limits allow; `update`: a sequence begins there."""
     applied = state.applied
     if update or tick - state.start >= TICKS_PER_SAMPLE:
         state.share = rate_share(limits, tick - state.moved)

@@ -3,9 +3,9 @@
     IDLE        no session
     SEARCHING   the rack does not answer
     JOINING     it answers; what it applies is being read back
-    IN_STEP     outputs are written in every scan, and taken
+    IN_STEP     outputs are written in every scan, and accepted
     NOT_TAKEN   it answers, and does not take the outputs
-    FOREIGN     it is in another session, or somebody else drives it
+    FOREIGN     it is in another session, or has another master
     FROZEN      it answers, and its clock does not move
 
 One rule decides: *no output is written unless what the rack applies was read twice since the last break: sealed,
@@ -68,7 +68,7 @@ class PlantLink:
         self.breaks = 0
         """Times that outputs were no longer taken."""
         self._noted = PlantLinkState.IDLE
-        """State that the journal knows of: in step when outputs have been taken, and not when they may be written."""
+        """State in the journal: synchronised once outputs have been accepted, not when they may be written."""
         self.frozen_ticks = float(FROZEN_TICKS)
         """How long the rack's tick may stand, in ticks of our clock."""
         self.generation = 0
@@ -78,7 +78,7 @@ class PlantLink:
         self.is_confirmed = False
         """The last reading said what the one before had said."""
         self._known_place: float | None = None
-        """Where the rack was, in ticks of the session, when it was last in step."""
+        """Where the rack was, in ticks of the session, when it was last synchronised."""
         self._old_since: float | None = None
         """Since when readings are of a time before that."""
         self.session = 0
@@ -128,12 +128,12 @@ class PlantLink:
             self._enter(PlantLinkState.SEARCHING, cause)
 
     def overslept(self) -> None:
-        """Note that this program stood still: what the rack has done meanwhile is not known."""
+        """Note that this program missed scans: the rack's state is unknown."""
         if self.in_step:
             self._enter(PlantLinkState.JOINING, LinkCause.OVERSLEPT)
 
     def repaced(self) -> None:
-        """Note that the time base was changed: where the rack is, and how fast it moves, is found out anew."""
+        """Note that the time base was changed: tick and speed of the rack are determined again."""
         self._moved_at = None
         if self.in_step:
             self._enter(PlantLinkState.JOINING, LinkCause.PACE)
@@ -157,7 +157,7 @@ class PlantLink:
         else:
             moved = reading.tick + reading.age - earlier.tick - earlier.age
             waits = reading.tick == earlier.tick == 0  # for the first outputs
-            in_time = waits or 0 < moved <= now - at + self.frozen_ticks  # an old answer that is repeated stands still
+            in_time = waits or 0 < moved <= now - at + self.frozen_ticks  # a repeated old answer does not advance
         in_time = in_time and not self._is_old(reading, now)
         self.is_confirmed = same and (in_time or reading.session != session)
 
@@ -174,7 +174,7 @@ class PlantLink:
         elif reading.session != session or not session:
             self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
         else:
-            if self.generation not in (0, reading.generation):  # somebody else, or its watchdog, has moved the outputs
+            if self.generation not in (0, reading.generation):  # another master, or its watchdog, has moved the outputs
                 self._alarms.raised(AlarmKind.PLANT_LOST, LinkCause.CHANGED)
             self.generation, self._read = reading.generation, None
             self._known_place = reading.tick + reading.age
@@ -186,7 +186,7 @@ class PlantLink:
         return outputs._replace(holder=self.holder, generation=self.generation)
 
     def joined(self) -> None:
-        """The program goes on from what was read back: outputs may be written."""
+        """The program has resumed from what was read back: outputs may be written."""
         self._enter(PlantLinkState.IN_STEP, self.cause)
 
     def exchanged(self, sent: Actuators, answer: Measurement, now: float | None) -> bool:
@@ -232,7 +232,7 @@ class PlantLink:
         return reading.tick > 0 and now - self._old_since < self.frozen_ticks
 
     def _watch_others(self, answer: Measurement) -> None:
-        """Raise the alarm when two answers say that the rack has refused somebody else's outputs."""
+        """Raise the alarm when two answers show that the rack has refused another master's outputs."""
         before, self._has_refused_more = self._has_refused_more, answer.refused != self.refused
         if before and self._has_refused_more:
             self.refused, self._has_refused_more = answer.refused, False

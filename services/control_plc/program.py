@@ -50,7 +50,7 @@ HANDSHAKE_TICKS = TICKS_PER_SAMPLE
 HANDSHAKE_PAUSE_S = 30.0
 """After a handshake that came to nothing the classical loops are not held again for so long."""
 SET_BACK_TICKS = TICKS_PER_SAMPLE
-"""Time that goes back by more than this begins anew: what was sent was for a time that is to come again."""
+"""Time set back by more than this drops all sequences: they were for a time that will come again."""
 LOST_TICKS = 4
 """A rack that has been out of step for longer takes no new sequences: they would be played late."""
 
@@ -105,7 +105,7 @@ class ControlProgram:
         """Take over what operators had said before a restart, and the alarms; the session is resumed later.
 
         Args:
-            operator: Who drives.
+            operator: Operating mode and setpoints.
             alarms: All alarms.
             watchdog: Time-out of the optimiser's watchdog, in ticks.
             tick: The last one.
@@ -125,7 +125,7 @@ class ControlProgram:
         operator: Operator,
         playing: InputSequence | None = None,
     ) -> None:
-        """Go on with a session after a restart.
+        """Resume a session after a restart.
 
         Args:
             session: Its number.
@@ -315,10 +315,10 @@ class ControlProgram:
         self._in_scan = False
 
     def rejoin(self, tick: int, applied: Sequence[float], passed: int | None = None) -> None:
-        """Go on at another tick: the rack was away, or time has leapt.
+        """Continue at another tick: the rack was away, or time has jumped.
 
         Forward, all timers count the time that has passed. Back by a little, they begin at the present tick at the
-        latest; back by more than `SET_BACK_TICKS`, sequences are dropped too, and the optimiser is invited anew.
+        latest; back by more than `SET_BACK_TICKS`, sequences are dropped too, and the optimiser is invited again.
 
         Args:
             tick: Tick of the next scan.
@@ -349,11 +349,11 @@ class ControlProgram:
         self.watchdog.trigger(max(self.tick, self.alarms.now))
 
     def optimizer_lost(self) -> None:
-        """Go on without the optimiser until it shows a sign of life; the alarm is raised by the next scan's end."""
+        """Continue without the optimiser until its next heartbeat; the alarm is raised by the end of the next scan."""
         self.optimizer_present = False
 
     def heartbeat(self, beat: Heartbeat) -> None:
-        """Take a sign of life that tells the optimiser's model."""
+        """Take a heartbeat, which names the optimiser's model."""
         self.optimizer_seen()
         wrong = beat.model_digest != self._point.model_digest
         self.alarms.holds(AlarmKind.MODEL_MISMATCH, condition=wrong)
@@ -389,13 +389,13 @@ class ControlProgram:
         return True
 
     def operate(self, operator: Operator) -> None:
-        """Let an operator decide who drives, from the next scan on."""
+        """Set the operating mode from the next scan on."""
         self.operator = operator
         self._let_play(usable=self._usable)
 
 
 def _are_states(x: Sequence[float]) -> bool:
-    """Tell whether these can be states: an update that has others is none."""
+    """Return whether these can be states; otherwise the update is invalid."""
     return math.isfinite(sum(x)) and min(x) >= -MAX_STATE and max(x) <= MAX_STATE
 
 

@@ -56,7 +56,7 @@ class ControlPublication:
         """That of the optimiser."""
 
     def begin(self) -> None:
-        """Count anew: a session begins."""
+        """Reset the counters: a session begins."""
         self.overruns = 0
         self.lateness = LatenessRecord()
         self.skew, self.offset_ms = Skew(0.0, math.inf), 0.0

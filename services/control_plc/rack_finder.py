@@ -20,7 +20,7 @@ log = logging.getLogger("coldloop.control_plc")
 SEARCH_S: Final = 0.5
 """How long one attempt to reach a lost rack may take, at least."""
 LOOK_PAUSE_S: Final = 0.1
-"""Between two looks at a rack that is not in step."""
+"""Between two reads of a rack that is not synchronised."""
 AT_ONCE: Final = 2
 """Looks after a break without a pause: the second confirms what the first has shown."""
 
@@ -63,7 +63,7 @@ class RackFinder:
         return True
 
     async def look(self, changed: asyncio.Event, patience_s: float | None) -> bool:
-        """Read what the rack applies, once; tell whether it has answered, and nobody else drives it.
+        """Read what the rack applies, once; return whether it has answered and has no other master.
 
         Args:
             changed: What ends the pause between two looks.
@@ -111,7 +111,7 @@ class RackFinder:
         return lease.state in (LeaseState.HELD, LeaseState.LINGERING)
 
     def _take(self, reading: Measurement, at: float, *, realtime: bool) -> None:
-        """Go on from a reading, where that may be done; `at` is when the rack was read, s."""
+        """Resume from a reading if allowed; `at` is when the rack was read, s."""
         self._cycle.answered(reading, at / self._clock.tick_s if realtime else None)
         if self._link.in_step:
             # at tick 0 the rack's clock waits for the first outputs
@@ -130,4 +130,4 @@ class RackFinder:
             self._link.starting()
             return
         self._cycle.failed(error)
-        log.warning("plant not in step", extra={"reason": str(error), "tick": self._link.tick})
+        log.warning("plant not synchronised", extra={"reason": str(error), "tick": self._link.tick})

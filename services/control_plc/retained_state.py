@@ -99,12 +99,12 @@ class ControlStateStore:
         self._writer = RetainedStateWriter(self._file) if self._file else None
         self._packed: tuple[InputSequence, tuple[SequenceHeader, str]] | None = None
         self.refused = False
-        """There was a state before, and it is not used."""
+        """A previous state exists and is not used."""
         self.boot = 1
         self.holder = secrets.randbelow(2**32 - 1) + 1
 
     def recall(self) -> RetainedControlState | None:
-        """Return the state of before, if there is one; boot and holder go on from it."""
+        """Return the previous state, if any; boot and holder continue from it."""
         if self._file is None:
             return None
         try:

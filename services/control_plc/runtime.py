@@ -1,8 +1,8 @@
 """The control PLC on the bus: client of the plant's rack, server of the optimiser and of operators.
 
-A scan makes one exchange (FC23) with the rack, and only while the link to it is in step (`plant_link.py`); out of step
+A scan makes one exchange (FC23) with the rack, and only while the link is synchronised (`plant_link.py`); otherwise
 the rack is read until it is. In lock-step the next scan waits for what it needs: the operator's grant, the optimiser's
-plan, and at an updating instant its sequence, as long as an optimiser is there. In real time it waits for the clock
+plan, and at an updating instant its sequence, while an optimiser is connected. In real time it waits for the clock
 only, which follows that of the rack (`rack_clock.py`).
 """
 
@@ -48,7 +48,7 @@ log = logging.getLogger("coldloop.control_plc")
 
 TICKS_PER_SECOND: Final = round(1 / TICK_S)
 ANSWER_TICKS: Final = 8
-"""In real time an answer that takes longer is of no use: the rack is looked at anew."""
+"""In real time a later answer is stale: the rack is read again."""
 SHORTEST_PATIENCE_S: Final = 0.1
 LONGEST_SLEEP_S: Final = 0.25
 """In real time it is seen so often whether an operator has called meanwhile."""
@@ -96,13 +96,13 @@ class ControlPlc:
         self.bank.put(WatchdogTime(program.watchdog.time))
         program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._store.refused))
         if self.sessions.kept is not None:
-            self._link.starting()  # nobody is to take us for one that has no session
+            self._link.starting()  # other clients must not take this for a PLC without a session
         if self._store.refused:
             program.alarms.raised(AlarmKind.STATE_NOT_RETAINED, STATE_REFUSED)
         self._publish()
 
     def close(self) -> None:
-        """Let go of the rack, and keep what is to be kept."""
+        """Disconnect from the rack, and save the retained state."""
         self._plant.close()
         self._keep()
         self._store.close()
@@ -171,7 +171,7 @@ class ControlPlc:
             async with asyncio.timeout(KEEP_ALIVE_S):
                 await self.clients.changed.wait()
         except TimeoutError:
-            with contextlib.suppress(LinkError):  # when time goes on, the rack is looked at
+            with contextlib.suppress(LinkError):  # the rack is read when time resumes
                 await self._plant.read(Measurement)
 
     async def _until_granted(self) -> bool:
@@ -193,7 +193,7 @@ class ControlPlc:
         return False
 
     async def _until_answered(self) -> None:
-        """Wait until somebody writes something; an optimiser that is waited for too long is lost."""
+        """Wait for a client's write; an optimiser that keeps us waiting too long is lost."""
         now = time.monotonic()
         since = self._awaiting_since = self._awaiting_since or now
         try:
@@ -234,7 +234,7 @@ class ControlPlc:
         self._after_scan(latched=update is not None)
 
     def _after_scan(self, *, latched: bool) -> None:
-        """Show what is new, and keep what is to be kept."""
+        """Publish what has changed, and save the retained state."""
         program, publication = self._program, self.publication
         on_the_second = program.tick % TICKS_PER_SECOND == 0
         if program.track():
@@ -252,7 +252,7 @@ class ControlPlc:
         self._keep()
 
     def _keep(self) -> None:
-        """Keep the state of now; of a session that is still to be gone on with, that of before the restart."""
+        """Save the present state; for a session still to be resumed, the state before the restart."""
         self._store.keep(self._program, self.sessions.pace, self.sessions.kept)
 
     def _watch_ourselves(self) -> None:
@@ -270,7 +270,7 @@ class ControlPlc:
             self._lost_lines = lost
 
     async def watch_scans(self) -> None:
-        """Raise an alarm while scans are not made, until cancelled: by a clock of its own."""
+        """Raise an alarm while no scans are made, until cancelled: by an independent clock."""
         while True:
             await asyncio.sleep(LOOK_S)
             self._look_for_scans()
@@ -299,7 +299,7 @@ class ControlPlc:
     # -- out of step ---------------------------------------------------------------------------------------------------
 
     async def _look(self) -> None:
-        """Read what the rack applies; in step with it, go on from there."""
+        """Read what the rack applies; once synchronised, resume from there."""
         realtime = self.sessions.pace.realtime
         answered = await self._finder.look(self.clients.changed, self._patience_s if realtime else None)
         if not self._link.in_step:
@@ -331,7 +331,7 @@ class ControlPlc:
         self._publish()
 
     def _change_pace(self, pace: Pace) -> None:
-        """Go on by another time base; before the next scan the rack is looked at."""
+        """Switch to another time base; the rack is read before the next scan."""
         self.clients.asked_pace = None
         self.sessions.pace = pace
         self._set_clock()

@@ -12,13 +12,13 @@ SCANS: Final = 8
 
 
 class ScanWatch:
-    """Counts looks, and starts anew with each scan."""
+    """Counts checks since the last scan."""
 
     def __init__(self) -> None:
         self._looks = 0
 
     def scanned(self) -> None:
-        """Note that a scan was made, or that none is to be expected."""
+        """Note that a scan was made, or that none is expected."""
         self._looks = 0
 
     def look(self, tick_s: float) -> bool:

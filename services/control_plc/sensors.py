@@ -36,7 +36,7 @@ class SensorCheckSettings(BaseModel):
     """A controlled output that does not change for so long, while others move, is frozen."""
     may_rest: bool = True
     """While its inputs do not move a plant may stand still bit for bit, as a simulated one with exact sensors does.
-    False for sensors that always tremble: an image that stands for `frozen_s` is then an old one in any case."""
+    False for sensors that are always noisy: an image unchanged for `frozen_s` is then stale in any case."""
     bridged_s: Annotated[float, Field(ge=0)] = 10.0
     """How long the last good value of a controlled output is worked with; then what needs it is left."""
 
@@ -48,7 +48,7 @@ class SensorCheckSettings(BaseModel):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if any(low >= high for low, high in self.ranges):
-            raise ValueError("each range begins below its end")
+            raise ValueError("each range must begin below its end")
         return self
 
 
@@ -61,7 +61,7 @@ def are_inside(y: Numbers, low: Numbers, high: Numbers) -> bool:
 
 
 def watch_standing(stands: MutableSequence[int], before: MutableSequence[float], y: Numbers, elapsed: int) -> None:
-    """Sum up for how many ticks each controlled output has stood while most of the others moved.
+    """Count for how many ticks each controlled output is unchanged while most of the others moved.
 
     `before` (22) becomes `y`, the measurements `elapsed` ticks later.
     """
@@ -82,7 +82,7 @@ def moved(before: Numbers, y: Numbers) -> int:
 
 
 class ImageWatch:
-    """Looks at all that is measured at once: for how many ticks it has stood, and whether the inputs have moved.
+    """Watches the whole image: for how many ticks it is unchanged, and whether the inputs have moved.
 
     Args:
         moves: How far each input must have moved for something to be seen of it.
@@ -95,14 +95,14 @@ class ImageWatch:
         self.begin()
 
     def begin(self) -> None:
-        """Begin anew: nothing is known of before."""
+        """Reset: nothing is known of earlier ticks."""
         self._image: tuple[Sequence[float], ...] = ()
         self._inputs: Sequence[float] = ()
         self._stands = 0
         self._moved = False
 
     def stands(self, inputs: Sequence[float], *image: Sequence[float], elapsed: int) -> int:
-        """Return for how many ticks the image has stood although the inputs have moved.
+        """Return for how many ticks the image is unchanged although the inputs have moved.
 
         Args:
             inputs: Being applied.
@@ -174,7 +174,7 @@ class SensorMonitor:
         return tuple(self._good)
 
     def set_back(self, tick: int) -> None:
-        """Go on at a tick before the present one: what has lasted until now begins there."""
+        """Set the time back to `tick`: conditions that hold now begin there."""
         self._tick = None
         self.bad = {output: min(since, tick) for output, since in self.bad.items()}
         self._recovering = {output: min(since, tick) for output, since in self._recovering.items()}

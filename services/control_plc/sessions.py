@@ -39,7 +39,7 @@ class Sessions:
         self._program = program
         self._configured = configured
         self.kept = recalled if recalled is not None and recalled.session else None
-        """The session to be gone on with, until the rack has been found in it, or in another one."""
+        """The session to be resumed, until the rack has been found in it, or in another one."""
         self.pace = self.kept.pace if self.kept else self._configured_pace
         """Time base of the present session."""
         self.running = False
@@ -53,7 +53,7 @@ class Sessions:
 
     @property
     def expected(self) -> bool:
-        """There is a session, or the rack may have one that is to be gone on with."""
+        """There is a session, or one to be resumed if the rack is in it."""
         return self.running or self._configured.autostart or self.kept is not None
 
     def start(self, asked: ControlSession) -> None:
@@ -87,7 +87,7 @@ class Sessions:
         return True
 
     def rack_answered(self) -> bool:
-        """Note that the rack is in no session of ours; tell whether there is one to go on looking for."""
+        """Note that the rack is in no session of ours; return whether to keep looking for one."""
         if not self.running and not self._configured.autostart:
             self.forget_kept()  # the rack has left the session that was retained
         return self.expected

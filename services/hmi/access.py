@@ -1,4 +1,4 @@
-"""Who is asking: sessions, the rate of requests, and where a request comes from. No sockets, no clock of its own."""
+"""Sessions, request rates and origin of requests. No sockets; the clock is given."""
 
 import hashlib
 import re

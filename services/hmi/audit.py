@@ -17,12 +17,12 @@ log = logging.getLogger("coldloop.hmi.audit")
 
 KEPT: Final = 500
 STRANGERS_KEPT: Final = 100
-"""Entries about requests of nobody who has logged in: they never push out those of users."""
+"""Entries about requests without a login: they never push out those of users."""
 LONGEST_DETAIL: Final = 300
 REPEATS_S: Final = 60.0
 """Refusals that are alike within this time are one entry, and a second one that says how many there were."""
 MOST_KINDS: Final = 20
-"""Kinds of refusals of strangers that have entries of their own in this time; all others have one together."""
+"""Kinds of refusals without a login that have their own entries in this time; all others share one."""
 LARGEST_FILE: Final = 8_000_000
 OLDER_FILES: Final = 4
 

@@ -29,7 +29,7 @@ class Branch(StrEnum):
     FIRST = "first"
     """There is no period before this one."""
     BEGUN_AGAIN = "begun again"
-    """The optimiser had lost the thread: others have moved the inputs, or it was restarted."""
+    """The optimiser was restarted, or another client has moved the inputs."""
     INTERRUPTED = "interrupted"
     """A load step ended the period before."""
     LATE = "late"

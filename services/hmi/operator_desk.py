@@ -123,9 +123,9 @@ class OperatorDesk:
         if pace is None or not pace.session:
             return ""
         if not pace.realtime:
-            return " of plant time, which goes as far as it is granted"
+            return " of plant time, which advances as it is granted"
         if pace.paused:
-            return " of plant time, which stands still now"
+            return " of plant time, which is paused"
         if pace.factor == 1.0 or pace.factor <= 0.0:
             return ""
         return f" of plant time, {duration_text(seconds / pace.factor)} by the clock at factor {pace.factor:g}"
@@ -139,7 +139,7 @@ class OperatorDesk:
         prepared = self._prepared.get(token)
         if prepared is None or prepared.user != user or self._now() > prepared.until:
             raise UsageError(
-                f"nothing to confirm: a command is confirmed once, within {CONFIRM_WITHIN_S:g} s, by who prepared it"
+                f"nothing to confirm: a command is confirmed once, within {CONFIRM_WITHIN_S:g} s, by its own user"
             )
         del self._prepared[token]
         async with self._turn:
@@ -155,7 +155,7 @@ class OperatorDesk:
             return CommandResult(asked, refused_because=str(error))
         except (LinkError, UsageError) as error:
             if any(client.has_written for client in clients.values()):
-                reason = f"{reason_of(error)}; look what has become of it before asking again"
+                reason = f"{reason_of(error)}; check its effect before repeating it"
                 return CommandResult(asked, uncertain_because=reason)
             return CommandResult(asked, refused_because=reason_of(error))
 

@@ -1,4 +1,4 @@
-"""What the page tells Prometheus: all registers that it reads, alarms, the last update, and the page itself."""
+"""Metrics of the page for Prometheus: all registers it reads, alarms, the last update, and the page itself."""
 
 from collections.abc import Iterator
 
@@ -20,7 +20,7 @@ def page_families(model: Model, browsers: int) -> Iterator[MetricFamily]:
     )  # fmt: skip
     ages = [(service, model.age_s(service)) for service in MAPS]
     yield MetricFamily(
-        "coldloop_age_seconds", "Time since a service answered last",
+        "coldloop_age_seconds", "Time since the last answer of a service",
         tuple(Sample(age, (("service", service),)) for service, age in ages if age is not None),
     )  # fmt: skip
     yield MetricFamily("coldloop_page_browsers", "Streams to browsers", (Sample(float(browsers)),))

@@ -93,7 +93,7 @@ class PageServer:
         """Listen.
 
         Raises:
-            PortInUseError: Somebody else does already.
+            PortInUseError: Another program already does.
             ConfigurationError: The files for HTTPS cannot be used.
         """
         settings = self._settings

@@ -1,6 +1,6 @@
 """What the page knows: the newest record of each block, trends, updates, predictions and events.
 
-Whoever reads a rig, or a recorded run, writes into it; the pages are made from it. Nothing here uses a socket.
+Readers of a rig or of a recorded run write into it; the pages are made from it. No sockets here.
 """
 
 from collections import deque
@@ -114,7 +114,7 @@ class Model:
             self.trends.add(record, self.mode, self.bad_sensors, values, is_after_gap=is_after_gap)
         elif isinstance(record, Prediction):
             self._predicted(record)
-        elif isinstance(record, SessionPace):  # ticks go on from now by another clock
+        elif isinstance(record, SessionPace):  # from now on ticks follow another clock
             for each in self.sources.values():
                 each.moved = self.now()
 
@@ -198,7 +198,7 @@ class Model:
 
     @property
     def bad_sensors(self) -> int:
-        """Outputs for which the last good value stands in, a bit for each."""
+        """Outputs substituted by their last good value, a bit for each."""
         ladder = self.record("control_plc", LadderStatus)
         return ladder.bad_sensors if ladder else 0
 
@@ -229,7 +229,7 @@ class Model:
         return age is not None and age < STALE_S
 
     def stands_still(self, service: str) -> bool:
-        """Tell whether the tick of a service does not move although its session goes on by the clock."""
+        """Return whether the tick of a service does not move although its session runs in real time."""
         pace = self.record("plant", SessionPace)
         if pace is None or not pace.realtime or pace.paused or not pace.session or not pace.factor > 0:
             return False

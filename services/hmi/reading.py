@@ -101,7 +101,7 @@ class Reading:
         """Answer with the state and its changes, as server-sent events, until the browser goes or its session ends."""
         stream = self._broadcast.begin(self._guard.party(request))
         if stream is None:
-            return refusal(503, f"{len(self._broadcast)} browsers look already: close some, or raise hmi.browsers")
+            return refusal(503, f"{len(self._broadcast)} browsers are connected: close some, or raise hmi.browsers")
         answer = web.StreamResponse(headers={hdrs.CONTENT_TYPE: "text/event-stream"})
         add_headers(answer)
         try:
@@ -124,7 +124,7 @@ class Reading:
         names = list(dict.fromkeys(name for name in query.get("names", "").split(",") if name)) or ["L1", "T5", "load"]
         unknown = [name for name in names if name not in NAMES]
         if unknown:
-            raise web.HTTPBadRequest(reason=f"no trend is called {printable(unknown[0])}")
+            raise web.HTTPBadRequest(reason=f"unknown trend {printable(unknown[0])}")
         if len(names) > MOST_NAMES:
             raise web.HTTPBadRequest(reason=f"a trend has at most {MOST_NAMES} signals, not {len(names)}")
         try:
@@ -133,7 +133,7 @@ class Reading:
             points = max(10, min(int(query.get("points", POINTS)), MOST_POINTS))
             return names, end - round(seconds / TICK_S), end, points
         except (ValueError, OverflowError):
-            raise web.HTTPBadRequest(reason="seconds, end and points are numbers") from None
+            raise web.HTTPBadRequest(reason="seconds, end and points must be numbers") from None
 
     async def trend(self, request: web.Request) -> web.Response:
         """Answer with what is drawn in a window; browsers that ask for the same share one answer."""
@@ -157,7 +157,7 @@ class Reading:
         add_headers(answer)
         await answer.prepare(request)
         await answer.write(",".join(["time_s", *names, "substituted"]).encode() + b"\n")
-        with suppress(ConnectionError, TimeoutError):  # nobody takes the rest
+        with suppress(ConnectionError, TimeoutError):  # the client has gone
             while start <= end:
                 async with self._turn(request):
                     rows, start = self._trend_rows(names, start, end)
@@ -185,7 +185,7 @@ class Reading:
             at_tick = round(float(at) / TICK_S) if at else None
             document = explanation_document(self._model, int(number) if number else None, at_tick)
         except (ValueError, OverflowError):
-            raise web.HTTPBadRequest(reason="update and at are numbers") from None
+            raise web.HTTPBadRequest(reason="update and at must be numbers") from None
         if document is None:
             wanted = printable(number or at) or "(the last one)"
             return refusal(404, f"update {wanted} is not known: only the newest are kept")
@@ -293,7 +293,7 @@ def csv_headers(name: str) -> dict[str, str]:
 
 
 def printable(text: str) -> str:
-    """Return what somebody asked for as a message names it: short, and on one line."""
+    """Return a request's text for a message: short, and on one line."""
     return "".join(one if one.isprintable() else "?" for one in text[:LONGEST_NAME])
 
 

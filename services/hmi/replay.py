@@ -149,7 +149,7 @@ class Replay:
             self._show()
             await asyncio.sleep(STEP_S)
             now = time.monotonic()
-            if int(position) != self._tick:  # somebody went elsewhere
+            if int(position) != self._tick:  # a user has moved the position
                 position = float(self._tick)
             if self._playing:
                 position = min(self._run.ticks - 1.0, position + (now - last) * self._speed / TICK_S)
@@ -157,7 +157,7 @@ class Replay:
                 self._playing = self._tick < self._run.ticks - 1
             last = now
 
-    # -- what the model is told ----------------------------------------------------------------------------------------
+    # -- updates of the model ------------------------------------------------------------------------------------------
 
     def _begin(self) -> None:
         model = self._model
@@ -231,7 +231,7 @@ async def serve_replays(runs: Sequence[RecordedRun], settings: HmiSection, annou
     """Serve one run, or several side by side, until cancelled.
 
     Raises:
-        PortInUseError: Somebody else listens there.
+        PortInUseError: Another program listens there.
         ConfigurationError: A file of the settings cannot be used.
     """
     models = [Model(time.monotonic, settings.kept_s) for _ in runs]

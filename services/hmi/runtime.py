@@ -20,7 +20,7 @@ async def serve(settings: HmiSettings) -> None:
 
     Raises:
         ConfigurationError: A file of the settings cannot be used.
-        PortInUseError: Somebody else listens there.
+        PortInUseError: Another program listens there.
     """
     hmi = settings.hmi
     model = Model(time.monotonic, hmi.kept_s)

@@ -30,7 +30,7 @@ class ModeInterval(NamedTuple):
 
 
 class Substitution(NamedTuple):
-    """A stretch of plant time in which another value stands in for that of a bad sensor."""
+    """A stretch of plant time in which the value of a bad sensor is substituted."""
 
     start: float
     end: float

@@ -95,7 +95,7 @@ class Users:
                 f"hmi.login.users: {file}: {reason}; `python -m hmi.users {file} NAME operate` writes it"
             ) from None
         if mode & stat.S_IWOTH:
-            raise ConfigurationError(f"hmi.login.users: {file}: everybody may write to it; `chmod o-w {file}`")
+            raise ConfigurationError(f"hmi.login.users: {file}: everyone can write to it; `chmod o-w {file}`")
         for number, line in enumerate(lines, 1):
             if line.strip() and not line.startswith("#"):
                 user = _user(line, f"{file}:{number}")

@@ -64,8 +64,8 @@ def estimator_of(prediction: PredictionModel, settings: EstimatorSettings, real:
     kalman = settings.kind is EstimatorKind.KALMAN
     if not kalman and prediction.n_states > len(STATE_NAMES):
         raise ConfigurationError(
-            "optimizer_plc.program.estimator.kind=state-feedback: the model has states that the plant does not"
-            " tell; use kalman"
+            "optimizer_plc.program.estimator.kind=state-feedback: the model has more states than the plant reports; "
+            "use kalman"
         )
     m = prediction.rounded(real)
     gains = np.array(list(stationary_gains(prediction, settings).values())) if kalman else np.zeros((1, 1, 1))

@@ -191,7 +191,7 @@ class OptimizerProgram:
     @property
     def _iterations(self) -> int:
         if not self._now["planned"]:
-            raise RuntimeError("solve and answer_after_s follow plan")
+            raise RuntimeError("call plan before solve and answer_after_s")
         return int(self._now["iterations"])
 
     def solve(self) -> InputSequence:
@@ -235,7 +235,7 @@ class OptimizerProgram:
         """Return what the last profile is expected to lead to."""
         header, sent = self._sent, self.state.sent
         if not header["length"]:
-            raise RuntimeError("prediction follows solve")
+            raise RuntimeError("call solve before prediction")
         horizon = self.problem.design.horizon
         outputs = self.problem.outputs(sent.z, ProblemParameters(sent.x, header["w"], sent.u_before))
         inputs = self.problem.inputs(sent.z, horizon)
@@ -259,7 +259,7 @@ class OptimizerProgram:
     def report(self, verdict: Verdict) -> Optimization:
         """Return what was done with the last update, once the control PLC has answered."""
         if not self._sent["length"]:
-            raise RuntimeError("report follows solve")
+            raise RuntimeError("call solve before report")
         now, sent = self._now, self._sent
         return Optimization(
             update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]),

@@ -129,7 +129,7 @@ class OptimizerPlc:
         if state is not ControlLinkState.FOREIGN:  # its connection may stay: nothing is wrong with it
             self._control.close()
         if isinstance(error, (RequestRefusedError, UnfitValueError)):
-            self._session = 0  # what it goes on from leads to what is refused: begin the session anew
+            self._session = 0  # its state leads to rejected sequences: restart the session
         if state is not ControlLinkState.SEARCHING:  # others may have had the lease meanwhile
             self._wanted, self._kept = FRESH_UPDATE, None
         else:

@@ -105,7 +105,7 @@ def named_families(name: str) -> list[LoadFamily] | None:
     if base not in NAMED:
         return None
     if at and not (draw.isdecimal() and 1 <= int(draw) <= 10**6):
-        raise LoadFileError(f"load {name}: '{draw}' is no draw; write {base}@2 for the second one")
+        raise LoadFileError(f"load {name}: '{draw}' is not a draw; write {base}@2 for the second one")
     seeds = DRAW_SEEDS * (int(draw) - 1 if at else 0)
     return [HOURS[hour]._replace(seed=HOURS[hour].seed + seeds) for hour in NAMED[base]]
 

@@ -100,7 +100,7 @@ class PlantProgram:
     def resume(
         self, tick: int, x: Sequence[float], u: Sequence[float], y: Sequence[float], noise_state: Mapping[str, Any]
     ) -> None:
-        """Go on from what `retained` returned.
+        """Resume from what `retained` returned.
 
         Raises:
             ValueError: it is not of this plant.
@@ -125,7 +125,7 @@ class PlantProgram:
         return self._x.copy(), self._slope.copy(), np.array(self._held)
 
     def take_over(self, tick: int, x: RealArray, slope: RealArray, held: RealArray, y: RealArray) -> None:
-        """Go on at another tick with what `between_ticks` and `measure` would have told there."""
+        """Resume at another tick with what `between_ticks` and `measure` would return there."""
         self.tick, self._x, self._slope, self._u = tick, x.copy(), slope.copy(), held[:3].copy()
         self._held, self._measured = tuple(held.tolist()), tuple(y.tolist())
 

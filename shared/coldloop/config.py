@@ -131,9 +131,9 @@ def load_configuration(
         if not _is_finite(value):
             raise ConfigurationError(f"{_where(key, layers.sources)}: input should be finite (got {value!r})")
         if _has_nul(value):
-            raise ConfigurationError(f"{_where(key, layers.sources)}: there is a NUL character in it; leave it out")
+            raise ConfigurationError(f"{_where(key, layers.sources)}: contains a NUL character; remove it")
         if value == Path():  # an empty text
-            raise ConfigurationError(f"{_where(key, layers.sources)}: names no file; leave the key out, or name one")
+            raise ConfigurationError(f"{_where(key, layers.sources)}: is empty; name a file, or leave the key out")
     return Configuration(settings, layers.sources)
 
 
@@ -236,7 +236,7 @@ def _read_toml(file: Path) -> dict[str, Any]:
         with file.open("rb") as content:  # a pipe will do, a device without an end will not
             data = content.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
-            raise ConfigurationError(f"{file}: more than {MOST_BYTES} bytes are no configuration")
+            raise ConfigurationError(f"{file}: not a configuration: more than {MOST_BYTES} bytes")
         return parsed_toml(data.decode("utf-8"))
     except OSError as error:
         raise ConfigurationError(f"{file}: {error.strerror}; name a readable TOML file with --config") from None

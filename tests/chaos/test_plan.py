@@ -36,14 +36,14 @@ def test_the_shipped_plans_are_sound_and_have_all_kinds() -> None:
         (with_fault('kind = "drop"', 'link = "plant"', "at_s = 3", "duration_s = 1", "share = 1.5"), "less than or"),
         (with_fault('kind = "clock"', "duration_s = 3"), "each of `faults` needs at_s"),
         (with_fault('kind = "clock"', "at_s = 600", "duration_s = 3"), "begins after the end of the run"),
-        (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T5"', 'shows = "value"'), "a value"),
-        (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T99"', 'shows = "nan"'), "no output"),
+        (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T5"', 'shows = "value"'), "`value`"),
+        (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T99"', 'shows = "nan"'), "unknown"),
         (with_fault('kind = "given"', "at_s = 1", "duration_s = 3", 'target = "nc1"', "value = 0"), "refrigerator"),
         ('plant = "refrigerator"\n' + with_fault('kind = "given"', "at_s = 1", "duration_s = 3", 'target = "leak"',
                                                  "value = 99"), "outside 0 to 50"),
         (with_fault('kind = "kill"', "at_s = 1", "duration_s = 9", 'process = "plant"')
          + '\n[[faults]]\nkind = "clock"\nat_s = 5\nduration_s = 1', "begins before 'kill plant' has ended"),
-        (HEAD + "every_s = 60", "every_s and `draw` go together"),
+        (HEAD + "every_s = 60", "give every_s and `draw` together"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_in_one_line(text: str, complaint: str) -> None:

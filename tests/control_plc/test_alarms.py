@@ -380,7 +380,7 @@ def test_each_alarm_has_a_rule_and_the_configuration_changes_what_it_names() -> 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"rules": {"sensor_worse": {}}}, "no alarm is called 'sensor_worse'; there are mode, level_band"),
+        ({"rules": {"sensor_worse": {}}}, "unknown alarm 'sensor_worse'; choose from mode, level_band"),
         ({"rules": {"mode": {"priority": "urgent"}}}, "'low', 'medium', 'high' or 'critical'"),
         ({"rules": {"mode": {"on_delay_s": -1}}}, "greater than or equal to 0"),
         ({"rules": {"mode": {"on_delay_s": "nan"}}}, "finite number"),

@@ -67,7 +67,7 @@ def test_who_may_only_look_is_refused(site: Site) -> None:
     cookie = site.log_in(VIEWER)
     answer = site.ask("/api/commands", LOAD, cookie=cookie)
     assert answer.status == 403
-    assert "may look" in answer.document["error"]
+    assert "may view" in answer.document["error"]
     assert refusals(site, "command", VIEWER[0], "may only look")
 
 
@@ -113,8 +113,8 @@ def test_scripts_come_from_the_page_alone(site: Site) -> None:
         ({"kind": "load_file", "content": "time_s,load_w\n0,400\n0.3,400\n"}, "multiple of 0.25"),
         ({"kind": "load_file", "content": "nothing"}, "the first line is time_s,load_w"),
         ({"kind": "load_file", "content": "time_s,load_w\n" + "9" * 200_000}, "write two numbers a line"),
-        ({"kind": "alarm", "alarm": 999, "action": 1}, "no alarm 999"),
-        ({"kind": "sensor_fault", "output": "T99", "fault": 1}, "no output T99"),
+        ({"kind": "alarm", "alarm": 999, "action": 1}, "unknown alarm 999"),
+        ({"kind": "sensor_fault", "output": "T99", "fault": 1}, "unknown output T99"),
         ({"kind": "setpoint", "input": "CV155", "value": 99.0}, "not from 20 to 60"),
         ({"kind": "setpoint", "input": "CV155", "value": 45.0}, "take over in manual first"),
         ([], "JSON object"),
@@ -316,7 +316,7 @@ def test_a_file_that_everybody_may_write_to_makes_nobody_an_operator(tmp_path: P
     file = tmp_path / "users"
     write_user(file, "anna", PageRole.OPERATE, "a long password")
     file.chmod(0o606)
-    with pytest.raises(ConfigurationError, match=r"everybody may write to it; `chmod o-w"):
+    with pytest.raises(ConfigurationError, match=r"everyone can write to it; `chmod o-w"):
         Users(file)
 
 

@@ -241,8 +241,8 @@ async def test_nothing_to_acknowledge_is_said(desk: Desk) -> None:
     [
         (SessionPace(1, 1, 1.0, 0), "Shelve: alarm t5 band for 15 min"),
         (SessionPace(1, 1, 20.0, 0), "for 15 min of plant time, 45 s by the clock at factor 20"),
-        (SessionPace(1, 1, 20.0, 1), "for 15 min of plant time, which stands still now"),
-        (SessionPace(1, 0, 1.0, 0), "for 15 min of plant time, which goes as far as it is granted"),
+        (SessionPace(1, 1, 20.0, 1), "for 15 min of plant time, which is paused"),
+        (SessionPace(1, 0, 1.0, 0), "for 15 min of plant time, which advances as it is granted"),
     ],
     ids=["factor 1", "factor 20", "paused", "lock-step"],
 )

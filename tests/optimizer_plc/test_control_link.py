@@ -21,7 +21,7 @@ from coldloop.service.journal import Journal
 from optimizer_plc.control_link import REPEAT_S, ControlLink
 
 S = ControlLinkState
-BUSY = RequestRefusedError("somebody else holds the lease", 6)
+BUSY = RequestRefusedError("another client holds the lease", 6)
 NO_SUCH_REGISTER = RequestRefusedError("no such register", 2)
 GONE = PeerUnreachableError("did not answer in time")
 OTHER_MODEL = ModelFileError("another model")

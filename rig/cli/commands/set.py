@@ -41,7 +41,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     setpoint.set_defaults(
         document=lambda options: {"kind": "setpoint", "input": INPUTS[options.input], "value": options.value}
     )
-    factor = what.add_parser("factor", help="seconds of plant time in a second; also changes over to real time")
+    factor = what.add_parser("factor", help="seconds of plant time per second; also switches to real time")
     factor.add_argument("factor", type=float)
     factor.set_defaults(document=lambda options: {"kind": "factor", "factor": options.factor})
     pause = what.add_parser("pause", help="pause plant time")
@@ -134,7 +134,7 @@ def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
 
     kinds = {kind.name.lower().replace("_", "-"): int(kind) for kind in AlarmKind}
     if options.alarm is not None and options.alarm not in kinds:
-        raise UsageError(f"no alarm is called '{options.alarm}'; there are {', '.join(kinds)}")
+        raise UsageError(f"unknown alarm '{options.alarm}'; choose from {', '.join(kinds)}")
     alarm = ALL_ALARMS if options.alarm is None else kinds[options.alarm]
     return {"kind": "alarm", "alarm": alarm, "action": int(AlarmAction.ACKNOWLEDGE)}
 

@@ -68,7 +68,7 @@ def guard_records(state: GuardState) -> Any:  # noqa: ANN401 records
 
 
 def give_back_guard(program: ControlProgram, g: Any) -> None:  # noqa: ANN401 a record
-    """Let the guard go on from a record."""
+    """Restore the guard from a record."""
     state, slots = program.guard.state, len(program.guard.state.moves)
     state.applied[:], state.anchor[:] = g["applied"].tolist(), g["anchor"].tolist()
     state.moves[:], state.before[:] = g["moves"][:slots].tolist(), g["before"][:slots].tolist()
@@ -78,7 +78,7 @@ def give_back_guard(program: ControlProgram, g: Any) -> None:  # noqa: ANN401 a 
 
 
 def give_back_scan(program: ControlProgram, s: Any, trace: Trace) -> None:  # noqa: ANN401 a record
-    """Let sensors, alarms, watchdog and process go on after the ticks of a record, of which there are some."""
+    """Restore sensors, alarms, watchdog and process after the ticks of a record (at least one)."""
     last = int(s["tick"]) - 1
     row = last - int(s["first"])
     y = tuple(trace.y[row].tolist())

@@ -94,7 +94,7 @@ def state_of(program: PlantProgram, noise: Array, ticks: int) -> PlantState:
 
 
 def give_back(program: PlantProgram, state: PlantState, tick: int, u: Array) -> None:
-    """Let the program go on at `tick`, to which the inputs `u` were held."""
+    """Resume the program at `tick`, up to which the inputs `u` were held."""
     if isinstance(state, BoxState):
         program.take_over(tick, state.x, state.slope, state.held, state.y)
     elif isinstance(program, RefrigeratorProgram):

@@ -25,7 +25,7 @@ class Stretch(NamedTuple):
 
 
 class CompiledStretches:
-    """Runs the programs of one session ahead as long as nothing unusual happens.
+    """Runs the programs of one session ahead while nothing unusual happens.
 
     Args:
         plant: Of either kind.
@@ -61,7 +61,7 @@ class CompiledStretches:
         with self._plant.noise(ticks) as noise:
             plant = plants.state_of(self._plant, noise, ticks)
             stretch = self._updates_too(plant, until) if whole else self._ticks_alone(plant, until)
-        if stretch is None:  # the programs go on alone to the next updating instant
+        if stretch is None:  # the programs run alone to the next updating instant
             self._pause_until = self._control.player.next_update_tick
         return stretch
 
@@ -99,7 +99,7 @@ class CompiledStretches:
         return Stretch(block, optimizer.optimizations(self._reports, solved))
 
     def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:
-        """Let plant and control PLC go on from what the loop has left; return the ticks it has done."""
+        """Hand the state of the loop back to plant and control PLC; return the ticks it has run."""
         plants.give_back(self._plant, plant, int(s["tick"]), guard["applied"])
         control.give_back_guard(self._control, guard)
         control.give_back_scan(self._control, s, self._trace)

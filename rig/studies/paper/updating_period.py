@@ -40,7 +40,7 @@ OWN_INTERRUPT: Final = Policy("contraction rule, interrupt", ADAPTIVE, (f"{RULE}
 CONTROL: Final = Policy("fixed 2.5 s, interrupt", 2.5, (INTERRUPT,))
 POLICIES: Final = (LITERAL, OWN, OWN_INTERRUPT, CONTROL, Policy("fixed 1.5 s, interrupt", 1.5, (INTERRUPT,)))
 RESPONDING: Final = (LITERAL, OWN, OWN_INTERRUPT)
-"""Whose response to load steps is told."""
+"""Policies whose response to load steps is reported."""
 TUNING_DRAWS: Final = (11, 12)
 """Draws that the constants of the contraction rule were chosen on."""
 

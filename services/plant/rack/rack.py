@@ -135,11 +135,11 @@ class Rack:
         self.journal.note(0, EventKind.LOAD, value=session.load.value(0), who=who)
 
     def resume(self, state: RetainedPlantState) -> None:
-        """Go on where a session was when the rack was ended; a new generation of outputs begins.
+        """Resume a session after a restart of the rack; a new generation of outputs begins.
 
         Raises:
             ArithmeticError, AttributeError, LookupError, TypeError, ValueError: It is not the state of such a plant, or
-                one from which no plant goes on; nothing has changed.
+                one that the plant cannot resume; nothing has changed.
         """
         load = LoadProfile(state.times, state.watts)
         schedule = LoadSchedule(load)
@@ -234,12 +234,12 @@ class Rack:
     # -- what operators change -----------------------------------------------------------------------------------------
 
     def set_watchdog(self, time: int, who: str) -> None:
-        """Change the time-out of the watchdog (ticks, 0 is off), and start it anew."""
+        """Change the time-out of the watchdog (ticks, 0 is off), and restart it."""
         self.journal.note(self.tick, EventKind.WATCHDOG_TIME, time, self.watchdog.time, who=who)
         self.watchdog.set(time, self.tick)
 
     def load_steps(self, asked: LiveLoad | LoadAhead) -> list[LoadStep]:
-        """Judge a load that was written while a session goes on; return its steps.
+        """Judge a load written during a session; return its steps.
 
         Raises:
             ValueError: It is not for this session, or not a load that can be taken now.
@@ -307,7 +307,7 @@ def _try_a_tick(program: PlantProgram, state: RetainedPlantState) -> None:
     program.resume(**state.program)
     program.advance()
     if not all(map(math.isfinite, (*program.measure(), *program.state))):
-        raise ValueError("from there the plant goes nowhere")
+        raise ValueError("the plant cannot advance from there")
 
 
 def station_snapshot(station: StationSample) -> Mapping[str, object]:

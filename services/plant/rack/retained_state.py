@@ -58,10 +58,10 @@ class PlantStateStore:
         self._file = RetainedFile(file, OWNER, model_digest) if file else None
         self.active = file is not None
         self.refused = False
-        """There was a state before, and it is not used."""
+        """A previous state exists and is not used."""
 
     def recall(self) -> RetainedPlantState | None:
-        """Return the state of before, if there is one."""
+        """Return the previous state, if any."""
         if self._file is None:
             return None
         try:
@@ -74,7 +74,7 @@ class PlantStateStore:
         return None
 
     def refuse(self, reason: str) -> None:
-        """Do without the state of before: the file is set aside, and the log says why."""
+        """Discard the previous state: set its file aside and log the reason."""
         self.refused = True
         if self._file is not None:
             log.warning("retained state refused", extra={"reason": reason, "file": self._file.set_aside()})

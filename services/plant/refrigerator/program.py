@@ -120,7 +120,7 @@ class RefrigeratorProgram(PlantProgram):
         )
 
     def take_over_whole(self, tick: int, u: RealArray, memory: RefrigeratorMemory, y: RealArray) -> None:
-        """Go on at another tick with what `memory` and `measure` would tell there; `u` was held up to it."""
+        """Resume at another tick with what `memory` and `measure` would return there; `u` was held up to it."""
         self.tick, self._u, self._memory = tick, u.copy(), memory
         self._x, self._measured = memory.x[:BOX_STATES], tuple(y.tolist())
 
@@ -133,7 +133,7 @@ class RefrigeratorProgram(PlantProgram):
         noise_state: Mapping[str, Any],
         warm: Mapping[str, Any] | None = None,
     ) -> None:
-        """Go on from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
+        """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
         if warm is None:
             raise ValueError("the retained state is that of a cold box, not of a refrigerator")
         names = {"x": "x", "signals": "signals", "commands": "commands", "integrals": "control"}

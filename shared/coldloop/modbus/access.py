@@ -20,7 +20,7 @@ MAX_LENGTH: Final = 127
 
 
 def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:
-    """Return who calls from an address, or None when nobody may from there."""
+    """Return the caller at an address, or None if the address is not allowed."""
     address = _plain_address(host)
     places = {Role.CONTROL: access.control, Role.OPTIMIZER: access.optimizer, Role.OPERATOR: access.operator}
     roles = frozenset(role for role, networks in places.items() if _within(address, networks))
@@ -30,7 +30,7 @@ def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:
 
 
 def caller_with(certificate: bytes, name: str) -> Caller:
-    """Return who calls with a certificate (DER) that has been verified."""
+    """Return the caller with a verified certificate (DER)."""
     subject, role = _subject_and_role(certificate)
     known = {each.value: each for each in Role}
     described = " ".join(f"{key}={json.dumps(text)}" for key, text in (("certificate", subject), ("role", role)))

@@ -137,7 +137,7 @@ class Connection(asyncio.Protocol):
         self._output_blocked = True
 
     def resume_writing(self) -> None:
-        """Go on serving (event loop callback)."""
+        """Resume serving (event loop callback)."""
         self._output_blocked = False
         self.last_request = monotonic()
         self._serve()
@@ -272,5 +272,5 @@ class Connection(asyncio.Protocol):
         if remaining > 0:
             self._idle_timer = self._loop.call_later(remaining, self._check_idle)
             return
-        self._refusals.note("idle_timeout", self.peer, f"no whole request for {self._settings.idle_timeout_s:g} s")
+        self._refusals.note("idle_timeout", self.peer, f"no complete request for {self._settings.idle_timeout_s:g} s")
         self._transport.abort()

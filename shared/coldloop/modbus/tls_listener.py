@@ -122,7 +122,7 @@ class TlsListener:
 
 def _reason(error: OSError) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate does not hold: {error.verify_message}"
+        return f"its certificate is invalid: {error.verify_message}"
     if isinstance(error, ssl.SSLError):
         return (error.reason or "TLS failed").replace("_", " ").lower()
     return f"the handshake ended early: {error}".rstrip(": ")

@@ -81,17 +81,17 @@ class Transport:
                 f"{self.peer} cannot be trusted: {error.verify_message}: check the host name, and tls.ca here"
             ) from None
         except UnicodeError:
-            raise PeerUnreachableError(f"{self.peer}: the host name is none") from None
+            raise PeerUnreachableError(f"{self.peer}: the host name is invalid") from None
         except TimeoutError:
             raise PeerUnreachableError(
-                f"{self.peer} did not answer in time when it was called: check host, port and the network between"
+                f"{self.peer} did not accept the connection in time: check host, port and the network between"
             ) from None
         except OSError as error:
             if self._tls is not None and isinstance(
                 error, ssl.SSLError | ConnectionResetError | ConnectionAbortedError
             ):
                 raise PeerUnreachableError(f"{self.peer} does not speak TLS 1.3: check server.tls there") from None
-            raise PeerUnreachableError(f"nobody listens as {self.peer}: start it, or check host and port") from None
+            raise PeerUnreachableError(f"nothing listens as {self.peer}: start it, or check host and port") from None
 
     async def transact(self, requests: Sequence[bytes], timeout_s: float) -> list[bytes]:
         """Send up to `REQUESTS_AT_ONCE` PDUs, and return the answers' PDUs; whatever goes wrong closes the connection.

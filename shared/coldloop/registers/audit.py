@@ -13,7 +13,7 @@ NOBODY: Final = (0,) * WHO_WORDS
 
 
 class EventKind(IntEnum):
-    """What an event tells of: `subject`, `cause` and `value` depend on it."""
+    """Kind of an event: `subject`, `cause` and `value` depend on it."""
 
     NONE = 0
     MODE = 1
@@ -28,7 +28,7 @@ class EventKind(IntEnum):
     ALARM_OUT_OF_SERVICE = 7
     ALARM_IN_SERVICE = 8
     BOOT = 9
-    """The service started: subject 1 when it goes on with a retained state, cause 1 when one was set aside."""
+    """The service started: subject 1 when it resumes a retained state, cause 1 when one was set aside."""
     SESSION = 10
     """A session was started: subject 0 lock-step, 1 real time; value the factor."""
     OPERATOR_MODE = 11
@@ -99,7 +99,7 @@ class JournalQuery(NamedTuple):
 
 
 class JournalPage(NamedTuple):
-    """State of the journal, and where to go on after the last query."""
+    """State of the journal, and where the next query continues."""
 
     oldest: Annotated[int, u32("Number of the oldest event kept")] = 0
     newest: Annotated[int, u32("Number of the newest event")] = 0

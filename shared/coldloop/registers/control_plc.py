@@ -57,13 +57,13 @@ class OperatorMode(IntEnum):
     """What an operator wants."""
 
     AUTO = 0
-    """MPC, and the ladder when it is not there."""
+    """MPC, and the ladder when MPC is unavailable."""
     CLASSICAL = 1
     MANUAL = 2
 
 
 class Verdict(IntEnum):
-    """What the control PLC thinks of a sequence."""
+    """Judgement of a sequence by the control PLC."""
 
     NONE = 0
     ACCEPTED = 1
@@ -79,7 +79,7 @@ class Verdict(IntEnum):
     NOT_INVITED = 11
     """No sequence is played now: an operator drives, or a sensor that MPC needs is bad."""
     PLANT_LOST = 12
-    """The rack has not been in step for a while."""
+    """The rack has not been synchronised for a while."""
 
 
 class PlantLinkState(IntEnum):
@@ -92,11 +92,11 @@ class PlantLinkState(IntEnum):
     JOINING = 2
     """It answers; what it applies is being read back, nothing is written."""
     IN_STEP = 3
-    """Outputs are written in every scan, and taken."""
+    """Outputs are written in every scan, and accepted."""
     NOT_TAKEN = 4
-    """It answers, and does not take the outputs."""
+    """It answers, and rejects the outputs."""
     FOREIGN = 5
-    """It is in another session, or somebody else drives it."""
+    """It is in another session, or has another master."""
     FROZEN = 6
     """It answers, and its clock does not move."""
 
@@ -109,26 +109,26 @@ class LinkCause(IntEnum):
     DAMAGED = 2
     """An answer whose seal is broken or absent."""
     IMPLAUSIBLE = 3
-    """It says what cannot be: a value out of its range, or no number."""
+    """A value out of its range, or not a number."""
     WRONG_SESSION = 4
     UNTIMELY = 5
     CHANGED = 6
-    """What it applies was changed by somebody else, or by its watchdog."""
+    """Its outputs were changed by another master, or by its watchdog."""
     SECOND_MASTER = 7
     """Another control PLC holds the lease of the rack."""
     REFUSED = 8
     """It refused a request with an exception."""
     OVERSLEPT = 9
-    """This program stood still for a tick or more."""
+    """This program missed one or more ticks."""
     LEAPT = 10
-    """The tick of the rack leapt, or went back."""
+    """The tick of the rack jumped, or went back."""
     STOPPED = 11
     """The tick of the rack does not move."""
     STARTED = 12
     PACE = 13
     """The time base of the session was changed."""
     LIMITED = 14
-    """The rack moved its outputs by no more than it lets anybody move them in one of its ticks."""
+    """The rack limited the change of its outputs to the rate of one tick."""
 
 
 class Process(NamedTuple):

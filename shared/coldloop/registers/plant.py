@@ -57,7 +57,7 @@ class OutputVerdict(IntEnum):
 class Actuators(NamedTuple):
     """Outputs for one tick, of the one control PLC that holds the lease of the rack.
 
-    The rack judges them whole; its next measurement tells whether it has taken them.
+    The rack judges them whole; its next measurement shows whether they were accepted.
     """
 
     tick: Annotated[
@@ -75,7 +75,7 @@ class Actuators(NamedTuple):
 class Measurement(NamedTuple):
     """What the rack reads at one tick, what it applies, and who decided that.
 
-    Load, outputs and states may be any number, or none: sensors fail, and the control PLC goes on without them.
+    Load, outputs and states may be any number, or NaN: sensors fail, and the control PLC works without them.
     """
 
     tick: Annotated[int, u32("Tick at which these values were read", high=LAST_TICK)]

@@ -32,7 +32,7 @@ class WatchdogTime(NamedTuple):
 
 
 class LeaseState(IntEnum):
-    """Whether somebody is the one writer of a role."""
+    """State of the lease of a role."""
 
     FREE = 0
     HELD = 1
@@ -67,7 +67,7 @@ class AlarmKind(IntEnum):
     SCAN_OVERRUN = 10
     ACCESS_REFUSED = 11
     PLANT_FOREIGN = 12
-    """The rack is driven by somebody else, or is in another session."""
+    """The rack has another master, or is in another session."""
     PLANT_FROZEN = 13
     """The rack answers, and its clock does not move."""
     OUTPUTS_NOT_TAKEN = 14

@@ -4,7 +4,7 @@ A lease is granted to a connection with its first write, and refused to all othe
 silence, or by hand-over: when the connection of a simple client closes, at once; when that of a holder with a number
 closes, after a moment in which it may come back over another connection, from the same address and with the same
 certificate: the number is no password, anybody can read it. A holder that comes back leaves its former connection for
-good: whoever writes over that one has the same number and is somebody else.
+good: another client that writes over it has the same number.
 """
 
 import time
@@ -51,7 +51,7 @@ class Lease:
 
     @property
     def state(self) -> LeaseState:
-        """Whether somebody holds it now."""
+        """Whether it is held now."""
         if self._caller is None:
             return LeaseState.FREE
         silence_s, now = self._silence_s(), self._now()
@@ -65,7 +65,7 @@ class Lease:
         """Check that a caller may write; `holder` is the number that it says it has, None where it does not say.
 
         Raises:
-            BusyError: Somebody else holds the lease.
+            BusyError: Another client holds the lease.
         """
         held = self._caller
         if held is None or held.connection == caller.connection or self.state is LeaseState.FREE:

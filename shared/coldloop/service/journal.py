@@ -59,11 +59,11 @@ class Journal:
         return self._events[0].number if self._events else 0
 
     def continue_from(self, boot: int, count: int) -> None:
-        """Number on from before a restart.
+        """Continue the numbering from before a restart.
 
         Args:
             boot: Number of this start.
-            count: Number of the last event before it; those of this start so far are numbered anew behind it.
+            count: Number of the last event before it; those of this start are renumbered after it.
         """
         moved = count - self.before
         self._events = deque(
@@ -103,7 +103,7 @@ class Journal:
         return list(newest_first)[::-1]
 
     def select(self, query: JournalQuery) -> tuple[JournalPage, list[JournalAnswer]]:
-        """Return the first events that a query selects, and where to go on.
+        """Return the first events that a query selects, and where the next query continues.
 
         At most `LOOKED_AT` events are looked at: a page may have fewer events than fit, even none, and `next_first`
         still says that there is more.

@@ -10,4 +10,4 @@ class Pace(NamedTuple):
     factor: float
     """Seconds of plant time in one second of real time."""
     paused: bool = False
-    """In real time: plant time does not go on until it is resumed."""
+    """In real time: plant time is stopped until it is resumed."""

@@ -53,8 +53,8 @@ function row(one) {
 // Shelving counts plant time: what that is by the clock is said wherever it is not the same.
 function shelvingNote() {
   const factor = state.values["plant.pace.factor"], real = state.values["plant.pace.realtime"], paused = state.values["plant.pace.paused"];
-  const text = !state.values["plant.pace.session"] || (real && !paused && factor === 1) ? "" : !real ? "Shelving counts plant time, which goes as far as it is granted."
-    : paused ? "Shelving counts plant time, which stands still." : `Shelving counts plant time: at factor ${factor}, 15 min are over in ${(900 / factor).toPrecision(3)} s by the clock.`;
+  const text = !state.values["plant.pace.session"] || (real && !paused && factor === 1) ? "" : !real ? "Shelving counts plant time, which advances as it is granted."
+    : paused ? "Shelving counts plant time, which is paused." : `Shelving counts plant time: at factor ${factor}, 15 min are over in ${(900 / factor).toPrecision(3)} s by the clock.`;
   const note = byId("shelving-note");
   note.hidden = !text;
   if (note.textContent !== text) note.textContent = text;

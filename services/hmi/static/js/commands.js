@@ -65,10 +65,10 @@ async function oneCommand(body, atOnce) {
   } catch (error) { await failed(prepared.text, error, "uncertain"); }
 }
 
-// Without a status nobody has answered: a command that was only prepared is not done, of a confirmed one nobody knows.
+// Without a status there was no answer: a prepared command is not done, the result of a confirmed one is unknown.
 async function failed(asked, error, unanswered) {
   if (error.status) note(asked, "refused", error.message);
-  else note(asked, unanswered, "the page's own server did not answer; look what has become of it before asking again");
+  else note(asked, unanswered, "the page's own server did not answer; check its effect before repeating it");
   if (error.status === 401) await refreshUser().catch(() => {});
 }
 
