@@ -278,19 +278,19 @@ def _row(service: str, *cells: object) -> str:
 async def main(options: argparse.Namespace) -> int:
     """Fuzz all three; return the exit code."""
     print(_row("service", "frames", "served", "sent", "received", "connections", "seconds", "MB then", "MB now"))
-    stood = True
+    passed = True
     with tempfile.TemporaryDirectory() as folder:
         settings = site(Path(folder)) if options.tls else Settings()
         async with LocalServices(settings, Path(folder)) as services:
             for service in options.service or SERVICES:
                 line, one_passed = await fuzz(service, services, Path(folder), options)
                 print(line, flush=True)
-                stood = stood and one_passed
-        if not stood:
+                passed = passed and one_passed
+        if not passed:
             for service in SERVICES:
                 log = text_of(Path(folder) / f"{service}.log")
                 print(f"--- the end of the log of {service}", *log.splitlines()[-options.log_lines :], sep="\n")
-    return 0 if stood else 1
+    return 0 if passed else 1
 
 
 if __name__ == "__main__":

@@ -190,10 +190,10 @@ def do_mpc_solved(problem: dict[str, Any], repeat: int) -> tuple[float, float]:
 def compare_problem(coldloop: Path, repeat: int) -> None:
     """Print the times and costs of one problem."""
     own = subprocess.run([coldloop, Path(__file__).with_name("peer_problem.py")], check=True, capture_output=True)
-    told = json.loads(own.stdout)
-    for name, (seconds, cost) in told["own"].items():
+    answer = json.loads(own.stdout)
+    for name, (seconds, cost) in answer["own"].items():
         print(f"Coldloop, {name}: {seconds * 1000:.2f} ms a problem, J {cost:.3f}", flush=True)
-    seconds, cost = do_mpc_solved(told["problem"], repeat)
+    seconds, cost = do_mpc_solved(answer["problem"], repeat)
     print(f"do-mpc, every sample: {seconds * 1000:.2f} ms a problem, J {cost:.3f}", flush=True)
 
 

@@ -258,7 +258,7 @@ class Sensor(Fault):
         return f"sensor {self.output} {self.shows if self.value is None else f'= {self.value:g}'}"
 
 
-class Given(Fault):
+class BoundaryFault(Fault):
     """Something that a refrigerator is given is otherwise: a compressor trips, nitrogen runs out, helium leaks."""
 
     kind: Literal["given"]
@@ -293,6 +293,6 @@ AnyLinkFault = Annotated[
 ]
 AnyFault = Annotated[
     AnyLinkFault
-    | Kill | Pause | Restart | Clock | Sensor | Given | WrongModel,
+    | Kill | Pause | Restart | Clock | Sensor | BoundaryFault | WrongModel,
     Field(discriminator="kind"),
 ]  # fmt: skip

@@ -13,8 +13,8 @@ from coldloop.registers.plant import SensorFault, SensorFaultKind
 from rig.chaos.faults import (
     SERVICE_OF,
     AnyFault,
+    BoundaryFault,
     Clock,
-    Given,
     Kill,
     Link,
     LinkFault,
@@ -73,7 +73,7 @@ class Injector:
                 self._services.pause(service)
         elif isinstance(fault, Sensor):
             await self._set_sensor(fault.output, SensorFault(_SHOWN[fault.shows], fault.value or 0.0))
-        elif isinstance(fault, Given):
+        elif isinstance(fault, BoundaryFault):
             before = await self._give(fault.target, fault.value)
             self._given_before.setdefault(fault.target, before)
         elif isinstance(fault, WrongModel):
@@ -95,7 +95,7 @@ class Injector:
                 self._services.resume(service)
         elif isinstance(fault, Sensor):
             await self._set_sensor(fault.output, SensorFault(SensorFaultKind.NONE, 0.0))
-        elif isinstance(fault, Given):
+        elif isinstance(fault, BoundaryFault):
             await self._give(fault.target, self._given_before.pop(fault.target))
         elif isinstance(fault, WrongModel):
             await self._services.stop("optimizer_plc", signal.SIGTERM)

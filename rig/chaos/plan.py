@@ -14,7 +14,7 @@ from coldloop.process.signals import TICK_S
 from coldloop.session.settings import TimeMode
 from plant.load import concatenated, find_load, named_families, telegraph
 from plant.settings import PlantKind
-from rig.chaos.faults import AnyFault, Given
+from rig.chaos.faults import AnyFault, BoundaryFault
 from rig.chaos.link_plan import LinkPlan
 from rig.cosim.scenario import Scenario
 from rig.settings import Settings
@@ -70,7 +70,7 @@ class ChaosPlan(BaseModel):
         if any(fault.tick >= self.ticks for fault in self.faults):
             raise ValueError(f"a fault begins after the end of the run, {self.duration_s:g} s")
         _refuse_overlaps(self.schedule())
-        if any(isinstance(fault, Given) for fault in (*self.faults, *self.draw)) and (
+        if any(isinstance(fault, BoundaryFault) for fault in (*self.faults, *self.draw)) and (
             self.plant is not PlantKind.REFRIGERATOR
         ):
             raise ValueError('a fault of kind "given" needs plant = "refrigerator"')

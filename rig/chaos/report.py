@@ -93,9 +93,9 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
     ]
     if trace.ladder is not None:
         lines.append(f"mode at the end: {Mode(trace.ladder.mode).name}, {trace.ladder.events} events")
-    standing = [AlarmKind(i).name for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
-    if standing:
-        lines.append(f"alarms active or unacknowledged: {', '.join(standing)}")
+    active = [AlarmKind(i).name for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
+    if active:
+        lines.append(f"alarms active or unacknowledged: {', '.join(active)}")
     return [*lines, *_resource_lines(trace)]
 
 

@@ -52,7 +52,7 @@ class FaultSequencer:
         self._progress = progress
         self._timeline = Timeline(plan.schedule(), factor=plan.factor if plan.realtime else None)
         self._marks: dict[int, Mark] = {}
-        self._began = self._standing_since = time.monotonic()
+        self._began = self._stopped_since = time.monotonic()
         self.tick = 0
 
     async def run(self) -> None:
@@ -62,7 +62,7 @@ class FaultSequencer:
                 await self._begin(moment)
             else:
                 await self._end(moment)
-            self._standing_since = time.monotonic()
+            self._stopped_since = time.monotonic()
         alarms = await self._client.contact(self._client.control.read_rows(Alarm, 0, len(AlarmKind)))
         self._trace.alarms = alarms or []
         await self._client.conclude()
@@ -100,7 +100,7 @@ class FaultSequencer:
         tick = await self._client.look()
         ladder = await self._client.ladder()
         if tick is not None and tick != self.tick:
-            self.tick, self._standing_since = tick, time.monotonic()
+            self.tick, self._stopped_since = tick, time.monotonic()
         self._trace.ladder = ladder or self._trace.ladder
         resources = self._trace.resources
         if not resources or self.tick - resources[-1].tick >= RESOURCE_TICKS:
@@ -114,17 +114,17 @@ class FaultSequencer:
         Raises:
             LinkError: Plant time stopped without a fault.
         """
-        standing = time.monotonic() - self._standing_since
+        stopped_s = time.monotonic() - self._stopped_since
         for end in self._timeline.on:
             fault = end.fault
             bearable = self._plan.standstill_s
             if fault.stops_time:
                 bearable = min(bearable, fault.duration_s)
-            if not self._plan.realtime and standing > bearable:
+            if not self._plan.realtime and stopped_s > bearable:
                 return self._timeline.take(end)
-        if not self._timeline.on and standing > max(STANDSTILL_PATIENCE_S, 4 * TICK_S / self._plan.factor):
+        if not self._timeline.on and stopped_s > max(STANDSTILL_PATIENCE_S, 4 * TICK_S / self._plan.factor):
             raise LinkError(
-                f"plan {self._plan.name}: the plant is at {self.tick * TICK_S:g} s for {standing:.0f} s without a "
+                f"plan {self._plan.name}: the plant is at {self.tick * TICK_S:g} s for {stopped_s:.0f} s without a "
                 f"fault: see {self._services.log('control_plc')}"
             )
         return None

@@ -46,7 +46,7 @@ async def keep_up(
     restarts, since = 0, loop.time()
     work: Callable[[], Awaitable[None]] = _nothing
     while True:
-        how = await _ended_beside(process, work)
+        how = await _run_until_exit(process, work)
         if loop.time() - since > STEADY_S:
             restarts = 0
         if restarts == len(pauses_s):
@@ -64,18 +64,18 @@ async def _nothing() -> None:
     """Do nothing after a start."""
 
 
-async def _ended_beside(process: Restartable, work: Callable[[], Awaitable[None]]) -> str:
+async def _run_until_exit(process: Restartable, work: Callable[[], Awaitable[None]]) -> str:
     """Wait until a process has ended while `work` runs, which is cancelled with it; return how it has ended."""
-    ended, beside = asyncio.ensure_future(process.ended()), asyncio.ensure_future(work())
+    exited, running = asyncio.ensure_future(process.ended()), asyncio.ensure_future(work())
     try:
-        await asyncio.wait({ended, beside}, return_when=asyncio.FIRST_COMPLETED)
-        if not ended.done():
-            await beside
-        return await ended
+        await asyncio.wait({exited, running}, return_when=asyncio.FIRST_COMPLETED)
+        if not exited.done():
+            await running
+        return await exited
     finally:
-        ended.cancel()
-        beside.cancel()
-        await asyncio.gather(ended, beside, return_exceptions=True)
+        exited.cancel()
+        running.cancel()
+        await asyncio.gather(exited, running, return_exceptions=True)
 
 
 def end_of(code: int, last_words: str) -> str:

@@ -176,7 +176,7 @@ class PageProcess:
             return
 
     @property
-    def whereabouts(self) -> str:
+    def addresses(self) -> str:
         """Where it is, and who may operate."""
         scheme = "https" if self._section.https else "http"
         text = f"  page           {scheme}://{self._section.host}:{self._section.port}/\n"

@@ -84,8 +84,8 @@ class UpRig:
         if page is not None:
             await page.is_served()
         if announce:
-            sys.stdout.write(whereabouts(self._settings, self._ports, self.folder))
-            sys.stdout.write(page.whereabouts if page is not None else "")
+            sys.stdout.write(addresses(self._settings, self._ports, self.folder))
+            sys.stdout.write(page.addresses if page is not None else "")
             sys.stdout.flush()
         self._write_state(services)
 
@@ -171,7 +171,7 @@ def _retaining(settings: Settings, folder: Path) -> Settings:
     return settings.model_copy(update=sections)
 
 
-def whereabouts(settings: Settings, ports: Sequence[int], folder: Path) -> str:
+def addresses(settings: Settings, ports: Sequence[int], folder: Path) -> str:
     """Return where everything is, with a line to paste."""
     base = "" if tuple(ports) == DEFAULT_PORTS else f" --port-base {ports[0]}"
     tls = any(getattr(settings, service).server.tls for service in SERVICES)

@@ -97,7 +97,7 @@ class RunFiles:
             self._discard()
             with contextlib.suppress(OSError):
                 self.folder.rmdir()  # it stays if it has logs
-            raise _told(error, self.folder)
+            raise _results_error(error, self.folder)
         reason = None if error is None else _reason(error)
         summary = summary_of(self._evaluation, self.recorder, realtime=self._realtime, reason=reason)
         manifest = final_manifest(self._manifest, reason, recorded, self._evaluation.trace_sha256)
@@ -108,7 +108,9 @@ class RunFiles:
         except OSError as of_files:
             error = error or of_files
         if error is not None:
-            raise _told(error, self.folder, f"{recorded} of {self.recorder.ticks} ticks are recorded in {self.folder}")
+            raise _results_error(
+                error, self.folder, f"{recorded} of {self.recorder.ticks} ticks are recorded in {self.folder}"
+            )
         return summary
 
     def _discard(self) -> None:
@@ -152,7 +154,7 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _told(error: BaseException, folder: Path, kept: str = "") -> BaseException:
+def _results_error(error: BaseException, folder: Path, kept: str = "") -> BaseException:
     """Return the error with what a user needs to know about the files."""
     if isinstance(error, OSError):
         error = ResultsError(f"{error.filename or folder}: {error.strerror or error}; choose another --out")

@@ -2,7 +2,7 @@
 
     condition ──on-delay, off-delay──> active ──TRANSITIONS──> state ──> registers, journal
 
-A condition is reported as it is (`holds`, `raised`, `returned`, `happened`). When it has changed for the delay of its
+A condition is reported as it is (`report`, `raised`, `returned`, `pulse`). When it has changed for the delay of its
 alarm, `active` follows, and the state makes a transition. Operators make the others. All times are plant time, measured
 by ticks and not by scans: scans can be missed.
 
@@ -123,7 +123,7 @@ class AlarmPanel:
         self.now = tick
 
     def pass_by(self) -> None:
-        """Let the delays and the shelving that are over by now take effect; call it once a scan."""
+        """Apply expired delays and shelving times; call it once per scan."""
         for kind in list(self._pending):
             self._settle(kind)
         for kind in self._shelved():
@@ -132,8 +132,8 @@ class AlarmPanel:
 
     # -- conditions ----------------------------------------------------------------------------------------------------
 
-    def holds(self, kind: AlarmKind, *, condition: bool, cause: int = 0) -> None:
-        """Tell whether the condition of an alarm holds, and why; a cause that it had not yet raises the alarm again."""
+    def report(self, kind: AlarmKind, *, condition: bool, cause: int = 0) -> None:
+        """Report the condition of an alarm and its cause; a new cause raises the alarm again."""
         row = self.rows[kind]
         if condition != bool(row.active):
             earlier = self._pending.get(kind)
@@ -142,18 +142,18 @@ class AlarmPanel:
             return
         self._pending.pop(kind, None)
         if condition and cause != row.cause:
-            if cause in self._causes[kind]:  # causes that take turns are no news
+            if cause in self._causes[kind]:  # alternating causes are not new
                 self._store(kind, cause=cause)
             else:
                 self._raise(kind, cause)
 
     def pending(self, *kinds: AlarmKind) -> list[int | None]:
-        """Return since when the condition of each alarm has been another than it shows; None where it is the same."""
+        """Return since when the condition of each alarm has differed from its shown state; None where it does not."""
         changes = map(self._pending.get, kinds)
         return [None if change is None else change.since for change in changes]
 
     def set_pending(self, kind: AlarmKind, since: int | None) -> None:
-        """Note since when the condition of an alarm has been another than it shows."""
+        """Set since when the condition of an alarm has differed from its shown state."""
         self._pending.pop(kind, None)
         if since is not None:
             self._pending[kind] = _Pending(since, 0)
@@ -165,20 +165,20 @@ class AlarmPanel:
         return not any(row.active for row in others) and all(kind in BANDS for kind in self._pending)
 
     def delay(self, kind: AlarmKind) -> int:
-        """Return for how many ticks its condition must have changed until an alarm follows it."""
+        """Return the delay (ticks) after which an alarm follows its condition."""
         rule = self._rules[kind]
         return rule.off_ticks if self.rows[kind].active else rule.on_ticks
 
     def raised(self, kind: AlarmKind, cause: int = 0) -> None:
-        """Tell that the condition of an alarm holds, and why."""
-        self.holds(kind, condition=True, cause=cause)
+        """Report that the condition of an alarm holds, and its cause."""
+        self.report(kind, condition=True, cause=cause)
 
     def returned(self, kind: AlarmKind) -> None:
-        """Tell that the condition of an alarm has ended."""
-        self.holds(kind, condition=False)
+        """Report that the condition of an alarm has ended."""
+        self.report(kind, condition=False)
 
-    def happened(self, kind: AlarmKind, cause: int = 0) -> None:
-        """Tell of something that happens at an instant: the alarm returns an off-delay after the last time.
+    def pulse(self, kind: AlarmKind, cause: int = 0) -> None:
+        """Report an instantaneous condition: the alarm returns an off-delay after the last one.
 
         An alarm with an on-delay is not raised by it.
         """

@@ -58,7 +58,7 @@ class CertificateWatch:
         """Take the days that are left of those to be renewed."""
         least, program = min(days, default=0.0), self._program
         cause = (EXPIRED if least < 0.0 else EXPIRES_SOON) if days else 0
-        program.alarms.holds(AlarmKind.CERTIFICATE, condition=bool(days), cause=cause)
+        program.alarms.report(AlarmKind.CERTIFICATE, condition=bool(days), cause=cause)
         if cause and cause != self._noted:
             program.journal.note(program.alarms.now, EventKind.CERTIFICATE, cause, value=least)
         self._noted = cause

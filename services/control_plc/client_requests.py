@@ -26,7 +26,7 @@ from coldloop.registers.declaration import Block, Role
 from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
 from coldloop.safety.sequence import InputSequence
 from coldloop.safety.writer_lease import LeaseEvent, WriterLease
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.program import ControlProgram
 from control_plc.publication import ControlPublication
 from control_plc.sessions import Sessions
@@ -75,7 +75,7 @@ class Clients:
         """Lock-step scans every tick before this one."""
         self.asked: ControlSession | None = None
         """A session that is to begin."""
-        self.asked_pace: Pace | None = None
+        self.pending_time_base: TimeBase | None = None
         """A time base that the session under way is to have."""
         publication.lease = self.lease
         bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader, SequenceRow)
@@ -96,7 +96,7 @@ class Clients:
         try:
             self.lease.check(caller, record.holder if isinstance(record, Heartbeat) else None)
         except BusyError:
-            self._program.alarms.happened(AlarmKind.SECOND_WRITER, SECOND_OPTIMIZER)
+            self._program.alarms.pulse(AlarmKind.SECOND_WRITER, SECOND_OPTIMIZER)
             raise
         if isinstance(record, Plan) and not record.crc:
             raise IllegalValueError("a plan needs a CRC: it decides when inputs change")
@@ -173,11 +173,11 @@ class Clients:
             self.granted = self._bank.get(Grant).until_tick
         elif record is ControlSession:
             self.asked = asked = self._bank.get(ControlSession)
-            self.asked_pace = None
+            self.pending_time_base = None
             self.granted = 0
             self._note(EventKind.SESSION, asked.realtime, caller.name, value=asked.factor)
         elif record is SessionPace:
-            self.asked_pace = pace = self._bank.get(SessionPace).of(program.session)
+            self.pending_time_base = pace = self._bank.get(SessionPace).of(program.session)
             self._note(EventKind.PACE, pace_subject(pace), caller.name, value=pace.factor)
         elif record is Operator:
             self._operate(self._bank.get(Operator), caller.name)
@@ -268,4 +268,4 @@ class Clients:
     def on_refusal(self, kind: str) -> None:
         """A server has refused a client's request."""
         if kind == "access_refused":
-            self._program.alarms.happened(AlarmKind.ACCESS_REFUSED)
+            self._program.alarms.pulse(AlarmKind.ACCESS_REFUSED)

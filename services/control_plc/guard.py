@@ -56,7 +56,7 @@ class OutputGuard:
         for slot, before in enumerate(state.before):  # what is further away limits nothing any more
             state.moves[slot] = min(state.moves[slot], tick) if _reaches(before, finite, rates) else NEVER
         state.applied[:] = finite
-        state.astray = not in_range(self.limits, finite)
+        state.out_of_bounds = not in_range(self.limits, finite)
         if not goes_on:
             state.anchor[:] = finite
             state.start = state.moved = tick

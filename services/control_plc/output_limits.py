@@ -60,7 +60,7 @@ class GuardState:
     moves: MutableSequence[int]
     """Tick of each of the last changes, in turn, shape (slew_ticks,)."""
     before: MutableSequence[MutableSequence[float]]
-    """What was applied before each of them, shape (slew_ticks, 3)."""
+    """Outputs applied before each of them, shape (slew_ticks, 3)."""
     start: int = 0
     share: float = 1.0
     """Depends on how long before the window the outputs last moved."""
@@ -68,8 +68,8 @@ class GuardState:
     """Tick of the last change."""
     changes: int = 0
     """Number of changes so far."""
-    astray: bool = False
-    """What was applied when the guard began is outside the bounds."""
+    out_of_bounds: bool = False
+    """The outputs applied when the guard began are outside the bounds."""
 
 
 def beginning(limits: Limits, applied: Numbers) -> GuardState:
@@ -87,7 +87,7 @@ def copy_state(source: GuardState, target: GuardState, limits: Limits) -> None:
         for i in range(3):
             target.before[slot][i] = source.before[slot][i]
     target.start, target.share = source.start, source.share
-    target.moved, target.changes, target.astray = source.moved, source.changes, source.astray
+    target.moved, target.changes, target.out_of_bounds = source.moved, source.changes, source.out_of_bounds
 
 
 def rate_share(limits: Limits, elapsed_ticks: int) -> float:
@@ -104,7 +104,7 @@ def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update:
         for i in range(3):
             state.anchor[i] = applied[i]
     same = wanted[0] == applied[0] and wanted[1] == applied[1] and wanted[2] == applied[2]
-    if same and not state.astray:  # it was admitted before, and a new window begins with it
+    if same and not state.out_of_bounds:  # it was admitted before, and a new window begins with it
         return
     a, b, c = (
         nearest(state, limits, tick, wanted[0], 0),
@@ -118,8 +118,8 @@ def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update:
             state.before[slot][i] = applied[i]
         state.changes += 1
         applied[0], applied[1], applied[2] = a, b, c
-    if state.astray:
-        state.astray = not in_range(limits, applied)
+    if state.out_of_bounds:
+        state.out_of_bounds = not in_range(limits, applied)
 
 
 def nearest(state: GuardState, limits: Limits, tick: int, wanted: float, i: int) -> float:

@@ -236,7 +236,7 @@ class PlantLink:
         before, self._has_refused_more = self._has_refused_more, answer.refused != self.refused
         if before and self._has_refused_more:
             self.refused, self._has_refused_more = answer.refused, False
-            self._alarms.happened(AlarmKind.SECOND_WRITER, SECOND_MASTER)
+            self._alarms.pulse(AlarmKind.SECOND_WRITER, SECOND_MASTER)
 
     def _clock_stopped(self, reading: Measurement, now: float | None) -> bool:
         """Note where the rack is; tell whether its clock has stopped. At tick 0 it waits for the first outputs."""

@@ -88,7 +88,7 @@ class ControlProgram:
 
     def restart(self, session: int) -> None:
         """Begin a session at tick 0 with the initial inputs applied."""
-        self.nobody_drives()
+        self.reset_operating_mode()
         self._begin(session, 0, self._initial, updates=0)
         classical = self._section.driver is ControlStrategy.CLASSICAL
         mode = Mode.CLASSICAL if classical else Mode.HOLD
@@ -96,7 +96,7 @@ class ControlProgram:
         if session:
             self._note_mode(0)
 
-    def nobody_drives(self) -> None:
+    def reset_operating_mode(self) -> None:
         """Let those drive whom the configuration names: no operator has said anything."""
         classical = self._section.driver is ControlStrategy.CLASSICAL
         self.operator = Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, *self._initial)
@@ -356,7 +356,7 @@ class ControlProgram:
         """Take a heartbeat, which names the optimiser's model."""
         self.optimizer_seen()
         wrong = beat.model_digest != self._point.model_digest
-        self.alarms.holds(AlarmKind.MODEL_MISMATCH, condition=wrong)
+        self.alarms.report(AlarmKind.MODEL_MISMATCH, condition=wrong)
 
     def accept_plan(self, plan: Plan) -> bool:
         """Take the updating period of the last update; tell whether it was acceptable."""
@@ -373,9 +373,9 @@ class ControlProgram:
         lost = self.alarms.now - self.tick > LOST_TICKS
         answer = self.player.offer(sequence, self._earliest, plant_lost=lost)
         accepted = answer.verdict == Verdict.ACCEPTED
-        self.alarms.holds(AlarmKind.SEQUENCE_REJECTED, condition=not accepted, cause=answer.verdict)
+        self.alarms.report(AlarmKind.SEQUENCE_REJECTED, condition=not accepted, cause=answer.verdict)
         if accepted or answer.verdict == Verdict.WRONG_MODEL:
-            self.alarms.holds(AlarmKind.MODEL_MISMATCH, condition=not accepted)
+            self.alarms.report(AlarmKind.MODEL_MISMATCH, condition=not accepted)
         return answer
 
     # -- the operator's side -------------------------------------------------------------------------------------------

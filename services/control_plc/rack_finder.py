@@ -48,7 +48,7 @@ class RackFinder:
         self.reached = False
         """The rack has answered at least once since the start."""
 
-    def look_at_once(self) -> None:
+    def read_soon(self) -> None:
         """Make the next looks without a pause before them."""
         self._looks = 0
 

@@ -18,7 +18,7 @@ from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.safety.retained_writer import RetainedStateWriter
 from coldloop.safety.sequence import InputSequence, checksum
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")
@@ -45,7 +45,7 @@ class RetainedControlState(BaseModel):
     """Number of the last event."""
     session: Count
     tick: Annotated[int, Field(ge=0, le=LAST_TICK)]
-    pace: Pace
+    pace: TimeBase
     updates: Annotated[int, Field(ge=0, le=LAST_NUMBER)]
     """Number of the next update."""
     playing: tuple[SequenceHeader, Annotated[str, Field(max_length=2 * SEQUENCE_ROWS * ROW.size)]] | None
@@ -123,7 +123,7 @@ class ControlStateStore:
         """Why the state cannot be written at present."""
         return self._writer.failed if self._writer else None
 
-    def keep(self, program: ControlProgram, pace: Pace, pending: RetainedControlState | None = None) -> None:
+    def keep(self, program: ControlProgram, pace: TimeBase, pending: RetainedControlState | None = None) -> None:
         """Keep the state of now; of a `pending` session, which is still to be resumed, what was retained of it."""
         if self._writer is None:
             return
@@ -132,7 +132,7 @@ class ControlStateStore:
             content |= {name: getattr(pending, name) for name in OF_THE_SESSION}
         self._writer.keep(content)
 
-    def content(self, program: ControlProgram, pace: Pace) -> dict[str, Any]:
+    def content(self, program: ControlProgram, pace: TimeBase) -> dict[str, Any]:
         """Return the state of a program, as a file holds it; nothing in it changes later."""
         return {
             "boot": self.boot, "holder": self.holder, "events": program.journal.count, "session": program.session,

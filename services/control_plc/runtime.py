@@ -30,7 +30,7 @@ from coldloop.service.logs import dropped
 from coldloop.service.metrics_server import MetricsServer
 from coldloop.service.start import SERVING
 from coldloop.service.telemetry import Telemetry
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.certificate_watch import CertificateWatch
 from control_plc.client_requests import Clients
 from control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
@@ -114,8 +114,8 @@ class ControlPlc:
         while True:
             if self.clients.asked is not None:
                 self._start(self.clients.asked)
-            elif self.clients.asked_pace is not None:
-                self._change_pace(self.clients.asked_pace)
+            elif self.clients.pending_time_base is not None:
+                self._change_pace(self.clients.pending_time_base)
             elif not self.sessions.expected:
                 await self._stand_by()
             elif self.sessions.pace.paused and self.sessions.kept is None:
@@ -154,7 +154,7 @@ class ControlPlc:
         self.publication.lateness.add(lateness)
         if lateness * 1000 > self._settings.control_plc.scan_tolerance_ms:
             self.publication.overruns += 1
-            program.alarms.happened(AlarmKind.SCAN_OVERRUN)
+            program.alarms.pulse(AlarmKind.SCAN_OVERRUN)
         if lateness > self._clock.tick_s and program.tick:  # at tick 0 the rack's clock waits for us
             self._link.overslept()
         return self._link.in_step
@@ -162,7 +162,7 @@ class ControlPlc:
     @property
     def _is_called(self) -> bool:
         """An operator has asked for another session, or another time base."""
-        return self.clients.asked is not None or self.clients.asked_pace is not None
+        return self.clients.asked is not None or self.clients.pending_time_base is not None
 
     async def _while_paused(self) -> None:
         """Wait until an operator writes something; the connection to the rack is kept open meanwhile."""
@@ -225,7 +225,7 @@ class ControlPlc:
         if not self._link.in_step:
             self._publish()
             return
-        self._finder.look_at_once()
+        self._finder.read_soon()
         self._watch.scanned()
         if self.sessions.pace.realtime and answer.tick:
             self._clock.observe(answer.tick + answer.age, at, (answered_at - asked_at) / 2)
@@ -262,9 +262,9 @@ class ControlPlc:
             self.publication.offset_ms = self._clock.offset * self._clock.tick_s * 1000
             limit = self._settings.control_plc.skew_alarm_ppm
             known = skew.error_ppm < limit / 4
-            self._program.alarms.holds(AlarmKind.CLOCK_SKEW, condition=known and abs(skew.ppm) > limit)
+            self._program.alarms.report(AlarmKind.CLOCK_SKEW, condition=known and abs(skew.ppm) > limit)
         program, lost = self._program, dropped()
-        program.alarms.holds(AlarmKind.STATE_NOT_RETAINED, condition=self._store.failure is not None)
+        program.alarms.report(AlarmKind.STATE_NOT_RETAINED, condition=self._store.failure is not None)
         if lost > self._lost_lines:
             program.journal.note(program.tick, EventKind.LOST, value=lost - self._lost_lines)
             self._lost_lines = lost
@@ -281,7 +281,7 @@ class ControlPlc:
             self._watch.scanned()
         stopped = self._watch.look(self._clock.tick_s) and not self._link.is_alarmed
         if stopped is not bool(alarms.rows[AlarmKind.SCANS_STOPPED].active):
-            alarms.holds(AlarmKind.SCANS_STOPPED, condition=stopped)
+            alarms.report(AlarmKind.SCANS_STOPPED, condition=stopped)
             self.publication.safety()
 
     @property
@@ -330,9 +330,9 @@ class ControlPlc:
         self._link.begin()
         self._publish()
 
-    def _change_pace(self, pace: Pace) -> None:
+    def _change_pace(self, pace: TimeBase) -> None:
         """Switch to another time base; the rack is read before the next scan."""
-        self.clients.asked_pace = None
+        self.clients.pending_time_base = None
         self.sessions.pace = pace
         self._set_clock()
         self._link.repaced()
@@ -351,7 +351,7 @@ class ControlPlc:
 
     def _set_clock(self) -> None:
         self._clock.begin(self.sessions.pace.factor, time.monotonic())
-        self._finder.look_at_once()
+        self._finder.read_soon()
         self._cycle.begin_time()
         self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
 

@@ -60,16 +60,16 @@ def are_inside(y: Numbers, low: Numbers, high: Numbers) -> bool:
     return inside
 
 
-def watch_standing(stands: MutableSequence[int], before: MutableSequence[float], y: Numbers, elapsed: int) -> None:
+def count_unchanged(unchanged: MutableSequence[int], before: MutableSequence[float], y: Numbers, elapsed: int) -> None:
     """Count for how many ticks each controlled output is unchanged while most of the others moved.
 
     `before` (22) becomes `y`, the measurements `elapsed` ticks later.
     """
     for place in range(len(CONTROLLED)):
         if y[CONTROLLED[place]] != before[CONTROLLED[place]]:
-            stands[place] = 0
+            unchanged[place] = 0
         elif 2 * moved(before, y) > len(y):
-            stands[place] += elapsed
+            unchanged[place] += elapsed
     before[:] = y
 
 
@@ -98,10 +98,10 @@ class ImageWatch:
         """Reset: nothing is known of earlier ticks."""
         self._image: tuple[Sequence[float], ...] = ()
         self._inputs: Sequence[float] = ()
-        self._stands = 0
+        self._unchanged = 0
         self._moved = False
 
-    def stands(self, inputs: Sequence[float], *image: Sequence[float], elapsed: int) -> int:
+    def unchanged(self, inputs: Sequence[float], *image: Sequence[float], elapsed: int) -> int:
         """Return for how many ticks the image is unchanged although the inputs have moved.
 
         Args:
@@ -111,13 +111,13 @@ class ImageWatch:
         """
         if image != self._image:  # NaN is not the same as NaN: a sensor that fails is for others to find
             self._image, self._inputs = image, inputs
-            self._stands, self._moved = 0, not self._may_rest
+            self._unchanged, self._moved = 0, not self._may_rest
             return 0
-        self._stands += elapsed
+        self._unchanged += elapsed
         if not self._moved:
             pairs = zip(inputs, self._inputs, self._moves, strict=True)
             self._moved = any(abs(now - before) > move for now, before, move in pairs)
-        return self._stands if self._moved else 0
+        return self._unchanged if self._moved else 0
 
 
 class SensorMonitor:
@@ -139,7 +139,7 @@ class SensorMonitor:
         self.before = list(initial)
         self._tick: int | None = None
         self._now = 0
-        self.stands = [0] * len(CONTROLLED)
+        self.unchanged = [0] * len(CONTROLLED)
         self._image = ImageWatch(moves, may_rest=settings.may_rest)
         self._recovering: dict[int, int] = {}
         """Output, and since which tick its measurements have been good again."""
@@ -157,12 +157,12 @@ class SensorMonitor:
             others: What else was measured.
         """
         elapsed = 1 if self._tick is None else max(0, tick - self._tick)
-        watch_standing(self.stands, self.before, y, elapsed)
+        count_unchanged(self.unchanged, self.before, y, elapsed)
         self._tick = self._now = tick
         frozen: Collection[int] = [
-            output for output, ticks in zip(CONTROLLED, self.stands, strict=True) if ticks >= self.frozen_ticks
+            output for output, ticks in zip(CONTROLLED, self.unchanged, strict=True) if ticks >= self.frozen_ticks
         ]
-        if self._image.stands(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
+        if self._image.unchanged(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
             frozen = range(len(y))
         if not self.bad and not frozen and are_inside(y, self.low, self.high):
             self._good[:] = y

@@ -9,8 +9,8 @@ from typing import Final
 
 from coldloop.registers.control_plc import ControlSession
 from coldloop.registers.plant import Measurement
-from coldloop.session.pace import Pace
 from coldloop.session.settings import SessionSettings, TimeMode
+from coldloop.session.time_base import TimeBase
 from control_plc.program import ControlProgram
 from control_plc.retained_state import RetainedControlState
 
@@ -48,8 +48,8 @@ class Sessions:
         """Another session that the rack was found in while ours ran, since when, and when it was seen there last (s)"""
 
     @property
-    def _configured_pace(self) -> Pace:
-        return Pace(self._configured.mode is TimeMode.REALTIME, self._configured.factor)
+    def _configured_pace(self) -> TimeBase:
+        return TimeBase(self._configured.mode is TimeMode.REALTIME, self._configured.factor)
 
     @property
     def expected(self) -> bool:
@@ -60,7 +60,7 @@ class Sessions:
         """Begin the session that an operator has asked for."""
         self.forget_kept()
         self._program.restart(asked.session)
-        self.pace = Pace(bool(asked.realtime), asked.factor)
+        self.pace = TimeBase(bool(asked.realtime), asked.factor)
         self._begin()
         log.info("session started", extra={"session": asked.session, "realtime": bool(asked.realtime)})
 
@@ -99,7 +99,7 @@ class Sessions:
             return
         self.pace = self._configured_pace
         if self._program.operator == kept.operator:
-            self._program.nobody_drives()
+            self._program.reset_operating_mode()
 
     def _is_ours_to_adopt(self, session: int) -> bool:
         """Tell whether a session of the rack has not been asked for by an operator, as far as one can tell by now."""

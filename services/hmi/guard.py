@@ -73,7 +73,7 @@ def cookie_name(request: web.Request) -> str:
     return f"coldloop_session_{port_of(host_header(request)) or 'default'}"
 
 
-def path_in_exhibit(request: web.Request) -> str:
+def path_in_site(request: web.Request) -> str:
     """Return what is asked for of one rig or run, without the number of the run among several."""
     return _RUN.sub("/", request.path, count=1)
 
@@ -104,7 +104,7 @@ class Guard:
     def session(self, request: web.Request) -> LoginSession | None:
         """Return the session of a request."""
         return self.sessions.find(
-            request.cookies.get(cookie_name(request)), is_use=path_in_exhibit(request) not in BY_ITSELF
+            request.cookies.get(cookie_name(request)), is_use=path_in_site(request) not in BY_ITSELF
         )
 
     def who(self, request: web.Request) -> str:
@@ -142,7 +142,7 @@ class Guard:
 
     def _judge(self, request: web.Request) -> web.Response | None:
         """Return why a request is refused; None when it is not."""
-        path, host = path_in_exhibit(request), host_header(request)
+        path, host = path_in_site(request), host_header(request)
         is_file = path in FILES or path.startswith("/static/")
         limit = self._files if is_file else self._requests
         if path not in UNLIMITED and not limit.allows(self.party(request)):
@@ -180,7 +180,7 @@ class Guard:
         try:
             answer = answer or await self._receive(request)
             if answer is None:
-                is_stream = path_in_exhibit(request) == STREAM
+                is_stream = path_in_site(request) == STREAM
                 has_session = self.party(request).has_session
                 with self._connections.serving(request, is_stream=is_stream, has_session=has_session):
                     answer = await handler(request)

@@ -17,7 +17,7 @@ from coldloop.registers.optimizer_plc import HISTORY_ROWS, ControlLinkStatus, Op
 from coldloop.registers.plant import LoadStatus, StationStatus
 from coldloop.registers.safety import Alarm, AlarmKind
 from hmi.compression_station import KIND, REFRIGERATOR
-from hmi.process_image import Model, Told
+from hmi.process_image import JournalEntry, Model
 from hmi.signals import shown_blocks
 
 log = logging.getLogger("coldloop.hmi")
@@ -170,7 +170,7 @@ class Poller:
         rows = await self._rows(Event, first, page.newest, EVENT_ROWS)
         news = sorted(row for row in rows if first <= row.number <= page.newest)
         self._last_event = news[-1] if news else self._last_event
-        self._model.put_events(Told.of(self._service, row) for row in news)
+        self._model.put_events(JournalEntry.of(self._service, row) for row in news)
         self._next_event = page.newest + 1
 
     async def _rows(self, record: type[Any], first: int, last: int, ring: int) -> list[Any]:

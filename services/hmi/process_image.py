@@ -29,7 +29,7 @@ STALE_S: Final = 1.5
 """A value whose source has been silent for this long is crossed out."""
 
 
-class Told(NamedTuple):
+class JournalEntry(NamedTuple):
     """An event in words, and the service whose journal it is from."""
 
     service: str
@@ -40,7 +40,7 @@ class Told(NamedTuple):
     text: EventText
 
     @classmethod
-    def of(cls, service: str, event: Event) -> "Told":
+    def of(cls, service: str, event: Event) -> "JournalEntry":
         """Return an event of a journal."""
         return cls(service, event.number, event.boot, utc_text(event), event.tick, describe(event))
 
@@ -77,7 +77,7 @@ class Model:
         self.updates: deque[Optimization] = deque(maxlen=UPDATES_KEPT)
         self.predictions: deque[Prediction] = deque(maxlen=PREDICTIONS_KEPT)
         self.alarms: list[Alarm] = []
-        self.events: deque[Told] = deque(maxlen=EVENTS_KEPT)
+        self.events: deque[JournalEntry] = deque(maxlen=EVENTS_KEPT)
         self.events_told = 0
         """Events so far; the last ones are in `events`."""
         self.changed: set[str] = set()
@@ -106,7 +106,7 @@ class Model:
         if isinstance(record, Identity):
             self._identity(service, record)
         elif isinstance(record, Process):
-            is_after_gap = source.was_silent or self._is_silent(source) or self.stands_still(service)
+            is_after_gap = source.was_silent or self._is_silent(source) or self.is_stopped(service)
             source.was_silent = False
             self._moved(source, record.tick)
             station = self.record("plant", StationStatus)
@@ -157,10 +157,10 @@ class Model:
             self.updates.append(update)
             self.changed.add("updates")
 
-    def put_events(self, events: Iterable[Told]) -> None:
+    def put_events(self, events: Iterable[JournalEntry]) -> None:
         """Take events that are new, oldest first."""
-        for told in events:
-            self.events.append(told)
+        for entry in events:
+            self.events.append(entry)
             self.events_told += 1
 
     def heard(self, service: str) -> None:
@@ -228,7 +228,7 @@ class Model:
         age = self.age_s(service)
         return age is not None and age < STALE_S
 
-    def stands_still(self, service: str) -> bool:
+    def is_stopped(self, service: str) -> bool:
         """Return whether the tick of a service does not move although its session runs in real time."""
         pace = self.record("plant", SessionPace)
         if pace is None or not pace.realtime or pace.paused or not pace.session or not pace.factor > 0:
@@ -244,9 +244,9 @@ class Model:
         stale = [f"{service}." for service in MAPS if not self.is_live(service)]
         identity = self.record("control_plc", Identity)
         is_looking = identity is not None and not identity.session  # for its session: nothing is measured
-        if self.is_live("control_plc") and (is_looking or self.stands_still("control_plc")):
+        if self.is_live("control_plc") and (is_looking or self.is_stopped("control_plc")):
             stale.append("control_plc.process.")
-        if self.is_live("plant") and self.stands_still("plant"):
+        if self.is_live("plant") and self.is_stopped("plant"):
             stale += ["plant.measurement.", "plant.station."]
         if self.mode != Mode.MPC and self.record("control_plc", LadderStatus) is not None:
             stale.append("update")

@@ -28,7 +28,7 @@ from hmi.documents import (
 from hmi.guard import Guard, add_headers, refusal
 from hmi.long_reads import LongReads
 from hmi.page_metrics import page_families
-from hmi.process_image import Model, Told
+from hmi.process_image import JournalEntry, Model
 from hmi.settings import HmiSection
 from hmi.trends import NAMES
 
@@ -195,21 +195,23 @@ class Reading:
         """Answer with all alarms."""
         return json_answer(encoded({"alarms": alarms_document(self._model)}))
 
-    def _events(self, query: Mapping[str, str]) -> list[Told]:
+    def _events(self, query: Mapping[str, str]) -> list[JournalEntry]:
         wanted, service = query.get("search", "").lower(), query.get("service", "")
         found = []
-        for told in reversed(self._model.events):
-            if service and told.service != service:
+        for entry in reversed(self._model.events):
+            if service and entry.service != service:
                 continue
-            if not wanted or wanted in f"{told.text.sentence} {told.utc} {told.service}".lower():
-                found.append(told)
+            if not wanted or wanted in f"{entry.text.sentence} {entry.utc} {entry.service}".lower():
+                found.append(entry)
         return found
 
     async def events(self, request: web.Request) -> web.Response:
         """Answer with the newest events that a search finds."""
         async with self._turn(request):
             found = self._events(request.query)
-            document = encoded({"found": len(found), "events": [event_document(told) for told in found[:EVENTS_SHOWN]]})
+            document = encoded(
+                {"found": len(found), "events": [event_document(entry) for entry in found[:EVENTS_SHOWN]]}
+            )
         return json_answer(document)
 
     async def events_table(self, request: web.Request) -> web.Response:
@@ -217,7 +219,7 @@ class Reading:
         async with self._turn(request):
             return self._events_as_table(self._events(request.query))
 
-    def _events_as_table(self, found: list[Told]) -> web.Response:
+    def _events_as_table(self, found: list[JournalEntry]) -> web.Response:
         text = io.StringIO()
         names = (
             "service",
@@ -235,8 +237,8 @@ class Reading:
         )
         writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
-        for told in found:
-            row = event_document(told)
+        for entry in found:
+            row = event_document(entry)
             writer.writerow({name: safe_cell(row[name]) for name in names})
         return web.Response(body=text.getvalue().encode(), headers=csv_headers("coldloop-events.csv"))
 

@@ -30,8 +30,8 @@ from coldloop.safety.sequence import InputSequence
 from coldloop.service.metrics_server import MetricsServer
 from coldloop.service.start import SERVING
 from coldloop.service.telemetry import Telemetry
-from coldloop.session.pace import Pace
 from coldloop.session.settings import TimeMode
+from coldloop.session.time_base import TimeBase
 from optimizer_plc.control_client import ControlClient
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.publication import OptimizerPublication
@@ -88,7 +88,7 @@ class OptimizerPlc:
         publish_configuration(self.publication.bank, selected(settings, SHOWN))
         self._link = self.publication.link
         self._control = ControlClient(section.control_plc, self._link, digest, str(settings.model.file))
-        self._configured_pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
+        self._configured_pace = TimeBase(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
         self._session = 0
         self._wanted = FRESH_UPDATE
         self._kept: _Answer | None = None
@@ -186,7 +186,7 @@ class OptimizerPlc:
         period_s = self._settings.optimizer_plc.program.updating_period_s
         asked = self.publication.asked_for(session)
         if asked is not None:
-            pace = Pace(bool(asked.realtime), asked.factor)
+            pace = TimeBase(bool(asked.realtime), asked.factor)
             period_s = asked.updating_period * TICK_S
         self._program.restart(period_s)
         self.publication.session_started(session, pace, self._program.rule_status())

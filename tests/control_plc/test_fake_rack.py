@@ -36,7 +36,7 @@ from coldloop.registers.safety import LeaseState
 from coldloop.safety.lease import Lease
 from coldloop.safety.sequence import InputSequence, with_checksum
 from coldloop.service.journal import Journal
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.plant_link import PlantLink
 from control_plc.program import make_program
 from control_plc.rack_clock import PHASE, RackClock
@@ -104,7 +104,7 @@ class FakeRack:
         self.own_steps: list[tuple[float, ...]] = []
 
     def session(self, number: int) -> Session:
-        return Session(number, Pace(self.realtime, 1.0), LoadProfile((0,), (HEADER.w0,)), 1)
+        return Session(number, TimeBase(self.realtime, 1.0), LoadProfile((0,), (HEADER.w0,)), 1)
 
     def passes(self, seconds: float) -> None:
         """Let real time pass; in real time the plant moves with it."""
@@ -264,7 +264,7 @@ class RackLink(RuleBasedStateMachine):
             self.keep()
 
     def keep(self) -> None:
-        content = ControlStateStore(None, HEADER.short_digest).content(self.program, Pace(self.realtime, 1.0))
+        content = ControlStateStore(None, HEADER.short_digest).content(self.program, TimeBase(self.realtime, 1.0))
         content["holder"] = self.holder
         self.kept = json.loads(json.dumps(content)) if self.remembers else None
 

@@ -11,7 +11,7 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.signals import L1, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow, Verdict
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.guard import OutputGuard
 from control_plc.retained_state import ControlStateStore, RetainedControlState
 
@@ -195,7 +195,7 @@ def test_after_a_restart_the_rest_of_what_was_played_is_played_on(bench: "Bench"
 def test_the_time_of_the_watchdog_that_an_operator_set_outlasts_a_restart(bench: "Bench") -> None:
     program = bench.program
     program.watchdog.set(240, program.tick)
-    content = ControlStateStore(None, 0).content(program, Pace(realtime=False, factor=1.0))
+    content = ControlStateStore(None, 0).content(program, TimeBase(realtime=False, factor=1.0))
     kept = RetainedControlState.parsed(json.loads(json.dumps(content)))
     program.watchdog.set(60, program.tick)
     program.recall(kept.operator, kept.alarms, kept.watchdog, kept.tick)

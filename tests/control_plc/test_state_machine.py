@@ -28,7 +28,7 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.safety.sequence import InputSequence, with_checksum
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.program import ControlProgram, make_program
 from control_plc.retained_state import ControlStateStore, RetainedControlState
 from control_plc.settings import ControlSection
@@ -212,7 +212,9 @@ class Link(RuleBasedStateMachine):
     @precondition(lambda self: self.program.tick > 0)
     @rule()
     def the_control_plc_is_killed_and_comes_back(self) -> None:
-        content = ControlStateStore(None, HEADER.short_digest).content(self.program, Pace(realtime=False, factor=1.0))
+        content = ControlStateStore(None, HEADER.short_digest).content(
+            self.program, TimeBase(realtime=False, factor=1.0)
+        )
         kept = RetainedControlState.parsed(json.loads(json.dumps(content)))
         self.program = self.new_program()
         self.program.alarms.restore(kept.alarms)

@@ -26,7 +26,7 @@ from hmi.access import (
 from hmi.audit import Audit
 from hmi.connections import Connections
 from hmi.guard import Guard
-from hmi.page_server import Exhibit, PageServer
+from hmi.page_server import PageServer, PageSite
 from hmi.process_image import Model
 from hmi.settings import HmiSection, LoginSettings
 from hmi.users import PageRole, User, Users, hash_password, write_user
@@ -178,7 +178,7 @@ def test_who_logs_in_again_leaves_no_session_behind(site: Site) -> None:
 async def test_two_pages_on_one_host_do_not_log_each_other_out(tmp_path: Path) -> None:
     write_user(tmp_path / "users", OPERATOR[0], PageRole.OPERATE, OPERATOR[1])
     section = HmiSection(port=0, login=LoginSettings(users=tmp_path / "users"))
-    pages = [PageServer(section, Exhibit(Model(Clock(), 300))) for _ in range(2)]
+    pages = [PageServer(section, PageSite(Model(Clock(), 300))) for _ in range(2)]
     async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as browser:  # keeps cookies of an IP
         for page in pages:
             await page.start()

@@ -13,7 +13,7 @@ import rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is pl
 from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import L1, T5
 from control_plc.output_limits import admit, admits, copy_state, in_range
-from control_plc.sensors import CONTROLLED, are_inside, watch_standing
+from control_plc.sensors import CONTROLLED, are_inside, count_unchanged
 from optimizer_plc import scheme
 from optimizer_plc.scheme import BY_THE_RULE
 from optimizer_plc.session_state import OptimizerState
@@ -41,8 +41,8 @@ def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> b
     interrupted = s.load_step > 0.0 and abs(load - s.update_load) > s.load_step
     frozen = False
     for place in range(len(CONTROLLED)):
-        stands = y[CONTROLLED[place]] == s.seen[CONTROLLED[place]]
-        frozen = frozen or (stands and s.stands[place] + 1 >= w.frozen_ticks)
+        unchanged = y[CONTROLLED[place]] == s.seen[CONTROLLED[place]]
+        frozen = frozen or (unchanged and s.unchanged[place] + 1 >= w.frozen_ticks)
     changes = is_due(alarms.level_band, alarms.level_active, alarms.level_delay, s.level_since, s.tick, y[L1])
     changes = changes or is_due(alarms.t5_band, alarms.t5_active, alarms.t5_delay, s.t5_since, s.tick, y[T5])
     return known and not (interrupted or frozen or changes) and are_inside(y, w.low, w.high)
@@ -78,7 +78,7 @@ def scan(
         for i in range(plant.y.shape[0]):
             plant.y[i] = plant.y[i] + w.biases[i] + w.deviations[i] * plant.noise[row, i]
     y = trace.y[row]
-    watch_standing(s.stands, s.seen, y, 1)
+    count_unchanged(s.unchanged, s.seen, y, 1)
     s.level_since = pending(alarms.level_band, alarms.level_active, s.level_since, tick, y[L1])
     s.t5_since = pending(alarms.t5_band, alarms.t5_active, s.t5_since, tick, y[T5])
     s.tick = tick + 1
@@ -100,7 +100,7 @@ def play(
 
 
 @kernel
-def go_on(
+def run_block(
     w: World,
     alarms: Alarms,
     o: Optimizer,

@@ -93,7 +93,7 @@ def state_of(program: PlantProgram, noise: Array, ticks: int) -> PlantState:
     return BoxState(x, y, np.empty(0), noise, slope, held)
 
 
-def give_back(program: PlantProgram, state: PlantState, tick: int, u: Array) -> None:
+def restore(program: PlantProgram, state: PlantState, tick: int, u: Array) -> None:
     """Resume the program at `tick`, up to which the inputs `u` were held."""
     if isinstance(state, BoxState):
         program.take_over(tick, state.x, state.slope, state.held, state.y)

@@ -84,7 +84,7 @@ class CompiledStretches:
             raise RuntimeError("an ordinary update plays a sequence")
         scans, guards = control.scan_record(program), control.guard_records(program.guard.state)
         rows = control.sequence_rows(playing)
-        loops.go_on(
+        loops.run_block(
             self._world, control.alarms_of(program), optimizer.parts_of(optimizer_plc), scans, guards, rows, plant,
             self._trace, self._reports, until,
         )  # fmt: skip
@@ -100,9 +100,9 @@ class CompiledStretches:
 
     def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:
         """Hand the state of the loop back to plant and control PLC; return the ticks it has run."""
-        plants.give_back(self._plant, plant, int(s["tick"]), guard["applied"])
-        control.give_back_guard(self._control, guard)
-        control.give_back_scan(self._control, s, self._trace)
+        plants.restore(self._plant, plant, int(s["tick"]), guard["applied"])
+        control.restore_guard(self._control, guard)
+        control.restore_scan(self._control, s, self._trace)
         ticks = int(s["tick"]) - int(s["first"])
         load, u, y, x, station = (part[:ticks].copy() for part in self._trace)
         return SampleBlock(int(s["first"]), load, u, y, x, station if station.size else NO_STATION)

@@ -61,7 +61,7 @@ class DisturbancesStudy:
             for load in _loads(event, options):
                 runs = [outcomes[request] for request in _runs(event, load)]
                 for (driver, station), run in zip(_pairs(), runs, strict=True):
-                    row = (f"{name} ({load.name})", driver, station, *_told(run))
+                    row = (f"{name} ({load.name})", driver, station, *_measures(run))
                     result.rows.append(row)
                     lines.append("| " + " | ".join(f"{c:.4g}" if isinstance(c, float) else str(c) for c in row) + " |")
                 if load.draw == 1:
@@ -88,7 +88,7 @@ def _runs(event: DisturbanceCase, load: Load) -> list[RunRequest]:
     ]
 
 
-def _told(run: Outcome) -> tuple[str | float, ...]:
+def _measures(run: Outcome) -> tuple[str | float, ...]:
     i = run.indicators
     spans = [
         f"{run.series(name).min():.{digits}f}..{run.series(name).max():.{digits}f}"

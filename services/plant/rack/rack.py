@@ -30,7 +30,7 @@ from coldloop.registers.plant import (
 )
 from coldloop.safety.watchdog import Watchdog
 from coldloop.service.journal import Journal
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from plant.program import HeatLoad, PlantProgram
 from plant.rack.faults import SensorFaults
 from plant.rack.load_schedule import LoadSchedule
@@ -52,7 +52,7 @@ class Session(NamedTuple):
 
     number: int
     """0 is none: the plant waits for an operator."""
-    pace: Pace
+    pace: TimeBase
     load: LoadProfile
     seed: int
 
@@ -262,7 +262,7 @@ class Rack:
             self.journal.note(self.tick, EventKind.LIVE_LOAD, int(ahead), value=steps[0].watts, who=who)
         self._load_by = who if ahead else ""
 
-    def set_pace(self, pace: Pace, who: str) -> None:
+    def set_pace(self, pace: TimeBase, who: str) -> None:
         """Change the time base from the present tick on."""
         self.session = self.session._replace(pace=pace)
         self.moving = pace.realtime and (self.moving or self.tick > 0)

@@ -35,8 +35,8 @@ from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 from coldloop.registers.text import from_words
 from coldloop.safety.writer_lease import LeaseEvent, WriterLease
 from coldloop.service.journal import Journal, JournalPublication
-from coldloop.session.pace import Pace
 from coldloop.session.settings import TimeMode
+from coldloop.session.time_base import TimeBase
 from plant.load import find_load
 from plant.rack.faults import HEALTHY
 from plant.rack.outputs import next_generation
@@ -106,7 +106,7 @@ class RackRegisters:
     ) -> tuple[Rack, bool]:
         """Return the rack at the beginning of the configured session, or, and True, where it was when it ended."""
         section, configured = settings.plant, settings.session
-        pace = Pace(configured.mode is TimeMode.REALTIME, configured.factor)
+        pace = TimeBase(configured.mode is TimeMode.REALTIME, configured.factor)
         load = find_load(section.load, header.w0)
         session = Session(1 if configured.autostart else 0, pace, load, section.seed)
         state = self._store.recall()
@@ -223,7 +223,7 @@ class RackRegisters:
 
     def _start_session(self, who: str) -> None:
         asked = self.bank.get(PlantSession)
-        pace = Pace(bool(asked.realtime), asked.factor)
+        pace = TimeBase(bool(asked.realtime), asked.factor)
         self.rack.start(Session(asked.session, pace, self._load_of(asked), asked.seed), who)
         for output in range(len(OUTPUT_NAMES)):
             self.bank.put(HEALTHY, output)

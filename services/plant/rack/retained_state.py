@@ -11,7 +11,7 @@ from coldloop.process.signals import LAST_TICK
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
 from coldloop.safety.retained import RetainedFile, RetainedStateError
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 
 log = logging.getLogger("coldloop.plant")
 
@@ -32,7 +32,7 @@ class RetainedPlantState(BaseModel):
     holder: Count
     session: Count
     """0: there has been none, and what follows is the rack as it is configured."""
-    pace: Pace
+    pace: TimeBase
     watchdog: Annotated[int, Field(ge=0, lt=2**16)]
     """Its time-out, in ticks."""
     times: tuple[Annotated[int, Field(ge=0, le=LAST_TICK)], ...]

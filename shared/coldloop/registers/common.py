@@ -4,7 +4,7 @@ from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.registers.declaration import Block, f32, u16, u32
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 
 MAGIC: Final = 123.456
 
@@ -40,7 +40,7 @@ class SessionPace(NamedTuple):
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)] = 1.0
     paused: Annotated[int, u16("1 pause, 0 go on; in real time only", high=1)] = 0
 
-    def of(self, session: int) -> Pace:
+    def of(self, session: int) -> TimeBase:
         """Return the time base that is asked for.
 
         Raises:
@@ -52,15 +52,15 @@ class SessionPace(NamedTuple):
             raise ValueError(f"session {session} is under way, not {self.session}")
         if self.paused and not self.realtime:
             raise ValueError("lock-step is not paused: grant no more ticks")
-        return Pace(bool(self.realtime), self.factor, bool(self.paused))
+        return TimeBase(bool(self.realtime), self.factor, bool(self.paused))
 
     @classmethod
-    def shown(cls, session: int, pace: Pace) -> "SessionPace":
+    def shown(cls, session: int, pace: TimeBase) -> "SessionPace":
         """Return the record of a time base."""
         return cls(session, int(pace.realtime), pace.factor, int(pace.paused))
 
 
-def pace_subject(pace: Pace) -> int:
+def pace_subject(pace: TimeBase) -> int:
     """Return the subject of the event PACE: 0 lock-step, 1 real time, 2 paused."""
     return 2 if pace.paused else int(pace.realtime)
 

@@ -173,9 +173,9 @@ def log_event(log: logging.Logger, event: Event) -> None:
     else:
         subject = "alarm" if _WORDINGS.get(event.kind) in (_ALARM, _SHELVING, _SUPPRESSION) else "subject"
     fields = {subject: text.subject, "cause": text.cause, "value": text.value, "who": text.who}
-    told = {name: field for name, field in fields.items() if field}
+    given = {name: field for name, field in fields.items() if field}
     level = logging.WARNING if event.kind in WARNINGS else logging.INFO
-    log.log(level, text.kind, extra={**told, "tick": event.tick, "number": event.number})
+    log.log(level, text.kind, extra={**given, "tick": event.tick, "number": event.number})
 
 
 def utc_text(event: Event) -> str:

@@ -48,7 +48,7 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
         configuration = load_configuration(
             settings, file=options.config, assignments=options.assignments, others=SECTIONS
         )
-        code = run_event_loop(lambda: _until_told(serve(configuration.settings), with_parent=options.with_parent))
+        code = run_event_loop(lambda: _until_stopped(serve(configuration.settings), with_parent=options.with_parent))
     except ColdloopError as error:
         code, last_line = error.exit_code, f"{name}: {error}"
     except Exception:  # the interpreter would write it past the queue, and block on its reader
@@ -83,7 +83,7 @@ def run_event_loop(start: Callable[[], Any]) -> int:
         return int(runner.run(start()))
 
 
-async def _until_told(service: Awaitable[None], *, with_parent: bool) -> int:
+async def _until_stopped(service: Awaitable[None], *, with_parent: bool) -> int:
     """Run the service; SIGTERM, SIGINT or the parent's end end it in good order."""
     loop = asyncio.get_running_loop()
     task = asyncio.ensure_future(service)

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 
-class Pace(NamedTuple):
+class TimeBase(NamedTuple):
     """In lock-step the factor has no meaning."""
 
     realtime: bool
