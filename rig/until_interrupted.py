@@ -10,7 +10,7 @@ from rig.interruption import INTERRUPTION
 
 
 def run_until_interrupted(start: Callable[[], Coroutine[Any, Any, None]]) -> bool:
-    """Run a coroutine to its end, or cancel it at the first signal; tell whether a signal ended it."""
+    """Run a coroutine to its end, or cancel it at the first signal; return whether a signal ended it."""
     interrupted = False
 
     async def watched() -> int:

@@ -113,7 +113,7 @@ class LocalServices:
         await _ended(process)
 
     def ended(self, service: str) -> bool:
-        """Tell whether a service has ended by itself."""
+        """Return whether a service has ended by itself."""
         return self._processes[service].returncode is not None
 
     def pause(self, service: str) -> None:

@@ -148,7 +148,7 @@ class UpdateReader:
                 self._next += 1
 
     def _follows(self, update: Optimization) -> bool:
-        """Tell whether a row is the update that is looked for, and not one that was recorded before."""
+        """Return whether a row is the update that is looked for, and not one that was recorded before."""
         return update.update == self._next and (self._last is None or update.tick > self._last.tick)
 
     async def read_until(self, ticks: int, last: int, patience_s: float) -> None:

@@ -56,7 +56,7 @@ def make_own_folder(name: str) -> Path:
 
 
 def is_private(folder: Path) -> bool:
-    """Tell whether something is a folder that belongs to this user and is closed to all others."""
+    """Return whether something is a folder that belongs to this user and is closed to all others."""
     try:
         status = folder.lstat()
     except OSError:

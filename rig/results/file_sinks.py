@@ -53,7 +53,7 @@ class ParquetFile:
         self._writer.write_table(table)
 
     def check(self) -> None:
-        """Tell whether more can be written.
+        """Return whether more can be written.
 
         Raises:
             ResultsError: The disk is full; what was written is whole, and the file can be closed.

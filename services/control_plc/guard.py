@@ -86,7 +86,7 @@ class OutputGuard:
         return Verdict.ACCEPTED if passes else Verdict.RATE_EXCEEDED
 
     def out_of_range(self, rows: Sequence[SequenceRow]) -> bool:
-        """Tell whether a row holds a value that is not finite or outside the bounds."""
+        """Return whether a row holds a value that is not finite or outside the bounds."""
         return not all(in_range(self.limits, row) for row in set(rows))
 
 

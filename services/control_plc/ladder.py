@@ -33,7 +33,7 @@ class Ladder:
         self.mode, self.cause, self.since = mode, cause, tick
 
     def step(self, tick: int, inputs: LadderInputs) -> bool:
-        """Choose the mode of this scan; tell whether it, or its cause, has changed."""
+        """Choose the mode of this scan; return whether it, or its cause, has changed."""
         mode, cause = self._chosen(tick, inputs)
         if (mode, cause) == (self.mode, self.cause) or (mode is self.mode and mode is Mode.MPC):
             return False

@@ -148,7 +148,7 @@ def nearest(state: GuardState, limits: Limits, tick: int, wanted: float, i: int)
 
 
 def is_reached(state: GuardState, limits: Limits, tick: int, value: float, i: int) -> bool:
-    """Tell whether a value of output `i` is within reach of all that it counts from."""
+    """Return whether a value of output `i` is within reach of all that it counts from."""
     reach, rate = limits.rate[i] * state.share, limits.rate[i]
     reached = abs(value - state.anchor[i]) <= reach and abs(value - state.applied[i]) <= reach
     for slot in range(limits.slew_ticks):
@@ -158,7 +158,7 @@ def is_reached(state: GuardState, limits: Limits, tick: int, value: float, i: in
 
 
 def in_range(limits: Limits, row: Numbers) -> bool:
-    """Tell whether the outputs (3) are finite and inside the bounds, but for the slack."""
+    """Return whether the outputs (3) are finite and inside the bounds, but for the slack."""
     inside = True
     for i in range(3):
         inside = inside and limits.low[i] - limits.slack[i] <= row[i] <= limits.high[i] + limits.slack[i]
@@ -166,7 +166,7 @@ def in_range(limits: Limits, row: Numbers) -> bool:
 
 
 def admits(state: GuardState, limits: Limits, first_tick: int, rows: Rows, length: int) -> bool:
-    """Tell whether a sequence of `length` rows, one a tick, would be applied as it is; `state` moves along with it."""
+    """Return whether a sequence of `length` rows, one a tick, would be applied as it is; `state` moves along with it."""
     for k in range(length):
         admit(state, limits, first_tick + k, rows[k], k == 0)
         for i in range(3):

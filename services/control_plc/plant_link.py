@@ -162,7 +162,7 @@ class PlantLink:
         self.is_confirmed = same and (in_time or reading.session != session)
 
     def read_back(self, reading: Measurement, session: int, now: float | None) -> bool:
-        """Judge a reading that was compared; tell whether outputs may be written from it on."""
+        """Judge a reading that was compared; return whether outputs may be written from it on."""
         stopped = self._clock_stopped(reading, now)
         self.refused = reading.refused
         if not all(map(math.isfinite, reading.u)):
@@ -190,7 +190,7 @@ class PlantLink:
         self._enter(PlantLinkState.IN_STEP, self.cause)
 
     def exchanged(self, sent: Actuators, answer: Measurement, now: float | None) -> bool:
-        """Judge the answer to outputs; tell whether they are what the rack applies, at their tick.
+        """Judge the answer to outputs; return whether they are what the rack applies, at their tick.
 
         In real time the rack's tick may differ by one: it changes between two scans, and a scan may be late.
         """
@@ -220,7 +220,7 @@ class PlantLink:
     # -- inside --------------------------------------------------------------------------------------------------------
 
     def _is_old(self, reading: Measurement, now: float | None) -> bool:
-        """Tell whether a reading is of a time before what is known, as from a gateway that is behind.
+        """Return whether a reading is of a time before what is known, as from a gateway that is behind.
 
         A rack that was started again may be back in time: it is believed when it has been seen there for long enough.
         """
@@ -239,7 +239,7 @@ class PlantLink:
             self._alarms.pulse(AlarmKind.SECOND_WRITER, SECOND_MASTER)
 
     def _clock_stopped(self, reading: Measurement, now: float | None) -> bool:
-        """Note where the rack is; tell whether its clock has stopped. At tick 0 it waits for the first outputs."""
+        """Note where the rack is; return whether its clock has stopped. At tick 0 it waits for the first outputs."""
         moved = (reading.session, reading.tick) != (self.session, self.tick)
         self.session, self.tick = reading.session, reading.tick
         if now is None or moved or reading.tick == 0 or self._moved_at is None:

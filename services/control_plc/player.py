@@ -90,7 +90,7 @@ class SequencePlayer:
     # -- scan ----------------------------------------------------------------------------------------------------------
 
     def begin(self, tick: int) -> bool:
-        """Tell whether a sequence begins at this tick; an updating instant without one is a miss."""
+        """Return whether a sequence begins at this tick; an updating instant without one is a miss."""
         self.broken_promise = False
         spare = self._spare
         if spare is not None and spare.header.first_tick <= tick:
@@ -135,7 +135,7 @@ class SequencePlayer:
         return self.update
 
     def _interrupted_by(self, load: float) -> bool:
-        """Tell whether the load has left the one that the update under way was latched with."""
+        """Return whether the load has left the one that the update under way was latched with."""
         if self.update is None or self.phase not in (*PROMISED, UpdatePhase.ANSWERED) or not self._load_step:
             return False
         return abs(load - self.update.load) > self._load_step
@@ -163,7 +163,7 @@ class SequencePlayer:
         return self._updates
 
     def is_ordinary(self, tick: int) -> bool:
-        """Tell whether a sequence is being played in time, and the update under way is planned."""
+        """Return whether a sequence is being played in time, and the update under way is planned."""
         if self._playing is None or self.late or not self.invited or self.next_update_tick < tick:
             return False
         if self._spare is None:
@@ -218,7 +218,7 @@ class SequencePlayer:
     # -- the optimiser's side ------------------------------------------------------------------------------------------
 
     def accept_plan(self, plan: Plan, earliest: int) -> bool:
-        """Take the updating period of the last update; tell whether it was acceptable."""
+        """Take the updating period of the last update; return whether it was acceptable."""
         update = self.update
         if not self.invited or update is None or self.phase is not UpdatePhase.LATCHED or plan.update != update.update:
             return False

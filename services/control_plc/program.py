@@ -263,7 +263,7 @@ class ControlProgram:
         return self.guard.applied if row is None else row
 
     def _handing_over(self, tick: int) -> bool:
-        """Tell whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows.
+        """Return whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows.
 
         A handshake fails when its update is abandoned or its sequence refused, and in any case after `HANDSHAKE_TICKS`.
         """
@@ -359,7 +359,7 @@ class ControlProgram:
         self.alarms.report(AlarmKind.MODEL_MISMATCH, condition=wrong)
 
     def accept_plan(self, plan: Plan) -> bool:
-        """Take the updating period of the last update; tell whether it was acceptable."""
+        """Take the updating period of the last update; return whether it was acceptable."""
         self.optimizer_seen()
         return self.player.accept_plan(plan, self._earliest)
 

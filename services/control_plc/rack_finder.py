@@ -53,7 +53,7 @@ class RackFinder:
         self._looks = 0
 
     async def reach(self) -> bool:
-        """Try once to reach the rack, without a session; tell whether it answers."""
+        """Try once to reach the rack, without a session; return whether it answers."""
         try:
             await self._rack.connect(SEARCH_S)
         except LinkError as error:
@@ -102,7 +102,7 @@ class RackFinder:
         return None if held else reading, (asked_at + time.monotonic()) / 2
 
     def _is_held_by_another(self, lease: LeaseStatus, reading: Measurement) -> bool:
-        """Tell whether the control PLC that we were refused for still holds the lease of the rack.
+        """Return whether the control PLC that we were refused for still holds the lease of the rack.
 
         One that has our number is another one if the rack has counted that it refused us.
         """

@@ -138,7 +138,7 @@ class ControlPlc:
         self._publish()
 
     async def _until_clock(self) -> bool:
-        """Wait for the scan's time; tell whether it may begin: after a whole tick slept through, the rack is looked at.
+        """Wait for the scan's time; return whether it may begin: after a whole tick slept through, the rack is looked at.
 
         It always yields, however late it is.
         """
@@ -175,7 +175,7 @@ class ControlPlc:
                 await self._plant.read(Measurement)
 
     async def _until_granted(self) -> bool:
-        """Wait until the next scan in lock-step has what it needs; tell whether it may begin."""
+        """Wait until the next scan in lock-step has what it needs; return whether it may begin."""
         program = self._program
         if self._is_called:
             return False

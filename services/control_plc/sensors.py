@@ -53,7 +53,7 @@ class SensorCheckSettings(BaseModel):
 
 
 def are_inside(y: Numbers, low: Numbers, high: Numbers) -> bool:
-    """Tell whether all measurements are numbers within their ranges; the rig compiles this function, and the next."""
+    """Return whether all measurements are numbers within their ranges; the rig compiles this function, and the next."""
     inside = True
     for output in range(len(y)):
         inside = inside and low[output] <= y[output] <= high[output]

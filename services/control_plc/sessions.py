@@ -65,7 +65,7 @@ class Sessions:
         log.info("session started", extra={"session": asked.session, "realtime": bool(asked.realtime)})
 
     def adopt(self, reading: Measurement) -> bool:
-        """Go over to the session of the rack, where that is ours to do; tell whether it was."""
+        """Go over to the session of the rack, where that is ours to do; return whether it was."""
         program, kept = self._program, self.kept
         if kept is not None and kept.session == reading.session != 0:
             self.kept = None
@@ -102,7 +102,7 @@ class Sessions:
             self._program.reset_operating_mode()
 
     def _is_ours_to_adopt(self, session: int) -> bool:
-        """Tell whether a session of the rack has not been asked for by an operator, as far as one can tell by now."""
+        """Return whether a session of the rack has not been asked for by an operator, as far as one can tell by now."""
         if not session or not self.running:
             return session > 0
         now = time.monotonic()

@@ -142,7 +142,7 @@ def port_of(header: str) -> int | None:
 
 
 def is_own_origin(origin: str | None, host: str) -> bool:
-    """Tell whether a request that changes something comes from the page itself: `Origin` names the address asked for.
+    """Return whether a request that changes something comes from the page itself: `Origin` names the address asked for.
 
     A request without `Origin` is not: browsers send it with every POST. A proxy in front may add HTTPS.
     """

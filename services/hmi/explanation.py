@@ -154,7 +154,7 @@ def period_ticks(iterations: int, rule: UpdatingRuleStatus) -> int:
 
 
 def is_rounded_to_one(update: Optimization) -> bool:
-    """Tell whether K was below 1, and is 1 in the single precision of the registers: Gamma is no slope of K then."""
+    """Return whether K was below 1, and is 1 in the single precision of the registers: Gamma is no slope of K then."""
     return update.contraction == 1.0 and abs(update.gamma) >= STEEPEST
 
 

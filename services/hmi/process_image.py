@@ -224,7 +224,7 @@ class Model:
         return None if heard is None else max(0.0, self.now() - heard)
 
     def is_live(self, service: str) -> bool:
-        """Tell whether a service answers."""
+        """Return whether a service answers."""
         age = self.age_s(service)
         return age is not None and age < STALE_S
 

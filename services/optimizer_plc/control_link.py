@@ -127,7 +127,7 @@ class ControlLink:
         return max(0.0, self._attempted_at + _PAUSES_S.get(self.state, 0.0) - now)
 
     def is_worth_logging(self, reason: str, now: float) -> bool:
-        """Tell whether something is to be logged at `now`, s: for a new reason, or an old one after `REPEAT_S`."""
+        """Return whether something is to be logged at `now`, s: for a new reason, or an old one after `REPEAT_S`."""
         if now - self._logged_at.get(reason, -math.inf) < REPEAT_S:
             return False
         if len(self._logged_at) >= MOST_REASONS:

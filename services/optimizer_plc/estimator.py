@@ -206,7 +206,7 @@ def stationary_gain(A: Array, C: Array, process: Array, sensors: Array, P: Array
 
 @kernel
 def _settled(columns: Array, previous: Array) -> bool:
-    """Tell whether no state's gains (a column each) have changed by more than 1e-10 of its largest; remember them."""
+    """Return whether no state's gains (a column each) have changed by more than 1e-10 of its largest; remember them."""
     settled = True
     for i in range(columns.shape[1]):
         change, size = 0.0, 0.0

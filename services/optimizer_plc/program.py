@@ -139,7 +139,7 @@ class OptimizerProgram:
         return Plan(update.update, update.tick + int(now["ticks"]), load_step)
 
     def _knows_what_is_played(self, update: Update) -> bool:
-        """Tell whether the control PLC plays something of ours, or has not begun to."""
+        """Return whether the control PLC plays something of ours, or has not begun to."""
         ours = [one["number"] for one in (self._playing, self._sent) if one["length"]]
         return not self._playing["length"] or update.playing in ours
 
@@ -153,7 +153,7 @@ class OptimizerProgram:
         self._now["planned"] = False
 
     def _is_interrupted(self, update: Update) -> bool:
-        """Tell whether a load step has cut the last period off."""
+        """Return whether a load step has cut the last period off."""
         now = self._now
         if not now["planned"]:
             return False
@@ -162,7 +162,7 @@ class OptimizerProgram:
         return stepped and 0 < elapsed < int(now["ticks"])
 
     def _follow(self, update: Update) -> bool:
-        """Find out which profile is played from this instant on; tell whether it is the last answer, in time."""
+        """Find out which profile is played from this instant on; return whether it is the last answer, in time."""
         sent, playing = self._sent, self.state.playing
         late = 0
         if begun := bool(sent["length"] and sent["number"] == update.playing):

@@ -239,7 +239,7 @@ class OptimizerPlc:
         self._wanted = FRESH_UPDATE if begin_again else AwaitUpdate(update.session, update.update + 1)
 
     async def _is_computed(self, answer: _Answer) -> bool:
-        """Wait until the PLC would have its answer; tell whether no load step or session has cut it off before."""
+        """Wait until the PLC would have its answer; return whether no load step or session has cut it off before."""
         spacing_s = (LOOK_OUT_S if answer.interruptible else HEARTBEAT_S) / self.publication.pace.factor
         look_s = min(max(spacing_s, SHORTEST_PAUSE_S), LONGEST_PAUSE_S)
         while (remaining := answer.ready - time.monotonic()) > 0.0:
@@ -255,7 +255,7 @@ class OptimizerPlc:
         return True
 
     async def _is_superseded(self, update: Update) -> bool:
-        """Tell whether the control PLC has latched another update since, and give it a sign of life."""
+        """Return whether the control PLC has latched another update since, and give it a sign of life."""
         newest = await self._control.newest()
         return newest.session != update.session or newest.update > update.update
 

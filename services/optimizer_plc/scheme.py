@@ -132,7 +132,7 @@ def row_at(tick: int, first_tick: int, length: int) -> int:
 
 @kernel
 def same_inputs(one: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
-    """Tell whether two rows (3) are the same."""
+    """Return whether two rows (3) are the same."""
     return bool(one[0] == other[0] and one[1] == other[1] and one[2] == other[2])
 
 

@@ -158,7 +158,7 @@ def _is_finite(value: object) -> bool:
 
 
 def _has_nul(value: object) -> bool:
-    """Tell whether a text or a path has a character in it that no file's name can have."""
+    """Return whether a text or a path has a character in it that no file's name can have."""
     if isinstance(value, Mapping | list | tuple):
         return any(map(_has_nul, value.values() if isinstance(value, Mapping) else value))
     return isinstance(value, str | Path) and "\0" in str(value)

@@ -111,7 +111,7 @@ def _stream(options: argparse.Namespace) -> tuple[tuple[str, ...], "Work"]:
 
 
 def _is_stream(options: argparse.Namespace) -> bool:
-    """Tell whether a load file is to be written, of any length: it takes as long as it takes."""
+    """Return whether a load file is to be written, of any length: it takes as long as it takes."""
     if options.document is not _load:
         return False
     try:

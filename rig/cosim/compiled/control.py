@@ -17,7 +17,7 @@ LONGEST_SILENCE = 22
 
 
 def is_ordinary(program: ControlProgram) -> bool:
-    """Tell whether the next tick is an ordinary one, as far as the control PLC is concerned."""
+    """Return whether the next tick is an ordinary one, as far as the control PLC is concerned."""
     return (
         program.mode is Mode.MPC
         and program.operator.mode == OperatorMode.AUTO

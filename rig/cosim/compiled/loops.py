@@ -28,7 +28,7 @@ UPDATE: Final = 2
 
 @kernel
 def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> bool:  # noqa: ANN401 a record
-    """Write load, outputs and state of the present tick into the trace; tell whether the tick is an ordinary one."""
+    """Write load, outputs and state of the present tick into the trace; return whether the tick is an ordinary one."""
     row = s.tick - s.first
     while s.load_index + 1 < w.load_ticks.shape[0] and w.load_ticks[s.load_index + 1] <= s.tick:
         s.load_index += 1
@@ -50,7 +50,7 @@ def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> b
 
 @kernel
 def is_due(band: tuple[float, float], active: bool, delay: int, since: int, tick: int, value: float) -> bool:  # noqa: FBT001
-    """Tell whether a band alarm follows its condition at this tick, `delay` ticks after it has changed."""
+    """Return whether a band alarm follows its condition at this tick, `delay` ticks after it has changed."""
     if (not band[0] <= value <= band[1]) == active:
         return False
     return tick - (tick if since == NOT else since) >= delay
@@ -149,7 +149,7 @@ def run_block(
 def answer(
     w: World, o: Optimizer, s: Any, guard: Any, twin: Any, rows: Array, reports: Reports  # noqa: ANN401
 ) -> bool:  # fmt: skip
-    """Solve the problem of the update under way; tell whether the control PLC would accept the sequence."""
+    """Solve the problem of the update under way; return whether the control PLC would accept the sequence."""
     m = o.memory
     scheme.solve(o.constants, o.method, m)
     offered, length = rows[1], m.sent.numbers[0].length

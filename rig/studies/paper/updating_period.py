@@ -217,7 +217,7 @@ def _judge(result: StudyResult, which: str, hours: Mapping[str, _Hour]) -> None:
 
 
 def is_inside(costs: Sequence[float] | Series) -> bool:
-    """Tell whether the least is neither the first nor the last."""
+    """Return whether the least is neither the first nor the last."""
     return 0 < int(np.argmin(costs)) < len(costs) - 1
 
 

@@ -87,7 +87,7 @@ def picoseconds(seconds: float) -> int:
 
 @kernel
 def is_far(switch: float, guessed: float, before: Costs) -> bool:
-    """Tell whether a problem is far from its optimum, from J+_k, J+_{k-1} and Jhat_{k-1}."""
+    """Return whether a problem is far from its optimum, from J+_k, J+_{k-1} and Jhat_{k-1}."""
     return max(guessed, before.guessed) > switch * before.delivered
 
 

@@ -93,7 +93,7 @@ class AppliedOutputs:
         return cv155, ncr22, cv156
 
     def _is_writer(self, holder: int, caller: Caller) -> bool:
-        """Tell whether the writer of this generation writes: its number says so, or the connection of one without."""
+        """Return whether the writer of this generation writes: its number says so, or the connection of one without."""
         if holder != self.holder:
             return False
         return holder != SIMPLE_CLIENT or (self._writer is not None and self._writer.connection == caller.connection)

@@ -340,7 +340,7 @@ class RackRegisters:
             self._keep()
 
     def _show_events(self) -> bool:
-        """Show and log new events; tell whether there were any."""
+        """Show and log new events; return whether there were any."""
         if not self._journal.is_behind:
             return False
         for event in self._journal.show():

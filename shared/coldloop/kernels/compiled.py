@@ -204,7 +204,7 @@ def _user() -> int:
 
 
 def _is_closed(folder: Path, *, sticky: bool = False) -> bool:
-    """Tell whether only this user and an administrator can write to a folder; the user's own group is left alone.
+    """Return whether only this user and an administrator can write to a folder; the user's own group is left alone.
 
     Args:
         folder: Which one.

@@ -204,7 +204,7 @@ class Connection(asyncio.Protocol):
         return more and bool(self._buffer)
 
     def _too_fast(self, limit: RateLimit) -> bool:
-        """Tell whether the next request comes too early; then it is served, and the client read from, later."""
+        """Return whether the next request comes too early; then it is served, and the client read from, later."""
         wait_s = limit.take()
         if wait_s:
             self._refusals.note("rate_limited", self.peer, f"more than {limit.rate:g} requests/s: read from later")

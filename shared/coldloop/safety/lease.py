@@ -77,7 +77,7 @@ class Lease:
         raise BusyError(f"{held.name} holds the lease of {self._what}")
 
     def take(self, caller: Caller, holder: int | None = None) -> bool:
-        """Note a write that `check` has let pass; tell whether the lease has a new holder with it."""
+        """Note a write that `check` has let pass; return whether the lease has a new holder with it."""
         held, state = self._caller, self.state
         same = held is not None and held.connection == caller.connection
         number = self._holder if holder is None and same else holder or SIMPLE_CLIENT
@@ -92,7 +92,7 @@ class Lease:
         return new
 
     def closed(self, caller: Caller) -> bool:
-        """Note that a connection has closed; tell whether it held the lease."""
+        """Note that a connection has closed; return whether it held the lease."""
         self._left.discard(caller.connection)
         gone = self._caller is None or self._caller.connection != caller.connection
         if gone or self._closed_at is not None:

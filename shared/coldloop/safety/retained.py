@@ -138,7 +138,7 @@ class RetainedFile:
 
 
 def _is_device(path: Path) -> bool:
-    """Tell whether a path is a device, such as /dev/null, which an administrator could replace for everybody."""
+    """Return whether a path is a device, such as /dev/null, which an administrator could replace for everybody."""
     try:
         mode = path.lstat().st_mode
     except OSError:

@@ -29,7 +29,7 @@ class Watchdog:
         self.triggered = min(self.triggered, tick)
 
     def check(self, tick: int) -> bool:
-        """Tell whether it expires at `tick`; once for each time that it does."""
+        """Return whether it expires at `tick`; once for each time that it does."""
         if not self.time or self.expired or self._remaining(tick) > 0:
             return False
         self.expired = True
