@@ -46,7 +46,7 @@ async def follow(ppm: float, factor: float, hours: float, folder: Path) -> Follo
             while True:
                 await asyncio.sleep(0.5)
                 link = await client.read(PlantLinkStatus)
-                lost += link.state != PlantLinkState.IN_STEP
+                lost += link.state != PlantLinkState.SYNCHRONISED
                 if link.plant_tick >= ticks:
                     return Followed(link, await client.read(Status), lost)
 

@@ -91,7 +91,7 @@ async def measure(options: argparse.Namespace, browsers: int | None, folder: Pat
 
 
 async def start_crowd(options: argparse.Namespace, browsers: int, port: int) -> asyncio.subprocess.Process:
-    """Start the browsers as a process of their own; they leave before the run ends."""
+    """Start the browsers as a separate process; they leave before the run ends."""
     return await asyncio.create_subprocess_exec(
         sys.executable, __file__, "--address", f"http://127.0.0.1:{port}/", "--browsers", str(browsers),
         "--seconds", str(0.8 * options.seconds), stdout=subprocess.PIPE,

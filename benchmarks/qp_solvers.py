@@ -39,14 +39,14 @@ EQUAL = 1e-9
 
 
 class RecordedProblem(NamedTuple):
-    """What a solver was started with."""
+    """Problem and guess of a solve."""
 
     problem: QuadraticProblem
     guess: Array
 
 
 class RecordingSolver:
-    """A solver that remembers what it was started with."""
+    """A solver that records its problems and guesses."""
 
     def __init__(self, solver: Solver) -> None:
         self._solver = solver
@@ -186,7 +186,9 @@ def main() -> None:
     for name in names:
         report_paths(name, problems, harsh, options.iterations)
     if harsh.any():
-        print("\nharsh problems, J / J* (median / largest), begun at the guess or at a point of their own, cut off at")
+        print(
+            "\nharsh problems, J / J* (median / largest), begun at the guess or at their own starting point, cut off at"
+        )
         chosen = [one for one, hard in zip(problems, harsh, strict=True) if hard]
         report_interior_points(chosen, best[harsh], alpha)
 

@@ -1,4 +1,4 @@
-"""What happens to the frames of a disturbed link: decisions only, no sockets."""
+"""Decides how each frame of a disturbed link is forwarded; no sockets."""
 
 import random
 from collections.abc import Iterable

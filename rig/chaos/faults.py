@@ -77,7 +77,7 @@ class LinkFault(Fault):
 
     @property
     def in_words(self) -> str:
-        """What it is, and how often frames are hit."""
+        """Kind of the fault, and the share of frames hit."""
         given = self.model_dump(mode="json", exclude={"at_s", "duration_s", "kind", "link"})
         return " ".join([self.kind, *(f"{name}={value}" for name, value in given.items())])
 
@@ -88,7 +88,7 @@ class LinkFault(Fault):
 
 
 class FrameFault(LinkFault):
-    """Something that happens to single frames."""
+    """A fault of single frames."""
 
     direction: Direction = Direction.BOTH
 
@@ -174,7 +174,7 @@ class WrongUnit(FrameFault):
 
 
 class ExceptionAnswer(FrameFault):
-    """An exception in the place of the server's answer; the server has done what it was asked for."""
+    """An exception instead of the server's answer; the server has carried out the request."""
 
     kind: Literal["exception"]
     direction: Literal[Direction.ANSWERS] = Direction.ANSWERS

@@ -39,7 +39,7 @@ class PlantWriter(Protocol):
         """Write the fault of an output, by its index; return whether the plant has taken it."""
 
     async def change_surroundings(self, target: str, value: float) -> float | None:
-        """Change one of the surroundings; return what it was, None if the plant has not taken it."""
+        """Change one of the surroundings; return its old value, None if the plant has not accepted it."""
 
 
 class Injector:

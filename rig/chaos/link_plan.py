@@ -19,7 +19,7 @@ class FaultTransition(NamedTuple):
 
 
 class LinkPlan(BaseModel):
-    """What happens to a link. Instants are real time, from the start of the proxy."""
+    """Faults of one link. Instants are real time, from the start of the proxy."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

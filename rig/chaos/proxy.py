@@ -24,9 +24,9 @@ class LinkProxy:
     Args:
         port: Where to listen; 0 takes any free port.
         target: The server.
-        seed: Decides what happens to which frame, with the number of the connection.
+        seed: Decides, with the number of the connection, how each frame is forwarded.
         host: The address of this machine to listen at.
-        tell: Hears in a line of each connection that the server did not take.
+        tell: Called with a line for each connection that the server did not accept.
 
     A frame is not read before the previous one has been forwarded, so nothing piles up here: what waits, waits in the
     buffers of TCP.

@@ -83,7 +83,7 @@ def document(
 
 
 def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
-    """Return what is said below the table."""
+    """Return the lines below the table."""
     steps = ", ".join(f"{name} {step:.3f}" for name, step in zip(INPUT_NAMES, evaluation.largest_steps, strict=True))
     outside, was = evaluation.outside_s, evaluation.undisturbed_s
     lines = [

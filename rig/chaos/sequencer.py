@@ -68,7 +68,7 @@ class FaultSequencer:
         await self._client.conclude()
 
     def finish(self) -> None:
-        """Record what is known at the end, whatever the end was."""
+        """Record the state at the end, however the run ended."""
         self._trace.seconds = self._seconds
         self._trace.log_lines = log_lines(self._services)
         self._trace.lost_contacts = self._client.lost_contacts
@@ -124,7 +124,7 @@ class FaultSequencer:
                 return self._timeline.take(end)
         if not self._timeline.on and stopped_s > max(STANDSTILL_PATIENCE_S, 4 * TICK_S / self._plan.factor):
             raise LinkError(
-                f"plan {self._plan.name}: the plant is at {self.tick * TICK_S:g} s for {stopped_s:.0f} s without a "
+                f"plan {self._plan.name}: the plant stays at {self.tick * TICK_S:g} s for {stopped_s:.0f} s without a "
                 f"fault: see {self._services.log('control_plc')}"
             )
         return None

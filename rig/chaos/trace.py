@@ -25,7 +25,7 @@ class Mark:
     end: int | None = None
     """Tick at which it ended, and what it had stopped answered again."""
     first_event: int = 0
-    """Index in `ChaosTrace.events` of the first one after its beginning. Ticks alone do not tell: a control PLC that
+    """Index in `ChaosTrace.events` of the first one after its beginning. Ticks alone are ambiguous: a control PLC that
     was restarted resumes one tick back."""
     done: int | None = None
     """First tick that was seen when it had been brought about: a process had ended by then."""

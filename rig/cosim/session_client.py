@@ -118,7 +118,7 @@ class SessionClient:
             await self.last_look()
 
     async def begin(self, scenario: Scenario, recorder: Recorder) -> None:
-        """Start a session for the scenario, which is to be recorded from now on."""
+        """Start a session for the scenario, recorded from now on."""
         self._events = await SessionEvents.after_now(self.control, self.plant, recorder)
         session = await self.start(scenario)
         self._scenario, self._recorder = scenario, recorder
@@ -273,7 +273,7 @@ class SessionClient:
         return await self.contact(self._write_fault(output, fault)) is not None
 
     async def change_surroundings(self, target: str, value: float) -> float | None:
-        """Change one of a refrigerator's surroundings; return what it was, None if the plant has not taken it."""
+        """Change one of a refrigerator's surroundings; return its old value, None if the plant has not accepted it."""
         return await self.contact(self._write_surroundings(target, value))
 
     async def _write_surroundings(self, target: str, value: float) -> float:

@@ -49,7 +49,7 @@ def check_page(section: HmiSection) -> None:
 def pointed_at(section: HmiSection, endpoints: RigEndpoints) -> HmiSection:
     """Return the settings of a page of the services at these endpoints.
 
-    Their certificate is an operator's, for commands; to read, the page takes the reader's beside it, if there is one.
+    Their certificate is an operator's, for commands; for reading the page uses the reader's next to it, if any.
     """
     update: dict[str, object] = {
         service: getattr(section, service).model_copy(
@@ -63,7 +63,7 @@ def pointed_at(section: HmiSection, endpoints: RigEndpoints) -> HmiSection:
 
 
 def readers(tls: TlsSettings | None) -> TlsSettings | None:
-    """Return the reader's certificate beside another one, as `coldloop certificates` makes it; or that one."""
+    """Return the reader's certificate next to the given one, as `coldloop certificates` makes it, or the given one."""
     if tls is None:
         return None
     certificate, key = tls.certificate.with_name("reader.crt"), tls.key.with_name("reader.key")

@@ -30,7 +30,7 @@ def make_private(folder: Path) -> Path:
     """Make a folder within one that exists, closed to others; return it.
 
     Raises:
-        UsageError: It cannot be made, or something that is not this user's own is in its place.
+        UsageError: It cannot be made, or its place is taken by a file of another user.
     """
     try:
         folder.mkdir(mode=OWN_ONLY, exist_ok=True)

@@ -54,7 +54,7 @@ class RecordedPage:
 
     @property
     def configuration(self) -> Mapping[str, Any]:
-        """What it was run with, by dotted key."""
+        """Its configuration, by dotted key."""
         return self._folder.configuration
 
     def _read_station(self) -> NDArray[np.float32] | None:

@@ -126,7 +126,7 @@ def running_rig(first_port: int) -> RunningRig | None:
     """Return the rig that was started on these ports and is still there.
 
     Raises:
-        UsageError: What is said of it is damaged.
+        UsageError: Its record is damaged.
     """
     folder = state_folder(first_port)
     if not (is_private(folder.parent) and is_private(folder)):  # another user's, where all may write
@@ -170,7 +170,7 @@ def find_rig(first_port: int | None) -> RunningRig | None:
     """Return the rig that was started here on these ports, or, without ports, the only one; None if there is none.
 
     Raises:
-        UsageError: There are several, or what is said of it is damaged.
+        UsageError: There are several, or its record is damaged.
     """
     if first_port is not None:
         return running_rig(first_port)
@@ -181,7 +181,7 @@ def find_rig(first_port: int | None) -> RunningRig | None:
 
 
 def no_rig(first_port: int | None) -> UsageError:
-    """Return what is said when `find_rig` finds none."""
+    """Return the message if `find_rig` finds none."""
     where = "" if first_port is None else f" on port {first_port}"
     return UsageError(f"no rig started here is up{where}: `coldloop up` starts one")
 

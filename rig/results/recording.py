@@ -176,7 +176,7 @@ class Recorder:
         self._taken(PlantSample(self.next_tick - 1, load, tuple(u), tuple(y), tuple(x)))
 
     def _taken(self, sample: PlantSample) -> None:
-        """Pass on what is old enough, and stop where that is asked for."""
+        """Pass on settled samples, and stop on request."""
         self._last = time.monotonic()
         for sink in self._sinks:
             sink.sample(sample)

@@ -92,7 +92,7 @@ def perform_all(requests: Sequence[RunRequest], store: Store, workers: Workers, 
 
 
 class _Agenda:
-    """What is still to be done: of each family the run with the largest limit, then those that it does not tell."""
+    """Remaining runs: of each family the run with the largest limit, then those that it does not determine."""
 
     def __init__(self, store: Store, outcomes: StoredOutcomes) -> None:
         self._store = store

@@ -1,4 +1,4 @@
-"""One run of a study: what it is asked to do, and what is kept of it. Both travel between processes as plain data."""
+"""One run of a study: request and outcome. Both travel between processes as plain data."""
 
 import asyncio
 import hashlib

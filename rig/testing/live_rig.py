@@ -179,7 +179,7 @@ class LiveRig:
         return True
 
     async def change_surroundings(self, target: str, value: float) -> float | None:
-        """Change one of a refrigerator's surroundings, and return what it was; for the injector."""
+        """Change one of a refrigerator's surroundings, and return its old value; for the injector."""
         try:
             given = await self._clients["plant"].read(Surroundings)
             before = getattr(given, target)

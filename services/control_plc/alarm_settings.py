@@ -44,7 +44,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     AlarmKind.PLANT_FOREIGN: AlarmRule(CRITICAL),  # another master decides the outputs
     AlarmKind.OUTPUTS_NOT_TAKEN: AlarmRule(CRITICAL),  # what is computed is not applied
     AlarmKind.SCANS_STOPPED: AlarmRule(CRITICAL),  # nothing is computed
-    # The process leaves its limits, or is about to without anybody seeing it: act within minutes.
+    # The process leaves its limits, or is about to unnoticed: act within minutes.
     AlarmKind.LEVEL_BAND: AlarmRule(HIGH),  # the bath may run dry or flood; on-delay: `band_delay_s`
     AlarmKind.T5_BAND: AlarmRule(HIGH),  # the turbines leave their range; on-delay: `band_delay_s`
     AlarmKind.PLANT_FROZEN: AlarmRule(HIGH),  # measurements are old

@@ -90,7 +90,7 @@ class AlarmPanel:
         self._rules = [settings.rule(kind) for kind in AlarmKind]
         self._pending: dict[AlarmKind, _Pending] = {}
         self._causes: dict[AlarmKind, set[int]] = {}
-        """Those that are no news: for which an active alarm has been raised since it was last acknowledged."""
+        """Causes for which an active alarm has been raised since its last acknowledgement."""
         self._now = 0
         self.rows = [Alarm(priority=rule.priority) for rule in self._rules]
         """What the registers show, by number of the alarm."""

@@ -1,4 +1,4 @@
-"""What optimisers and operators write to the control PLC, and what it makes of it."""
+"""Requests of optimisers and operators to the control PLC, and their effects."""
 
 import asyncio
 from collections.abc import Awaitable
@@ -126,7 +126,7 @@ class Clients:
 
     @property
     def optimizer_waits(self) -> bool:
-        """An optimiser has asked for an update and is owed the answer: that it is silent means nothing."""
+        """An optimiser waits for an update: its silence is no failure."""
         return self._waits > 0
 
     def tell(self, update: Update) -> None:
@@ -227,7 +227,9 @@ class Clients:
             latched = program.player.update
             if latched is not None and not (program.awaiting_plan and latched.tick == program.tick - 1):
                 program.abandon()
-                self._bank.put_sealed(latched._replace(session=0))  # what waits in vain is not given this one
+                self._bank.put_sealed(
+                    latched._replace(session=0)
+                )  # a waiting request of another session must not get this one
                 wanted = latched.update + 1
             else:
                 wanted = latched.update if latched else 0

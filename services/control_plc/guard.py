@@ -20,7 +20,7 @@ from control_plc.output_limits import (
 
 
 class OutputGuard:
-    """Keeps every output inside its bounds, its rate window and the slew limit, whatever is asked.
+    """Keeps every output inside its bounds, its rate window and the slew limit, whatever is requested.
 
     Its time is that of the ticks, but never faster than the time that has really passed: it does not go back, and a
     leap of the tick ends no window.

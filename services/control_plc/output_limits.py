@@ -166,7 +166,7 @@ def in_range(limits: Limits, row: Numbers) -> bool:
 
 
 def admits(state: GuardState, limits: Limits, first_tick: int, rows: Rows, length: int) -> bool:
-    """Return whether a sequence of `length` rows, one a tick, would be applied as it is; `state` moves along with it."""
+    """Return whether a sequence of `length` rows, one per tick, would be applied unchanged; `state` advances."""
     for k in range(length):
         admit(state, limits, first_tick + k, rows[k], k == 0)
         for i in range(3):

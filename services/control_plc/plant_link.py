@@ -1,16 +1,16 @@
 """The control PLC's link to the rack as a state machine.
 
-    IDLE        no session
-    SEARCHING   the rack does not answer
-    JOINING     it answers; what it applies is being read back
-    IN_STEP     outputs are written in every scan, and accepted
-    NOT_TAKEN   it answers, and does not take the outputs
-    FOREIGN     it is in another session, or has another master
-    FROZEN      it answers, and its clock does not move
+    IDLE          no session
+    SEARCHING     the rack does not answer
+    JOINING       it answers; its outputs are being read back
+    SYNCHRONISED  outputs are written in every scan, and accepted
+    REJECTED      it answers, and rejects the outputs
+    OTHER_MASTER  it is in another session, or has another master
+    FROZEN        it answers, and its clock does not move
 
 One rule decides: *no output is written unless what the rack applies was read twice since the last break: sealed,
-finite, of this session, the same both times, and at ticks as far apart as the readings.* Only IN_STEP writes, and only
-a reading that `read_back` accepts leads there; every doubt leads out of it. A single answer that lies, about outputs,
+finite, of this session, the same both times, and at ticks as far apart as the readings.* Only SYNCHRONISED writes, and
+only a reading that `read_back` accepts leads there; every doubt leads out of it. A single wrong answer, about outputs,
 session or time, thus moves nothing, even where it is the first after a break. The rack holds its side of the rule: it
 takes no outputs that name another generation than the one that was read back. Pure: no sockets, no clock.
 """
@@ -34,18 +34,18 @@ FROZEN_S: Final = 0.5
 ALARMS: Final = {
     PlantLinkState.SEARCHING: AlarmKind.PLANT_LOST,
     PlantLinkState.JOINING: AlarmKind.PLANT_LOST,
-    PlantLinkState.NOT_TAKEN: AlarmKind.OUTPUTS_NOT_TAKEN,
-    PlantLinkState.FOREIGN: AlarmKind.PLANT_FOREIGN,
+    PlantLinkState.REJECTED: AlarmKind.OUTPUTS_NOT_TAKEN,
+    PlantLinkState.OTHER_MASTER: AlarmKind.PLANT_FOREIGN,
     PlantLinkState.FROZEN: AlarmKind.PLANT_FROZEN,
 }
 SECOND_MASTER: Final = 2
 """Cause of the alarm SECOND_WRITER."""
-HARMLESS: Final = (LinkCause.STARTED, LinkCause.OVERSLEPT, LinkCause.LEAPT, LinkCause.PACE)
+HARMLESS: Final = (LinkCause.STARTED, LinkCause.MISSED_SCANS, LinkCause.TIME_JUMP, LinkCause.TIME_BASE)
 """Causes that raise no alarm: what will be read back is expected to be what we applied."""
-NOT_TAKEN: Final = (PlantLinkState.NOT_TAKEN, LinkCause.REFUSED)
+OUTPUTS_REJECTED: Final = (PlantLinkState.REJECTED, LinkCause.REFUSED)
 REFUSED_OUTPUTS: Final[Mapping[int, tuple[PlantLinkState, LinkCause]]] = {
-    OutputVerdict.WRONG_SESSION: (PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION),
-    OutputVerdict.UNTIMELY: (PlantLinkState.NOT_TAKEN, LinkCause.UNTIMELY),
+    OutputVerdict.WRONG_SESSION: (PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION),
+    OutputVerdict.STALE: (PlantLinkState.REJECTED, LinkCause.STALE),
     OutputVerdict.CHANGED: (PlantLinkState.JOINING, LinkCause.CHANGED),
     OutputVerdict.LIMITED: (PlantLinkState.JOINING, LinkCause.LIMITED),
 }
@@ -91,9 +91,9 @@ class PlantLink:
         """The last answer said so."""
 
     @property
-    def in_step(self) -> bool:
+    def synchronised(self) -> bool:
         """Whether outputs may be written."""
-        return self.state is PlantLinkState.IN_STEP
+        return self.state is PlantLinkState.SYNCHRONISED
 
     @property
     def is_alarmed(self) -> bool:
@@ -117,29 +117,29 @@ class PlantLink:
         self._return_alarms()
 
     def unanswered(self, cause: LinkCause) -> None:
-        """Note that a request came to nothing: what it has done to the rack is not known."""
+        """Note that a request failed: its effect on the rack is unknown."""
         if cause is LinkCause.SECOND_MASTER:
-            self._enter(PlantLinkState.FOREIGN, cause)
+            self._enter(PlantLinkState.OTHER_MASTER, cause)
         elif cause is LinkCause.REFUSED:
-            self._enter(PlantLinkState.NOT_TAKEN, cause)
+            self._enter(PlantLinkState.REJECTED, cause)
         elif cause in (LinkCause.DAMAGED, LinkCause.IMPLAUSIBLE):
             self._enter(PlantLinkState.JOINING, cause)
         else:
             self._enter(PlantLinkState.SEARCHING, cause)
 
-    def overslept(self) -> None:
+    def missed_scans(self) -> None:
         """Note that this program missed scans: the rack's state is unknown."""
-        if self.in_step:
-            self._enter(PlantLinkState.JOINING, LinkCause.OVERSLEPT)
+        if self.synchronised:
+            self._enter(PlantLinkState.JOINING, LinkCause.MISSED_SCANS)
 
     def repaced(self) -> None:
         """Note that the time base was changed: tick and speed of the rack are determined again."""
         self._moved_at = None
-        if self.in_step:
-            self._enter(PlantLinkState.JOINING, LinkCause.PACE)
+        if self.synchronised:
+            self._enter(PlantLinkState.JOINING, LinkCause.TIME_BASE)
 
     def compare(self, reading: Measurement, session: int, now: float | None) -> None:
-        """Note whether a reading that was asked for without writing confirms the one before.
+        """Note whether a reading without a write confirms the one before.
 
         Args:
             reading: What the rack answered, its seal intact.
@@ -172,7 +172,7 @@ class PlantLink:
         elif not self.is_confirmed:
             return False
         elif reading.session != session or not session:
-            self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
+            self._enter(PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION)
         else:
             if self.generation not in (0, reading.generation):  # another master, or its watchdog, has moved the outputs
                 self._alarms.raised(AlarmKind.PLANT_LOST, LinkCause.CHANGED)
@@ -187,7 +187,7 @@ class PlantLink:
 
     def joined(self) -> None:
         """The program has resumed from what was read back: outputs may be written."""
-        self._enter(PlantLinkState.IN_STEP, self.cause)
+        self._enter(PlantLinkState.SYNCHRONISED, self.cause)
 
     def exchanged(self, sent: Actuators, answer: Measurement, now: float | None) -> bool:
         """Judge the answer to outputs; return whether they are what the rack applies, at their tick.
@@ -196,25 +196,25 @@ class PlantLink:
         """
         stopped = self._clock_stopped(answer, now)
         self._watch_others(answer)
-        if answer.verdict != OutputVerdict.TAKEN:
-            self._enter(*REFUSED_OUTPUTS.get(answer.verdict, NOT_TAKEN))
+        if answer.verdict != OutputVerdict.ACCEPTED:
+            self._enter(*REFUSED_OUTPUTS.get(answer.verdict, OUTPUTS_REJECTED))
         elif answer.session != sent.session:
-            self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
+            self._enter(PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION)
         elif answer.u != sent[1:4] or answer.holder != self.holder or answer.generation != self.generation:
             self._enter(PlantLinkState.JOINING, LinkCause.CHANGED)
         elif stopped:
             self._enter(PlantLinkState.FROZEN, LinkCause.STOPPED)
         elif abs(answer.tick - sent.tick) > (now is not None):
-            self._enter(PlantLinkState.JOINING, LinkCause.LEAPT)
+            self._enter(PlantLinkState.JOINING, LinkCause.TIME_JUMP)
         else:
             self._known_place = answer.tick + answer.age
             return True
         return False
 
     def settled(self) -> None:
-        """Note a scan that was taken: what was wrong with the rack is over."""
-        if self._noted is not PlantLinkState.IN_STEP:
-            self._note(PlantLinkState.IN_STEP)
+        """Note an accepted scan: the fault of the rack is over."""
+        if self._noted is not PlantLinkState.SYNCHRONISED:
+            self._note(PlantLinkState.SYNCHRONISED)
         self._return_alarms()
 
     # -- inside --------------------------------------------------------------------------------------------------------
@@ -256,8 +256,8 @@ class PlantLink:
             self._alarm(state, cause if before in HARMLESS else before)
             return
         self.since = self._alarms.now
-        if state not in (PlantLinkState.IN_STEP, self._noted):
-            self.breaks += self._noted is PlantLinkState.IN_STEP
+        if state not in (PlantLinkState.SYNCHRONISED, self._noted):
+            self.breaks += self._noted is PlantLinkState.SYNCHRONISED
             self._note(state)
         self._alarm(state, cause)
 

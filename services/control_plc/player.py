@@ -209,7 +209,7 @@ class SequencePlayer:
         self.invite(tick)
 
     def set_back(self, tick: int) -> None:
-        """Begin again at a tick long before the present one: what was sent was for a time that is to come again."""
+        """Start over at a tick long before the present one: all sequences were for a time that will come again."""
         self._playing = self._spare = self.update = None
         self.late = False
         if self.invited:

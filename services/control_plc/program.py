@@ -46,7 +46,7 @@ from control_plc.settings import ControlSection, ControlStrategy
 SEEN = 0.1
 """Share of its rate by which an input must have moved for the process to show it."""
 HANDSHAKE_TICKS = TICKS_PER_SAMPLE
-"""For no longer are the classical loops held for a sequence that is to come."""
+"""Longest time that the classical loops wait for an announced sequence."""
 HANDSHAKE_PAUSE_S = 30.0
 """After a handshake that came to nothing the classical loops are not held again for so long."""
 SET_BACK_TICKS = TICKS_PER_SAMPLE
@@ -130,7 +130,7 @@ class ControlProgram:
         Args:
             session: Its number.
             tick: Where the rack is.
-            applied: What it applies.
+            applied: Its applied outputs.
             updates: Number of the next update.
             operator: What operators have said.
             playing: What was being played. Its rest is played on, if what the rack applies is of it: a state that was
@@ -254,7 +254,7 @@ class ControlProgram:
         self.journal.note(tick, EventKind.MODE, self.ladder.mode, self.ladder.cause)
 
     def _wanted(self, tick: int, row: SequenceRow | None) -> SequenceRow:
-        """Return what is asked for by whom the ladder has chosen."""
+        """Return the outputs requested in the mode of the ladder."""
         mode = self.ladder.mode
         if mode is Mode.MANUAL:
             return SequenceRow(*self.operator[1:])
@@ -381,7 +381,7 @@ class ControlProgram:
     # -- the operator's side -------------------------------------------------------------------------------------------
 
     def track(self) -> bool:
-        """Let the manual setpoints follow what is applied, so that manual begins without a bump; tell if they moved."""
+        """Let the manual setpoints follow the applied inputs for a bumpless change; return whether they moved."""
         applied = self.guard.applied
         if self.operator.mode == OperatorMode.MANUAL or self.operator[1:] == applied[:]:
             return False

@@ -113,7 +113,7 @@ class RackFinder:
     def _take(self, reading: Measurement, at: float, *, realtime: bool) -> None:
         """Resume from a reading if allowed; `at` is when the rack was read, s."""
         self._cycle.answered(reading, at / self._clock.tick_s if realtime else None)
-        if self._link.in_step:
+        if self._link.synchronised:
             # at tick 0 the rack's clock waits for the first outputs
             self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
 

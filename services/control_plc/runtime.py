@@ -120,7 +120,7 @@ class ControlPlc:
                 await self._stand_by()
             elif self.sessions.pace.paused and self.sessions.kept is None:
                 await self._while_paused()
-            elif not self._link.in_step:
+            elif not self._link.synchronised:
                 await self._look()
             elif await (self._until_clock() if self.sessions.pace.realtime else self._until_granted()):
                 await self._scan()
@@ -138,7 +138,7 @@ class ControlPlc:
         self._publish()
 
     async def _until_clock(self) -> bool:
-        """Wait for the scan's time; return whether it may begin: after a whole tick slept through, the rack is looked at.
+        """Wait for the scan's time; return whether it may begin: after a missed tick, the rack is read first.
 
         It always yields, however late it is.
         """
@@ -156,12 +156,12 @@ class ControlPlc:
             self.publication.overruns += 1
             program.alarms.pulse(AlarmKind.SCAN_OVERRUN)
         if lateness > self._clock.tick_s and program.tick:  # at tick 0 the rack's clock waits for us
-            self._link.overslept()
-        return self._link.in_step
+            self._link.missed_scans()
+        return self._link.synchronised
 
     @property
     def _is_called(self) -> bool:
-        """An operator has asked for another session, or another time base."""
+        """An operator has requested another session, or another time base."""
         return self.clients.asked is not None or self.clients.pending_time_base is not None
 
     async def _while_paused(self) -> None:
@@ -222,7 +222,7 @@ class ControlPlc:
         answered_at = time.monotonic()
         at = (asked_at + answered_at) / 2
         update = self._cycle.answered(answer, self._in_ticks(at))
-        if not self._link.in_step:
+        if not self._link.synchronised:
             self._publish()
             return
         self._finder.read_soon()
@@ -302,7 +302,7 @@ class ControlPlc:
         """Read what the rack applies; once synchronised, resume from there."""
         realtime = self.sessions.pace.realtime
         answered = await self._finder.look(self.clients.changed, self._patience_s if realtime else None)
-        if not self._link.in_step:
+        if not self._link.synchronised:
             if answered and self._link.is_confirmed and not self.sessions.rack_answered():
                 self.bank.put(self._program.operator)
                 self._link.end()
@@ -323,7 +323,7 @@ class ControlPlc:
         return adopted
 
     def _start(self, asked: ControlSession) -> None:
-        """Begin the session that an operator has asked for; nothing is written before the rack has been read."""
+        """Begin the session requested by an operator; nothing is written before the rack has been read."""
         self.clients.asked = None
         self.sessions.start(asked)
         self._begin()

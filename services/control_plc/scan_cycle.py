@@ -1,4 +1,4 @@
-"""A scan with the rack: what is sent, and what becomes of the program with what comes back.
+"""A scan with the rack: the outputs to send, and the program's reaction to the answer.
 
 Pure: the runtime sends what `begin` returns (outputs, or a mere reading) and reports the result, and so does a test
 with its own rack. Time is the rack's: after a break the program resumes at the rack's tick.
@@ -53,7 +53,7 @@ class ScanCycle:
     def begin(self) -> Actuators | None:
         """Return the outputs to be written now, or None to read the rack only."""
         self._sent = None
-        if self._link.in_step:
+        if self._link.synchronised:
             self._sent = self._link.addressed(self._program.begin_scan())
         return self._sent
 

@@ -22,6 +22,6 @@ class ScanWatch:
         self._looks = 0
 
     def look(self, tick_s: float) -> bool:
-        """Tell, `LOOK_S` after the last look, whether scans have stopped; a tick lasts `tick_s` of real time."""
+        """Return, `LOOK_S` after the last check, whether scans have stopped; a tick lasts `tick_s` of real time."""
         self._looks += 1
         return self._looks > max(LOOKS, SCANS * tick_s / LOOK_S)

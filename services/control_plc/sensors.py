@@ -20,7 +20,7 @@ RECOVERY_TICKS = 8
 
 
 class SensorCheckSettings(BaseModel):
-    """What a sensor can tell, and how long a bad one is bridged."""
+    """Ranges of sensors, and how long a bad one is bridged."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -86,7 +86,7 @@ class ImageWatch:
 
     Args:
         moves: How far each input must have moved for something to be seen of it.
-        may_rest: Otherwise nothing may stand still, whatever the inputs do.
+        may_rest: Whether an image may be unchanged while the inputs are.
     """
 
     def __init__(self, moves: Sequence[float], *, may_rest: bool) -> None:
@@ -126,7 +126,7 @@ class SensorMonitor:
     `bad` holds the outputs that are substituted now, and since which tick.
 
     Args:
-        settings: What sensors can tell.
+        settings: Ranges of sensors.
         initial: The outputs at rest.
         moves: How far an input must have moved for something to be seen of it.
     """

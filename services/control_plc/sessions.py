@@ -57,7 +57,7 @@ class Sessions:
         return self.running or self._configured.autostart or self.kept is not None
 
     def start(self, asked: ControlSession) -> None:
-        """Begin the session that an operator has asked for."""
+        """Begin the session requested by an operator."""
         self.forget_kept()
         self._program.restart(asked.session)
         self.pace = TimeBase(bool(asked.realtime), asked.factor)
@@ -102,7 +102,7 @@ class Sessions:
             self._program.reset_operating_mode()
 
     def _is_ours_to_adopt(self, session: int) -> bool:
-        """Return whether a session of the rack has not been asked for by an operator, as far as one can tell by now."""
+        """Return whether a session of the rack was not requested by an operator, as far as is known now."""
         if not session or not self.running:
             return session > 0
         now = time.monotonic()

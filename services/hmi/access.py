@@ -102,7 +102,7 @@ class ClientRateLimits:
     Args:
         now: Monotonic clock, s.
         per_second: Rate at which it fills.
-        burst: What it holds.
+        burst: Its capacity.
     """
 
     def __init__(self, now: Callable[[], float], per_second: float, burst: float) -> None:

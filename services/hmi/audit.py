@@ -88,7 +88,7 @@ class Audit:
         """Add an entry.
 
         Args:
-            what: What was asked for: login, logout, command, request.
+            what: Kind of request: login, logout, command, request.
             who: The user who has logged in.
             address: Where the request came from.
             outcome: done, refused, or uncertain when it is not known.
@@ -101,7 +101,7 @@ class Audit:
         """Add a refusal, or count it where one like it has an entry already.
 
         Args:
-            what: What was asked for.
+            what: Kind of request.
             who: The user; of a login, the name that was given.
             address: Where the request came from.
             reason: Why; refusals of one reason to one user or address are alike.

@@ -64,7 +64,7 @@ class Connections:
         first = min(ranks, key=lambda one: (ranks[one], -crowd[_address(one)], self._uses[one].since))
         transport = first.transport
         if transport is not None:
-            transport.abort()  # what it has not read yet is not waited for
+            transport.abort()  # do not wait for unread data
         first.force_close()
         return True
 

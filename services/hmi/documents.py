@@ -169,7 +169,7 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
 
 
 def explanation_document(model: Model, number: int | None, at_tick: int | None = None) -> Document | None:
-    """Return why an updating period is as long as it is; None without such an update.
+    """Return the explanation of an updating period; None without such an update.
 
     Args:
         model: What is known.

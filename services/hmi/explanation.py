@@ -1,4 +1,4 @@
-"""Why an updating period is as long as it is: from what was recorded of an update to the branch that decided, in words.
+"""Explains an updating period: from the record of an update to the branch that decided it.
 
 A pure function of registers: it works on a running rig and on a recorded run alike. Symbols are those of Algorithm 1
 (`optimizer_plc/rules/`): the quantities of update i were found at t_i, of the period that ended there.
@@ -22,7 +22,7 @@ LONGEST_TICKS: Final = TICKS_PER_SAMPLE
 
 
 class Branch(StrEnum):
-    """What decided the number of iterations."""
+    """Branch that decided the number of iterations."""
 
     FIXED = "fixed"
     """The period is fixed."""
@@ -93,7 +93,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Why an updating period is as long as it is."""
+    """Explanation of an updating period."""
 
     update: Optimization
     before: Optimization | None

@@ -83,7 +83,7 @@ class Model:
         self.changed: set[str] = set()
         """Names of signals, `alarms`, `updates`, `prediction`: what changed since it was last looked at."""
         self.configuration: Mapping[str, Any] = {}
-        """What the plant's registers tell of its configuration, by dotted key."""
+        """The plant's configuration from its registers, by dotted key."""
         self._values: dict[str, float | int | str] = {}
         self._session = 0
         self.replay: dict[str, object] | None = None

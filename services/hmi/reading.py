@@ -179,7 +179,7 @@ class Reading:
         return text.getvalue().encode(), following
 
     async def explanation(self, request: web.Request) -> web.Response:
-        """Answer with why an updating period is as long as it is."""
+        """Answer with the explanation of an updating period."""
         number, at = request.query.get("update", ""), request.query.get("at", "")
         try:
             at_tick = round(float(at) / TICK_S) if at else None

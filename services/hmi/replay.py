@@ -52,7 +52,7 @@ class RecordedRun(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Its name."""
 
     @property
     def ticks(self) -> int:
@@ -76,7 +76,7 @@ class RecordedRun(Protocol):
 
     @property
     def configuration(self) -> Mapping[str, Any]:
-        """What it was run with, by dotted key."""
+        """Its configuration, by dotted key."""
 
     def frame(self, tick: int) -> ReplayFrame | None:
         """Return one tick; None if it is missing in the recording."""

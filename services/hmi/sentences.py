@@ -1,4 +1,4 @@
-"""One sentence that says why an updating period is as long as it is."""
+"""One sentence that explains the length of an updating period."""
 
 from collections.abc import Callable, Mapping
 from typing import Final
@@ -14,7 +14,7 @@ AT_REST: Final = 1e-9
 
 
 def sentence(found: Explanation, rule: UpdatingRuleStatus) -> str:
-    """Return why the period is as long as it is, in one sentence or two."""
+    """Return the explanation of the period in one or two sentences."""
     text = _WORDS[found.branch](found, rule)
     if found.spare_s and found.branch is not Branch.FIXED:
         text += (

@@ -146,7 +146,7 @@ class TrendStore:
         return found
 
     def substituted(self, start: int, end: int) -> dict[str, list[Substitution]]:
-        """Return when another value stood in for outputs between two ticks, by name."""
+        """Return the intervals in which outputs were substituted between two ticks, by name."""
         rows = self.between(start, end)
         bad = self._bad[rows.start : rows.stop]
         if not any(bad):
@@ -157,7 +157,7 @@ class TrendStore:
         return {name: stretches for name, stretches in found.items() if stretches}
 
     def substituted_at(self, row: int) -> list[str]:
-        """Return the outputs for which another value stood in."""
+        """Return the substituted outputs."""
         bad = self._bad[row]
         return [name for bit, name in enumerate(OUTPUT_NAMES) if bad >> bit & 1]
 

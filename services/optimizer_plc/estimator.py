@@ -59,7 +59,7 @@ def estimator_of(prediction: PredictionModel, settings: EstimatorSettings, real:
     """Return the estimator that the settings name.
 
     Raises:
-        ConfigurationError: The simulated state is to be believed, and is not that of the model.
+        ConfigurationError: The simulated state is used, and is not that of the model.
     """
     kalman = settings.kind is EstimatorKind.KALMAN
     if not kalman and prediction.n_states > len(STATE_NAMES):

@@ -42,11 +42,11 @@ log = logging.getLogger("coldloop.optimizer_plc")
 LOOK_OUT_S: Final = TICK_S / 8
 """Plant time between two looks for a load step in real time: the new computation begins so much later."""
 HEARTBEAT_S: Final = 1.0
-"""Plant time between two signs of life while an answer is computed."""
+"""Plant time between two heartbeats while an answer is computed."""
 SHORTEST_PAUSE_S: Final = 0.001
 """Real time between two such requests, however high the factor: others want to be served too."""
 LONGEST_PAUSE_S: Final = 1.0
-"""The same, however low the factor: a new session does not wait for an answer that nobody wants any more."""
+"""Lower limit of it at low factors: a new session does not wait for an obsolete answer."""
 SHORTEST_WAIT_S: Final = 0.02
 """An answer without a new update that comes sooner, in real time, is followed by a pause: it should have waited."""
 FRESH_UPDATE: Final = AwaitUpdate(session=0, update=0)
@@ -94,7 +94,7 @@ class OptimizerPlc:
         self._kept: _Answer | None = None
 
     def close(self) -> None:
-        """Let go of the control PLC."""
+        """Disconnect from the control PLC."""
         self._control.close()
 
     # -- the link ------------------------------------------------------------------------------------------------------
@@ -123,10 +123,10 @@ class OptimizerPlc:
 
     def _lose(self, error: ColdloopError) -> None:
         """Note why the link is lost, and prepare the next attempt."""
-        was_foreign = self._link.state is ControlLinkState.FOREIGN
+        was_foreign = self._link.state is ControlLinkState.OTHER_MASTER
         self._link.failed(error)
         state, reason = self._link.state, str(error)
-        if state is not ControlLinkState.FOREIGN:  # its connection may stay: nothing is wrong with it
+        if state is not ControlLinkState.OTHER_MASTER:  # its connection may stay: nothing is wrong with it
             self._control.close()
         if isinstance(error, (RequestRefusedError, UnfitValueError)):
             self._session = 0  # its state leads to rejected sequences: restart the session
@@ -137,7 +137,7 @@ class OptimizerPlc:
                 self._control.reload_certificates()
             except ConfigurationError as unusable:
                 reason = f"{reason}; {unusable}"
-        still_foreign = was_foreign and state is ControlLinkState.FOREIGN
+        still_foreign = was_foreign and state is ControlLinkState.OTHER_MASTER
         if not still_foreign and self._link.is_worth_logging(reason, time.monotonic()):
             log.warning("control PLC lost", extra={"link": state.name.lower(), "reason": reason})
 
@@ -172,7 +172,7 @@ class OptimizerPlc:
                 await asyncio.sleep(SHORTEST_WAIT_S)
 
     def _is_news(self, update: Update) -> bool:
-        """Tell an awaited update from the old one that the control PLC answers with when nothing happens."""
+        """Distinguish an awaited update from the old one that the control PLC returns when nothing happens."""
         if not update.session:
             return False
         if update.session != self._session:

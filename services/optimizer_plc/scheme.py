@@ -1,7 +1,7 @@
 """The implementation scheme as kernels: steps (2) to (5) of the paper's section II on the state of a session.
 
 `plan` are steps (4), (5) and (2); `solve`, which is `pose`, a solver and `deliver`, is step (3). They take single and
-double precision alike. What is decided beside the arithmetic is in `program.py`.
+double precision alike. Decisions outside the arithmetic are in `program.py`.
 """
 
 from typing import Any, Final, NamedTuple

@@ -35,7 +35,7 @@ guessed_before, delivered_before: J+ and Jhat of the problem before, infinite wh
 
 
 class Delivery(NamedTuple):
-    """A profile, the parameters it was computed for, and the rows that tell it to the control PLC."""
+    """A profile, the parameters it was computed for, and its rows for the control PLC."""
 
     numbers: Any
     """`DELIVERY`, shape (1,)."""

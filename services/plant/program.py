@@ -25,7 +25,7 @@ class HeatLoad(Protocol):
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """White Gaussian noise on the outputs, one draw a tick whoever reads them, and a bias.
+    """White Gaussian noise on the outputs, one draw per tick for all readers, and a bias.
 
     Raises:
         ValueError: not one standard deviation and one bias per output, or one that is negative or not finite.
@@ -133,7 +133,7 @@ class PlantProgram:
     def noise(self, ticks: int) -> Iterator[RealArray]:
         """Lend the draws of the next `ticks` ticks, shape (ticks, 22), or (0, 22) without noise; those used are gone.
 
-        How many were used is told by the tick afterwards.
+        The tick afterwards shows how many were used.
         """
         before, start = self._generator.bit_generator.state, self.tick
         outputs = len(OUTPUT_NAMES)

@@ -1,7 +1,7 @@
 """Configuration: a TOML file, then the environment, then the command line, each overriding the one before.
 
 The environment spells `COLDLOOP__SECTION__KEY=value`, the command line `--set section.key=value`; both read the
-value as TOML, and as text when it is none. Every value remembers where it came from.
+value as TOML, or else as text. Every value remembers where it came from.
 
 Some settings decide others, as a preset does. A section says so in a class variable `decides`: by key, the keys that
 follow from it, both relative to the section. Such a setting on the command line also replaces what the environment and

@@ -1,7 +1,7 @@
 """Everything that Coldloop raises on purpose.
 
     ColdloopError
-    ├── UsageError                  exit code 2: what the caller asked for cannot be done
+    ├── UsageError                  exit code 2: the request cannot be carried out
     │   ├── ConfigurationError      a key, a value or a configuration file
     │   └── LoadFileError           a load profile
     ├── ResultsError                the files of a run cannot be written
@@ -42,7 +42,7 @@ class ColdloopError(Exception):
 
 
 class UsageError(ColdloopError):
-    """What the caller asked for cannot be done."""
+    """The request cannot be carried out."""
 
     exit_code = 2
 

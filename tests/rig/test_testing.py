@@ -114,10 +114,10 @@ def test_the_links_of_a_rig_in_real_time_can_be_disturbed_and_its_ports_closed_b
         def until(name: str, condition: Callable[[Any], bool]) -> None:
             rig.wait_until(lambda: condition(rig.control_plc.read(name)), within_s=900)
 
-        until("plant link.state", lambda state: state == PlantLinkState.IN_STEP)
+        until("plant link.state", lambda state: state == PlantLinkState.SYNCHRONISED)
         with rig.fault("freeze", link="plant"):
             until("plant link.state", lambda state: state == PlantLinkState.SEARCHING)
-        until("plant link.state", lambda state: state == PlantLinkState.IN_STEP)
+        until("plant link.state", lambda state: state == PlantLinkState.SYNCHRONISED)
         with rig.fault("sensor", output="T5", shows="nan"):
             until("ladder.bad_sensors", lambda sensors: sensors != 0)
         assert rig.log("plant").is_file()

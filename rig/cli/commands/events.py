@@ -100,7 +100,7 @@ async def _show(options: argparse.Namespace) -> None:
 
 
 def _place(options: argparse.Namespace) -> "Endpoint":
-    """Return where the service is whose journal is asked for."""
+    """Return the endpoint of the service whose journal is read."""
     settings = operator_settings(options)
     if options.endpoint is not None and (options.rig or options.port_base):
         raise UsageError("HOST:PORT, --rig and --port-base: give one of them")

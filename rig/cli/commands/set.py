@@ -51,7 +51,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     acknowledge = what.add_parser("acknowledge", help="an alarm, or all")
     acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as t5-band (default: all)")
     acknowledge.set_defaults(document=_acknowledgement)
-    for subcommand in what.choices.values():  # options are taken before and behind what is to be done
+    for subcommand in what.choices.values():  # options are accepted before and after the subcommand
         add_configuration_options(subcommand, again=True)
         add_rig_options(subcommand, again=True)
     parser.set_defaults(execute=execute)
@@ -111,7 +111,7 @@ def _stream(options: argparse.Namespace) -> tuple[tuple[str, ...], "Work"]:
 
 
 def _is_stream(options: argparse.Namespace) -> bool:
-    """Return whether a load file is to be written, of any length: it takes as long as it takes."""
+    """Return whether a load file is written: that has no time limit."""
     if options.document is not _load:
         return False
     try:
@@ -140,6 +140,6 @@ def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
 
 
 def _say(text: str) -> None:
-    with suppress(BrokenPipeError):  # nobody listens: it is done all the same
+    with suppress(BrokenPipeError):  # no reader: the command has been carried out all the same
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""When the optimiser's updates go through the compiled loop, and what it did in there."""
+"""Decides which updates run in the compiled loop, and takes over their results."""
 
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization

@@ -1,6 +1,6 @@
 """The plants in the compiled loop: the tick of each, and what their programs hand over before and after.
 
-Each plant has constants and a state of types of its own, and numba makes a loop for each.
+Each plant has its own types of constants and state, and numba makes a loop for each.
 """
 
 from typing import Any

@@ -112,7 +112,7 @@ class World(NamedTuple):
     load_watts: Array
     limits: Limits
     low: Array
-    """Lowest value that a sensor can tell, shape (22,)."""
+    """Lowest value in the range of a sensor, shape (22,)."""
     high: Array
     frozen_ticks: int
     largest_load: float

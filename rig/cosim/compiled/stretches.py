@@ -18,7 +18,7 @@ SHORTEST: Final = 6
 
 
 class Stretch(NamedTuple):
-    """What was done without the programs."""
+    """Results of the ticks run in the compiled loop."""
 
     block: SampleBlock
     updates: list[Optimization]

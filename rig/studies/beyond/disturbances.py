@@ -54,7 +54,7 @@ class DisturbancesStudy:
         return [run for event in CASES.values() for load in _loads(event, options) for run in _runs(event, load)]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Tell bands, pressures, modes and alarms of each run."""
+        """Tabulate bands, pressures, modes and alarms of each run."""
         result = StudyResult(COLUMNS, [], {})
         lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
         for name, event in CASES.items():

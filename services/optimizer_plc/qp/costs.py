@@ -1,7 +1,7 @@
 """What a profile costs: the augmented cost J that solvers decrease, its gradient, and the indicators of section V.
 
 Gamma z - gamma and the gradient are computed here for all solvers, except by the interior-point method, which has its
-variables in an order of its own.
+variables in its own order.
 """
 
 from typing import NamedTuple

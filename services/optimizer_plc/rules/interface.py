@@ -1,4 +1,4 @@
-"""What a rule of the updating period is told, the quantities of Algorithm 1, and the call of the right rule's kernel.
+"""Inputs of a rule of the updating period, the quantities of Algorithm 1, and the call of the right rule's kernel.
 
 A rule decides q(t_{k+1}), the number of iterations of the next period. Its file has a NamedTuple of its parameters and
 a kernel `decide` that is registered for it. It takes single and double precision alike.

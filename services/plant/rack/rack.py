@@ -41,7 +41,7 @@ from plant.settings import SafeAction, WatchdogSettings
 MakePlant = Callable[[HeatLoad, int], PlantProgram]
 """Returns the plant at tick 0, for a load and a seed of the sensors' noise."""
 
-APPLIED: Final = (OutputVerdict.TAKEN, OutputVerdict.LIMITED)
+APPLIED: Final = (OutputVerdict.ACCEPTED, OutputVerdict.LIMITED)
 """Verdicts on outputs that move the plant."""
 UNWATCHED_SILENCE_S: Final = 10.0
 """Real time after which a silent client loses its lease when the watchdog is off."""
@@ -58,7 +58,7 @@ class Session(NamedTuple):
 
 
 class Rack:
-    """The simulation, what it applies, and what watches over who writes that.
+    """The simulation, its applied outputs, and the supervision of their writer.
 
     Args:
         watchdog: Its configuration.
@@ -194,7 +194,7 @@ class Rack:
         return sample
 
     def _note_station(self, before: StationSample, now: StationSample) -> None:
-        """Tell changes of the station's mode and alarms."""
+        """Note changes of the station's mode and alarms."""
         if now.mode != before.mode:
             self.journal.note(self.tick, EventKind.STATION_MODE, now.mode)
         for number, alarm in enumerate(StationAlarm):

@@ -54,7 +54,7 @@ class RackRegisters:
         settings: The configuration.
         header: Of the model file.
         make_plant: Makes the simulation of a session.
-        first_generation: Of the outputs, where no retained state tells one; drawn by default, so that nobody takes this
+        first_generation: Of the outputs, without a retained state; random by default, so that no client takes this
             rack for the one before its restart.
         age: Returns the time since the present tick began, in ticks; 0 while no clock runs.
         now: A clock, s, by which the lease of the outputs ends.
@@ -218,7 +218,7 @@ class RackRegisters:
         verdict = self.rack.offer(asked, caller)
         if verdict in {*APPLIED, OutputVerdict.CHANGED}:
             self.lease.take(caller, asked.holder)
-        if verdict is not OutputVerdict.TAKEN or not asked.crc:
+        if verdict is not OutputVerdict.ACCEPTED or not asked.crc:
             self._show_applied()
 
     def _start_session(self, who: str) -> None:

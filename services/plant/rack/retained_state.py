@@ -1,4 +1,4 @@
-"""What the rack keeps over a restart: the simulation, what it applies, and the count of its journal."""
+"""State that the rack keeps over a restart: simulation, applied outputs and count of its journal."""
 
 import logging
 from pathlib import Path
@@ -31,7 +31,7 @@ class RetainedPlantState(BaseModel):
     generation: Annotated[int, Field(ge=1, lt=2**32)]
     holder: Count
     session: Count
-    """0: there has been none, and what follows is the rack as it is configured."""
+    """0: none yet; the other fields are as configured."""
     pace: TimeBase
     watchdog: Annotated[int, Field(ge=0, lt=2**16)]
     """Its time-out, in ticks."""

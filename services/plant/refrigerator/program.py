@@ -1,4 +1,4 @@
-"""The whole refrigerator as a program: the plant, its station's controller, and what happens to both."""
+"""The whole refrigerator as a program: the plant, its station's controller, and their disturbances."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -35,7 +35,7 @@ class RefrigeratorProgram(PlantProgram):
         u0: Inputs held until the first `apply`, 3 numbers.
         load: The heat load over time.
         station: Settings of the station's controller.
-        events: What happens to the refrigerator.
+        events: Disturbances of the refrigerator.
         noise: Noise on the cold box's measurements; None measures exactly.
 
     Raises:

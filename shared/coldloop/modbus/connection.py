@@ -37,7 +37,7 @@ _numbers = count(1)
 class Connection(asyncio.Protocol):
     """Serves one client.
 
-    `opened` tells the server that the connection exists, and returns whether it may stay; `lost` tells that it is gone.
+    `opened` reports the connection to the server and returns whether it may stay; `lost` reports its end.
     """
 
     _handle: Callable[[bytes], bytes | Written]
@@ -237,7 +237,7 @@ class Connection(asyncio.Protocol):
         return framed(frame, outcome)
 
     def _answer_written(self, frame: Frame, written: Written, blocks: Iterator[Block]) -> bytes:
-        """Tell the program about the blocks; return the answer, or nothing when the program makes it wait."""
+        """Report the written blocks to the program; return the answer, or nothing if the program delays it."""
         try:
             for block in blocks:
                 waiting = self._on_write(block, self.caller)

@@ -1,4 +1,4 @@
-"""Is the peer who we think it is? Its identity block tells."""
+"""Checks the identity block of a peer."""
 
 import math
 

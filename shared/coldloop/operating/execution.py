@@ -301,7 +301,7 @@ def _treated(
     """Return what has become of alarms.
 
     Raises:
-        NotTakenError: Nothing of what was asked for.
+        NotTakenError: Nothing of the command took effect.
     """
     left = [kind for kind in kinds if not _is_done(action, rows[kind].state)]
     if len(left) == len(kinds):

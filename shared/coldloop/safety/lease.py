@@ -3,7 +3,7 @@
 A lease is granted to a connection with its first write, and refused to all others while it is held. It ends with
 silence, or by hand-over: when the connection of a simple client closes, at once; when that of a holder with a number
 closes, after a moment in which it may come back over another connection, from the same address and with the same
-certificate: the number is no password, anybody can read it. A holder that comes back leaves its former connection for
+certificate: the number is no password, anyone can read it. A holder that reconnects leaves its former connection for
 good: another client that writes over it has the same number.
 """
 

@@ -158,7 +158,7 @@ def _read(path: Path) -> bytes:
 
 
 def _new(path: Path) -> FileIO:
-    """Create a draft; one that was left there, whatever it is, is removed and not followed."""
+    """Create a draft; a leftover one is removed and not followed."""
     try:
         return path.open("xb", buffering=0)
     except FileExistsError:

@@ -50,7 +50,7 @@ function row(one) {
     element("td", {}, state.me.operates ? actions(one) : ""));
 }
 
-// Shelving counts plant time: what that is by the clock is said wherever it is not the same.
+// Shelving counts plant time: the real time is shown where it differs.
 function shelvingNote() {
   const factor = state.values["plant.pace.factor"], real = state.values["plant.pace.realtime"], paused = state.values["plant.pace.paused"];
   const text = !state.values["plant.pace.session"] || (real && !paused && factor === 1) ? "" : !real ? "Shelving counts plant time, which advances as it is granted."
@@ -60,7 +60,7 @@ function shelvingNote() {
   if (note.textContent !== text) note.textContent = text;
 }
 
-// Only rows that have changed are made anew: a button is not replaced under somebody's hand.
+// Only changed rows are replaced: a button must not vanish while it is clicked.
 const rows = new Map();
 function table() {
   const body = byId("alarm-table").querySelector("tbody");

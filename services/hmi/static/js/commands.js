@@ -72,7 +72,7 @@ async function failed(asked, error, unanswered) {
   if (error.status === 401) await refreshUser().catch(() => {});
 }
 
-// Enter does not confirm by itself: whoever holds a key down, or clicks twice, has not read what is asked.
+// Enter does not confirm by itself: a held key or a double click must not confirm an unread question.
 function confirmed(text) {
   const dialog = byId("confirm");
   byId("confirm-text").textContent = `${text}?`;
@@ -88,7 +88,7 @@ function confirmed(text) {
   });
 }
 
-// A field shows what there is until somebody writes into it: what is sent by mistake then changes nothing. Returns what
+// A field shows the present value until it is edited: sending it by mistake then changes nothing. Returns what
 // makes it follow again.
 function follow(field, name, others = []) {
   let touched = false;

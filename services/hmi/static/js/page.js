@@ -73,7 +73,7 @@ function overview() {
   setInterval(refreshStrips, 1000);
 }
 
-// One drawing for each kind of plant. Where another plant is found later, the page begins anew.
+// One drawing for each kind of plant. If another plant is found later, the page reloads.
 const MIMICS = { refrigerator: "static/mimic-refrigerator.svg" };
 async function mimic(kind) {
   const text = await (await fetch(MIMICS[kind] || "static/mimic.svg")).text();

@@ -1,4 +1,4 @@
-// Why the updating period of one update is as long as it is.
+// Explanation of the updating period of one update.
 import { ask, element, indexed, onChange, shape, timeText } from "./store.js";
 import { makeChart } from "./charts.js";
 
