@@ -76,10 +76,7 @@ def record(hours: str, minutes: float, period_s: float) -> list[RecordedProblem]
         heard += listener.heard
     matrices = {"Phi": heard[0].problem.Phi, "Gamma": heard[0].problem.Gamma}
     floor = settings.optimizer_plc.program.adaptive.cost_floor
-    return [
-        RecordedProblem(problem._replace(**matrices, constant=problem.constant + floor), guess)
-        for problem, guess in heard
-    ]
+    return [RecordedProblem(qp._replace(**matrices, constant=qp.constant + floor), guess) for qp, guess in heard]
 
 
 def lowest_cost(qp: QuadraticProblem, alpha: float) -> float:
@@ -186,9 +183,7 @@ def main() -> None:
     for name in names:
         report_paths(name, problems, harsh, options.iterations)
     if harsh.any():
-        print(
-            "\nharsh problems, J / J* (median / largest), begun at the guess or at their own starting point, cut off at"
-        )
+        print("\nharsh problems, J / J* (median / largest), begun at the guess or at their own point, cut off at")
         chosen = [one for one, hard in zip(problems, harsh, strict=True) if hard]
         report_interior_points(chosen, best[harsh], alpha)
 

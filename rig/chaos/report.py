@@ -43,17 +43,12 @@ def as_markdown(cells: Sequence[Sequence[str]]) -> str:
 
 
 def write_report(
-    folder: Path,
-    plan: ChaosPlan,
-    trace: ChaosTrace,
-    evaluation: Evaluation,
-    hashes: dict[str, str],
-    failure: str | None,
+    out: Path, plan: ChaosPlan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
 ) -> None:
     """Write chaos.json and chaos.md."""
-    write_json(folder / "chaos.json", document(plan, trace, evaluation, hashes, failure))
+    write_json(out / "chaos.json", document(plan, trace, evaluation, hashes, failure))
     text = _page(plan, trace, evaluation, failure)
-    whole_file(folder / "chaos.md", lambda draft: draft.write_text(text, encoding="utf-8"))
+    whole_file(out / "chaos.md", lambda draft: draft.write_text(text, encoding="utf-8"))
 
 
 def document(

@@ -84,13 +84,7 @@ class LocalServices:
         self._ports.release()
 
     async def start(self, service: str, environment: Mapping[str, str] | None = None, *, may_end: bool = False) -> None:
-        """Start one of them, where it was before.
-
-        Args:
-            service: Which one.
-            environment: Further variables for this time.
-            may_end: Its end by itself does not end the run.
-        """
+        """Start a service where it was before; `may_end`: its end by itself does not end the run."""
         # In their own process session: Ctrl-C is handled by the rig.
         with self.log(service).open("ab") as log:
             process = await asyncio.create_subprocess_exec(

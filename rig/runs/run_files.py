@@ -108,9 +108,8 @@ class RunFiles:
         except OSError as of_files:
             error = error or of_files
         if error is not None:
-            raise _results_error(
-                error, self.folder, f"{recorded} of {self.recorder.ticks} ticks are recorded in {self.folder}"
-            )
+            kept = f"{recorded} of {self.recorder.ticks} ticks are recorded in {self.folder}"
+            raise _results_error(error, self.folder, kept)
         return summary
 
     def _discard(self) -> None:

@@ -13,7 +13,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.safety.sequence import InputSequence
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, ProblemParameters
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from optimizer_plc.rules import UpdatingRule
 from optimizer_plc.settings import ProgramSettings, SolverName
 from rig.cosim.one_process import OneProcessRig
@@ -36,7 +36,7 @@ CONVERGED: Final = ("optimizer_plc.program.solver=daqp", "optimizer_plc.program.
 class LoopProblem(NamedTuple):
     """A problem of the converged loop."""
 
-    parameters: ProblemParameters
+    parameters: QpParameters
     z: Array
     """The profile that the loop delivered: the optimum of the quadratic problem."""
 
@@ -71,7 +71,7 @@ class _ListeningOptimizer(OptimizerProgram):
         sequence = super().solve()
         sent = self.state.sent
         w, ticks = float(sent.numbers[0]["w"]), int(sent.numbers[0]["ticks"])
-        self.heard.append(LoopProblem(ProblemParameters(sent.x.copy(), w, sent.u_before.copy(), ticks), sent.z.copy()))
+        self.heard.append(LoopProblem(QpParameters(sent.x.copy(), w, sent.u_before.copy(), ticks), sent.z.copy()))
         return sequence
 
 
@@ -96,6 +96,6 @@ def _recorded(scenario: Scenario, assignments: tuple[str, ...]) -> ProblemSequen
     ]))  # fmt: skip
 
 
-def _lowest(problem: PredictiveProblem, profiles: PlayedProfiles, parameters: ProblemParameters) -> float:
+def _lowest(problem: PredictiveProblem, profiles: PlayedProfiles, parameters: QpParameters) -> float:
     qp = problem.at(parameters)
     return profiles.cost(qp, profiles.optimum(qp, parameters), parameters).total

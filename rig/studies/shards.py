@@ -146,9 +146,7 @@ def _common_number(study: Study, options: StudyOptions, sources: Sequence[Path])
     cuts = {record.of: path for path, record in records}
     if len(cuts) > 1:
         (of, path), (other, other_path) = list(cuts.items())[:2]
-        raise UsageError(
-            f"{other_path}: one of {other} shards, while {path} is one of {of}; merge shards of the same division"
-        )
+        raise UsageError(f"{other_path}: one of {other} shards, while {path} is one of {of}; merge shards of one set")
     return next(iter(cuts))
 
 

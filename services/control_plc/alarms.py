@@ -216,12 +216,7 @@ class AlarmPanel:
     # -- operators, restarts -------------------------------------------------------------------------------------------
 
     def command(self, command: AlarmCommand, who: str = "") -> None:
-        """Do what an operator asks for; what makes no sense changes nothing.
-
-        Args:
-            command: Alarm, action, and for shelving the time.
-            who: Whose request it is, for the journal.
-        """
+        """Carry out an operator's command; an impossible one changes nothing."""
         event = COMMANDED.get(command.action)
         if event is None:
             return

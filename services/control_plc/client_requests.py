@@ -227,9 +227,7 @@ class Clients:
             latched = program.player.update
             if latched is not None and not (program.awaiting_plan and latched.tick == program.tick - 1):
                 program.abandon()
-                self._bank.put_sealed(
-                    latched._replace(session=0)
-                )  # a waiting request of another session must not get this one
+                self._bank.put_sealed(latched._replace(session=0))  # not for a request of another session
                 wanted = latched.update + 1
             else:
                 wanted = latched.update if latched else 0

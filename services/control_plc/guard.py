@@ -35,15 +35,10 @@ class OutputGuard:
         """The last tick, and by how much our time is behind it."""
 
     def begin_at(self, tick: int, applied: SequenceRow, passed: int | None = None) -> None:
-        """Restart from the outputs applied at `tick`; they count as having moved just then.
+        """Restart at `tick` from the outputs applied there; they count as having moved just then.
 
-        A window that is open stays open: breaks that follow one another would else give a full rate each. A value that
-        is not finite is not taken over: the last finite one stays.
-
-        Args:
-            tick: Tick of the restart.
-            applied: What is applied there.
-            passed: Ticks that have passed since the last scan by another clock; None where there is none.
+        An open window stays open: consecutive breaks would otherwise give a full rate each. A non-finite value is
+        ignored: the last finite one stays. `passed`: ticks since the last scan by another clock, None without one.
         """
         leap = tick - self._tick
         self._lag += leap - max(0, leap if passed is None else min(leap, passed))

@@ -102,13 +102,7 @@ class ImageWatch:
         self._moved = False
 
     def unchanged(self, inputs: Sequence[float], *image: Sequence[float], elapsed: int) -> int:
-        """Return for how many ticks the image is unchanged although the inputs have moved.
-
-        Args:
-            inputs: Being applied.
-            image: All that is measured.
-            elapsed: Ticks since the last one.
-        """
+        """Return for how many ticks the image (all measurements) is unchanged although the inputs have moved."""
         if image != self._image:  # NaN is not the same as NaN: a sensor that fails is for others to find
             self._image, self._inputs = image, inputs
             self._unchanged, self._moved = 0, not self._may_rest

@@ -96,7 +96,7 @@ def _digest(token: str) -> str:
     return hashlib.sha256(token.encode(errors="surrogatepass")).hexdigest()
 
 
-class ClientRateLimits:
+class ClientLimit:
     """A bucket of requests for each address or party.
 
     Args:

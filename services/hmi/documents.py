@@ -169,13 +169,7 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
 
 
 def explanation_document(model: Model, number: int | None, at_tick: int | None = None) -> Document | None:
-    """Return the explanation of an updating period; None without such an update.
-
-    Args:
-        model: What is known.
-        number: Of the update; None is the last one.
-        at_tick: The update whose period this tick is in, in the place of a number.
-    """
+    """Return the explanation of the period of an update: by number, at a tick, or the last one; None without it."""
     updates = model.updates
     place = len(updates) - 1
     if at_tick is not None:
@@ -277,9 +271,7 @@ def _some(predictions: list[Prediction]) -> list[Prediction]:
 
 
 def _marks(model: Model, start: int, end: int) -> list[Document]:
-    begun = max(
-        (entry.utc for entry in model.events if entry.service == "plant" and entry.text.kind == BEGUN), default=""
-    )
+    begun = max((e.utc for e in model.events if e.service == "plant" and e.text.kind == BEGUN), default="")
     found = [
         entry
         for entry in model.events

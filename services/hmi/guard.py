@@ -14,7 +14,7 @@ from hmi.access import (
     LOGINS_A_MINUTE,
     REQUEST_BURST,
     REQUESTS_A_BROWSER,
-    ClientRateLimits,
+    ClientLimit,
     LoginSession,
     LoginSessions,
     Party,
@@ -96,9 +96,9 @@ class Guard:
         self._checking = asyncio.Semaphore(PASSWORDS_AT_ONCE)
         login = settings.login
         self.sessions = LoginSessions(time.monotonic, login.idle_minutes * 60, login.longest_minutes * 60)
-        self.logins = ClientRateLimits(time.monotonic, LOGINS_A_MINUTE / 60, LOGIN_BURST)
-        self._requests = ClientRateLimits(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
-        self._files = ClientRateLimits(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
+        self.logins = ClientLimit(time.monotonic, LOGINS_A_MINUTE / 60, LOGIN_BURST)
+        self._requests = ClientLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
+        self._files = ClientLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
         self._hosts = LOCAL_NAMES | {settings.host, *map(str.lower, settings.allowed_hosts)}
 
     def session(self, request: web.Request) -> LoginSession | None:
@@ -149,9 +149,7 @@ class Guard:
             return self._refused(request, 429, "too many requests: wait a little")
         if host_of(host) not in self._hosts:
             reason = "host name not allowed"
-            return self._refused(
-                request, 421, reason, f"host name '{host}' is not allowed: add it to hmi.allowed_hosts"
-            )
+            return self._refused(request, 421, reason, f"host '{host}' is not allowed: add it to hmi.allowed_hosts")
         if request.method not in SAFE and not is_own_origin(request.headers.get(hdrs.ORIGIN), host):
             return self._refused(request, 403, "commands are accepted from the page itself only, not from another site")
         is_open = path in OPEN or is_file

@@ -53,6 +53,5 @@ def _alarms(model: Model) -> Iterator[MetricFamily]:
 def _update(update: Optimization) -> Iterator[MetricFamily]:
     for (name, field), value in zip(fields_of(Optimization).items(), update, strict=True):
         unit = f" ({field.unit})" if field.unit else ""
-        yield MetricFamily(
-            f"coldloop_update_{name}", f"Last update: {field.description}{unit}", (Sample(float(value)),)
-        )
+        description = f"Last update: {field.description}{unit}"
+        yield MetricFamily(f"coldloop_update_{name}", description, (Sample(float(value)),))

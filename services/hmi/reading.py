@@ -209,9 +209,7 @@ class Reading:
         """Answer with the newest events that a search finds."""
         async with self._turn(request):
             found = self._events(request.query)
-            document = encoded(
-                {"found": len(found), "events": [event_document(entry) for entry in found[:EVENTS_SHOWN]]}
-            )
+            document = encoded({"found": len(found), "events": [*map(event_document, found[:EVENTS_SHOWN])]})
         return json_answer(document)
 
     async def events_table(self, request: web.Request) -> web.Response:

@@ -30,7 +30,7 @@ from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import estimator_of
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, ProblemParameters
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from optimizer_plc.rules import UpdatingRule, make_rule
 from optimizer_plc.session_state import empty_state
 from optimizer_plc.settings import ProgramSettings
@@ -60,7 +60,7 @@ class OptimizerProgram:
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
             self.state = empty_state(prediction.n_states, self.problem.size, self._real)
             estimator = estimator_of(prediction, settings.estimator, self._real)
-            at_rest = self.problem.at(ProblemParameters(self.state.belief.x, self._real(0.0), self.state.u))
+            at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
             self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
             self.constants = scheme.constants_of(estimator, self.problem, self.solver.alpha, settings, self.budget)
             self._compile_kernels(model)
@@ -237,7 +237,7 @@ class OptimizerProgram:
         if not header["length"]:
             raise RuntimeError("call solve before prediction")
         horizon = self.problem.design.horizon
-        outputs = self.problem.outputs(sent.z, ProblemParameters(sent.x, header["w"], sent.u_before))
+        outputs = self.problem.outputs(sent.z, QpParameters(sent.x, header["w"], sent.u_before))
         inputs = self.problem.inputs(sent.z, horizon)
         shown = outputs[[min(sample, horizon) - 1 for sample in PREDICTED_SAMPLES]]
         planned = inputs[[min(sample, horizon) - 1 for sample in INPUT_SAMPLES]]

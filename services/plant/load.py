@@ -37,9 +37,7 @@ HOURS: Final = {
     **{
         str(hour): LoadFamily((0.0, 60.0, -60.0, 100.0, -100.0, 150.0), 60.0, 400.0, 20 + hour) for hour in range(1, 9)
     },  # sustained loads, under which throttled qpOASES predicts violations as large as in the paper (c1 of 20)
-    "pulses": LoadFamily(
-        (-45.0, 135.0), 150.0, 450.0, 30, in_turn=True
-    ),  # as a tokamak's magnets load their refrigerator
+    "pulses": LoadFamily((-45.0, 135.0), 150.0, 450.0, 30, in_turn=True),  # like the magnets of a tokamak
 }
 
 NAMED: Final = {

@@ -212,9 +212,8 @@ class Link(RuleBasedStateMachine):
     @precondition(lambda self: self.program.tick > 0)
     @rule()
     def the_control_plc_is_killed_and_comes_back(self) -> None:
-        content = ControlStateStore(None, HEADER.short_digest).content(
-            self.program, TimeBase(realtime=False, factor=1.0)
-        )
+        store = ControlStateStore(None, HEADER.short_digest)
+        content = store.content(self.program, TimeBase(realtime=False, factor=1.0))
         kept = RetainedControlState.parsed(json.loads(json.dumps(content)))
         self.program = self.new_program()
         self.program.alarms.restore(kept.alarms)

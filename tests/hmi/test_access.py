@@ -14,15 +14,7 @@ from aiohttp.test_utils import make_mocked_request
 from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
-from hmi.access import (
-    REQUEST_BURST,
-    REQUESTS_A_BROWSER,
-    ClientRateLimits,
-    LoginSessions,
-    host_of,
-    is_own_origin,
-    port_of,
-)
+from hmi.access import REQUEST_BURST, REQUESTS_A_BROWSER, ClientLimit, LoginSessions, host_of, is_own_origin, port_of
 from hmi.audit import Audit
 from hmi.connections import Connections
 from hmi.guard import Guard
@@ -257,7 +249,7 @@ def test_a_page_that_wants_a_login_can_be_opened_to_log_in(guard: Guard, run: st
 def test_as_many_browsers_as_are_served_may_draw_trends_from_one_address() -> None:
     clock = Clock()
     browsers = HmiSection().browsers
-    limit = ClientRateLimits(clock, REQUESTS_A_BROWSER * browsers, REQUEST_BURST)
+    limit = ClientLimit(clock, REQUESTS_A_BROWSER * browsers, REQUEST_BURST)
     for second in range(60):
         clock.time = float(second)
         assert all(limit.allows("proxy") for _ in range(2 * browsers))
@@ -265,7 +257,7 @@ def test_as_many_browsers_as_are_served_may_draw_trends_from_one_address() -> No
 
 def test_requests_of_one_address_are_limited_and_others_not() -> None:
     clock = Clock()
-    limit = ClientRateLimits(clock, per_second=1.0, burst=3.0)
+    limit = ClientLimit(clock, per_second=1.0, burst=3.0)
     assert [limit.allows("here") for _ in range(5)] == [True, True, True, False, False]
     assert limit.allows("elsewhere")
     clock.time = 2.0

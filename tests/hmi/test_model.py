@@ -308,9 +308,7 @@ def test_what_is_sent_is_json_even_when_numbers_or_words_are_none(model: Model) 
 def test_loads_and_alarms_are_marked_on_the_trends(model: Model) -> None:
     model.put("control_plc", process(100))
     kinds = (EventKind.LIVE_LOAD, EventKind.BOOT, EventKind.ALARM_RAISED)
-    model.put_events(
-        JournalEntry.of("plant", Event(number, 1, 50 + number, kind=kind)) for number, kind in enumerate(kinds)
-    )
+    model.put_events(JournalEntry.of("plant", Event(i, 1, 50 + i, kind=kind)) for i, kind in enumerate(kinds))
     marks = trend_document(model, ["L1"], 0, 100, 100)["marks"]
     assert [(mark["kind"], mark["time"]) for mark in marks] == [("load", 12.5), ("alarm", 13.0)]
 

@@ -91,9 +91,8 @@ async def test_a_refusal_says_who_refused_what(serve: "Serve") -> None:
 
 async def test_nobody_listens(free_port: int) -> None:
     async with client_of(free_port) as client:
-        with pytest.raises(
-            PeerUnreachableError, match=rf"^nothing listens as plant at 127.0.0.1:{free_port}: start it"
-        ):
+        message = rf"^nothing listens as plant at 127.0.0.1:{free_port}: start it"
+        with pytest.raises(PeerUnreachableError, match=message):
             await client.connect(0.0)
 
 

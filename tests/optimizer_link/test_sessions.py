@@ -29,9 +29,8 @@ UPDATING_PERIOD = BLOCK.end - 1
 
 
 def shown(power: float = 1.0, tau_1_s: float = 0.25) -> OptimizerPublication:
-    return OptimizerPublication(
-        WordOrder.HIGH_FIRST, PlcBudget(BudgetSettings(power=power), tau_1_s), OperatingLimits(), 1, 1
-    )
+    budget = PlcBudget(BudgetSettings(power=power), tau_1_s)
+    return OptimizerPublication(WordOrder.HIGH_FIRST, budget, OperatingLimits(), 1, 1)
 
 
 @asynccontextmanager

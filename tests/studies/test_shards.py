@@ -142,11 +142,7 @@ def changed(**fields: object) -> Callable[[Path], None]:
             UsageError,
             r"of another configuration \(seeds 2 there, 1 here\); give all shards and the merge the same options",
         ),
-        (
-            changed(shard=3, of=3),
-            UsageError,
-            r"one of 3 shards, while .* is one of 2; merge shards of the same division",
-        ),
+        (changed(shard=3, of=3), UsageError, r"one of 3 shards, while .* is one of 2; merge shards of one set"),
     ],
 )
 def test_what_cannot_be_merged_is_one_line(

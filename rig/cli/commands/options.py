@@ -138,9 +138,7 @@ def first_port_here(options: argparse.Namespace) -> int | None:
         return None if options.port_base is None else int(options.port_base)
     plant: HostPort = options.rig[0]
     if plant.host not in LOOPBACK:
-        raise UsageError(
-            f"--rig {plant.host}:{plant.port}: services can be killed or suspended on their own machine only"
-        )
+        raise UsageError(f"--rig {plant.host}:{plant.port}: kill and suspend services on their own machine only")
     return plant.port
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from optimizer_plc.qp.linear_algebra import Columns, add_product, add_transposed_product, by_columns
-from optimizer_plc.qp.problem import PredictiveProblem, ProblemParameters, QuadraticProblem
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 
 Array = NDArray[np.float64]
 
@@ -156,9 +156,7 @@ def output_maps(problem: PredictiveProblem) -> OutputMaps:
     )  # fmt: skip
 
 
-def indicators(
-    problem: PredictiveProblem, qp: QuadraticProblem, z: Array, parameters: ProblemParameters
-) -> ProfileCosts:
+def indicators(problem: PredictiveProblem, qp: QuadraticProblem, z: Array, parameters: QpParameters) -> ProfileCosts:
     """Return the indicators of profile z at the parameters (paper, section V); `qp` is the problem's instance there."""
     maps, real = output_maps(problem), z.dtype.type
     return ProfileCosts(

@@ -40,7 +40,7 @@ class QuadraticProblem(NamedTuple):
     constant: float
 
 
-class ProblemParameters(NamedTuple):
+class QpParameters(NamedTuple):
     """What an instance depends on, as deviations from the operating point."""
 
     x: Array
@@ -127,7 +127,7 @@ class PredictiveProblem:
 
     # -- instances ---------------------------------------------------------------------------------------------------
 
-    def at(self, parameters: ProblemParameters) -> QuadraticProblem:
+    def at(self, parameters: QpParameters) -> QuadraticProblem:
         """Return the instance of the problem for these parameters."""
         share = self._real(self.limits.rate_share(parameters.elapsed_ticks))
         phi, gamma, low, high, constant = instance(self.maps, parameters.x, parameters.w, parameters.u_before, share)
@@ -145,7 +145,7 @@ class PredictiveProblem:
             return shifted(self.shifts[ticks], z)
         return shifted(self._rounded(shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE)), z)
 
-    def within_first_rate(self, z: Array, parameters: ProblemParameters) -> Array:
+    def within_first_rate(self, z: Array, parameters: QpParameters) -> Array:
         """Return the profile z with its first knot within the rate of the input before it, as it can be sent."""
         share = self._real(self.limits.rate_share(parameters.elapsed_ticks))
         result = z.copy()
@@ -159,7 +159,7 @@ class PredictiveProblem:
         """
         return inputs_of(self.knots_to_samples[:samples], z, self.input_scale, self._u0, self.rate)
 
-    def outputs(self, z: Array, parameters: ProblemParameters) -> Array:
+    def outputs(self, z: Array, parameters: QpParameters) -> Array:
         """Return L1 and T5 predicted for a profile at the end of each sampling period, shape (horizon, 2)."""
         outputs = self.resting_outputs.copy()
         add_transposed_product(self.stacked_outputs_z, z, outputs)

@@ -28,9 +28,7 @@ class OptimizerSession(NamedTuple):
     """Settings of a session, taken when its first update arrives."""
 
     session: Annotated[int, u32("Number of the session", low=1)]
-    realtime: Annotated[
-        int, u16("0 lock-step, 1 real time: answers then arrive at the time the PLC would need", high=1)
-    ]
+    realtime: Annotated[int, u16("0 lock-step, 1 real time: answers are delayed as by the PLC", high=1)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
     updating_period: Annotated[int, u16("Fixed updating period, 2 or more; 0 is adaptive", unit="0.25 s", high=20)]
 

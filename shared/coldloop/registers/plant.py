@@ -60,9 +60,7 @@ class Actuators(NamedTuple):
     The rack judges them whole; its next measurement shows whether they were accepted.
     """
 
-    tick: Annotated[
-        int, u32("Tick of these outputs; in lock-step writing the present one advances the plant", high=LAST_TICK)
-    ]
+    tick: Annotated[int, u32("Tick of these outputs; in lock-step the present one advances the plant", high=LAST_TICK)]
     cv155: Annotated[float, f32("Opening of the Joule-Thomson valve", unit="%", low=0, high=100)]
     ncr22: Annotated[float, f32("Actuator part of the bath heater's power", unit="W", low=0, high=1000)]
     cv156: Annotated[float, f32("Opening of the turbine valve", unit="%", low=0, high=100)]
@@ -86,9 +84,7 @@ class Measurement(NamedTuple):
     u: Annotated[
         tuple[float, ...], f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS, low=0, high=MAX_INPUT)
     ] = (0.0, 0.0, 0.0)
-    holder: Annotated[
-        int, u32("Holder of these outputs; 0 is a simple client, the safe state or the initial state")
-    ] = 0
+    holder: Annotated[int, u32("Holder of these outputs; 0 is a simple client, safe or initial state")] = 0
     generation: Annotated[
         int,
         u32("Rises when outputs change other than by their writer: safe state, session, new writer", low=1),
@@ -158,9 +154,7 @@ class LoadStatus(NamedTuple):
 class LiveLoad(NamedTuple):
     """Changes the heat load of the session under way; what was known of later ticks is dropped."""
 
-    tick: Annotated[
-        int, u32("First tick of the load, in the future; 0 is the next tick", unit="0.25 s", high=LAST_TICK)
-    ] = 0
+    tick: Annotated[int, u32("First tick, in the future; 0 is the next tick", unit="0.25 s", high=LAST_TICK)] = 0
     watts: Annotated[float, f32("Heat load", unit="W", low=0, high=MAX_LOAD_W)] = 0.0
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 

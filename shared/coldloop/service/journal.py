@@ -59,12 +59,7 @@ class Journal:
         return self._events[0].number if self._events else 0
 
     def continue_from(self, boot: int, count: int) -> None:
-        """Continue the numbering from before a restart.
-
-        Args:
-            boot: Number of this start.
-            count: Number of the last event before it; those of this start are renumbered after it.
-        """
+        """Continue the numbering of an earlier start after its event `count`; present events are renumbered."""
         moved = count - self.before
         self._events = deque(
             [event._replace(number=event.number + moved, boot=boot & 0xFFFF) for event in self._events], maxlen=KEPT
@@ -74,16 +69,7 @@ class Journal:
     def note(
         self, tick: int, kind: EventKind, subject: int = 0, cause: int = 0, *, value: float = 0.0, who: str = ""
     ) -> None:
-        """Add an event.
-
-        Args:
-            tick: Tick of plant time.
-            kind: What happened.
-            subject: Of what; depends on the kind.
-            cause: Why; depends on the kind.
-            value: A value; depends on the kind.
-            who: Whose request it was: address, role, certificate.
-        """
+        """Add an event; its arguments are the fields of `Event`."""
         self.noted += 1
         milliseconds = max(0, int(self._now() * 1000))
         self._events.append(
