@@ -94,7 +94,7 @@ def examine(service: str, read: Read) -> None:
         time.sleep(PAUSE_S)
         if identity(read) != first:
             return
-    raise UnhealthyError(f"stands at tick {first.tick}")
+    raise UnhealthyError(f"stays at tick {first.tick}")
 
 
 def identity(read: Read) -> Identity:

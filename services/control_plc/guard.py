@@ -45,14 +45,14 @@ class OutputGuard:
         self._tick, tick = tick, tick - self._lag
         state, rates = self.state, self.limits.rate
         finite = [value if math.isfinite(value) else last for value, last in zip(applied, self.applied, strict=True)]
-        goes_on = 0 <= tick - state.start < TICKS_PER_SAMPLE and _reaches(
+        window_is_open = 0 <= tick - state.start < TICKS_PER_SAMPLE and _reaches(
             state.anchor, finite, [rate * state.share for rate in rates]
         )
         for slot, before in enumerate(state.before):  # what is further away limits nothing any more
             state.moves[slot] = min(state.moves[slot], tick) if _reaches(before, finite, rates) else NEVER
         state.applied[:] = finite
         state.out_of_bounds = not in_range(self.limits, finite)
-        if not goes_on:
+        if not window_is_open:
             state.anchor[:] = finite
             state.start = state.moved = tick
             state.share = rate_share(self.limits, 0)

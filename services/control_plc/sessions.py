@@ -1,6 +1,6 @@
 """Which session the control PLC is in, and by which time base.
 
-It is the one that an operator asks for, the one retained over a restart, or with `session.autostart` that of the rack.
+It is the one requested by an operator, the one retained over a restart, or with `session.autostart` that of the rack.
 """
 
 import logging

@@ -92,7 +92,7 @@ class Audit:
             who: The user who has logged in.
             address: Where the request came from.
             outcome: done, refused, or uncertain when it is not known.
-            detail: The command in words, what came back, or why not.
+            detail: The command in words, its result, or the reason of a refusal.
         """
         self._sum_up()
         self._add(_entry(what, who, address, outcome, detail), self._of_users)

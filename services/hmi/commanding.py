@@ -111,7 +111,7 @@ class Commanding:
         return web.json_response({"token": token, "text": text})
 
     async def confirm(self, request: web.Request) -> web.Response:
-        """Carry out a command that was prepared; answer with what was asked and what came of it."""
+        """Carry out a prepared command; answer with the command and its result."""
         operator = self._operator(request)
         if isinstance(operator, web.Response) or self._desk is None:
             return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")

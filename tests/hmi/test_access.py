@@ -43,7 +43,7 @@ def test_everybody_may_look_and_nobody_may_operate_without_a_login(site: Site) -
     assert site.ask("/api/state").status == 200
     answer = site.ask("/api/commands", LOAD)
     assert answer.status == 401
-    assert refusals(site, "command", "", "nobody has logged in")
+    assert refusals(site, "command", "", "not logged in")
 
 
 def test_a_wrong_password_is_refused_and_audited_without_the_password(site: Site) -> None:
@@ -60,7 +60,7 @@ def test_who_may_only_look_is_refused(site: Site) -> None:
     answer = site.ask("/api/commands", LOAD, cookie=cookie)
     assert answer.status == 403
     assert "may view" in answer.document["error"]
-    assert refusals(site, "command", VIEWER[0], "may only look")
+    assert refusals(site, "command", VIEWER[0], "may only view")
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", ""])

@@ -133,7 +133,7 @@ def changed(**fields: object) -> Callable[[Path], None]:
     [
         (one_gone, StudyError, r"1 of 12 runs are missing or damaged, of shards 2/2; do these with --shard"),
         (one_half_written, StudyError, r"1 of 12 runs are missing or damaged, of shards 2/2"),
-        (lambda part: record(part).unlink(), UsageError, r"no shard of study trade-off; name folders"),
+        (lambda part: record(part).unlink(), UsageError, r"no shard of study trade-off; name the --out folders"),
         (lambda part: record(part).write_text('{"study"'), UsageError, r"not the record of a shard"),
         (changed(programs="others"), UsageError, r"done by another version of Coldloop"),
         (changed(runs="others"), UsageError, r"of another configuration \(load files differ\)"),

@@ -68,7 +68,7 @@ def _seconds(text: str) -> float:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Do it, and say what came back."""
+    """Send the command, and print the result."""
     from rig.until_interrupted import run_until_interrupted
 
     return 130 if run_until_interrupted(lambda: _do(options)) else 0

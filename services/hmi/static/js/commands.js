@@ -1,4 +1,4 @@
-// Commands in two steps: what would be done, then confirm; and what came of it. Login.
+// Commands in two steps, preview and confirmation, with their results. Login.
 import { ask, element, isStale, onChange, send, signal, state, timeText } from "./store.js";
 import { bindAll } from "./values.js";
 
@@ -125,7 +125,7 @@ function faceplates() {
   bindAll(holder);
 }
 
-// The mode that the operator asks for is the button that is pressed.
+// The pressed button shows the operator's mode.
 function showMode() {
   const about = signal("control_plc.operator.mode"), asked = about && about.words[state.values["control_plc.operator.mode"]];
   for (const one of document.querySelectorAll("[data-mode]")) one.setAttribute("aria-pressed", String(Boolean(asked) && asked.startsWith(one.dataset.mode) && !isStale("control_plc.")));

@@ -60,7 +60,7 @@ function overview() {
     const values = state.values, upcoming = values["plant.load status.upcoming"];
     const note = byId("tau-u-note"), inUse = !state.stale.includes("update");
     note.hidden = inUse;
-    if (!inUse) note.textContent = "Of the last update: MPC does not drive now.";
+    if (!inUse) note.textContent = "Of the last update: MPC is not active now.";
     const rows = [["expected next", state.replay ? "–" : upcoming ? `${values["plant.load status.next_watts"]?.toFixed(1)} W in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
       ["estimated mismatch", state.update ? `${state.update.update.load_mismatch.toFixed(1)} W` : "–", "optimizer_plc.", "update"]];
     const text = JSON.stringify(rows);
