@@ -31,7 +31,7 @@ class Followed(NamedTuple):
 
 
 async def follow(ppm: float, factor: float, hours: float, folder: Path) -> Followed:
-    """Run a session beside a rack whose clock is off."""
+    """Run a session with a rack whose clock is off."""
     settings = load_configuration(Settings, environment={}, assignments=[f"plant.clock_error_ppm={ppm}"]).settings
     ticks = round(hours * 3600 / TICK_S)
     load = find_load("8h", own_header(settings.model.file).w0)
@@ -46,7 +46,7 @@ async def follow(ppm: float, factor: float, hours: float, folder: Path) -> Follo
             while True:
                 await asyncio.sleep(0.5)
                 link = await client.read(PlantLinkStatus)
-                lost += link.state != PlantLinkState.IN_STEP
+                lost += link.state != PlantLinkState.SYNCHRONISED
                 if link.plant_tick >= ticks:
                     return Followed(link, await client.read(Status), lost)
 
@@ -69,7 +69,8 @@ def report(ppm: float, factor: float, hours: float) -> None:
         run_event_loop(run)
     link, status, lost = found[0]
     print(f"{ppm:+g} ppm, factor {factor:g}, {hours:g} h: skew found {link.skew:+.1f} +- {link.skew_error:.1f} ppm, "
-          f"phase {link.offset:+.2f} ms, {link.breaks} breaks, {lost} looks out of step, at tick {link.plant_tick}; "
+          f"phase {link.offset:+.2f} ms, {link.breaks} breaks, {lost} readings not synchronised, "
+          f"at tick {link.plant_tick}; "
           f"{status.deadline_misses} misses, lateness p99 {status.lateness_p99:.2f} ms", flush=True)  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Scan lateness in real time at factor 1, with and without a crowd that polls the control PLC; and who is too many.
 
-With `--flood` a client sends requests without waiting for answers beside the crowd, as fast as they are taken. Crowd
+With `--flood` another client sends requests without waiting for answers, as fast as they are accepted. Crowd
 and flood have no role, unless `--with-role` is given.
 
     .venv/bin/python benchmarks/crowd.py --flood                                      # two minutes
@@ -91,7 +91,7 @@ async def crowd(options: argparse.Namespace) -> None:
 
 
 async def measure(options: argparse.Namespace, clients: int, logs: Path) -> tuple[LinkStatistics, str]:
-    """Run the loop with so many clients beside it; return how well it kept time, and what the crowd met."""
+    """Run the loop under so many clients; return its timing and the clients' results."""
     source = (OURSELVES if options.with_role else STRANGER, 0)
     ours = json.dumps([OURSELVES])
     roles = [f"control_plc.server.access.{role}={ours}" for role in ("control", "optimizer", "operator")]
@@ -116,7 +116,7 @@ async def measure(options: argparse.Namespace, clients: int, logs: Path) -> tupl
 
 
 async def start_crowd(options: argparse.Namespace, port: int) -> asyncio.subprocess.Process:
-    """Start the crowd as a process of its own; it ends before the run does."""
+    """Start the crowd as a separate process; it ends before the run does."""
     arguments = [
         sys.executable, __file__, "--port", str(port), "--clients", str(options.clients), "--rate", str(options.rate),
         "--seconds", str(0.8 * options.seconds), "--source", OURSELVES if options.with_role else STRANGER,
@@ -126,7 +126,7 @@ async def start_crowd(options: argparse.Namespace, port: int) -> asyncio.subproc
 
 
 async def watchdog_trips(services: LocalServices) -> str:
-    """Tell how often the watchdogs of the rack and the control PLC have expired."""
+    """Print how often the watchdogs of the rack and the control PLC have expired."""
     trips = []
     for register_map, endpoint in (
         (PLANT_MAP, services.endpoints.plant),
@@ -139,7 +139,7 @@ async def watchdog_trips(services: LocalServices) -> str:
 
 
 async def one_too_many(services: LocalServices, clients: int, source: tuple[str, int]) -> str:
-    """Fill what is left of the connections, and tell what becomes of the next one."""
+    """Fill the remaining connections, and print the result of the next one."""
     end = services.endpoints.control_plc
     statistics = RegisterClient.at(CONTROL_MAP, end)
     await asyncio.sleep(5.0)  # everyone has asked something by now

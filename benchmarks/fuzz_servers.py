@@ -187,7 +187,7 @@ async def provoke(door: Door, data: bytes, tally: Tally) -> None:
 
 
 async def ask(door: Door, pdu: bytes) -> bytes:
-    """Return the answer to a right question, empty when there is none."""
+    """Return the answer to a valid request, empty when there is none."""
     reader, writer = await door.open()
     try:
         writer.write(framed(pdu))
@@ -234,7 +234,7 @@ def text_of(log: Path) -> str:
 
 
 async def fuzz(service: str, services: LocalServices, folder: Path, options: argparse.Namespace) -> tuple[str, bool]:
-    """Fuzz one service; return its line of the table, and whether it stood."""
+    """Fuzz one service; return its line of the table, and whether it passed."""
     chance = random.Random(f"{options.seed} {service}")  # noqa: S311 - must be repeatable
     requests = Requests(MAPS[service], chance, waits=not options.tls)
     door = Door(getattr(services.endpoints, service).port, certificates(folder) if options.tls else [])
@@ -251,11 +251,11 @@ async def fuzz(service: str, services: LocalServices, folder: Path, options: arg
         for data in requests.garbage(options.bytes):
             await provoke(door, data, tally)
         if await ask(door, READ_MAGIC) != MAGIC:
-            tally.failures.append("no right answer to a right question")
+            tally.failures.append("a valid request got no valid answer")
         statistics = await ask(door, READ_STATISTICS)
         tally.served = int.from_bytes(statistics[8:12], "big")
     except ConnectionRefusedError:
-        tally.failures.append("listens no more")
+        tally.failures.append("no longer listens")
     seconds = time.monotonic() - began
     ended = services.ended(service)
     if ended:
@@ -263,7 +263,7 @@ async def fuzz(service: str, services: LocalServices, folder: Path, options: arg
     if "Traceback" in text_of(log):
         tally.failures.append("traceback in its log")
     after = 0.0 if ended else resident_mb(services)[service]
-    outcome = ", ".join(dict.fromkeys(tally.failures)) or "stood"
+    outcome = ", ".join(dict.fromkeys(tally.failures)) or "passed"
     line = _row(
         service, tally.frames, tally.served, tally.sent, tally.received, tally.connections,
         f"{seconds:.0f}", f"{before:.1f}", f"{after:.1f}",
@@ -278,19 +278,19 @@ def _row(service: str, *cells: object) -> str:
 async def main(options: argparse.Namespace) -> int:
     """Fuzz all three; return the exit code."""
     print(_row("service", "frames", "served", "sent", "received", "connections", "seconds", "MB then", "MB now"))
-    stood = True
+    passed = True
     with tempfile.TemporaryDirectory() as folder:
         settings = site(Path(folder)) if options.tls else Settings()
         async with LocalServices(settings, Path(folder)) as services:
             for service in options.service or SERVICES:
-                line, one_stood = await fuzz(service, services, Path(folder), options)
+                line, one_passed = await fuzz(service, services, Path(folder), options)
                 print(line, flush=True)
-                stood = stood and one_stood
-        if not stood:
+                passed = passed and one_passed
+        if not passed:
             for service in SERVICES:
                 log = text_of(Path(folder) / f"{service}.log")
                 print(f"--- the end of the log of {service}", *log.splitlines()[-options.log_lines :], sep="\n")
-    return 0 if stood else 1
+    return 0 if passed else 1
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What becomes of a service that is killed, or stands still, at instants drawn by a seed."""
+"""Kills or suspends a service at random instants and measures the recovery."""
 
 import argparse
 import random
@@ -11,7 +11,7 @@ from coldloop.session.settings import TimeMode
 from rig.chaos.evaluation import Evaluation
 from rig.chaos.experiment import perform
 from rig.chaos.faults import Kill, Pause
-from rig.chaos.plan import Plan
+from rig.chaos.plan import ChaosPlan
 from rig.chaos.progress import ChaosProgress
 from rig.chaos.report import summary_lines, write_report
 from rig.results.folders import claim_folder
@@ -22,7 +22,7 @@ IN_FLIGHT_MS = 20.0
 HOURS = 8
 
 
-def make_plan(options: argparse.Namespace) -> Plan:
+def make_plan(options: argparse.Namespace) -> ChaosPlan:
     """Return a plan with all the instants in one run."""
     draw = random.Random(options.seed)  # noqa: S311 not for secrets
     faults = []
@@ -36,7 +36,7 @@ def make_plan(options: argparse.Namespace) -> Plan:
         faults.append(Kill(kind="kill", **values) if options.signal == "kill" else Pause(kind="pause", **values))
     duration_s = (options.count + 2) * options.gap
     draws = int(duration_s // (HOURS * 3600)) + 1
-    return Plan(
+    return ChaosPlan(
         name=f"{options.signal}-{options.service}",
         description=f"{options.count} times {options.signal} {options.service}",
         load=tuple(f"{HOURS}h@{number}" for number in range(1, draws + 1)),

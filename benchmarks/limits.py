@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from qp_solvers import Recorded, record
+from qp_solvers import RecordedProblem, record
 
 from coldloop.process.lti_model import load
 from coldloop.process.signals import TICK_S
@@ -40,7 +40,7 @@ class Floors(NamedTuple):
 
 @numba.njit(error_model="numpy")
 def steps(x, u, w, box, helium, first, count):  # noqa: ANN001, ANN201 compiled
-    """Go so many ticks forward; `first` evaluates the slope anew each time."""
+    """Advance so many ticks; `first` re-evaluates the slope each time."""
     slope, y = np.empty(28), np.empty(22)
     evaluate(x, u, w, box, helium, slope, y)
     for _ in range(count):
@@ -69,7 +69,7 @@ def seconds(call, *arguments) -> float:  # noqa: ANN001, ANN002 of any function
     return time.perf_counter() - start
 
 
-def floors(problems: list[Recorded], count: int) -> Floors:
+def floors(problems: list[RecordedProblem], count: int) -> Floors:
     """Return the times of the kernels; `count` calls of the plant's, and each problem ten times."""
     model, helium, flow = (
         load(Settings().model.file),

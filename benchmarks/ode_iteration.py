@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from qp_solvers import Recorded, record
+from qp_solvers import RecordedProblem, record
 from scipy.linalg import lapack
 
 from optimizer_plc.computing_settings import OdeSettings
@@ -22,7 +22,7 @@ FLOOR_US = 1.0
 """Nothing of this size takes less: a smaller figure is a mistake of this program."""
 
 
-def lively(problems: list[Recorded]) -> list[Recorded]:
+def lively(problems: list[RecordedProblem]) -> list[RecordedProblem]:
     """Return the problems that do not stall."""
     solver = ode_solver(OdeSettings())
     return [one for one in problems if solver.solve(*one, (ITERATIONS + 1,)).iterations[-1] > ITERATIONS]
@@ -36,7 +36,7 @@ def microseconds(work: Callable[[], object], times: int) -> float:
     return (time.perf_counter() - start) / times * 1e6
 
 
-def iteration_us(problems: list[Recorded]) -> float:
+def iteration_us(problems: list[RecordedProblem]) -> float:
     """Return the mean time of an iteration."""
     solver, total = ode_solver(OdeSettings()), 0.0
     for one in problems:
@@ -45,7 +45,7 @@ def iteration_us(problems: list[Recorded]) -> float:
     return total / ITERATIONS / len(problems)
 
 
-def cholesky_us(problems: list[Recorded]) -> float:
+def cholesky_us(problems: list[RecordedProblem]) -> float:
     """Return the mean time of LAPACK's factorisation of Phi + I, without the copy."""
     matrices = [np.asfortranarray(problem.Phi + np.eye(len(problem.Phi))) for problem, _ in problems]
     return statistics.fmean(microseconds(lambda M=M: lapack.dpotrf(M), 10) for M in matrices)
@@ -57,7 +57,7 @@ def measured(problems: int, minutes: float, repeat: int) -> tuple[float, float, 
     pairs = [(iteration_us(chosen), cholesky_us(chosen)) for _ in range(repeat)]
     iteration, cholesky = (statistics.median(each) for each in zip(*pairs, strict=True))
     if min(iteration, cholesky) < FLOOR_US:
-        raise SystemExit(f"the machine is too busy for this: {iteration:.2f} us and {cholesky:.2f} us are no times")
+        raise SystemExit(f"the machine is too busy to measure: {iteration:.2f} us and {cholesky:.2f} us are no times")
     return iteration, cholesky, len(chosen)
 
 

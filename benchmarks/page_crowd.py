@@ -67,7 +67,7 @@ async def crowd(options: argparse.Namespace) -> None:
 
 
 async def measure(options: argparse.Namespace, browsers: int | None, folder: Path) -> tuple[LinkStatistics, str]:
-    """Run the loop beside so many browsers, or without the page; return how well it kept time, and what they got."""
+    """Run the loop under so many browsers, or without the page; return its timing and what they received."""
     settings = load_configuration(Settings, environment={}).settings
     ticks = round(options.seconds / TICK_S)
     scenario = Scenario(ticks, find_load("a", load_model(settings.model.file).w0), 0.0, 1, realtime=True)
@@ -91,7 +91,7 @@ async def measure(options: argparse.Namespace, browsers: int | None, folder: Pat
 
 
 async def start_crowd(options: argparse.Namespace, browsers: int, port: int) -> asyncio.subprocess.Process:
-    """Start the browsers as a process of their own; they leave before the run ends."""
+    """Start the browsers as a separate process; they leave before the run ends."""
     return await asyncio.create_subprocess_exec(
         sys.executable, __file__, "--address", f"http://127.0.0.1:{port}/", "--browsers", str(browsers),
         "--seconds", str(0.8 * options.seconds), stdout=subprocess.PIPE,

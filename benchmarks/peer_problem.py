@@ -17,7 +17,7 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load
 from optimizer_plc.qp.design import ControlDesign, trivial_design
 from optimizer_plc.qp.prediction import PredictionModel, state_weights
-from optimizer_plc.qp.problem import PredictiveProblem, Situation
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from optimizer_plc.settings import ProgramSettings, SolverName
 from optimizer_plc.solvers import make_solver
 from rig.settings import Settings
@@ -34,7 +34,7 @@ def solved(prediction: PredictionModel, design: ControlDesign, limits: InputLimi
     times = []
     for _ in range(6):
         start = time.perf_counter()
-        qp = problem.at(Situation(np.zeros(prediction.n_states), LOAD_STEP_W, at_rest))
+        qp = problem.at(QpParameters(np.zeros(prediction.n_states), LOAD_STEP_W, at_rest))
         answer = solver.solve(qp, problem.hold(at_rest), (ITERATIONS,))
         times.append(time.perf_counter() - start)
     return statistics.median(times[1:]), answer.cost + float(qp.constant)

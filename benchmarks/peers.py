@@ -1,8 +1,8 @@
 """Coldloop beside general tools: exchanges a second of the same data between two processes, and one predictive problem.
 
-Each exchange carries what plant and control PLC tell each other in a tick: 51 numbers one way and 4 the other. Neither
+Each exchange carries the data of plant and control PLC in a tick: 51 numbers one way and 4 the other. Neither
 side computes anything, so a framework's figure is its upper limit; Coldloop's lock-step (`lockstep.py`, of the same
-run) has plant, control PLC and solver in it. Coldloop and mosaik act in turn, the one on what the other has just told;
+run) has plant, control PLC and solver in it. Coldloop and mosaik act in turn, the one on what the other has just sent;
 so does HELICS, and again with both sides at once, which hides one of the two ways but is another coupling. The problem
 (`peer_problem.py`) is stated in do-mpc, with every sample of the horizon a decision, and solved by IPOPT; Coldloop
 solves the same one, and that of the paper's seven instants.
@@ -34,7 +34,7 @@ def helics_federate(core: str, name: str, other: str, numbers: int, exchanges: i
     """Exchange vectors once a second of simulated time; return exchanges a second of real time.
 
     In turn, the plant has the halves of seconds: each side sees what the other made of its last vector, as a controller
-    and a plant do, and Coldloop's control PLC and rack. Otherwise both tell and hear at the same time.
+    and a plant do, and Coldloop's control PLC and rack. Otherwise both send and receive at the same time.
     """
     import helics as h  # noqa: PLC0415 in its own environment
 
@@ -82,7 +82,7 @@ def helics_exchanges(core: str, exchanges: int, *, in_turn: bool) -> float:
 
 
 def mosaik_side(numbers: int) -> Any:  # noqa: ANN401 a class of a package that may not be there
-    """Return a simulator that tells so many numbers in each step."""
+    """Return a simulator that sends so many numbers in each step."""
     import mosaik_api_v3  # noqa: PLC0415
 
     model = {"public": True, "params": [], "attrs": ["told", "heard"]}
@@ -104,14 +104,14 @@ def mosaik_side(numbers: int) -> Any:  # noqa: ANN401 a class of a package that 
             return time + 1
 
         def get_data(self, outputs: dict[str, list[str]]) -> dict[str, dict[str, list[float]]]:
-            """Tell the numbers."""
+            """Return the numbers."""
             return {entity: {"told": [float(self.tick)] * numbers} for entity in outputs}
 
     return Side()
 
 
 def mosaik_exchanges(exchanges: int) -> float:
-    """Return exchanges a second between two simulators in processes of their own."""
+    """Return exchanges a second between two simulators in separate processes."""
     import mosaik  # noqa: PLC0415
 
     command = f"{sys.executable} {__file__} --mosaik-side {{}} %(addr)s"
@@ -190,10 +190,10 @@ def do_mpc_solved(problem: dict[str, Any], repeat: int) -> tuple[float, float]:
 def compare_problem(coldloop: Path, repeat: int) -> None:
     """Print the times and costs of one problem."""
     own = subprocess.run([coldloop, Path(__file__).with_name("peer_problem.py")], check=True, capture_output=True)
-    told = json.loads(own.stdout)
-    for name, (seconds, cost) in told["own"].items():
+    answer = json.loads(own.stdout)
+    for name, (seconds, cost) in answer["own"].items():
         print(f"Coldloop, {name}: {seconds * 1000:.2f} ms a problem, J {cost:.3f}", flush=True)
-    seconds, cost = do_mpc_solved(told["problem"], repeat)
+    seconds, cost = do_mpc_solved(answer["problem"], repeat)
     print(f"do-mpc, every sample: {seconds * 1000:.2f} ms a problem, J {cost:.3f}", flush=True)
 
 

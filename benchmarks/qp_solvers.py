@@ -38,20 +38,20 @@ EQUAL = 1e-9
 """Relative rise of J that is rounding."""
 
 
-class Recorded(NamedTuple):
-    """What a solver was started with."""
+class RecordedProblem(NamedTuple):
+    """Problem and guess of a solve."""
 
     problem: QuadraticProblem
     guess: Array
 
 
-class Listener:
-    """A solver that remembers what it was started with."""
+class RecordingSolver:
+    """A solver that records its problems and guesses."""
 
     def __init__(self, solver: Solver) -> None:
         self._solver = solver
         self.alpha, self.tau_1_s = solver.alpha, solver.tau_1_s
-        self.heard: list[Recorded] = []
+        self.heard: list[RecordedProblem] = []
 
     def reset(self) -> None:
         """Pass on."""
@@ -59,26 +59,24 @@ class Listener:
 
     def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
         """Remember, and pass on."""
-        self.heard.append(Recorded(problem, guess.copy()))
+        self.heard.append(RecordedProblem(problem, guess.copy()))
         return self._solver.solve(problem, guess, counts)
 
 
-def record(hours: str, minutes: float, period_s: float) -> list[Recorded]:
+def record(hours: str, minutes: float, period_s: float) -> list[RecordedProblem]:
     """Run the loop with the ODE-based solver; return its problems and guesses."""
     settings = Settings()
-    heard: list[Recorded] = []
+    heard: list[RecordedProblem] = []
     for hour in hours:
         rig = OneProcessRig(settings)
-        listener = Listener(make_solver(settings.optimizer_plc.program))
+        listener = RecordingSolver(make_solver(settings.optimizer_plc.program))
         rig.optimizer.solver = listener
         ticks = round(240 * minutes)
         rig.run(Scenario(ticks, find_load(hour, load(settings.model.file).w0), period_s, seed=1), Recorder(ticks))
         heard += listener.heard
     matrices = {"Phi": heard[0].problem.Phi, "Gamma": heard[0].problem.Gamma}
     floor = settings.optimizer_plc.program.adaptive.cost_floor
-    return [
-        Recorded(problem._replace(**matrices, constant=problem.constant + floor), guess) for problem, guess in heard
-    ]
+    return [RecordedProblem(qp._replace(**matrices, constant=qp.constant + floor), guess) for qp, guess in heard]
 
 
 def lowest_cost(qp: QuadraticProblem, alpha: float) -> float:
@@ -97,7 +95,7 @@ def lowest_cost(qp: QuadraticProblem, alpha: float) -> float:
     return float(lowest) + qp.constant
 
 
-def paths(solver: Solver, problems: list[Recorded], iterations: int) -> Array:
+def paths(solver: Solver, problems: list[RecordedProblem], iterations: int) -> Array:
     """Return J after 0, 1, ... iterations, a row for each problem."""
     costs = np.empty((len(problems), iterations + 1))
     for row, (problem, guess) in zip(costs, problems, strict=True):
@@ -115,7 +113,7 @@ def smallest_l(costs: Array, starts: int | None) -> str:
     return f"> {costs.shape[1] - 1}"
 
 
-def times(solver: Solver, problems: list[Recorded], count: int) -> tuple[float, float]:
+def times(solver: Solver, problems: list[RecordedProblem], count: int) -> tuple[float, float]:
     """Return the median times, in us, of a start and of `count` iterations."""
     starts, iterations = [], []
     for problem, guess in problems:
@@ -128,7 +126,7 @@ def times(solver: Solver, problems: list[Recorded], count: int) -> tuple[float, 
     return float(np.median(starts)) * 1e6, float(np.median(iterations)) * 1e6
 
 
-def report_cuts(name: str, problems: list[Recorded], best: Array, harsh: NDArray[np.bool_]) -> None:
+def report_cuts(name: str, problems: list[RecordedProblem], best: Array, harsh: NDArray[np.bool_]) -> None:
     """Print the accuracy on harsh problems when every problem of the sequence is cut off at the same count."""
     cells = []
     for count in COUNTS:
@@ -145,7 +143,7 @@ def report_cuts(name: str, problems: list[Recorded], best: Array, harsh: NDArray
     print(f"{name:14}", *cells, f"{primal:8.1e} {dual:8.1e}")
 
 
-def report_paths(name: str, problems: list[Recorded], harsh: NDArray[np.bool_], iterations: int) -> None:
+def report_paths(name: str, problems: list[RecordedProblem], harsh: NDArray[np.bool_], iterations: int) -> None:
     """Print times and monotonicity."""
     settings = ProgramSettings(solver=SolverName(name))
     warm_up = make_solver(settings)
@@ -185,12 +183,12 @@ def main() -> None:
     for name in names:
         report_paths(name, problems, harsh, options.iterations)
     if harsh.any():
-        print("\nharsh problems, J / J* (median / largest), begun at the guess or at a point of their own, cut off at")
+        print("\nharsh problems, J / J* (median / largest), begun at the guess or at their own point, cut off at")
         chosen = [one for one, hard in zip(problems, harsh, strict=True) if hard]
         report_interior_points(chosen, best[harsh], alpha)
 
 
-def report_interior_points(problems: list[Recorded], best: Array, alpha: float) -> None:
+def report_interior_points(problems: list[RecordedProblem], best: Array, alpha: float) -> None:
     """Print the accuracy of our interior point and of libraries after few iterations, each problem begun cold."""
     peers = installed_peers()
     print(f"\n{'':14}", *(f"{count:21}" for count in (*FEW, TO_THE_END)), " ms a solve")

@@ -29,7 +29,7 @@ LOOK_S: Final = 0.005
 
 
 def answered(port: int) -> bool:
-    """Tell whether a server answers a request for its first registers."""
+    """Return whether a server answers a request for its first registers."""
     try:
         with socket.create_connection((HOST, port), timeout=5.0) as client:
             client.sendall(READ_MAGIC)

@@ -94,7 +94,7 @@ def examine(service: str, read: Read) -> None:
         time.sleep(PAUSE_S)
         if identity(read) != first:
             return
-    raise UnhealthyError(f"stands at tick {first.tick}")
+    raise UnhealthyError(f"stays at tick {first.tick}")
 
 
 def identity(read: Read) -> Identity:
@@ -114,7 +114,7 @@ def number(data: bytes, low_first: bool) -> int:  # noqa: FBT001 - as the regist
 
 
 def in_real_time(service: str, now: Identity, read: Read) -> bool:
-    """Tell whether the session goes by the clock: as somebody started it, or by the configuration."""
+    """Return whether the session goes by the clock: as somebody started it, or by the configuration."""
     block = read(SESSIONS[service], 3)
     if number(block[:4], now.low_first) == now.session:
         return block[4:6] != b"\0\0"

@@ -152,7 +152,7 @@ PARTS: Final[dict[str, tuple[Callable[[], None], int]]] = {
 
 
 def compile_parts(parts: Sequence[str]) -> bool:
-    """Compile parts in parallel, those first that are named first; tell whether all went well."""
+    """Compile parts in parallel, those first that are named first; return whether all went well."""
     waiting, processes, done = list(parts), dict[str, subprocess.Popen[bytes]](), set[str]()
     cores, began = os.cpu_count() or 1, time.monotonic()
     total_s = max(sum(PARTS[part][1] for part in parts) / cores, *(PARTS[part][1] for part in parts))

@@ -1,4 +1,4 @@
-"""What is seen while a run goes on: simulated time, speed, and the state of the loop in one line."""
+"""The progress line of a run: simulated time, speed and the state of the loop."""
 
 import os
 import time

@@ -1,4 +1,4 @@
-"""Work that goes on until Ctrl-C or SIGTERM: that is how it ends, and it ends in good order."""
+"""Work that runs until Ctrl-C or SIGTERM and then ends cleanly."""
 
 import asyncio
 import signal
@@ -10,7 +10,7 @@ from rig.interruption import INTERRUPTION
 
 
 def run_until_interrupted(start: Callable[[], Coroutine[Any, Any, None]]) -> bool:
-    """Run a coroutine to its end, or cancel it at the first signal; tell whether a signal ended it."""
+    """Run a coroutine to its end, or cancel it at the first signal; return whether a signal ended it."""
     interrupted = False
 
     async def watched() -> int:

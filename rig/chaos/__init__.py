@@ -1,1 +1,1 @@
-"""Faults on purpose: chaos plans, the proxies and processes they act on, and what came of them."""
+"""Fault injection: chaos plans, their proxies and processes, and the evaluation."""

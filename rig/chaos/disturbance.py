@@ -1,4 +1,4 @@
-"""What happens to the frames of a disturbed link: decisions only, no sockets."""
+"""Decides how each frame of a disturbed link is forwarded; no sockets."""
 
 import random
 from collections.abc import Iterable
@@ -24,17 +24,17 @@ UNIT: Final = 6
 """Where a frame has its unit; the function comes next."""
 
 
-class Outcome(NamedTuple):
-    """What becomes of one frame."""
+class FrameAction(NamedTuple):
+    """How one frame is forwarded."""
 
     data: bytes
-    """What goes on, with what was held back before."""
+    """Bytes to forward, with any that were held back before."""
     delay_s: float = 0.0
-    """How much later."""
+    """Delay before forwarding."""
     close: bool = False
-    """Whether the connection is closed behind it."""
+    """Whether the connection is closed afterwards."""
     reset: bool = False
-    """Whether that is a reset."""
+    """Whether it is closed by a reset (RST)."""
 
 
 class Mangler:
@@ -52,8 +52,8 @@ class Mangler:
         self.hold_s: float | None = None
         """While a frame is held back: how long, unless another one comes."""
 
-    def decide(self, frame: bytes, faults: Iterable[FrameFault]) -> Outcome:  # noqa: C901 a branch for each kind
-        """Return what becomes of a frame under the faults that are on."""
+    def decide(self, frame: bytes, faults: Iterable[FrameFault]) -> FrameAction:  # noqa: C901 a branch for each kind
+        """Return how a frame is forwarded under the active faults."""
         pieces, delay_s, overtaken = [frame], 0.0, self.release()
         for fault in faults:
             if fault.direction not in {Direction.BOTH, self.direction}:
@@ -62,10 +62,10 @@ class Mangler:
                 delay_s += max(0.0, fault.delay_ms + fault.jitter_ms * self._draw.uniform(-1, 1)) / 1000
             elif isinstance(fault, Truncate):
                 if pieces and self._hit(fault.share):
-                    return Outcome(b"".join(pieces[:-1]) + pieces[-1][: len(pieces[-1]) // 2], delay_s, close=True)
+                    return FrameAction(b"".join(pieces[:-1]) + pieces[-1][: len(pieces[-1]) // 2], delay_s, close=True)
             elif isinstance(fault, Abort):
                 if pieces and self._hit(fault.share):
-                    return Outcome(b"", delay_s, close=True, reset=True)
+                    return FrameAction(b"", delay_s, close=True, reset=True)
             elif isinstance(fault, Reorder):
                 if pieces and not overtaken and self._hit(fault.share):
                     self._held, self.hold_s = pieces.pop(), fault.hold_ms / 1000
@@ -73,15 +73,15 @@ class Mangler:
                 pieces = [new for piece in pieces for new in self._instead(piece, fault)]
             else:
                 raise TypeError(f"no frame is disturbed by {fault.kind}: add a branch")
-        return Outcome(b"".join([*pieces, overtaken]), delay_s)
+        return FrameAction(b"".join([*pieces, overtaken]), delay_s)
 
     def release(self) -> bytes:
-        """Return what is held back; it is let go."""
+        """Return the held frame and clear it."""
         held, self._held, self.hold_s = self._held, b"", None
         return held
 
     def _instead(self, piece: bytes, fault: Replacing) -> list[bytes]:
-        """Return what goes on in the place of a frame."""
+        """Return the frames that replace `piece`."""
         if not self._hit(fault.share):
             return [piece]
         if isinstance(fault, Drop):

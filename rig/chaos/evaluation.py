@@ -148,7 +148,7 @@ def _largest(steps: NDArray[np.float64]) -> Triple:
 
 
 def _outside(recording: Recording, bands: Bands) -> NDArray[np.bool_]:
-    """Tell for each tick whether L1 and T5 are outside, (N, 2); a tick that is not known is not."""
+    """Return for each tick whether L1 and T5 are outside, (N, 2); False for unknown ticks."""
     y = recording.y[:, [L1, T5]]
     outside: NDArray[np.bool_] = (y < np.array(bands.low)) | (y > np.array(bands.high))
     return outside

@@ -8,7 +8,7 @@ from coldloop.config import Configuration
 from coldloop.errors import LinkError
 from coldloop.process.lti_model import load as load_model
 from rig.chaos.evaluation import Evaluation, evaluate
-from rig.chaos.plan import Plan
+from rig.chaos.plan import ChaosPlan
 from rig.chaos.runner import conduct
 from rig.chaos.sequencer import Progress
 from rig.chaos.trace import ChaosTrace
@@ -33,7 +33,7 @@ class Experiment(NamedTuple):
 
 
 def perform(
-    plan: Plan,
+    plan: ChaosPlan,
     effective: Configuration[Settings],
     folder: Path,
     progress: Progress,

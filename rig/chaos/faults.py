@@ -66,7 +66,7 @@ class Fault(BaseModel):
 
     @property
     def stops_time(self) -> bool:
-        """Whether plant time cannot go on under it in lock-step: the plant and the control PLC make it."""
+        """Whether it stops plant time in lock-step: plant and control PLC advance it."""
         return bool(self.processes & {"plant", "control_plc"})
 
 
@@ -77,7 +77,7 @@ class LinkFault(Fault):
 
     @property
     def in_words(self) -> str:
-        """What it is, and how often frames are hit."""
+        """Kind of the fault, and the share of frames hit."""
         given = self.model_dump(mode="json", exclude={"at_s", "duration_s", "kind", "link"})
         return " ".join([self.kind, *(f"{name}={value}" for name, value in given.items())])
 
@@ -88,7 +88,7 @@ class LinkFault(Fault):
 
 
 class FrameFault(LinkFault):
-    """Something that happens to single frames."""
+    """A fault of single frames."""
 
     direction: Direction = Direction.BOTH
 
@@ -133,7 +133,7 @@ class Reorder(FrameFault):
 
 
 class Reset(LinkFault):
-    """All connections are reset (RST), and new ones as long as it lasts."""
+    """All connections are reset (RST), and new ones while the fault lasts."""
 
     kind: Literal["reset"]
 
@@ -174,7 +174,7 @@ class WrongUnit(FrameFault):
 
 
 class ExceptionAnswer(FrameFault):
-    """An exception in the place of the server's answer; the server has done what it was asked for."""
+    """An exception instead of the server's answer; the server has carried out the request."""
 
     kind: Literal["exception"]
     direction: Literal[Direction.ANSWERS] = Direction.ANSWERS
@@ -221,7 +221,7 @@ class Restart(ProcessFault):
 
 
 class Clock(Fault):
-    """A jump of the clock as all three processes see it: all are paused, and go on."""
+    """A jump of the clock as all three processes see it: all are suspended and resumed."""
 
     kind: Literal["clock"]
 
@@ -247,9 +247,9 @@ class Sensor(Fault):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.output not in OUTPUT_NAMES:
-            raise ValueError(f"there is no output '{self.output}'; take one of {', '.join(OUTPUT_NAMES)}")
+            raise ValueError(f"unknown output '{self.output}'; choose one of {', '.join(OUTPUT_NAMES)}")
         if (self.shows == "value") != (self.value is not None):
-            raise ValueError('a value goes with shows = "value", and only with that')
+            raise ValueError('give `value` with shows = "value", and only then')
         return self
 
     @property
@@ -258,7 +258,7 @@ class Sensor(Fault):
         return f"sensor {self.output} {self.shows if self.value is None else f'= {self.value:g}'}"
 
 
-class Given(Fault):
+class BoundaryFault(Fault):
     """Something that a refrigerator is given is otherwise: a compressor trips, nitrogen runs out, helium leaks."""
 
     kind: Literal["given"]
@@ -293,6 +293,6 @@ AnyLinkFault = Annotated[
 ]
 AnyFault = Annotated[
     AnyLinkFault
-    | Kill | Pause | Restart | Clock | Sensor | Given | WrongModel,
+    | Kill | Pause | Restart | Clock | Sensor | BoundaryFault | WrongModel,
     Field(discriminator="kind"),
 ]  # fmt: skip

@@ -13,8 +13,8 @@ from coldloop.registers.plant import SensorFault, SensorFaultKind
 from rig.chaos.faults import (
     SERVICE_OF,
     AnyFault,
+    BoundaryFault,
     Clock,
-    Given,
     Kill,
     Link,
     LinkFault,
@@ -39,7 +39,7 @@ class PlantWriter(Protocol):
         """Write the fault of an output, by its index; return whether the plant has taken it."""
 
     async def change_surroundings(self, target: str, value: float) -> float | None:
-        """Change one of the surroundings; return what it was, None if the plant has not taken it."""
+        """Change one of the surroundings; return its old value, None if the plant has not accepted it."""
 
 
 class Injector:
@@ -73,7 +73,7 @@ class Injector:
                 self._services.pause(service)
         elif isinstance(fault, Sensor):
             await self._set_sensor(fault.output, SensorFault(_SHOWN[fault.shows], fault.value or 0.0))
-        elif isinstance(fault, Given):
+        elif isinstance(fault, BoundaryFault):
             before = await self._give(fault.target, fault.value)
             self._given_before.setdefault(fault.target, before)
         elif isinstance(fault, WrongModel):
@@ -95,7 +95,7 @@ class Injector:
                 self._services.resume(service)
         elif isinstance(fault, Sensor):
             await self._set_sensor(fault.output, SensorFault(SensorFaultKind.NONE, 0.0))
-        elif isinstance(fault, Given):
+        elif isinstance(fault, BoundaryFault):
             await self._give(fault.target, self._given_before.pop(fault.target))
         elif isinstance(fault, WrongModel):
             await self._services.stop("optimizer_plc", signal.SIGTERM)
@@ -109,11 +109,11 @@ class Injector:
             if before is not None:
                 return before
             await asyncio.sleep(0.5)
-        raise LinkError(f"the plant took no {target} = {value:g}: see its log")
+        raise LinkError(f"the plant did not accept {target} = {value:g}: see its log")
 
     async def _set_sensor(self, output: str, fault: SensorFault) -> None:
         for _ in range(ATTEMPTS):
             if await self._plant.set_sensor_fault(OUTPUT_NAMES.index(output), fault):
                 return
             await asyncio.sleep(0.5)
-        raise LinkError(f"the plant took no sensor fault for {output}: see its log")
+        raise LinkError(f"the plant did not accept a sensor fault for {output}: see its log")

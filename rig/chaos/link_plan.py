@@ -1,4 +1,4 @@
-"""Plans of a proxy that stands alone: TOML files that say what goes wrong in its link, and when."""
+"""Plans of a stand-alone proxy: TOML files with the faults of its link and their times."""
 
 from typing import Annotated, Any, NamedTuple
 
@@ -9,7 +9,7 @@ from rig.chaos.faults import AnyLinkFault, Link, LinkFault
 DAY_S = 86_400.0
 
 
-class Change(NamedTuple):
+class FaultTransition(NamedTuple):
     """A fault begins or ends."""
 
     at_s: float
@@ -19,7 +19,7 @@ class Change(NamedTuple):
 
 
 class LinkPlan(BaseModel):
-    """What happens to a link. Instants are real time, from the start of the proxy."""
+    """Faults of one link. Instants are real time, from the start of the proxy."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -37,13 +37,13 @@ class LinkPlan(BaseModel):
             raise ValueError("this is a chaos plan; a proxy's plan has only `seed` and `faults` (docs/chaos.md)")
         return {**content, "faults": [_completed(fault) for fault in content["faults"]]}
 
-    def changes(self) -> list[Change]:
+    def changes(self) -> list[FaultTransition]:
         """Return when faults begin and end, in the order of time."""
         changes = []
         for fault in self.faults:
             begin_s = fault.at_s or 0.0
-            changes.append(Change(begin_s, begins=True, fault=fault))
-            changes.append(Change(begin_s + fault.duration_s, begins=False, fault=fault))
+            changes.append(FaultTransition(begin_s, begins=True, fault=fault))
+            changes.append(FaultTransition(begin_s + fault.duration_s, begins=False, fault=fault))
         return sorted(changes, key=lambda change: change.at_s)
 
 

@@ -1,4 +1,4 @@
-"""A proxy of its own, before any Modbus/TCP server: a link that is disturbed by plan, in real time."""
+"""A stand-alone proxy in front of any Modbus/TCP server: disturbs the link by plan, in real time."""
 
 import asyncio
 from collections.abc import Callable
@@ -16,7 +16,7 @@ async def disturb(plan: LinkPlan, listen: tuple[str, int], target: Endpoint, say
         plan: What goes wrong, and when.
         listen: Address and port to listen at.
         target: The server.
-        say: Hears in lines where the proxy listens, what begins and ends, and why the server took no connection.
+        say: Called with lines: where the proxy listens, faults that begin and end, refused connections.
 
     Raises:
         UsageError: It cannot listen there.

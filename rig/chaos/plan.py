@@ -14,7 +14,7 @@ from coldloop.process.signals import TICK_S
 from coldloop.session.settings import TimeMode
 from plant.load import concatenated, find_load, named_families, telegraph
 from plant.settings import PlantKind
-from rig.chaos.faults import AnyFault, Given
+from rig.chaos.faults import AnyFault, BoundaryFault
 from rig.chaos.link_plan import LinkPlan
 from rig.cosim.scenario import Scenario
 from rig.settings import Settings
@@ -33,7 +33,7 @@ SPREAD_S: Final = 20.0
 """Drawn faults begin up to so much after their multiple of `every_s`: anywhere in an updating period."""
 
 
-class Plan(BaseModel):
+class ChaosPlan(BaseModel):
     """A run and its faults."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -52,8 +52,8 @@ class Plan(BaseModel):
     updating_period_s: Annotated[float, Field(ge=0, le=5)] = 0.0
     """0 is adaptive."""
     standstill_s: Annotated[float, Field(gt=0, le=600)] = 8.0
-    """In lock-step a fault under which plant time does not go on ends after so much real time. The control PLC gives an
-    optimiser up that does not go on for `control_plc.ladder.optimizer_patience_s`, and goes on."""
+    """In lock-step a fault that stops plant time ends after this real time. The control PLC drops an
+    optimiser that is silent for `control_plc.ladder.optimizer_patience_s`, and continues."""
     faults: tuple[AnyFault, ...] = ()
     every_s: Annotated[float, Field(ge=2 * SPREAD_S)] | None = None
     """Draw a fault so often, from `draw`."""
@@ -66,19 +66,19 @@ class Plan(BaseModel):
         if any(fault.at_s is not None for fault in self.draw):
             raise ValueError("those in `draw` have no at_s: their instants are drawn")
         if (self.every_s is None) != (not self.draw):
-            raise ValueError("every_s and `draw` go together")
+            raise ValueError("give every_s and `draw` together")
         if any(fault.tick >= self.ticks for fault in self.faults):
             raise ValueError(f"a fault begins after the end of the run, {self.duration_s:g} s")
         _refuse_overlaps(self.schedule())
-        if any(isinstance(fault, Given) for fault in (*self.faults, *self.draw)) and (
+        if any(isinstance(fault, BoundaryFault) for fault in (*self.faults, *self.draw)) and (
             self.plant is not PlantKind.REFRIGERATOR
         ):
-            raise ValueError('a fault of kind "given" is one of a refrigerator: write plant = "refrigerator"')
+            raise ValueError('a fault of kind "given" needs plant = "refrigerator"')
         return self
 
     @property
     def realtime(self) -> bool:
-        """Whether the clock makes time go on."""
+        """Whether plant time follows the clock."""
         return self.mode is TimeMode.REALTIME
 
     @property
@@ -132,7 +132,7 @@ class Plan(BaseModel):
 
 
 def _refuse_overlaps(schedule: list[AnyFault]) -> None:
-    """Refuse a process that is to be stopped while it is stopped."""
+    """Reject a second stop of a process that is already stopped."""
     for number, fault in enumerate(schedule):
         for later in schedule[number + 1 :]:
             if later.tick >= fault.end_tick:
@@ -153,14 +153,14 @@ def _load(load: str | tuple[str, ...], mean_w: float) -> LoadProfile:
     return concatenated([telegraph(family, mean_w) for family in families])
 
 
-def shipped_plans() -> list[Plan]:
+def shipped_plans() -> list[ChaosPlan]:
     """Return the plans that come with Coldloop, by name."""
     entries = [entry for entry in SHIPPED.iterdir() if entry.name.endswith(".toml")]
     plans = [parse_plan(entry.read_text(encoding="utf-8"), entry.name, {}) for entry in entries]
     return sorted(plans, key=lambda plan: plan.name)
 
 
-def find_plan(name: str, changes: dict[str, Any]) -> Plan:
+def find_plan(name: str, changes: dict[str, Any]) -> ChaosPlan:
     """Return a shipped plan, or that of a file, with some of its values changed.
 
     Raises:
@@ -195,14 +195,14 @@ def _text_of(name: str) -> str:
         raise UsageError(f"{name}: {error.strerror}; name a readable TOML file") from None
 
 
-def parse_plan(text: str, source: str, changes: dict[str, Any]) -> Plan:
+def parse_plan(text: str, source: str, changes: dict[str, Any]) -> ChaosPlan:
     """Return the plan that a TOML text holds, with some of its values changed."""
     content = _content(text, source)
     if "duration_s" in changes:  # a shorter run has fewer faults
         content["faults"] = [
             fault for fault in content.get("faults", []) if _begins_before(fault, changes["duration_s"])
         ]
-    return _validated(Plan, {**content, **changes}, source)
+    return _validated(ChaosPlan, {**content, **changes}, source)
 
 
 def _content(text: str, source: str) -> dict[str, Any]:

@@ -55,7 +55,7 @@ class LinkProxies:
 class ProxiedServices:
     """Processes of the three services, whose clients are pointed at proxies; an async context in which they run.
 
-    The control PLC and the plant keep their state in the folder: one that is killed and started again goes on.
+    The control PLC and the plant keep their state in the folder: one that is killed and restarted resumes.
 
     Args:
         settings: Their configuration.

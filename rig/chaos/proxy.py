@@ -24,11 +24,11 @@ class LinkProxy:
     Args:
         port: Where to listen; 0 takes any free port.
         target: The server.
-        seed: Decides what happens to which frame, with the number of the connection.
+        seed: Decides, with the number of the connection, how each frame is forwarded.
         host: The address of this machine to listen at.
-        tell: Hears in a line of each connection that the server did not take.
+        tell: Called with a line for each connection that the server did not accept.
 
-    A frame is not read before the one in front of it has gone on, so nothing piles up here: what waits, waits in the
+    A frame is not read before the previous one has been forwarded, so nothing piles up here: what waits, waits in the
     buffers of TCP.
     """
 
@@ -97,7 +97,7 @@ class LinkProxy:
             self._open.update(ends)
             await self._pass_both_ways((reader, writer), (far_reader, far_writer))
         except OSError as error:
-            reset(writer)  # nobody listens behind the proxy: as if nobody listened here
+            reset(writer)  # no server behind the proxy: refuse, as if none listened here
             if self._tell is not None:
                 self._tell(f"{self._target.host}:{self._target.port}: {error.strerror or error}")
         except asyncio.CancelledError:  # the proxy is being closed: what is not sent yet is not waited for
@@ -148,7 +148,7 @@ class LinkProxy:
                         return
 
     async def _pass(self, frame: bytes, writer: asyncio.StreamWriter, mangler: Mangler) -> bool:
-        """Do with a frame what is decided; tell whether the connection is to go on."""
+        """Forward a frame as decided; return whether the connection stays open."""
         outcome = mangler.decide(frame, [fault for fault in self._faults if isinstance(fault, FrameFault)])
         if outcome.delay_s > 0:
             await asyncio.sleep(outcome.delay_s)

@@ -10,7 +10,7 @@ from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind, AlarmState
 from rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
-from rig.chaos.plan import Plan
+from rig.chaos.plan import ChaosPlan
 from rig.chaos.trace import ChaosTrace
 from rig.results.folders import whole_file, write_json
 
@@ -43,16 +43,16 @@ def as_markdown(cells: Sequence[Sequence[str]]) -> str:
 
 
 def write_report(
-    folder: Path, plan: Plan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
+    out: Path, plan: ChaosPlan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
 ) -> None:
     """Write chaos.json and chaos.md."""
-    write_json(folder / "chaos.json", document(plan, trace, evaluation, hashes, failure))
+    write_json(out / "chaos.json", document(plan, trace, evaluation, hashes, failure))
     text = _page(plan, trace, evaluation, failure)
-    whole_file(folder / "chaos.md", lambda draft: draft.write_text(text, encoding="utf-8"))
+    whole_file(out / "chaos.md", lambda draft: draft.write_text(text, encoding="utf-8"))
 
 
 def document(
-    plan: Plan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
+    plan: ChaosPlan, trace: ChaosTrace, evaluation: Evaluation, hashes: dict[str, str], failure: str | None
 ) -> dict[str, Any]:
     """Return what chaos.json holds."""
     return {
@@ -78,7 +78,7 @@ def document(
 
 
 def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
-    """Return what is said below the table."""
+    """Return the lines below the table."""
     steps = ", ".join(f"{name} {step:.3f}" for name, step in zip(INPUT_NAMES, evaluation.largest_steps, strict=True))
     outside, was = evaluation.outside_s, evaluation.undisturbed_s
     lines = [
@@ -88,9 +88,9 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
     ]
     if trace.ladder is not None:
         lines.append(f"mode at the end: {Mode(trace.ladder.mode).name}, {trace.ladder.events} events")
-    standing = [AlarmKind(i).name for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
-    if standing:
-        lines.append(f"alarms that stand or wait for an operator: {', '.join(standing)}")
+    active = [AlarmKind(i).name for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
+    if active:
+        lines.append(f"alarms active or unacknowledged: {', '.join(active)}")
     return [*lines, *_resource_lines(trace)]
 
 
@@ -108,7 +108,7 @@ def _resource_lines(trace: ChaosTrace) -> list[str]:
     return lines
 
 
-def _page(plan: Plan, trace: ChaosTrace, evaluation: Evaluation, failure: str | None) -> str:
+def _page(plan: ChaosPlan, trace: ChaosTrace, evaluation: Evaluation, failure: str | None) -> str:
     lines = [
         f"# Chaos plan {plan.name}\n",
         f"{plan.description}\n",

@@ -9,7 +9,7 @@ from rig.cosim.wiring import SERVICES
 
 
 def resident_mb(services: LocalServices) -> dict[str, float]:
-    """Return the resident memory of the services that run, where the system tells it (Linux)."""
+    """Return the resident memory of the services that run, where the system reports it (Linux)."""
     sizes = {}
     for service, process in services.processes.items():
         with contextlib.suppress(OSError):

@@ -10,7 +10,7 @@ from coldloop.process.signals import TICK_S
 from rig.chaos.faults import WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
-from rig.chaos.plan import Plan
+from rig.chaos.plan import ChaosPlan
 from rig.chaos.proxied_services import ProxiedServices
 from rig.chaos.sequencer import FaultSequencer, Progress
 from rig.chaos.trace import ChaosTrace
@@ -25,7 +25,7 @@ SLOWEST: Final = 20.0
 
 
 async def conduct(
-    plan: Plan,
+    plan: ChaosPlan,
     scenario: Scenario,
     settings: Settings,
     folder: Path,
@@ -36,7 +36,7 @@ async def conduct(
     """Run a plan on three services started for it; `trace`, a sink of the recorder, has what there was.
 
     Raises:
-        LinkError: A service ended by itself, the rig stood still, or it all took too long.
+        LinkError: A service ended by itself, plant time stopped, or the run took too long.
     """
     if any(isinstance(fault, WrongModel) for fault in plan.schedule()):  # not while the clock is running
         await asyncio.to_thread(save_wrong_model, settings.model.file, folder / WRONG_MODEL)
@@ -63,7 +63,7 @@ async def conduct(
             await client.last_look()
 
 
-def _patience_s(plan: Plan) -> float:
+def _patience_s(plan: ChaosPlan) -> float:
     schedule = plan.schedule()
     speed = SLOWEST if not plan.realtime else plan.factor / 2
     return 300.0 + plan.duration_s / speed + sum(60.0 + fault.duration_s / speed for fault in schedule)

@@ -13,7 +13,7 @@ from coldloop.registers.control_plc import LadderStatus
 from coldloop.registers.safety import Alarm, AlarmKind
 from rig.chaos.faults import AnyFault, ProcessFault, WrongModel
 from rig.chaos.injection import Injector
-from rig.chaos.plan import Plan
+from rig.chaos.plan import ChaosPlan
 from rig.chaos.resources import log_lines, resident_mb
 from rig.chaos.timeline import Moment, Timeline
 from rig.chaos.trace import ChaosTrace, Mark, Resources
@@ -37,7 +37,7 @@ class FaultSequencer:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: ChaosPlan,
         services: LocalServices,
         client: SessionClient,
         injector: Injector,
@@ -52,7 +52,7 @@ class FaultSequencer:
         self._progress = progress
         self._timeline = Timeline(plan.schedule(), factor=plan.factor if plan.realtime else None)
         self._marks: dict[int, Mark] = {}
-        self._began = self._standing_since = time.monotonic()
+        self._began = self._stopped_since = time.monotonic()
         self.tick = 0
 
     async def run(self) -> None:
@@ -62,13 +62,13 @@ class FaultSequencer:
                 await self._begin(moment)
             else:
                 await self._end(moment)
-            self._standing_since = time.monotonic()
+            self._stopped_since = time.monotonic()
         alarms = await self._client.contact(self._client.control.read_rows(Alarm, 0, len(AlarmKind)))
         self._trace.alarms = alarms or []
         await self._client.conclude()
 
     def finish(self) -> None:
-        """Record what is known at the end, whatever the end was."""
+        """Record the state at the end, however the run ended."""
         self._trace.seconds = self._seconds
         self._trace.log_lines = log_lines(self._services)
         self._trace.lost_contacts = self._client.lost_contacts
@@ -78,9 +78,9 @@ class FaultSequencer:
         return time.monotonic() - self._began
 
     async def _next_moment(self) -> Moment | None:
-        """Let the rig go on until a fault begins or ends; return None at the end of the run."""
+        """Advance the rig until a fault begins or ends; return None at the end of the run."""
         while True:
-            with contextlib.suppress(TimeoutError):  # what does not go on must not keep a fault from ending in time
+            with contextlib.suppress(TimeoutError):  # a stopped rig must not keep a fault from ending in time
                 async with asyncio.timeout(self._timeline.left_s(self._seconds)):
                     await self._look()
             moment = self._timeline.due(self.tick, self._seconds) or self._cut_short()
@@ -100,7 +100,7 @@ class FaultSequencer:
         tick = await self._client.look()
         ladder = await self._client.ladder()
         if tick is not None and tick != self.tick:
-            self.tick, self._standing_since = tick, time.monotonic()
+            self.tick, self._stopped_since = tick, time.monotonic()
         self._trace.ladder = ladder or self._trace.ladder
         resources = self._trace.resources
         if not resources or self.tick - resources[-1].tick >= RESOURCE_TICKS:
@@ -109,22 +109,22 @@ class FaultSequencer:
         return ladder
 
     def _cut_short(self) -> Moment | None:
-        """Return the end of a fault under which plant time does not go on.
+        """Return the end of a fault that stops plant time.
 
         Raises:
-            LinkError: It does not go on, without a fault.
+            LinkError: Plant time stopped without a fault.
         """
-        standing = time.monotonic() - self._standing_since
+        stopped_s = time.monotonic() - self._stopped_since
         for end in self._timeline.on:
             fault = end.fault
             bearable = self._plan.standstill_s
             if fault.stops_time:
                 bearable = min(bearable, fault.duration_s)
-            if not self._plan.realtime and standing > bearable:
+            if not self._plan.realtime and stopped_s > bearable:
                 return self._timeline.take(end)
-        if not self._timeline.on and standing > max(STANDSTILL_PATIENCE_S, 4 * TICK_S / self._plan.factor):
+        if not self._timeline.on and stopped_s > max(STANDSTILL_PATIENCE_S, 4 * TICK_S / self._plan.factor):
             raise LinkError(
-                f"plan {self._plan.name}: the plant is at {self.tick * TICK_S:g} s for {standing:.0f} s without a "
+                f"plan {self._plan.name}: the plant stays at {self.tick * TICK_S:g} s for {stopped_s:.0f} s without a "
                 f"fault: see {self._services.log('control_plc')}"
             )
         return None

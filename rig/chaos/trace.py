@@ -25,8 +25,8 @@ class Mark:
     end: int | None = None
     """Tick at which it ended, and what it had stopped answered again."""
     first_event: int = 0
-    """Index in `ChaosTrace.events` of the first one after its beginning. Ticks alone do not tell: a control PLC that
-    was restarted goes on one tick back."""
+    """Index in `ChaosTrace.events` of the first one after its beginning. Ticks alone are ambiguous: a control PLC that
+    was restarted resumes one tick back."""
     done: int | None = None
     """First tick that was seen when it had been brought about: a process had ended by then."""
 
@@ -43,7 +43,7 @@ class Resources(NamedTuple):
 
 @dataclass
 class ChaosTrace(Sink):
-    """Collects while a run goes on; ticks that nobody saw stay NaN."""
+    """Collects during a run; ticks that were not recorded stay NaN."""
 
     ticks: int
     events: list[Event] = field(default_factory=list)

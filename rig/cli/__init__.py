@@ -22,14 +22,14 @@ COMMANDS: Final = {
     "page": "the operator's page of a rig that is up, or of recorded runs",
     "set": "load, mode, setpoint, factor, pause, resume, acknowledge: commands to a rig that is up",
     "record": "record a session that is under way, to be replayed",
-    "fault": "kill, freeze, sensor: faults on purpose in a rig that is up",
+    "fault": "kill, freeze, sensor: inject faults into a rig that is up",
     "rerun": "repeat a recorded run and compare the traces",
     "plot": "draw a recorded run again, as PNG, PDF or SVG",
     "report": "one HTML page of a recorded run, with interactive plots",
     "compare": "a table and a figure of several recorded runs",
     "export": "a recorded run as CSV, MATLAB or HDF5 files",
-    "chaos": "a run with faults on purpose, and what became of it",
-    "proxy": "a disturbed link to any Modbus/TCP server: late, lost, damaged, cut, refused",
+    "chaos": "a run with injected faults, and its evaluation",
+    "proxy": "a proxy that delays, loses, damages, cuts or refuses Modbus/TCP traffic",
     "study": "do the runs of a study and draw its figure",
     "reproduce": "all studies of the paper, one report and a scorecard",
     "budget": "what the reference PLC can compute, and in which time",
@@ -114,7 +114,7 @@ def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
 
 
 def _complete() -> NoReturn:
-    """Answer a shell that asks how the line goes on."""
+    """Print the shell's completions of the line."""
     from argcomplete import autocomplete  # noqa: PLC0415 only a shell needs it
 
     words = os.environ.get("COMP_LINE", "").split()

@@ -58,7 +58,7 @@ def write_site(out: Path, hosts: Sequence[str], days: int) -> tuple[int, Path]:
 
 
 def revoke(out: Path, names: Sequence[str], days: int) -> tuple[int, Path]:
-    """Write the list of revoked certificates anew, with these added; return how many it has, and its file.
+    """Rewrite the list of revoked certificates with these added; return how many it has, and its file.
 
     Raises:
         UsageError: The folder has no such certificate, list or key of the authority.

@@ -1,6 +1,6 @@
-"""Certificates for a test site: an authority, and what it issues to servers and clients.
+"""Certificates for a test site: an authority, and certificates of servers and clients.
 
-For trying Modbus/TCP Security out. A plant has an authority of its own, and keeps its key elsewhere.
+For trying Modbus/TCP Security out. A real plant has its own authority, and keeps its key elsewhere.
 """
 
 from collections.abc import Iterable, Sequence

@@ -1,4 +1,4 @@
-"""A job as commands do it: its folder is claimed, a bar goes on, and what came out is told in a few lines."""
+"""A job as commands run it: claims its folder, shows a progress bar, prints a short result."""
 
 import argparse
 import sys
@@ -36,7 +36,7 @@ def record(job: Job, options: argparse.Namespace, figure: FigureProcess) -> int:
 
 @contextmanager
 def _progress(job: Job) -> Iterator[list[Sink]]:
-    """Show a bar while the run goes on; one that is over before it could be read has none."""
+    """Show a progress bar during the run, unless the run is too short."""
     if job.way is Way.IN_PROCESS and job.scenario.ticks <= SHORT_RUN_TICKS:
         yield []
         return

@@ -18,7 +18,7 @@ from control_plc.guard import OutputGuard
 from optimizer_plc.computing_settings import EstimatorKind
 from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
 from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem, Situation
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from optimizer_plc.solvers.daqp import DaqpSolver
 from plant.kinds import plant_maker
 from plant.own_model import own_header
@@ -48,7 +48,7 @@ def run_ideal_loop(
         scenario: Its updating period has no effect.
         recorder: Takes the samples; there are no updates.
         ticks: From one instant to the next, 1 to 20.
-        solved: Is told of each problem.
+        solved: Called with each problem.
     """
     header, model = own_header(settings.model.file), load(settings.model.file)
     prediction, program = PredictionModel(model), settings.optimizer_plc.program
@@ -68,8 +68,8 @@ def run_ideal_loop(
         if instant:
             correct(estimator, belief, np.array(applied), watts, np.array(y), np.array(x))
             u = np.array(applied) - model.u0
-            situation = Situation(belief.x.copy(), float(belief.numbers[0]["w"]), u, ticks)
-            qp, guess = problem.at(situation), problem.shifted(z, ticks)
+            parameters = QpParameters(belief.x.copy(), float(belief.numbers[0]["w"]), u, ticks)
+            qp, guess = problem.at(parameters), problem.shifted(z, ticks)
             z = solver.solve(qp, guess, (1,)).z
             if solved is not None:
                 solved(qp, guess, z)

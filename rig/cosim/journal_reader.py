@@ -17,7 +17,7 @@ MOST_KEPT: Final = 100_000
 
 
 class JournalReader:
-    """Reads a journal from one event on, and goes on where it was.
+    """Reads a journal incrementally, from a given event on.
 
     Args:
         client: Of the service.
@@ -55,7 +55,7 @@ class JournalReader:
             if page.newest < self._newest:
                 restarts += 1
                 if restarts > 1:
-                    raise LinkError(f"{self._client.peer}: its journal ends at another event each time it is asked")
+                    raise LinkError(f"{self._client.peer}: its journal reports another last event at each query")
                 self.restarted, self._next, self._newest = True, 1, 0
                 continue
             if 1 < self._next < page.oldest:

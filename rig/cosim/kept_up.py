@@ -12,7 +12,7 @@ from coldloop.errors import LinkError
 PAUSES_S: Final = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Before each further start; after the last one the service is given up."""
 STEADY_S: Final = 60.0
-"""After so long without an end the pauses begin anew."""
+"""After this time without an exit the pauses start from the first one."""
 
 
 class Restartable(Protocol):
@@ -46,11 +46,11 @@ async def keep_up(
     restarts, since = 0, loop.time()
     work: Callable[[], Awaitable[None]] = _nothing
     while True:
-        how = await _ended_beside(process, work)
+        how = await _run_until_exit(process, work)
         if loop.time() - since > STEADY_S:
             restarts = 0
         if restarts == len(pauses_s):
-            raise LinkError(f"{process.name} {how}, and was started again {restarts} times before: it is given up")
+            raise LinkError(f"{process.name} {how}; given up after {restarts} restarts")
         pause = pauses_s[restarts]
         restarts += 1
         say(f"{process.name} {how}: started again in {pause:g} s ({restarts} of {len(pauses_s)})")
@@ -64,18 +64,18 @@ async def _nothing() -> None:
     """Do nothing after a start."""
 
 
-async def _ended_beside(process: Restartable, work: Callable[[], Awaitable[None]]) -> str:
-    """Wait until a process has ended, with work beside, which may fail and ends with it; return how it has ended."""
-    ended, beside = asyncio.ensure_future(process.ended()), asyncio.ensure_future(work())
+async def _run_until_exit(process: Restartable, work: Callable[[], Awaitable[None]]) -> str:
+    """Wait until a process has ended while `work` runs, which is cancelled with it; return how it has ended."""
+    exited, running = asyncio.ensure_future(process.ended()), asyncio.ensure_future(work())
     try:
-        await asyncio.wait({ended, beside}, return_when=asyncio.FIRST_COMPLETED)
-        if not ended.done():
-            await beside
-        return await ended
+        await asyncio.wait({exited, running}, return_when=asyncio.FIRST_COMPLETED)
+        if not exited.done():
+            await running
+        return await exited
     finally:
-        ended.cancel()
-        beside.cancel()
-        await asyncio.gather(ended, beside, return_exceptions=True)
+        exited.cancel()
+        running.cancel()
+        await asyncio.gather(exited, running, return_exceptions=True)
 
 
 def end_of(code: int, last_words: str) -> str:
@@ -89,7 +89,7 @@ def end_of(code: int, last_words: str) -> str:
 
 
 def say(text: str) -> None:
-    """Tell who keeps the rig up, or its log, if it can be told."""
+    """Print a line for the operator or the log; ignore a closed output."""
     with suppress(OSError):  # the disk may be full, the terminal closed
         sys.stderr.write(f"coldloop: {text}\n")
         sys.stderr.flush()

@@ -33,7 +33,7 @@ class LocalServices:
         log_folder: Their logs go to `<folder>/<service>.log`.
         detours: Where something is between clients and servers.
         environment: Further variables for all of them.
-        ports: Where they listen; by default on ports that nobody else uses.
+        ports: Where they listen; by default on free ports.
     """
 
     def __init__(
@@ -84,14 +84,8 @@ class LocalServices:
         self._ports.release()
 
     async def start(self, service: str, environment: Mapping[str, str] | None = None, *, may_end: bool = False) -> None:
-        """Start one of them, where it was before.
-
-        Args:
-            service: Which one.
-            environment: Further variables for this time.
-            may_end: Its end by itself does not end the run.
-        """
-        # A session of their own: a Ctrl-C is the rig's to answer, in good order.
+        """Start a service where it was before; `may_end`: its end by itself does not end the run."""
+        # In their own process session: Ctrl-C is handled by the rig.
         with self.log(service).open("ab") as log:
             process = await asyncio.create_subprocess_exec(
                 *PYTHON, "-m", service, "--with-parent",
@@ -113,7 +107,7 @@ class LocalServices:
         await _ended(process)
 
     def ended(self, service: str) -> bool:
-        """Tell whether a service has ended by itself."""
+        """Return whether a service has ended by itself."""
         return self._processes[service].returncode is not None
 
     def pause(self, service: str) -> None:
@@ -121,7 +115,7 @@ class LocalServices:
         self._signal(service, signal.SIGSTOP)
 
     def resume(self, service: str) -> None:
-        """Let it go on."""
+        """Resume it."""
         self._signal(service, signal.SIGCONT)
 
     def _signal(self, service: str, number: signal.Signals) -> None:

@@ -10,10 +10,10 @@ from coldloop.modbus.endpoints import Endpoint
 from coldloop.service.start import run_event_loop
 from rig.cosim.answer_time import answered_in_time
 from rig.cosim.endpoints import RigEndpoints
-from rig.cosim.handing_back import give_back, look_around
 from rig.cosim.job import Job, StopRequest
 from rig.cosim.local_services import run_on_localhost
 from rig.cosim.rig_configuration import attached, running_configuration
+from rig.cosim.saved_session import restore_session, save_session
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
 from rig.cosim.session_recording import SessionUnderWay, find_session, record_session
@@ -117,11 +117,11 @@ async def _attached(endpoints: RigEndpoints, settings: Settings, scenario: Scena
     try:
         await rig.connect(ATTACH_PATIENCE_S)
         async with answered_in_time("to read what the rig does"):
-            found = await look_around(rig)
+            saved = await save_session(rig)
         try:
             await rig.run(scenario, recorder)
         finally:
-            await _to_its_end(give_back(rig, found, rig.session))
+            await _to_its_end(restore_session(rig, saved, rig.session))
     finally:
         rig.close()
 

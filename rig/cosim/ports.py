@@ -8,11 +8,11 @@ HOST: Final = "127.0.0.1"
 
 
 class ReservedPorts:
-    """Ports that the system gives to nobody else until they are released; a context that releases them.
+    """Ports reserved until they are released; a context that releases them.
 
     A socket that never listens is bound to each. Servers may listen there all the same, again and again, as they set
     SO_REUSEADDR; while none does, connections are refused. Other systems than Linux do not let two sockets have a port
-    in this way: there the sockets are closed at once, and somebody else may take a port before its server does.
+    in this way: there the sockets are closed at once, and another program may take a port before its server does.
     """
 
     def __init__(self, count: int) -> None:

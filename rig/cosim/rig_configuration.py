@@ -26,7 +26,7 @@ SHOWN: Final[Mapping[str, Sequence[str]]] = {
 OF_SESSION: Final = (
     "session.mode", "session.factor", "plant.load", "plant.seed", "optimizer_plc.program.updating_period_s",
 )  # fmt: skip
-"""Keys that a rig takes from whoever begins a session."""
+"""Keys that a rig takes from the client that begins a session."""
 OF_CLIENT: Final = ("model.", "rig.")
 """Sections that concern the client. The model of a rig is compared with ours when it is connected to."""
 SOURCE: Final = "the rig"
@@ -44,7 +44,7 @@ def _files(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
 
 
 FILES: Final = frozenset(_files(Settings))
-"""Keys whose value names a file: what a rig tells of them is compared, and never opened."""
+"""Keys whose value names a file: the rig's values are compared and never opened."""
 
 
 async def read_configuration(client: RegisterClient, shown: Sequence[str]) -> dict[str, Any]:
@@ -70,7 +70,7 @@ async def read_configuration(client: RegisterClient, shown: Sequence[str]) -> di
 
 
 def _text(value: object) -> str:
-    """Return what a rig tells, as a message can show it."""
+    """Return a value of a rig as a message can show it."""
     text = str(value)
     return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
 

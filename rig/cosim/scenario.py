@@ -7,7 +7,7 @@ from coldloop.process.signals import TICK_S
 from plant.load import HOUR_TICKS, named_families
 
 BEHIND_LAST_STEP = round(300 / TICK_S)
-"""How long a run goes on after the last step of a load file, unless given otherwise."""
+"""Default time that a run continues after the last step of a load file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +24,6 @@ class Scenario:
 
 
 def natural_ticks(name: str, load: LoadProfile) -> int:
-    """Return how long a run under the load of this name or file goes on when nobody says."""
+    """Return the default duration of a run under the load of this name or file."""
     families = named_families(name)
     return len(families) * HOUR_TICKS if families else load.times[-1] + BEHIND_LAST_STEP

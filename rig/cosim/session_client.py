@@ -41,7 +41,7 @@ QUIET_S: Final = 20.0
 LAST_LOOK_S: Final = 2.0
 """How long the events of a run that has ended are waited for."""
 CONTACT_S: Final = 1.0
-"""With `tolerant`: how long an answer may take. A process that does not go on must not hold up the rest for long."""
+"""With `tolerant`: how long an answer may take. A stopped process must not hold up the rest for long."""
 
 
 def next_session(present: Sequence[int]) -> int:
@@ -118,7 +118,7 @@ class SessionClient:
             await self.last_look()
 
     async def begin(self, scenario: Scenario, recorder: Recorder) -> None:
-        """Start a session for the scenario, which is to be recorded from now on."""
+        """Start a session for the scenario, recorded from now on."""
         self._events = await SessionEvents.after_now(self.control, self.plant, recorder)
         session = await self.start(scenario)
         self._scenario, self._recorder = scenario, recorder
@@ -149,7 +149,7 @@ class SessionClient:
     async def hold(self, look_s: float) -> None:
         """Keep the session that was started last, in real time, supplied with its load until cancelled.
 
-        A load that somebody else writes replaces all of it, as it replaces what the plant knows of later ticks.
+        A load that another client writes replaces all of it, as it replaces the plant's later steps.
 
         Raises:
             PeerUnreachableError: The plant does not answer.
@@ -157,7 +157,7 @@ class SessionClient:
         """
         while True:
             identity = await self.plant.read(Identity)
-            if identity.session != self.session:  # somebody has begun another one
+            if identity.session != self.session:  # another client has begun one
                 self.load = None
             elif self.load is not None and not self.load.done:
                 await self._supply(self.load, identity.tick)
@@ -201,7 +201,7 @@ class SessionClient:
                 await self._events.read(CONTROL)
                 await self._events.read(PLANT)
 
-    # -- while it goes on ----------------------------------------------------------------------------------------------
+    # -- in the session ----------------------------------------------------------------------------------------------
 
     async def _follow(self) -> None:
         scenario, recorder = self._scenario, self._recorder
@@ -223,7 +223,7 @@ class SessionClient:
             await asyncio.sleep(max(pause_s, SHORTEST_PAUSE_S))
 
     async def grant(self, until: int) -> None:
-        """Let the rig go on to a tick, but not further than the load is known and the plant's history reaches back."""
+        """Advance the rig to a tick, limited by the known load and by the length of the plant's history."""
         done = self._samples.read_until
         if self.load is not None:
             await self.contact(self.load.feed(done))
@@ -252,7 +252,7 @@ class SessionClient:
         return tick
 
     async def _read_updates(self) -> None:
-        """Read updates beside the rest, which an optimiser that does not answer is not to hold up."""
+        """Read updates in the background: a silent optimiser must not hold up the rest."""
         await self.contact(self._updates.read())
 
     async def ladder(self) -> LadderStatus | None:
@@ -273,7 +273,7 @@ class SessionClient:
         return await self.contact(self._write_fault(output, fault)) is not None
 
     async def change_surroundings(self, target: str, value: float) -> float | None:
-        """Change one of a refrigerator's surroundings; return what it was, None if the plant has not taken it."""
+        """Change one of a refrigerator's surroundings; return its old value, None if the plant has not accepted it."""
         return await self.contact(self._write_surroundings(target, value))
 
     async def _write_surroundings(self, target: str, value: float) -> float:

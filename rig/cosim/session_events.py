@@ -1,4 +1,4 @@
-"""The events of a session: read from the journals of control PLC and plant while it goes on."""
+"""The events of a session: read from the journals of control PLC and plant as it runs."""
 
 import time
 from typing import Final

@@ -91,7 +91,7 @@ class SampleReader:
                 self.read_until = tick + 1
 
     async def _read_stations(self, first: int, count: int) -> None:
-        """Read what goes with ticks, if the plant is a whole refrigerator: the first row that is read tells."""
+        """Read what goes with ticks, if the plant is a whole refrigerator: the first row that is read decides."""
         if self.has_station is None:
             (station,) = await self._client.read_rows(StationSample, first % STATION_ROWS, 1)
             self.has_station = any(station.signals)
@@ -148,7 +148,7 @@ class UpdateReader:
                 self._next += 1
 
     def _follows(self, update: Optimization) -> bool:
-        """Tell whether a row is the update that is looked for, and not one that was recorded before."""
+        """Return whether a row is the update that is looked for, and not one that was recorded before."""
         return update.update == self._next and (self._last is None or update.tick > self._last.tick)
 
     async def read_until(self, ticks: int, last: int, patience_s: float) -> None:

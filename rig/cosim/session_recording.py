@@ -1,4 +1,4 @@
-"""A session under way, recorded by somebody who only looks: what a run leaves, from now on, and nothing is changed."""
+"""Records a session under way without changing it: writes the files of a run, from now on."""
 
 import asyncio
 import contextlib
@@ -164,14 +164,14 @@ def state_of(events: Iterable[Event]) -> list[Event]:
 
 
 class Lateness:
-    """Counts what was late since a first look, also where the control PLC has been started again and counts anew."""
+    """Counts what was late since a first look, also where the control PLC was restarted and counts from 0."""
 
     def __init__(self, first: Status) -> None:
         self._before = first
         self._late = LinkStatistics(0, 0, first.lateness_max, first.lateness_p99)
 
     def after(self, status: Status | None) -> LinkStatistics:
-        """Return what was late up to a look, None where nobody answered; the largest lateness is of the session."""
+        """Return what was late up to a look, None where there was no answer; the largest lateness is of the session."""
         if status is not None:
             before, self._before, late = self._before, status, self._late
             self._late = LinkStatistics(

@@ -193,13 +193,13 @@ def _cost(axes: Axes, time: Series, cost: Series) -> None:
 
 
 def spans_a_decade(cost: Series) -> bool:
-    """Return whether a cost is to be drawn on a logarithmic axis."""
+    """Return whether a cost needs a logarithmic axis."""
     finite = cost[np.isfinite(cost)]
     return bool(len(finite)) and float(finite.max()) > 10 * max(float(finite.min()), LEAST_COST)
 
 
 def _ribbons(axes: Axes, events: Sequence[Mapping[str, Any]], scale_s: float, end: float) -> None:
-    """Draw who drives as a ribbon, and below it when alarms are active."""
+    """Draw the operating mode as a ribbon, and the active alarms below it."""
     modes = [(event["time_s"] / scale_s, event["subject"]) for event in events if event["kind"] == "mode"]
     ends = [time for time, _ in modes[1:]] + [end]
     for (begin, mode), until in zip(modes, ends, strict=False):

@@ -1,4 +1,4 @@
-"""The figure of a run, drawn by a process of its own: matplotlib is loaded while the run goes on, on another core.
+"""The figure of a run, drawn by a separate process: matplotlib is loaded during the run, on another core.
 
 python -m rig.figures.worker < (folder and formats as JSON): an error is one line on standard error, as of any command
 """
@@ -41,7 +41,7 @@ class FigureProcess:
     def start(self) -> None:
         """Start the process, which then waits for a run; without this `draw` does."""
         pipe = subprocess.PIPE
-        # A session of its own: a Ctrl-C is the command's to answer, which has what was recorded drawn.
+        # In its own process session: Ctrl-C is handled by the command, which has the recorded part drawn.
         self._process = subprocess.Popen(  # noqa: S603 our own module
             COMMAND, stdin=pipe, stdout=pipe, stderr=pipe, start_new_session=True
         )
@@ -82,7 +82,7 @@ def main() -> None:
     except (OSError, ColdloopError) as error:
         sys.stderr.write(f"{error}\n")
         sys.exit(getattr(error, "exit_code", 1))
-    gc.freeze()  # whoever waits for the end need not wait until all modules have been searched for cycles
+    gc.freeze()  # do not search all modules for cycles at the exit
 
 
 if __name__ == "__main__":

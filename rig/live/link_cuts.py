@@ -94,7 +94,7 @@ class CuttableLinks(LinkProxies):
             await asyncio.sleep(cut.seconds)
         finally:
             proxy.end(fault)
-        say(f"the {cut.link} link is whole again")
+        say(f"the {cut.link} link is restored")
 
 
 async def cut(first_port: int | None, link: Link, seconds: float) -> None:

@@ -12,7 +12,7 @@ Work = Callable[[Clients], Awaitable[str]]
 
 
 async def ask(rig: RigEndpoints, services: Iterable[str], work: Work, *, limited: bool = True) -> str:
-    """Connect to the services that something concerns, do it, and return what came back.
+    """Connect to the services of a request, carry it out, and return the result.
 
     Args:
         rig: Where it is.

@@ -1,4 +1,4 @@
-"""The operator's page as a process beside the services of a rig that is up."""
+"""The operator's page as a process of a rig that is up."""
 
 import asyncio
 import os
@@ -33,7 +33,7 @@ def check_page(section: HmiSection) -> None:
         UsageError: It has no port, its extra is not installed, or its port is in use.
     """
     if not section.port:
-        raise UsageError("the page of a rig that is up has a port of its own: give one with --page-port")
+        raise UsageError("the page needs a fixed port: give one with --page-port")
     if find_spec("aiohttp") is None:
         raise UsageError("--page needs aiohttp: pip install 'coldloop[hmi]'")
     with socket.socket(socket.AF_INET6 if ":" in section.host else socket.AF_INET) as one:
@@ -49,7 +49,7 @@ def check_page(section: HmiSection) -> None:
 def pointed_at(section: HmiSection, endpoints: RigEndpoints) -> HmiSection:
     """Return the settings of a page of the services at these endpoints.
 
-    Their certificate is an operator's, for commands; to read, the page takes the reader's beside it, if there is one.
+    Their certificate is an operator's, for commands; for reading the page uses the reader's next to it, if any.
     """
     update: dict[str, object] = {
         service: getattr(section, service).model_copy(
@@ -63,7 +63,7 @@ def pointed_at(section: HmiSection, endpoints: RigEndpoints) -> HmiSection:
 
 
 def readers(tls: TlsSettings | None) -> TlsSettings | None:
-    """Return the reader's certificate beside another one, as `coldloop certificates` makes it; or that one."""
+    """Return the reader's certificate next to the given one, as `coldloop certificates` makes it, or the given one."""
     if tls is None:
         return None
     certificate, key = tls.certificate.with_name("reader.crt"), tls.key.with_name("reader.key")
@@ -176,7 +176,7 @@ class PageProcess:
             return
 
     @property
-    def whereabouts(self) -> str:
+    def addresses(self) -> str:
         """Where it is, and who may operate."""
         scheme = "https" if self._section.https else "http"
         text = f"  page           {scheme}://{self._section.host}:{self._section.port}/\n"

@@ -1,7 +1,7 @@
 """The folder in which this user's rigs keep what others must neither read nor change.
 
 It is `coldloop` in `XDG_RUNTIME_DIR`, if that is a folder of this user, or `coldloop-UID` in the folder for temporary
-files. Folders are used only if they belong to this user and are closed to others, and are not links: somebody else may
+files. Folders are used only if they belong to this user and are closed to others, and are not links: another user may
 have made them first where everybody can write. Files are opened without following links.
 """
 
@@ -30,7 +30,7 @@ def make_private(folder: Path) -> Path:
     """Make a folder within one that exists, closed to others; return it.
 
     Raises:
-        UsageError: It cannot be made, or something that is not this user's own is in its place.
+        UsageError: It cannot be made, or its place is taken by a file of another user.
     """
     try:
         folder.mkdir(mode=OWN_ONLY, exist_ok=True)
@@ -50,13 +50,13 @@ def make_own_folder(name: str) -> Path:
     """Make a private folder of this name in the one of all rigs; return it.
 
     Raises:
-        UsageError: It cannot be made, or is somebody else's.
+        UsageError: It cannot be made, or belongs to another user.
     """
     return make_private(make_private(base_folder()) / name)
 
 
 def is_private(folder: Path) -> bool:
-    """Tell whether something is a folder that belongs to this user and is closed to all others."""
+    """Return whether something is a folder that belongs to this user and is closed to all others."""
     try:
         status = folder.lstat()
     except OSError:

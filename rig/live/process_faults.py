@@ -31,7 +31,7 @@ def kill(process: ServiceProcess) -> None:
 
 
 async def freeze(process: ServiceProcess, seconds: float) -> bool:
-    """Let a process stand still for a while; it runs again when this ends, however it ends. Tell whether it does."""
+    """Suspend a process for a while; it is resumed in any case. Return whether it runs."""
     _signal(process, signal.SIGSTOP)
     try:
         await asyncio.sleep(seconds)

@@ -16,8 +16,8 @@ from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Upda
 from coldloop.registers.plant import StationSample
 from coldloop.registers.safety import Alarm
 from coldloop.service.event_text import EventText, word
-from hmi.process_image import Told
-from hmi.replay import Frame
+from hmi.process_image import JournalEntry
+from hmi.replay import ReplayFrame
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.rules import make_rule
 from optimizer_plc.settings import OptimizerSettings
@@ -54,7 +54,7 @@ class RecordedPage:
 
     @property
     def configuration(self) -> Mapping[str, Any]:
-        """What it was run with, by dotted key."""
+        """Its configuration, by dotted key."""
         return self._folder.configuration
 
     def _read_station(self) -> NDArray[np.float32] | None:
@@ -83,9 +83,9 @@ class RecordedPage:
             return [_optimization(row) for row in file.read().to_pylist()]
 
     @cached_property
-    def events(self) -> list[Told]:
+    def events(self) -> list[JournalEntry]:
         """Events of the journals, in the order of their ticks."""
-        return sorted((_told(row) for row in self._folder.events()), key=lambda told: told.tick)
+        return sorted((_entry(row) for row in self._folder.events()), key=lambda entry: entry.tick)
 
     @cached_property
     def rule(self) -> UpdatingRuleStatus:
@@ -101,7 +101,7 @@ class RecordedPage:
         design, limits = self._settings.optimizer_plc.program.design, self._settings.limits
         return OperatingLimits(design.output_low, design.output_high, limits.low, limits.high, limits.rate)
 
-    def frame(self, tick: int) -> Frame | None:
+    def frame(self, tick: int) -> ReplayFrame | None:
         """Return one tick; None if it is missing in the recording."""
         load, *values = self._values[tick].tolist()
         if math.isnan(load):
@@ -110,9 +110,9 @@ class RecordedPage:
         mode = _MODES.get(self._modes[tick], int(Mode.MPC))
         cause = _CAUSES.get(self._causes[tick], int(Cause.NONE))
         bad, station = self._bad_sensors[tick], self._station_at(tick)
-        return Frame(Process(tick, load, u, y), mode, cause, self._since[tick], bad, station)
+        return ReplayFrame(Process(tick, load, u, y), mode, cause, self._since[tick], bad, station)
 
-    def alarms(self, events: Sequence[Told]) -> list[Alarm]:
+    def alarms(self, events: Sequence[JournalEntry]) -> list[Alarm]:
         """Return the alarms after these events."""
         return alarms_after(events)
 
@@ -145,7 +145,7 @@ def _optimization(row: Mapping[str, Any]) -> Optimization:
     return Optimization(**values, tau_u=round(row["tau_u_s"] / TICK_S))
 
 
-def _told(row: Mapping[str, Any]) -> Told:
+def _entry(row: Mapping[str, Any]) -> JournalEntry:
     value = "" if row["value"] is None else f"{row['value']:.7g}"
     text = EventText(row["kind"], row["subject"], row["cause"], value, row["unit"], row["who"])
-    return Told(row["service"], row["number"], row["boot"], row["utc"], row["tick"], text)
+    return JournalEntry(row["service"], row["number"], row["boot"], row["utc"], row["tick"], text)

@@ -25,7 +25,7 @@ DEFAULT_PORTS: Final = (PLANT_PORT, CONTROL_PORT, OPTIMIZER_PORT)
 STATE_FILE: Final = "rig.json"
 """What `coldloop down`, `status` and `set` know of a rig that is up: process, ports, certificates."""
 LOCK_FILE: Final = "lock"
-"""Locked by the process of a rig as long as it runs."""
+"""Locked by the process of a rig while it runs."""
 LOOK_UP_S: Final = 0.05
 """Between two looks at the process of a rig."""
 ANSWER_S: Final = 5.0
@@ -53,7 +53,7 @@ class ServiceProcess(NamedTuple):
         """
         process = cls(*content)
         if type(process.pid) is not int or not 1 < process.pid < 2**31 or not isinstance(process.identity, str):
-            raise ValueError("a process in it is none")
+            raise ValueError("its process id is invalid")
         return process
 
 
@@ -100,7 +100,7 @@ class RunningRig(NamedTuple):
             type(port) is int and 0 < port < 0x10000 for port in rig.ports
         )
         if not ports_fit or not isinstance(rig.tls, str) or "\0" in rig.tls:
-            raise ValueError("a port or a folder in it is none")
+            raise ValueError("a port or a folder in it is invalid")
         return rig
 
     @property
@@ -110,7 +110,7 @@ class RunningRig(NamedTuple):
 
     @property
     def place(self) -> str:
-        """How commands are told which one it is."""
+        """Options that select this rig."""
         return f"--port-base {self.ports[0]} (process {self.pid})"
 
 
@@ -126,10 +126,10 @@ def running_rig(first_port: int) -> RunningRig | None:
     """Return the rig that was started on these ports and is still there.
 
     Raises:
-        UsageError: What is said of it is damaged.
+        UsageError: Its record is damaged.
     """
     folder = state_folder(first_port)
-    if not (is_private(folder.parent) and is_private(folder)):  # somebody else's, where all may write
+    if not (is_private(folder.parent) and is_private(folder)):  # another user's, where all may write
         return None
     file = folder / STATE_FILE
     try:
@@ -146,7 +146,7 @@ def rigs_up() -> list[RunningRig]:
     """Return the rigs that were started here and are still there.
 
     Raises:
-        UsageError: There is none, and what is said of one is damaged.
+        UsageError: There is none, and its record is damaged.
     """
     found: list[RunningRig] = []
     damaged: UsageError | None = None
@@ -170,7 +170,7 @@ def find_rig(first_port: int | None) -> RunningRig | None:
     """Return the rig that was started here on these ports, or, without ports, the only one; None if there is none.
 
     Raises:
-        UsageError: There are several, or what is said of it is damaged.
+        UsageError: There are several, or its record is damaged.
     """
     if first_port is not None:
         return running_rig(first_port)
@@ -181,9 +181,9 @@ def find_rig(first_port: int | None) -> RunningRig | None:
 
 
 def no_rig(first_port: int | None) -> UsageError:
-    """Return what is said when `find_rig` finds none."""
+    """Return the message if `find_rig` finds none."""
     where = "" if first_port is None else f" on port {first_port}"
-    return UsageError(f"no rig that was started here is up{where}: `coldloop up` starts one")
+    return UsageError(f"no rig started here is up{where}: `coldloop up` starts one")
 
 
 class RigLock:
@@ -261,7 +261,7 @@ _HOLDER: Final = "a rig in containers, or another program (ss -ltnp names it): e
 
 
 def require_listener(port: int) -> None:
-    """Refuse a port of this machine on which nobody listens.
+    """Reject a port of this machine without a listener.
 
     Raises:
         UsageError: No rig was started here, and there is none in containers either.
@@ -279,7 +279,7 @@ def require_listener(port: int) -> None:
 
 
 def detached(ports: Sequence[int], lock: RigLock) -> int:
-    """Start the same command in a process of its own; return 0 when the rig is up, 130 when Ctrl-C has ended it.
+    """Start the same command in a background process; return 0 when the rig is up, 130 when Ctrl-C has ended it.
 
     Args:
         ports: Of the rig.

@@ -27,13 +27,13 @@ LOOK_S: Final = 0.5
 LOOKING: Final = (PlantLinkState.SEARCHING, PlantLinkState.JOINING)
 """A control PLC without a session is looking for the one that it has retained."""
 RETAINING: Final = ("plant", "control_plc")
-"""Services that go on after a restart where they were, with a file for their state."""
+"""Services that resume after a restart, from a state file."""
 
 
 class UpRig:
     """Starts the services, begins a session in real time, and keeps both up until it is cancelled.
 
-    A service or page that ends is started again (`rig.cosim.kept_up`), and goes on with the state that it has retained.
+    A service or page that ends is started again (`rig.cosim.kept_up`), and resumes from its retained state.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class UpRig:
         """One session is begun at a time."""
 
     async def run(self, *, announce: bool) -> None:
-        """Run until cancelled; load steps beyond what the plant holds are written as time goes on.
+        """Run until cancelled; load steps beyond the plant's capacity are written as time advances.
 
         Raises:
             ColdloopError: The session could not begin, or a service has ended again and again.
@@ -84,8 +84,8 @@ class UpRig:
         if page is not None:
             await page.is_served()
         if announce:
-            sys.stdout.write(whereabouts(self._settings, self._ports, self.folder))
-            sys.stdout.write(page.whereabouts if page is not None else "")
+            sys.stdout.write(addresses(self._settings, self._ports, self.folder))
+            sys.stdout.write(page.addresses if page is not None else "")
             sys.stdout.flush()
         self._write_state(services)
 
@@ -116,14 +116,14 @@ class UpRig:
             except PeerUnreachableError:
                 pass  # the plant is being started again
             except LinkError as error:
-                say(f"no more steps of the load are written: {error}")
+                say(f"the rest of the load is not written: {error}")
             await asyncio.sleep(LOOK_S)
 
     async def _keep_service(self, services: LocalServices, service: str, rig: SessionClient) -> None:
         async def restarted() -> None:
             try:
                 self._write_state(services)
-            except OSError as error:  # commands do not know its process; the rig goes on
+            except OSError as error:  # commands cannot find this process; the rig keeps running
                 say(f"{error.filename}: {error.strerror}")
             while service in RETAINING:  # the optimiser learns it from the control PLC
                 with suppress(LinkError):  # another one has ended, too
@@ -135,7 +135,7 @@ class UpRig:
         await keep_up(KeptService(services, service), restarted)
 
     async def _goes_on(self, service: str, rig: SessionClient) -> bool:
-        """Tell whether the session goes on after a service was started again, or another one has begun in its place.
+        """Print whether the session was resumed after a restart of a service, or a new one has begun.
 
         Not yet, while the control PLC is looking for the one that it has retained.
         """
@@ -147,12 +147,12 @@ class UpRig:
             if plant and looking:
                 return False
             session = await rig.start(self._scenario)
-            say(f"session {session} has begun: the {service} service had no state to go on with")
+            say(f"session {session} has begun: the {service} service had no state to resume")
             return True
 
 
 async def _keep_page(page: PageProcess) -> None:
-    """Keep the page up; the rig goes on without one that is given up."""
+    """Keep the page up; the rig keeps running without it once it is given up."""
     try:
         await keep_up(page)
     except LinkError as error:
@@ -171,7 +171,7 @@ def _retaining(settings: Settings, folder: Path) -> Settings:
     return settings.model_copy(update=sections)
 
 
-def whereabouts(settings: Settings, ports: Sequence[int], folder: Path) -> str:
+def addresses(settings: Settings, ports: Sequence[int], folder: Path) -> str:
     """Return where everything is, with a line to paste."""
     base = "" if tuple(ports) == DEFAULT_PORTS else f" --port-base {ports[0]}"
     tls = any(getattr(settings, service).server.tls for service in SERVICES)
@@ -188,7 +188,7 @@ def whereabouts(settings: Settings, ports: Sequence[int], folder: Path) -> str:
             f"  mbpoll -0 -1 -m tcp -p {ports[0]} -t 4:float -B -r 216 -c 1 127.0.0.1",
         ]
     lines += [
-        f"coldloop status{base} --follow    what it does",
+        f"coldloop status{base} --follow    its status",
         f"coldloop set{base} load 420       and load FILE.csv, mode, setpoint, factor, pause, resume, acknowledge",
     ]
     return "\n".join(lines) + "\n"

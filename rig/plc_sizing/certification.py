@@ -55,7 +55,7 @@ class Problem(NamedTuple):
 
 
 class Needs(NamedTuple):
-    """Iterations that the problems of one scenario need; `LONGEST` + 1 stands for more."""
+    """Iterations that the problems of one scenario need; `LONGEST` + 1 means more."""
 
     worst: int
     at_random: int
@@ -120,7 +120,7 @@ def scenario_problems(settings: Settings, number: int) -> list[Problem]:
 
 
 def scenario_needs(solver: Solver, problems: list[Problem], number: int, tolerance: float, floor: float) -> Needs:
-    """Return what a scenario needs of a solver, whose hot starts begin anew."""
+    """Return what a scenario needs of a solver, beginning without a hot start."""
     solver.reset()
     needs = [iterations_needed(solver, problem, tolerance, floor) for problem in problems]
     return Needs(max(needs), needs[random.Random(number).randrange(len(needs))])  # noqa: S311
@@ -136,7 +136,7 @@ def certify(
         scenarios: N.
         tolerance: Share of the optimal J that an answer may cost more.
         beta: One minus the confidence.
-        progress: Is told the number of scenarios done.
+        progress: Called with the number of scenarios done.
     """
     program = settings.optimizer_plc.program
     solvers = {name: solver for name in SolverName if (solver := _solver(program, name)) is not None}

@@ -49,7 +49,7 @@ def estimator_memory(prediction: PredictionModel, settings: EstimatorSettings) -
 
 
 def footprint(problem: PredictiveProblem, estimator: int) -> Footprint:
-    """Return what a problem made in single precision needs beside an estimator of so many bytes."""
+    """Return what a problem made in single precision needs in addition to an estimator of so many bytes."""
     if problem.Phi.dtype != np.float32:
         raise ValueError("the PLC computes in single precision")
     profile = problem.hold(np.zeros(N_INPUTS, problem.Phi.dtype.type))

@@ -1,1 +1,1 @@
-"""The report: every claim of the paper beside what was found here, and the verdict."""
+"""The report: every claim of the paper with our result and the verdict."""

@@ -10,7 +10,7 @@ from typing import Final
 
 from markdown_it import MarkdownIt
 
-from rig.report.scorecard import Claim, Judged, Verdict, counted, counts
+from rig.report.scorecard import Claim, ClaimVerdict, Judged, counted, counts
 from rig.studies.intervals import interval_of_mean
 
 STYLE: Final = """
@@ -64,7 +64,7 @@ def deviations(judged: Sequence[Judged], explanations: Mapping[str, str], values
     """Return what does not reproduce among what counts, each with what is known of why and the numbers for it."""
     lines = []
     for j in counted(judged):
-        if j.verdict in (Verdict.PARTLY, Verdict.NOT_REPRODUCED):
+        if j.verdict in (ClaimVerdict.PARTLY, ClaimVerdict.NOT_REPRODUCED):
             why = explained(explanations.get(j.claim.value, "Not explained yet."), values)
             lines.append(f"- **{j.verdict}: {j.claim.value}** ({j.claim.figure}): ours {_ours(j.values)}, "
                          f"paper {_of_paper(j)}. {why}")  # fmt: skip
@@ -114,7 +114,7 @@ def as_page(title: str, markdown: str, folder: Path) -> str:
     """Return a report as one HTML page; its pictures are looked for in `folder`."""
     body = MarkdownIt("commonmark", {"html": True}).enable("table").render(markdown)
     body = re.sub(r'<img src="([^"]+)"', lambda match: f'<img src="{_embedded(folder / match[1])}"', body)
-    for verdict in Verdict:
+    for verdict in ClaimVerdict:
         body = body.replace(f"<td>{verdict}</td>", f'<td class="{verdict.replace(" ", "-")}">{verdict}</td>')
     head = (
         f'<meta charset="utf-8"><title>{html.escape(title)}</title><meta name="viewport" content="width=device-width">'

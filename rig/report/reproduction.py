@@ -66,7 +66,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def circumstances(options: StudyOptions, effort: str) -> str:
-    """Return the line below the title, which nobody writes by hand."""
+    """Return the generated line below the title."""
     return (
         f"Coldloop {__version__}, Python {platform.python_version()}, {datetime.now(UTC):%Y-%m-%d}; "
         f"{_draws(options)}; {effort}, what was kept from before included."

@@ -34,8 +34,8 @@ def _limits(value: object) -> object:
 Range = Annotated[tuple[float, float], BeforeValidator(_limits)]
 
 
-class Verdict(StrEnum):
-    """What became of a claim."""
+class ClaimVerdict(StrEnum):
+    """Result of a claim."""
 
     REPRODUCED = "reproduced"
     PARTLY = "partly"
@@ -44,7 +44,7 @@ class Verdict(StrEnum):
     NOT_RUN = "not run"
 
 
-class Kind(StrEnum):
+class ClaimKind(StrEnum):
     """What a claim is, and whether its verdict counts."""
 
     CLAIM = "claim"
@@ -57,10 +57,10 @@ class Kind(StrEnum):
     """A milder form of a claim; it does not count."""
 
 
-COUNTED: Final = (Kind.CLAIM, Kind.AIM)
+COUNTED: Final = (ClaimKind.CLAIM, ClaimKind.AIM)
 
 
-class Change(BaseModel):
+class Revision(BaseModel):
     """When something was added, changed or withdrawn after a report, and why; a claim as it was at first has none."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -76,11 +76,11 @@ class Change(BaseModel):
         return self
 
 
-class Claim(Change):
-    """A claim of the paper, an aim of this project, or what stands beside them."""
+class Claim(Revision):
+    """A claim of the paper, an aim of this project, a check or a variant."""
 
     study: str
-    kind: Kind = Kind.CLAIM
+    kind: ClaimKind = ClaimKind.CLAIM
     figure: str
     says: str
     of_paper: str
@@ -99,7 +99,7 @@ class Judged(NamedTuple):
     """One a draw; empty where the study gave none."""
     of_paper: float | None
     """From the points of the paper's figures."""
-    verdict: Verdict
+    verdict: ClaimVerdict
 
 
 @cache
@@ -109,9 +109,9 @@ def claims() -> tuple[Claim, ...]:
 
 
 @cache
-def withdrawn() -> tuple[Change, ...]:
+def withdrawn() -> tuple[Revision, ...]:
     """Return what was claimed in an earlier report."""
-    return tuple(Change.model_validate(one) for one in _document()["withdrawn"])
+    return tuple(Revision.model_validate(one) for one in _document()["withdrawn"])
 
 
 def _document() -> dict[str, Any]:
@@ -128,18 +128,18 @@ def _judged(claim: Claim, values: tuple[float, ...]) -> Judged:
     return Judged(claim, values, of_paper, verdict(claim, values))
 
 
-def verdict(claim: Claim, values: tuple[float, ...]) -> Verdict:
+def verdict(claim: Claim, values: tuple[float, ...]) -> ClaimVerdict:
     """Return the verdict on a claim, given one value a draw."""
     if not values:
-        return Verdict.NOT_RUN
+        return ClaimVerdict.NOT_RUN
     if claim.reproduced is None or claim.partly is None:
-        return Verdict.NO_DATA
+        return ClaimVerdict.NO_DATA
     if all(_within(claim.reproduced, value) for value in values):
-        return Verdict.REPRODUCED
+        return ClaimVerdict.REPRODUCED
     mean = float(np.mean(values))
     if _within(claim.reproduced, mean) or all(_within(claim.partly, value) for value in values):
-        return Verdict.PARTLY
-    return Verdict.NOT_REPRODUCED
+        return ClaimVerdict.PARTLY
+    return ClaimVerdict.NOT_REPRODUCED
 
 
 def _within(limits: tuple[float, float], value: float) -> bool:
@@ -202,12 +202,13 @@ def counts(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
     """
     some = counted(judged)
     groups = {
-        "claims of the paper": [j for j in some if j.claim.kind is Kind.CLAIM],
-        "among them calibrated": [j for j in some if j.claim.kind is Kind.CLAIM and j.claim.calibrated],
-        "aims of this project": [j for j in some if j.claim.kind is Kind.AIM],
+        "claims of the paper": [j for j in some if j.claim.kind is ClaimKind.CLAIM],
+        "among them calibrated": [j for j in some if j.claim.kind is ClaimKind.CLAIM and j.claim.calibrated],
+        "aims of this project": [j for j in some if j.claim.kind is ClaimKind.AIM],
     }
     return {
-        name: {one.value: sum(j.verdict is one for j in group) for one in Verdict} for name, group in groups.items()
+        name: {one.value: sum(j.verdict is one for j in group) for one in ClaimVerdict}
+        for name, group in groups.items()
     }
 
 

@@ -1,1 +1,1 @@
-"""Results of a run: recorded as it goes on, evaluated, kept in a folder, read again, compared, exported."""
+"""Results of a run: recorded, evaluated, kept in a folder, read again, compared, exported."""

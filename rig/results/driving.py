@@ -26,7 +26,7 @@ DRIVERS: Final[Mapping[int, str]] = {
     Mode.CLASSICAL: "loops",
     Mode.MANUAL: "operator",
 }
-"""Whose inputs are applied in each mode; nobody's while the last ones are held."""
+"""Source of the applied inputs in each mode; "nobody" while the last ones are held."""
 SHOWN: Final = (L1, T5)
 """Outputs of which the trace has what the sensor showed."""
 
@@ -41,7 +41,7 @@ class Driving(NamedTuple):
     """Outputs whose measurement was substituted."""
 
 
-class Fault(NamedTuple):
+class SensorFaultRecord(NamedTuple):
     """What is wrong with a sensor from one tick on."""
 
     tick: int
@@ -52,12 +52,12 @@ class Fault(NamedTuple):
 class DrivingHistory:
     """Takes events in the order of each journal; returns the columns of ticks that do not come back.
 
-    A control PLC that was restarted may go on some ticks back: what it notes then holds from there on.
+    A restarted control PLC may resume some ticks back: its later events hold from there on.
     """
 
     def __init__(self) -> None:
         self._states = [Driving()]
-        self._faults: dict[int, list[Fault]] = {output: [] for output in SHOWN}
+        self._faults: dict[int, list[SensorFaultRecord]] = {output: [] for output in SHOWN}
         self._held = dict.fromkeys(SHOWN, math.nan)
         """What a frozen sensor shows."""
 
@@ -67,7 +67,7 @@ class DrivingHistory:
             if event.kind == EventKind.SESSION:  # it begins with healthy sensors
                 self._faults = {output: [] for output in SHOWN}
             elif event.kind == EventKind.SENSOR_FAULT and event.subject in self._faults:
-                self._faults[event.subject].append(Fault(event.tick, event.cause, event.value))
+                self._faults[event.subject].append(SensorFaultRecord(event.tick, event.cause, event.value))
             return
         last = self._states[-1]
         if event.kind == EventKind.MODE:
@@ -132,7 +132,7 @@ def _texts(state: Driving) -> dict[str, str | None]:
     return dict(zip(_TEXTS, words, strict=True))
 
 
-def _shown_by(fault: Fault | None, true: float, held: float) -> float:
+def _shown_by(fault: SensorFaultRecord | None, true: float, held: float) -> float:
     if fault is None or fault.kind == SensorFaultKind.NONE:
         return float(true)
     if fault.kind == SensorFaultKind.NOT_A_NUMBER:

@@ -1,4 +1,4 @@
-"""Sinks that write the files of a run as it goes on, row group by row group, in constant memory."""
+"""Sinks that write the files of a run while it runs, row group by row group, in constant memory."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -53,7 +53,7 @@ class ParquetFile:
         self._writer.write_table(table)
 
     def check(self) -> None:
-        """Tell whether more can be written.
+        """Return whether more can be written.
 
         Raises:
             ResultsError: The disk is full; what was written is whole, and the file can be closed.

@@ -1,4 +1,4 @@
-"""Indicators of a run (paper, section V), summed while it goes on or from a recording."""
+"""Indicators of a run (paper, section V), summed during the run or from a recording."""
 
 import hashlib
 import math

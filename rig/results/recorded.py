@@ -92,7 +92,7 @@ class PendingTicks:
         self.count = end
 
     def put(self, sample: PlantSample, station: StationSample | None) -> bool:
-        """Put a tick where it belongs; tell whether nothing was known of it before."""
+        """Put a tick where it belongs; return whether nothing was known of it before."""
         row = sample.tick - self.first
         load, u, y, x, warm = self._parts
         unknown = bool(np.isnan(load[row, 0]))

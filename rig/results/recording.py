@@ -1,4 +1,4 @@
-"""What a run reports while it goes on, and to whom.
+"""What a run reports to its sinks.
 
 A rig calls the `Recorder`; the recorder passes samples on in blocks, and updates when their sequence was played, to
 its sinks. Sinks write files, evaluate, show a line, or keep all in memory.
@@ -150,7 +150,7 @@ class Recorder:
         place = sample.tick - self._pending.first
         if place < 0:
             raise LinkError(
-                f"tick {sample.tick} came again after tick {self.next_tick - 1}: the plant went back too far"
+                f"tick {sample.tick} was repeated after tick {self.next_tick - 1}: the plant was set back too far"
             )
         missing = max(0, sample.tick - self.next_tick)
         again = sample.tick < self.next_tick
@@ -176,7 +176,7 @@ class Recorder:
         self._taken(PlantSample(self.next_tick - 1, load, tuple(u), tuple(y), tuple(x)))
 
     def _taken(self, sample: PlantSample) -> None:
-        """Pass on what is old enough, and stop where that is asked for."""
+        """Pass on settled samples, and stop on request."""
         self._last = time.monotonic()
         for sink in self._sinks:
             sink.sample(sample)

@@ -105,7 +105,7 @@ class RunFolder:
 
     @contextmanager
     def reading(self, name: str) -> Iterator[pq.ParquetFile]:
-        """Have a Parquet file of the run open, and be told in a line if it is damaged.
+        """Open a Parquet file of the run; a damaged one is a one-line error.
 
         Raises:
             UsageError: It cannot be read, or has other columns.

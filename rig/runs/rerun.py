@@ -1,7 +1,7 @@
 """A recorded run again, from its manifest: the same trace, or what is different.
 
 The trace depends on the configuration alone, so a run over Modbus is repeated in one process. A run in real time has
-the trace of lock-step as long as no deadline was missed.
+the trace of lock-step if no deadline was missed.
 """
 
 from collections.abc import Mapping
@@ -52,7 +52,7 @@ def repeat(folder: Path, out: Path | None, *, force: bool) -> tuple[bool, str]:
     effective = _configuration(run)
     scenario = make_scenario(effective.settings, manifest["recorded_ticks"])
     if profile_digest(scenario.load) != manifest["inputs"]["load"]["profile_sha256"]:
-        raise UsageError(f"load {manifest['inputs']['load']['source']}: this version makes another one of the name")
+        raise UsageError(f"load {manifest['inputs']['load']['source']}: this version has another load of the name")
     trace = _trace(effective, scenario, out, force=force)
     if trace == manifest["hashes"]["trace_sha256"]:
         return True, f"{scenario.ticks} ticks, the same trace {trace}\n"

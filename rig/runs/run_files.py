@@ -1,4 +1,4 @@
-"""The files of a run while it goes on, and how they end: complete, or with the reason why not."""
+"""The files of a run: written during the run, and completed with its result or the reason of its failure."""
 
 import contextlib
 import math
@@ -45,7 +45,7 @@ class RunFiles:
         sinks: Further sinks of the recorder.
 
     Raises:
-        UsageError: The disk is nearly full, or what is to be run lies in the folder.
+        UsageError: The disk is nearly full, or an input of the run lies in the folder.
         OSError: A file cannot be made.
     """
 
@@ -97,7 +97,7 @@ class RunFiles:
             self._discard()
             with contextlib.suppress(OSError):
                 self.folder.rmdir()  # it stays if it has logs
-            raise _told(error, self.folder)
+            raise _results_error(error, self.folder)
         reason = None if error is None else _reason(error)
         summary = summary_of(self._evaluation, self.recorder, realtime=self._realtime, reason=reason)
         manifest = final_manifest(self._manifest, reason, recorded, self._evaluation.trace_sha256)
@@ -108,7 +108,8 @@ class RunFiles:
         except (OSError, ColdloopError) as of_files:
             error = error or of_files
         if error is not None:
-            raise _told(error, self.folder, f"{recorded} of {self.recorder.ticks} ticks are recorded in {self.folder}")
+            kept = f"{recorded} of {self.recorder.ticks} ticks are recorded in {self.folder}"
+            raise _results_error(error, self.folder, kept)
         return summary
 
     def _discard(self) -> None:
@@ -152,7 +153,7 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _told(error: BaseException, folder: Path, kept: str = "") -> BaseException:
+def _results_error(error: BaseException, folder: Path, kept: str = "") -> BaseException:
     """Return the error with what a user needs to know about the files."""
     if isinstance(error, OSError):
         error = ResultsError(f"{error.filename or folder}: {error.strerror or error}; choose another --out")

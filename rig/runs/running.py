@@ -1,4 +1,4 @@
-"""One run into a folder: driven, recorded as it goes on, evaluated, drawn. What is recorded outlives what stops it."""
+"""One run into a folder: driven, recorded, evaluated, drawn. What is recorded survives an interruption."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,7 @@
 """How the runs of a study are done: by Dask workers, each run once, what is done already being read back.
 
 Results do not depend on the number of workers: a run is a function of its request. A worker that dies costs only the
-runs it had in hand, which others do again; a study that is stopped goes on where it was. Workers write outcomes to the
+runs it had in hand, which others do again; a stopped study resumes where it was. Workers write outcomes to the
 store themselves: only requests go through the scheduler.
 """
 
@@ -92,7 +92,7 @@ def perform_all(requests: Sequence[RunRequest], store: Store, workers: Workers, 
 
 
 class _Agenda:
-    """What is still to be done: of each family the run with the largest limit, then those that it does not tell."""
+    """Remaining runs: of each family the run with the largest limit, then those that it does not determine."""
 
     def __init__(self, store: Store, outcomes: StoredOutcomes) -> None:
         self._store = store

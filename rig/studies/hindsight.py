@@ -36,27 +36,27 @@ WIDTH: Final = 1
 
 
 class Objective(StrEnum):
-    """What is to be low."""
+    """Cost to be minimised."""
 
     CLOSED_LOOP = "J_BF"
     OPEN_LOOP = "J_open_mean"
 
 
-class Branch(Protocol):
-    """One way that a run may have gone so far."""
+class SearchBranch(Protocol):
+    """One candidate run of the search."""
 
     @property
     def cost(self) -> float:
-        """What is to be low, so far."""
+        """Cost so far."""
 
     def fork(self) -> Self:
-        """Return a branch that goes on from here by itself."""
+        """Return an independent copy."""
 
     def advance(self, choice: int, until: int) -> None:
-        """Go on to the tick `until` with this choice."""
+        """Advance to the tick `until` with this choice."""
 
 
-B = TypeVar("B", bound=Branch)
+B = TypeVar("B", bound=SearchBranch)
 
 
 def beam_search(root: B, choices: int, boundaries: Sequence[int], width: int) -> tuple[tuple[int, ...], B]:
@@ -80,7 +80,7 @@ def beam_search(root: B, choices: int, boundaries: Sequence[int], width: int) ->
     return min(beam, key=_cost_and_choices)
 
 
-def _cost_and_choices(one: tuple[tuple[int, ...], Branch]) -> tuple[float, tuple[int, ...]]:
+def _cost_and_choices(one: tuple[tuple[int, ...], SearchBranch]) -> tuple[float, tuple[int, ...]]:
     return one[1].cost, one[0]
 
 
@@ -137,7 +137,7 @@ class LoopBranch:
         return copy.deepcopy(self)
 
     def advance(self, choice: int, until: int) -> None:
-        """Go on to `until`; periods that begin from now on are of the choice."""
+        """Advance to `until`; periods that begin from now on have this choice."""
         plant, control, optimizer = programs = self._programs
         optimizer.rule = self._rules[choice]
         stretches = CompiledStretches(plant, control, optimizer, self._load) if self._compiled else None

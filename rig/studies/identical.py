@@ -28,7 +28,7 @@ def iteration_limit(request: RunRequest) -> int | None:
 
 
 def never_cut_off(outcome: Outcome, limit: int) -> bool:
-    """Tell whether each solve of a run ended by itself before `limit` iterations."""
+    """Return whether each solve of a run ended by itself before `limit` iterations."""
     return max(outcome.updates["iterations"], default=limit) < limit
 
 

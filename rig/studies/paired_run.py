@@ -31,13 +31,13 @@ def paired_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
     solver, problem, penalised = make_solver(program), sequence.problem, sequence.solved_with(program)
     z = problem.hold(np.zeros(len(problem.design.input_scale)))
     columns: Columns = {name: [] for name in ("iterations", "j_dev", "j_cst", "violation", "lowest")}
-    for (situation, _), lowest in zip(sequence.recorded, sequence.lowest.tolist(), strict=True):
-        qp, ticks = problem.at(situation), situation.elapsed_ticks
+    for (parameters, _), lowest in zip(sequence.recorded, sequence.lowest.tolist(), strict=True):
+        qp, ticks = problem.at(parameters), parameters.elapsed_ticks
         iterations = PlcBudget(program.budget, solver.tau_1_s).iterations(ticks)
-        answer = solver.solve(penalised.at(situation), problem.shifted(z, ticks), (iterations,))
-        z = penalised.within_first_rate(answer.z, situation)
-        cost = sequence.profiles.cost(qp, z, situation)
-        violation = float(indicators(problem, qp, z, situation).violation)
+        answer = solver.solve(penalised.at(parameters), problem.shifted(z, ticks), (iterations,))
+        z = penalised.within_first_rate(answer.z, parameters)
+        cost = sequence.profiles.cost(qp, z, parameters)
+        violation = float(indicators(problem, qp, z, parameters).violation)
         for name, value in zip(columns, (answer.iterations[-1], *cost, violation, lowest), strict=True):
             columns[name].append(float(value))
     return columns
@@ -54,21 +54,21 @@ def harsh_run(sequence: ProblemSequence, program: ProgramSettings) -> Columns:
     names = ("lowest", "guess", *(f"{what}_{k}" for k in counts for what in ("count", "after")))
     columns: Columns = {name: [] for name in names}
     before = problem.hold(np.zeros(len(problem.design.input_scale)))
-    for (situation, z), lowest in zip(sequence.recorded, sequence.lowest.tolist(), strict=True):
-        qp = problem.at(situation)
-        guess = problem.shifted(before, situation.elapsed_ticks)
-        at_guess = sequence.profiles.cost(qp, guess, situation).total
+    for (parameters, z), lowest in zip(sequence.recorded, sequence.lowest.tolist(), strict=True):
+        qp = problem.at(parameters)
+        guess = problem.shifted(before, parameters.elapsed_ticks)
+        at_guess = sequence.profiles.cost(qp, guess, parameters).total
         before, settling = z, SETTLING.get(program.solver, 0)
         harsh = at_guess + FLOOR > HARSH * (lowest + FLOOR)
         if not harsh and not settling:
             continue
         looked_at = tuple(counts.values()) if harsh else ()
         last = looked_at[-1] if harsh else 0
-        answer = solver.solve(penalised.at(situation), guess, (*looked_at, last + settling))
+        answer = solver.solve(penalised.at(parameters), guess, (*looked_at, last + settling))
         if harsh:
             row = [lowest, at_guess]
             for count, point in zip(looked_at, answer.points, strict=False):
-                row += [count, sequence.profiles.cost(qp, point, situation).total]
+                row += [count, sequence.profiles.cost(qp, point, parameters).total]
             for name, value in zip(columns, row, strict=True):
                 columns[name].append(float(value))
     return columns

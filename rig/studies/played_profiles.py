@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from coldloop.errors import StudyError
 from optimizer_plc.qp.costs import indicators
 from optimizer_plc.qp.design import N_INPUTS, N_SLACKS
-from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem, Situation
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 
 Array = NDArray[np.float64]
 
@@ -61,12 +61,12 @@ class PlayedProfiles:
             knots[knot] = np.clip(knots[knot], knots[knot - 1] - reach, knots[knot - 1] + reach)
         return self._with_slacks(knots.ravel())
 
-    def cost(self, qp: QuadraticProblem, z: Array, situation: Situation) -> PlayedCost:
+    def cost(self, qp: QuadraticProblem, z: Array, parameters: QpParameters) -> PlayedCost:
         """Return what a profile costs as it is played; violations are those of the predicted outputs."""
-        found = indicators(self._problem, qp, self.played(qp, z), situation)
+        found = indicators(self._problem, qp, self.played(qp, z), parameters)
         return PlayedCost(float(found.j_dev), float(found.j_cst))
 
-    def optimum(self, qp: QuadraticProblem, situation: Situation) -> Array:
+    def optimum(self, qp: QuadraticProblem, parameters: QpParameters) -> Array:
         """Return the profile of lowest cost among those that can be played.
 
         The cost is quadratic wherever the same outputs are outside their bands: Newton's method on these pieces, each
@@ -75,8 +75,8 @@ class PlayedProfiles:
         Raises:
             StudyError: It does not end.
         """
-        outputs = self._problem.outputs(np.zeros(self._problem.size), situation).ravel()
-        p = np.clip(self._problem.hold(situation.u_before), qp.low, qp.high)[: self._n]
+        outputs = self._problem.outputs(np.zeros(self._problem.size), parameters).ravel()
+        p = np.clip(self._problem.hold(parameters.u_before), qp.low, qp.high)[: self._n]
         for _ in range(MOST_STEPS):
             outside = self._outside(outputs + self._outputs @ p)
             hessian, slope = self._piece(qp, outputs, outside)

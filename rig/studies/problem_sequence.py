@@ -13,7 +13,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.safety.sequence import InputSequence
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, Situation
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from optimizer_plc.rules import UpdatingRule
 from optimizer_plc.settings import ProgramSettings, SolverName
 from rig.cosim.one_process import OneProcessRig
@@ -33,10 +33,10 @@ so that no penalty has an effect there."""
 CONVERGED: Final = ("optimizer_plc.program.solver=daqp", "optimizer_plc.program.budget.preparation_slots=0")
 
 
-class Recorded(NamedTuple):
+class LoopProblem(NamedTuple):
     """A problem of the converged loop."""
 
-    situation: Situation
+    parameters: QpParameters
     z: Array
     """The profile that the loop delivered: the optimum of the quadratic problem."""
 
@@ -49,7 +49,7 @@ class ProblemSequence(NamedTuple):
     problem: PredictiveProblem
     """With the default penalties: what profiles are judged by."""
     profiles: PlayedProfiles
-    recorded: Sequence[Recorded]
+    recorded: Sequence[LoopProblem]
     lowest: Array
     """The lowest cost of a profile that can be played, for each problem."""
 
@@ -59,11 +59,11 @@ class ProblemSequence(NamedTuple):
 
 
 class _ListeningOptimizer(OptimizerProgram):
-    """Keeps the situation and the profile of every problem."""
+    """Keeps parameters and profile of every problem."""
 
     def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
-        """Begin anew."""
-        self.heard: list[Recorded] = []
+        """Reset."""
+        self.heard: list[LoopProblem] = []
         super().restart(updating_period_s, rule)
 
     def solve(self) -> InputSequence:
@@ -71,7 +71,7 @@ class _ListeningOptimizer(OptimizerProgram):
         sequence = super().solve()
         sent = self.state.sent
         w, ticks = float(sent.numbers[0]["w"]), int(sent.numbers[0]["ticks"])
-        self.heard.append(Recorded(Situation(sent.x.copy(), w, sent.u_before.copy(), ticks), sent.z.copy()))
+        self.heard.append(LoopProblem(QpParameters(sent.x.copy(), w, sent.u_before.copy(), ticks), sent.z.copy()))
         return sequence
 
 
@@ -92,10 +92,10 @@ def _recorded(scenario: Scenario, assignments: tuple[str, ...]) -> ProblemSequen
     problem = PredictiveProblem(prediction, program.design, settings.limits)
     profiles = PlayedProfiles(problem)
     return ProblemSequence(prediction, settings.limits, problem, profiles, listening.heard, np.array([
-        _lowest(problem, profiles, recorded.situation) for recorded in listening.heard
+        _lowest(problem, profiles, recorded.parameters) for recorded in listening.heard
     ]))  # fmt: skip
 
 
-def _lowest(problem: PredictiveProblem, profiles: PlayedProfiles, situation: Situation) -> float:
-    qp = problem.at(situation)
-    return profiles.cost(qp, profiles.optimum(qp, situation), situation).total
+def _lowest(problem: PredictiveProblem, profiles: PlayedProfiles, parameters: QpParameters) -> float:
+    qp = problem.at(parameters)
+    return profiles.cost(qp, profiles.optimum(qp, parameters), parameters).total

@@ -1,4 +1,4 @@
-"""One run of a study: what it is asked to do, and what is kept of it. Both travel between processes as plain data."""
+"""One run of a study: request and outcome. Both travel between processes as plain data."""
 
 import asyncio
 import hashlib
@@ -73,7 +73,7 @@ class Procedure(StrEnum):
     CONFIGURED = "configured"
     """The three programs, as they are configured."""
     PAIRED_PROBLEMS = "paired problems"
-    """Nobody: the configured solver goes through the problems of a converged loop (`rig.studies.paired_run`)."""
+    """No loop: the configured solver solves the problems of a converged loop (`rig.studies.paired_run`)."""
     HARSH_PROBLEMS = "harsh problems"
     """The same, and only those count whose guess is far from the optimum, each solver beginning at the same one."""
     INFINITELY_FAST = "infinitely fast"

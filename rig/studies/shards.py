@@ -146,14 +146,14 @@ def _common_number(study: Study, options: StudyOptions, sources: Sequence[Path])
     cuts = {record.of: path for path, record in records}
     if len(cuts) > 1:
         (of, path), (other, other_path) = list(cuts.items())[:2]
-        raise UsageError(f"{other_path}: one of {other} shards, while {path} is one of {of}; merge shards of one cut")
+        raise UsageError(f"{other_path}: one of {other} shards, while {path} is one of {of}; merge shards of one set")
     return next(iter(cuts))
 
 
 def _records(study: Study, source: Path) -> list[Path]:
     found = sorted((source / study.name).glob(RECORDS))
     if not found:
-        raise UsageError(f"{source}: no shard of study {study.name}; name folders that --shard was done with --out")
+        raise UsageError(f"{source}: no shard of study {study.name}; name the --out folders of the shards")
     return found
 
 

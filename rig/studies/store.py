@@ -1,7 +1,7 @@
 """Where outcomes are kept: a file each, named by the digest of its request, whole or not at all.
 
 Any number of processes, on any number of machines that share the folder, may write to a store at once: a run is a
-function of its request, so whoever writes the same file writes the same bytes.
+function of its request, so every writer of a file writes the same bytes.
 """
 
 from collections import OrderedDict

@@ -1,4 +1,4 @@
-"""What a study is: runs that are asked for, and what is made of their outcomes."""
+"""A study: its runs, and the evaluation of their outcomes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ Outcomes = Mapping[RunRequest, Outcome]
 Cell = str | float | int
 
 USUAL_DRAWS = 3
-"""Of each load, unless a study has a number of its own or the command says."""
+"""Of each load, unless the study or the command sets another number."""
 RUNS = "runs"
 """Folder, beside those of the studies, in which runs are kept: studies share them."""
 QUICK_TICKS = 2400
@@ -34,7 +34,7 @@ PROGRAM = "optimizer_plc.program."
 
 @dataclass(frozen=True)
 class StudyOptions:
-    """How much of a study is asked for."""
+    """Extent of a study."""
 
     seeds: int | None = None
     """Draws of each named load, if not the study's own number; of a load file, draws of the sensors' noise."""
@@ -47,7 +47,7 @@ class StudyOptions:
 
     @property
     def draws(self) -> range:
-        """Numbers of the draws of a study that has no number of its own."""
+        """Default numbers of the draws."""
         return self.drawn(USUAL_DRAWS)
 
     def drawn(self, usual: int) -> range:

@@ -9,7 +9,7 @@ T = TypeVar("T")
 
 
 class BackgroundLoop:
-    """Runs coroutines in a thread of its own until it is closed."""
+    """Runs coroutines in a background thread until it is closed."""
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()

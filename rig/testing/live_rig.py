@@ -116,7 +116,7 @@ class LiveRig:
         """Wait until `condition()` is true, for at most `within_s` of plant time; return the plant time then.
 
         The condition is looked at every 0.25 s of plant time in lock-step, and a hundred times a second in real time.
-        While plant time does not go on, as without the plant, real time counts.
+        While plant time is stopped, as without the plant, real time counts.
 
         Raises:
             TimeoutError: It did not become true.
@@ -126,11 +126,11 @@ class LiveRig:
             tick = self._tick_or_none()
             start = tick if start is None else start
             if tick is not None and start is not None and (tick - start) * TICK_S >= within_s:
-                raise TimeoutError(f"the condition was not true within {within_s:g} s of plant time")
+                raise TimeoutError(f"the condition was not met within {within_s:g} s of plant time")
             if self._scenario.realtime or tick is None:
                 if time.monotonic() > deadline:
                     raise TimeoutError(
-                        f"the condition was not true within {within_s:g} s, and plant time does not go on"
+                        f"the condition was not met within {within_s:g} s, and plant time does not advance"
                     )
                 time.sleep(LOOK_S)
             else:
@@ -147,7 +147,7 @@ class LiveRig:
 
     @contextmanager
     def fault(self, kind: str, **parameters: object) -> Iterator[None]:
-        """Have a fault for as long as the context lasts; at its end, wait until what was stopped answers again.
+        """Inject a fault during the context; at its end, wait until stopped services answer again.
 
         Args:
             kind: One of those of a chaos plan, such as `kill`, `pause`, `drop` or `sensor`.
@@ -179,7 +179,7 @@ class LiveRig:
         return True
 
     async def change_surroundings(self, target: str, value: float) -> float | None:
-        """Change one of a refrigerator's surroundings, and return what it was; for the injector."""
+        """Change one of a refrigerator's surroundings, and return its old value; for the injector."""
         try:
             given = await self._clients["plant"].read(Surroundings)
             before = getattr(given, target)
@@ -191,7 +191,7 @@ class LiveRig:
     def log(self, service: str) -> Path:
         """Return the log of `plant`, `control_plc` or `optimizer_plc`: one JSON object a line."""
         if service not in SERVICES:
-            raise UsageError(f"no service '{service}'; there are {', '.join(SERVICES)}")
+            raise UsageError(f"unknown service '{service}'; choose from {', '.join(SERVICES)}")
         return self._proxied.services.log(service)
 
     # -- start and end -------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ class NamedRegisters:
     A name is that of the block, a dot, and that of the register: `measurement.y.T5`, `operator.mode`. Without the
     element it is the whole array: `measurement.y`. Values have the units of the register map.
 
-    A block with a CRC that nobody has sealed cannot be read (`DamagedAnswerError`): write all of it.
+    A block with a CRC that was never sealed cannot be read (`DamagedAnswerError`): write all of it.
 
     All methods raise `UsageError` for a name that does not exist, `PeerUnreachableError` when the service does not
     answer, and `RequestRefusedError`, with the `exception_code`, when it refuses the request.
@@ -84,7 +84,7 @@ class NamedRegisters:
 
     def _block(self, name: str) -> Block:
         if name not in self._blocks:
-            raise UsageError(f"no block '{name}'; there are {', '.join(self._blocks)}")
+            raise UsageError(f"unknown block '{name}'; choose from {', '.join(self._blocks)}")
         return self._blocks[name]
 
     def _place(self, name: str) -> _Place:

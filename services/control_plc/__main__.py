@@ -1,4 +1,4 @@
-"""`python -m control_plc`: the control PLC as a service of its own."""
+"""`python -m control_plc`: the control PLC as a service."""
 
 import sys
 

@@ -39,25 +39,25 @@ class AlarmRule(NamedTuple):
 
 
 DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
-    # Nobody controls the process, or somebody else does: act at once.
+    # The process is uncontrolled, or under another master: act at once.
     AlarmKind.PLANT_LOST: AlarmRule(CRITICAL),  # only the rack's watchdog protects the plant
     AlarmKind.PLANT_FOREIGN: AlarmRule(CRITICAL),  # another master decides the outputs
     AlarmKind.OUTPUTS_NOT_TAKEN: AlarmRule(CRITICAL),  # what is computed is not applied
     AlarmKind.SCANS_STOPPED: AlarmRule(CRITICAL),  # nothing is computed
-    # The process leaves its limits, or is about to without anybody seeing it: act within minutes.
+    # The process leaves its limits, or is about to unnoticed: act within minutes.
     AlarmKind.LEVEL_BAND: AlarmRule(HIGH),  # the bath may run dry or flood; on-delay: `band_delay_s`
     AlarmKind.T5_BAND: AlarmRule(HIGH),  # the turbines leave their range; on-delay: `band_delay_s`
     AlarmKind.PLANT_FROZEN: AlarmRule(HIGH),  # measurements are old
-    # Control goes on with less quality, or a protection is gone: act within the shift.
+    # Control is degraded, or a protection is lost: act within the shift.
     AlarmKind.MODE: AlarmRule(MEDIUM),  # the ladder has left MPC
     AlarmKind.SEQUENCE_EXHAUSTED: AlarmRule(MEDIUM),  # outputs are held, then the classical loops control
     AlarmKind.OPTIMIZER_LOST: AlarmRule(MEDIUM),  # no new sequence will come by itself
     AlarmKind.SENSOR_BAD: AlarmRule(MEDIUM),  # substituted; the ladder reacts to those that matter
-    AlarmKind.MODEL_MISMATCH: AlarmRule(MEDIUM),  # no sequence is accepted until somebody changes a configuration
+    AlarmKind.MODEL_MISMATCH: AlarmRule(MEDIUM),  # no sequence is accepted until a configuration is changed
     AlarmKind.SECOND_WRITER: AlarmRule(MEDIUM, off_delay_s=60.0),  # refused, but wired or configured wrongly
     AlarmKind.CERTIFICATE: AlarmRule(MEDIUM),  # clients will not connect once it has expired
     AlarmKind.STATE_NOT_RETAINED: AlarmRule(MEDIUM),  # a restart would not continue from here
-    # Nothing is to be done at once: a hint for maintenance.
+    # No immediate action: a hint for maintenance.
     AlarmKind.SEQUENCE_REJECTED: AlarmRule(LOW),  # the rest of the last sequence is played meanwhile
     AlarmKind.SEQUENCE_LATE: AlarmRule(LOW),  # likewise
     AlarmKind.SCAN_OVERRUN: AlarmRule(LOW, off_delay_s=60.0),  # outputs came some milliseconds late
@@ -70,7 +70,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
 def _known_name(name: str) -> str:
     if name.upper() not in AlarmKind.__members__:
         known = ", ".join(kind.name.lower() for kind in AlarmKind)
-        raise ValueError(f"no alarm is called '{name}'; there are {known}")
+        raise ValueError(f"unknown alarm '{name}'; choose from {known}")
     return name.lower()
 
 

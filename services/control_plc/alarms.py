@@ -2,7 +2,7 @@
 
     condition ──on-delay, off-delay──> active ──TRANSITIONS──> state ──> registers, journal
 
-A condition is reported as it is (`holds`, `raised`, `returned`, `happened`). When it has changed for the delay of its
+A condition is reported as it is (`report`, `raised`, `returned`, `pulse`). When it has changed for the delay of its
 alarm, `active` follows, and the state makes a transition. Operators make the others. All times are plant time, measured
 by ticks and not by scans: scans can be missed.
 
@@ -47,11 +47,11 @@ TRANSITIONS: Final[Mapping[AlarmState, Mapping[EventKind, AlarmState]]] = {
         EventKind.ALARM_RAISED: AlarmState.SHELVED,  # in the journal, and not shown
         EventKind.ALARM_RETURNED: AlarmState.SHELVED,
         EventKind.ALARM_SHELVED: AlarmState.SHELVED,  # for another time
-        EventKind.ALARM_UNSHELVED: AlarmState.NORMAL,  # and raised anew when active
+        EventKind.ALARM_UNSHELVED: AlarmState.NORMAL,  # and raised again when active
         EventKind.ALARM_OUT_OF_SERVICE: AlarmState.OUT_OF_SERVICE,
     },
     AlarmState.OUT_OF_SERVICE: {
-        EventKind.ALARM_IN_SERVICE: AlarmState.NORMAL,  # and raised anew when active
+        EventKind.ALARM_IN_SERVICE: AlarmState.NORMAL,  # and raised again when active
     },
 }
 """The state after an event. What is not here does not happen: it changes nothing, and nothing is noted."""
@@ -90,7 +90,7 @@ class AlarmPanel:
         self._rules = [settings.rule(kind) for kind in AlarmKind]
         self._pending: dict[AlarmKind, _Pending] = {}
         self._causes: dict[AlarmKind, set[int]] = {}
-        """Those that are no news: for which an active alarm has been raised since it was last acknowledged."""
+        """Causes for which an active alarm has been raised since its last acknowledgement."""
         self._now = 0
         self.rows = [Alarm(priority=rule.priority) for rule in self._rules]
         """What the registers show, by number of the alarm."""
@@ -119,11 +119,11 @@ class AlarmPanel:
             self._store(kind, shelved_until=max(tick + 1, self.rows[kind].shelved_until - back))
 
     def begin_at(self, tick: int) -> None:
-        """Go on at a tick that may lie before the present one."""
+        """Set the tick, which may lie before the present one."""
         self.now = tick
 
     def pass_by(self) -> None:
-        """Let the delays and the shelving that are over by now take effect; call it once a scan."""
+        """Apply expired delays and shelving times; call it once per scan."""
         for kind in list(self._pending):
             self._settle(kind)
         for kind in self._shelved():
@@ -132,8 +132,8 @@ class AlarmPanel:
 
     # -- conditions ----------------------------------------------------------------------------------------------------
 
-    def holds(self, kind: AlarmKind, *, condition: bool, cause: int = 0) -> None:
-        """Tell whether the condition of an alarm holds, and why; a cause that it had not yet raises the alarm again."""
+    def report(self, kind: AlarmKind, *, condition: bool, cause: int = 0) -> None:
+        """Report the condition of an alarm and its cause; a new cause raises the alarm again."""
         row = self.rows[kind]
         if condition != bool(row.active):
             earlier = self._pending.get(kind)
@@ -142,18 +142,18 @@ class AlarmPanel:
             return
         self._pending.pop(kind, None)
         if condition and cause != row.cause:
-            if cause in self._causes[kind]:  # causes that take turns are no news
+            if cause in self._causes[kind]:  # alternating causes are not new
                 self._store(kind, cause=cause)
             else:
                 self._raise(kind, cause)
 
     def pending(self, *kinds: AlarmKind) -> list[int | None]:
-        """Return since when the condition of each alarm has been another than it shows; None where it is the same."""
+        """Return since when the condition of each alarm has differed from its shown state; None where it does not."""
         changes = map(self._pending.get, kinds)
         return [None if change is None else change.since for change in changes]
 
     def set_pending(self, kind: AlarmKind, since: int | None) -> None:
-        """Note since when the condition of an alarm has been another than it shows."""
+        """Set since when the condition of an alarm has differed from its shown state."""
         self._pending.pop(kind, None)
         if since is not None:
             self._pending[kind] = _Pending(since, 0)
@@ -165,20 +165,20 @@ class AlarmPanel:
         return not any(row.active for row in others) and all(kind in BANDS for kind in self._pending)
 
     def delay(self, kind: AlarmKind) -> int:
-        """Return for how many ticks its condition must have changed until an alarm follows it."""
+        """Return the delay (ticks) after which an alarm follows its condition."""
         rule = self._rules[kind]
         return rule.off_ticks if self.rows[kind].active else rule.on_ticks
 
     def raised(self, kind: AlarmKind, cause: int = 0) -> None:
-        """Tell that the condition of an alarm holds, and why."""
-        self.holds(kind, condition=True, cause=cause)
+        """Report that the condition of an alarm holds, and its cause."""
+        self.report(kind, condition=True, cause=cause)
 
     def returned(self, kind: AlarmKind) -> None:
-        """Tell that the condition of an alarm has ended."""
-        self.holds(kind, condition=False)
+        """Report that the condition of an alarm has ended."""
+        self.report(kind, condition=False)
 
-    def happened(self, kind: AlarmKind, cause: int = 0) -> None:
-        """Tell of something that happens at an instant: the alarm returns an off-delay after the last time.
+    def pulse(self, kind: AlarmKind, cause: int = 0) -> None:
+        """Report an instantaneous condition: the alarm returns an off-delay after the last one.
 
         An alarm with an on-delay is not raised by it.
         """
@@ -216,12 +216,7 @@ class AlarmPanel:
     # -- operators, restarts -------------------------------------------------------------------------------------------
 
     def command(self, command: AlarmCommand, who: str = "") -> None:
-        """Do what an operator asks for; what makes no sense changes nothing.
-
-        Args:
-            command: Alarm, action, and for shelving the time.
-            who: Whose request it is, for the journal.
-        """
+        """Carry out an operator's command; an impossible one changes nothing."""
         event = COMMANDED.get(command.action)
         if event is None:
             return
@@ -243,7 +238,7 @@ class AlarmPanel:
         """Take the alarms of before a restart; priorities are those of the configuration."""
         self.rows = [row._replace(priority=rule.priority) for row, rule in zip(rows, self._rules, strict=True)]
         self._causes = {kind: {row.cause} for kind, row in zip(AlarmKind, rows, strict=True) if row.active}
-        # Who tells of instants does not tell that they are over.
+        # An instantaneous alarm has no end.
         self._pending = {kind: _Pending(self.now, 0) for kind in PASSING if self.rows[kind].active}
         self.changes += 1
 

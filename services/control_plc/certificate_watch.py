@@ -1,4 +1,4 @@
-"""The alarm about certificates that are to be renewed."""
+"""The alarm about certificates that must be renewed."""
 
 import asyncio
 import logging
@@ -41,7 +41,7 @@ class CertificateWatch:
         while self._certificates:
             try:
                 days = await asyncio.to_thread(self._days_of_those_to_renew)  # no scan waits for a disk
-            except ConfigurationError as error:  # somebody is renewing them, perhaps; what was read at the start serves
+            except ConfigurationError as error:  # they may be being renewed: keep what was read at the start
                 log.warning("certificates unreadable", extra={"reason": str(error)})
                 self._program.alarms.raised(AlarmKind.CERTIFICATE, UNREADABLE)
             else:
@@ -58,7 +58,7 @@ class CertificateWatch:
         """Take the days that are left of those to be renewed."""
         least, program = min(days, default=0.0), self._program
         cause = (EXPIRED if least < 0.0 else EXPIRES_SOON) if days else 0
-        program.alarms.holds(AlarmKind.CERTIFICATE, condition=bool(days), cause=cause)
+        program.alarms.report(AlarmKind.CERTIFICATE, condition=bool(days), cause=cause)
         if cause and cause != self._noted:
             program.journal.note(program.alarms.now, EventKind.CERTIFICATE, cause, value=least)
         self._noted = cause

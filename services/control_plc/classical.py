@@ -63,7 +63,7 @@ class ClassicalSettings(BaseModel):
     @model_validator(mode="after")
     def _whole_ticks(self) -> Self:
         if self.period_ticks * TICK_S != self.period_s:
-            raise ValueError(f"period_s is a multiple of the tick, {TICK_S} s")
+            raise ValueError(f"period_s must be a multiple of the tick, {TICK_S} s")
         return self
 
 
@@ -75,7 +75,7 @@ class PiController:
     """A discrete PI controller for an input with bounds and a rate limit.
 
     It computes what to add to the input that is really applied: du = K (e_k - e_{k-1} + T/T_i e_k). This is the PI
-    whose integral is set anew before each execution such that its last output is the applied input (tracking with the
+    whose integral is reset before each execution such that its last output is the applied input (tracking with the
     shortest time constant; Astrom and Murray, Feedback Systems, section on anti-windup). So nothing winds up,
     whatever limits the input, and a start from any input is bumpless.
 
@@ -163,7 +163,7 @@ class ClassicalLoops:
         A loop whose output is among those to do `without` is left: its input stays.
 
         Between executions they are the applied ones. Executions are at multiples of the period, so that with 5 s and
-        no sequence before each of them has a rate window of its own and may use it in full. Where the scan at such a
+        no sequence before each of them has its own rate window and may use it in full. Where the scan at such a
         tick was missed the next one executes, with the time that has passed.
         """
         if not self._is_due(tick):

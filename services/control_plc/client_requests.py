@@ -1,4 +1,4 @@
-"""What optimisers and operators write to the control PLC, and what it makes of it."""
+"""Requests of optimisers and operators to the control PLC, and their effects."""
 
 import asyncio
 from collections.abc import Awaitable
@@ -26,9 +26,9 @@ from coldloop.registers.declaration import Block, Role
 from coldloop.registers.safety import AlarmCommand, AlarmKind, WatchdogTime
 from coldloop.safety.sequence import InputSequence
 from coldloop.safety.writer_lease import LeaseEvent, WriterLease
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.program import ControlProgram
-from control_plc.publication import Publication
+from control_plc.publication import ControlPublication
 from control_plc.sessions import Sessions
 
 LONGEST_WAIT_S: Final = 1.0
@@ -57,7 +57,7 @@ class Clients:
         program: ControlProgram,
         limits: InputLimits,
         bank: RegisterBank,
-        publication: Publication,
+        publication: ControlPublication,
         sessions: Sessions,
     ) -> None:
         self._program = program
@@ -75,7 +75,7 @@ class Clients:
         """Lock-step scans every tick before this one."""
         self.asked: ControlSession | None = None
         """A session that is to begin."""
-        self.asked_pace: Pace | None = None
+        self.pending_time_base: TimeBase | None = None
         """A time base that the session under way is to have."""
         publication.lease = self.lease
         bank.judged_by(self._judge_optimizer, AwaitUpdate, Plan, Heartbeat, SequenceHeader, SequenceRow)
@@ -96,10 +96,10 @@ class Clients:
         try:
             self.lease.check(caller, record.holder if isinstance(record, Heartbeat) else None)
         except BusyError:
-            self._program.alarms.happened(AlarmKind.SECOND_WRITER, SECOND_OPTIMIZER)
+            self._program.alarms.pulse(AlarmKind.SECOND_WRITER, SECOND_OPTIMIZER)
             raise
         if isinstance(record, Plan) and not record.crc:
-            raise IllegalValueError("a plan without CRC: it decides when inputs change, so it is sealed")
+            raise IllegalValueError("a plan needs a CRC: it decides when inputs change")
 
     def _judge_operator(self, record: Operator, _row: int, _caller: Caller) -> None:
         for name, value, low, high in zip(INPUT_NAMES, record[1:], self._limits.low, self._limits.high, strict=True):
@@ -126,7 +126,7 @@ class Clients:
 
     @property
     def optimizer_waits(self) -> bool:
-        """An optimiser has asked for an update and is owed the answer: that it is silent means nothing."""
+        """An optimiser waits for an update: its silence is no failure."""
         return self._waits > 0
 
     def tell(self, update: Update) -> None:
@@ -173,11 +173,11 @@ class Clients:
             self.granted = self._bank.get(Grant).until_tick
         elif record is ControlSession:
             self.asked = asked = self._bank.get(ControlSession)
-            self.asked_pace = None
+            self.pending_time_base = None
             self.granted = 0
             self._note(EventKind.SESSION, asked.realtime, caller.name, value=asked.factor)
         elif record is SessionPace:
-            self.asked_pace = pace = self._bank.get(SessionPace).of(program.session)
+            self.pending_time_base = pace = self._bank.get(SessionPace).of(program.session)
             self._note(EventKind.PACE, pace_subject(pace), caller.name, value=pace.factor)
         elif record is Operator:
             self._operate(self._bank.get(Operator), caller.name)
@@ -227,7 +227,7 @@ class Clients:
             latched = program.player.update
             if latched is not None and not (program.awaiting_plan and latched.tick == program.tick - 1):
                 program.abandon()
-                self._bank.put_sealed(latched._replace(session=0))  # what waits in vain is not given this one
+                self._bank.put_sealed(latched._replace(session=0))  # not for a request of another session
                 wanted = latched.update + 1
             else:
                 wanted = latched.update if latched else 0
@@ -255,7 +255,7 @@ class Clients:
             self._waits -= 1
 
     def on_departure(self, role: Role) -> None:
-        """Nobody of this role is connected any more: an optimiser is not waited for."""
+        """The last client of this role has disconnected: do not wait for an optimiser."""
         if role is Role.OPTIMIZER:
             self._program.optimizer_lost()
             self._publication.safety()
@@ -266,6 +266,6 @@ class Clients:
         self.lease.closed(caller)
 
     def on_refusal(self, kind: str) -> None:
-        """A server has refused something to somebody."""
+        """A server has refused a client's request."""
         if kind == "access_refused":
-            self._program.alarms.happened(AlarmKind.ACCESS_REFUSED)
+            self._program.alarms.pulse(AlarmKind.ACCESS_REFUSED)

@@ -20,7 +20,7 @@ from control_plc.output_limits import (
 
 
 class OutputGuard:
-    """Keeps every output inside its bounds, its rate window and the slew limit, whatever is asked.
+    """Keeps every output inside its bounds, its rate window and the slew limit, whatever is requested.
 
     Its time is that of the ticks, but never faster than the time that has really passed: it does not go back, and a
     leap of the tick ends no window.
@@ -35,29 +35,24 @@ class OutputGuard:
         """The last tick, and by how much our time is behind it."""
 
     def begin_at(self, tick: int, applied: SequenceRow, passed: int | None = None) -> None:
-        """Go on from what is applied at `tick`, wherever that is; it counts as having moved just then.
+        """Restart at `tick` from the outputs applied there; they count as having moved just then.
 
-        A window that is open stays open: breaks that follow one another would else give a full rate each. A value that
-        is not finite is not taken over: the last finite one stays.
-
-        Args:
-            tick: Where to go on.
-            applied: What is applied there.
-            passed: Ticks that have passed since the last scan by another clock; None where there is none.
+        An open window stays open: consecutive breaks would otherwise give a full rate each. A non-finite value is
+        ignored: the last finite one stays. `passed`: ticks since the last scan by another clock, None without one.
         """
         leap = tick - self._tick
         self._lag += leap - max(0, leap if passed is None else min(leap, passed))
         self._tick, tick = tick, tick - self._lag
         state, rates = self.state, self.limits.rate
         finite = [value if math.isfinite(value) else last for value, last in zip(applied, self.applied, strict=True)]
-        goes_on = 0 <= tick - state.start < TICKS_PER_SAMPLE and _reaches(
+        window_is_open = 0 <= tick - state.start < TICKS_PER_SAMPLE and _reaches(
             state.anchor, finite, [rate * state.share for rate in rates]
         )
         for slot, before in enumerate(state.before):  # what is further away limits nothing any more
             state.moves[slot] = min(state.moves[slot], tick) if _reaches(before, finite, rates) else NEVER
         state.applied[:] = finite
-        state.astray = not in_range(self.limits, finite)
-        if not goes_on:
+        state.out_of_bounds = not in_range(self.limits, finite)
+        if not window_is_open:
             state.anchor[:] = finite
             state.start = state.moved = tick
             state.share = rate_share(self.limits, 0)
@@ -86,7 +81,7 @@ class OutputGuard:
         return Verdict.ACCEPTED if passes else Verdict.RATE_EXCEEDED
 
     def out_of_range(self, rows: Sequence[SequenceRow]) -> bool:
-        """Tell whether a row holds a value that is not finite or outside the bounds."""
+        """Return whether a row holds a value that is not finite or outside the bounds."""
         return not all(in_range(self.limits, row) for row in set(rows))
 
 

@@ -14,15 +14,15 @@ from coldloop.registers.control_plc import Cause, Mode, OperatorMode
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
-    """What the choice depends on."""
+class LadderInputs:
+    """Inputs of the choice of mode."""
 
     operator: OperatorMode
     sensors_unusable: bool
     row: bool
-    """There is a row to be played."""
+    """A sequence has a row for this tick."""
     late: bool
-    """It is the rest of a sequence whose successor is late, or will not come: the optimiser is lost."""
+    """The next sequence is late, or the optimiser is lost: this is the rest of the last one."""
 
 
 class Ladder:
@@ -32,27 +32,27 @@ class Ladder:
         self._hold_ticks = hold_ticks
         self.mode, self.cause, self.since = mode, cause, tick
 
-    def step(self, tick: int, situation: Situation) -> bool:
-        """Choose the mode of this scan; tell whether it, or its cause, has changed."""
-        mode, cause = self._chosen(tick, situation)
+    def step(self, tick: int, inputs: LadderInputs) -> bool:
+        """Choose the mode of this scan; return whether it, or its cause, has changed."""
+        mode, cause = self._chosen(tick, inputs)
         if (mode, cause) == (self.mode, self.cause) or (mode is self.mode and mode is Mode.MPC):
             return False
         self.mode, self.cause, self.since = mode, cause, tick
         return True
 
     def set_back(self, tick: int) -> None:
-        """Go on at a tick before the present one."""
+        """Set the time back to a tick before the present one."""
         self.since = min(self.since, tick)
 
-    def _chosen(self, tick: int, situation: Situation) -> tuple[Mode, Cause]:
-        if situation.operator is OperatorMode.MANUAL:
+    def _chosen(self, tick: int, inputs: LadderInputs) -> tuple[Mode, Cause]:
+        if inputs.operator is OperatorMode.MANUAL:
             return Mode.MANUAL, Cause.OPERATOR
-        if situation.operator is OperatorMode.CLASSICAL:
+        if inputs.operator is OperatorMode.CLASSICAL:
             return Mode.CLASSICAL, Cause.OPERATOR
-        if situation.sensors_unusable:
+        if inputs.sensors_unusable:
             return Mode.CLASSICAL, Cause.SENSOR_BAD
-        if situation.row:
-            return (Mode.REST, Cause.SEQUENCE_LATE) if situation.late else (Mode.MPC, Cause.SEQUENCE_BEGAN)
+        if inputs.row:
+            return (Mode.REST, Cause.SEQUENCE_LATE) if inputs.late else (Mode.MPC, Cause.SEQUENCE_BEGAN)
         return self._without_sequence(tick)
 
     def _without_sequence(self, tick: int) -> tuple[Mode, Cause]:

@@ -60,7 +60,7 @@ class GuardState:
     moves: MutableSequence[int]
     """Tick of each of the last changes, in turn, shape (slew_ticks,)."""
     before: MutableSequence[MutableSequence[float]]
-    """What was applied before each of them, shape (slew_ticks, 3)."""
+    """Outputs applied before each of them, shape (slew_ticks, 3)."""
     start: int = 0
     share: float = 1.0
     """Depends on how long before the window the outputs last moved."""
@@ -68,12 +68,12 @@ class GuardState:
     """Tick of the last change."""
     changes: int = 0
     """Number of changes so far."""
-    astray: bool = False
-    """What was applied when the guard began is outside the bounds."""
+    out_of_bounds: bool = False
+    """The outputs applied when the guard began are outside the bounds."""
 
 
 def beginning(limits: Limits, applied: Numbers) -> GuardState:
-    """Return the state in which `applied` has stood for ever."""
+    """Return the state after `applied` has been constant for ever."""
     slots = range(limits.slew_ticks)
     return GuardState(list(applied), list(applied), [NEVER for _ in slots], [list(applied) for _ in slots])
 
@@ -87,7 +87,7 @@ def copy_state(source: GuardState, target: GuardState, limits: Limits) -> None:
         for i in range(3):
             target.before[slot][i] = source.before[slot][i]
     target.start, target.share = source.start, source.share
-    target.moved, target.changes, target.astray = source.moved, source.changes, source.astray
+    target.moved, target.changes, target.out_of_bounds = source.moved, source.changes, source.out_of_bounds
 
 
 def rate_share(limits: Limits, elapsed_ticks: int) -> float:
@@ -96,7 +96,7 @@ def rate_share(limits: Limits, elapsed_ticks: int) -> float:
 
 
 def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update: bool) -> None:  # noqa: FBT001 compiled
-    """Apply `wanted` (3) at `tick` as far as it may be; `update` tells that a sequence begins there."""
+    """Apply `wanted` (3) at `tick` as far as the limits allow; `update`: a sequence begins there."""
     applied = state.applied
     if update or tick - state.start >= TICKS_PER_SAMPLE:
         state.share = rate_share(limits, tick - state.moved)
@@ -104,7 +104,7 @@ def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update:
         for i in range(3):
             state.anchor[i] = applied[i]
     same = wanted[0] == applied[0] and wanted[1] == applied[1] and wanted[2] == applied[2]
-    if same and not state.astray:  # it was admitted before, and a new window begins with it
+    if same and not state.out_of_bounds:  # it was admitted before, and a new window begins with it
         return
     a, b, c = (
         nearest(state, limits, tick, wanted[0], 0),
@@ -118,8 +118,8 @@ def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update:
             state.before[slot][i] = applied[i]
         state.changes += 1
         applied[0], applied[1], applied[2] = a, b, c
-    if state.astray:
-        state.astray = not in_range(limits, applied)
+    if state.out_of_bounds:
+        state.out_of_bounds = not in_range(limits, applied)
 
 
 def nearest(state: GuardState, limits: Limits, tick: int, wanted: float, i: int) -> float:
@@ -148,7 +148,7 @@ def nearest(state: GuardState, limits: Limits, tick: int, wanted: float, i: int)
 
 
 def is_reached(state: GuardState, limits: Limits, tick: int, value: float, i: int) -> bool:
-    """Tell whether a value of output `i` is within reach of all that it counts from."""
+    """Return whether a value of output `i` is within reach of all that it counts from."""
     reach, rate = limits.rate[i] * state.share, limits.rate[i]
     reached = abs(value - state.anchor[i]) <= reach and abs(value - state.applied[i]) <= reach
     for slot in range(limits.slew_ticks):
@@ -158,7 +158,7 @@ def is_reached(state: GuardState, limits: Limits, tick: int, value: float, i: in
 
 
 def in_range(limits: Limits, row: Numbers) -> bool:
-    """Tell whether the outputs (3) are finite and inside the bounds, but for the slack."""
+    """Return whether the outputs (3) are finite and inside the bounds, but for the slack."""
     inside = True
     for i in range(3):
         inside = inside and limits.low[i] - limits.slack[i] <= row[i] <= limits.high[i] + limits.slack[i]
@@ -166,7 +166,7 @@ def in_range(limits: Limits, row: Numbers) -> bool:
 
 
 def admits(state: GuardState, limits: Limits, first_tick: int, rows: Rows, length: int) -> bool:
-    """Tell whether a sequence of `length` rows, one a tick, would be applied as it is; `state` moves along with it."""
+    """Return whether a sequence of `length` rows, one per tick, would be applied unchanged; `state` advances."""
     for k in range(length):
         admit(state, limits, first_tick + k, rows[k], k == 0)
         for i in range(3):

@@ -1,16 +1,16 @@
 """The control PLC's link to the rack as a state machine.
 
-    IDLE        no session
-    SEARCHING   the rack does not answer
-    JOINING     it answers; what it applies is being read back
-    IN_STEP     outputs are written in every scan, and taken
-    NOT_TAKEN   it answers, and does not take the outputs
-    FOREIGN     it is in another session, or somebody else drives it
-    FROZEN      it answers, and its clock does not move
+    IDLE          no session
+    SEARCHING     the rack does not answer
+    JOINING       it answers; its outputs are being read back
+    SYNCHRONISED  outputs are written in every scan, and accepted
+    REJECTED      it answers, and rejects the outputs
+    OTHER_MASTER  it is in another session, or has another master
+    FROZEN        it answers, and its clock does not move
 
 One rule decides: *no output is written unless what the rack applies was read twice since the last break: sealed,
-finite, of this session, the same both times, and at ticks as far apart as the readings.* Only IN_STEP writes, and only
-a reading that `read_back` accepts leads there; every doubt leads out of it. A single answer that lies, about outputs,
+finite, of this session, the same both times, and at ticks as far apart as the readings.* Only SYNCHRONISED writes, and
+only a reading that `read_back` accepts leads there; every doubt leads out of it. A single wrong answer, about outputs,
 session or time, thus moves nothing, even where it is the first after a break. The rack holds its side of the rule: it
 takes no outputs that name another generation than the one that was read back. Pure: no sockets, no clock.
 """
@@ -34,18 +34,18 @@ FROZEN_S: Final = 0.5
 ALARMS: Final = {
     PlantLinkState.SEARCHING: AlarmKind.PLANT_LOST,
     PlantLinkState.JOINING: AlarmKind.PLANT_LOST,
-    PlantLinkState.NOT_TAKEN: AlarmKind.OUTPUTS_NOT_TAKEN,
-    PlantLinkState.FOREIGN: AlarmKind.PLANT_FOREIGN,
+    PlantLinkState.REJECTED: AlarmKind.OUTPUTS_NOT_TAKEN,
+    PlantLinkState.OTHER_MASTER: AlarmKind.PLANT_FOREIGN,
     PlantLinkState.FROZEN: AlarmKind.PLANT_FROZEN,
 }
 SECOND_MASTER: Final = 2
 """Cause of the alarm SECOND_WRITER."""
-HARMLESS: Final = (LinkCause.STARTED, LinkCause.OVERSLEPT, LinkCause.LEAPT, LinkCause.PACE)
+HARMLESS: Final = (LinkCause.STARTED, LinkCause.MISSED_SCANS, LinkCause.TIME_JUMP, LinkCause.TIME_BASE)
 """Causes that raise no alarm: what will be read back is expected to be what we applied."""
-NOT_TAKEN: Final = (PlantLinkState.NOT_TAKEN, LinkCause.REFUSED)
+OUTPUTS_REJECTED: Final = (PlantLinkState.REJECTED, LinkCause.REFUSED)
 REFUSED_OUTPUTS: Final[Mapping[int, tuple[PlantLinkState, LinkCause]]] = {
-    OutputVerdict.WRONG_SESSION: (PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION),
-    OutputVerdict.UNTIMELY: (PlantLinkState.NOT_TAKEN, LinkCause.UNTIMELY),
+    OutputVerdict.WRONG_SESSION: (PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION),
+    OutputVerdict.STALE: (PlantLinkState.REJECTED, LinkCause.STALE),
     OutputVerdict.CHANGED: (PlantLinkState.JOINING, LinkCause.CHANGED),
     OutputVerdict.LIMITED: (PlantLinkState.JOINING, LinkCause.LIMITED),
 }
@@ -68,7 +68,7 @@ class PlantLink:
         self.breaks = 0
         """Times that outputs were no longer taken."""
         self._noted = PlantLinkState.IDLE
-        """State that the journal knows of: in step when outputs have been taken, and not when they may be written."""
+        """State in the journal: synchronised once outputs have been accepted, not when they may be written."""
         self.frozen_ticks = float(FROZEN_TICKS)
         """How long the rack's tick may stand, in ticks of our clock."""
         self.generation = 0
@@ -78,7 +78,7 @@ class PlantLink:
         self.is_confirmed = False
         """The last reading said what the one before had said."""
         self._known_place: float | None = None
-        """Where the rack was, in ticks of the session, when it was last in step."""
+        """Where the rack was, in ticks of the session, when it was last synchronised."""
         self._old_since: float | None = None
         """Since when readings are of a time before that."""
         self.session = 0
@@ -91,9 +91,9 @@ class PlantLink:
         """The last answer said so."""
 
     @property
-    def in_step(self) -> bool:
+    def synchronised(self) -> bool:
         """Whether outputs may be written."""
-        return self.state is PlantLinkState.IN_STEP
+        return self.state is PlantLinkState.SYNCHRONISED
 
     @property
     def is_alarmed(self) -> bool:
@@ -117,29 +117,29 @@ class PlantLink:
         self._return_alarms()
 
     def unanswered(self, cause: LinkCause) -> None:
-        """Note that a request came to nothing: what it has done to the rack is not known."""
+        """Note that a request failed: its effect on the rack is unknown."""
         if cause is LinkCause.SECOND_MASTER:
-            self._enter(PlantLinkState.FOREIGN, cause)
+            self._enter(PlantLinkState.OTHER_MASTER, cause)
         elif cause is LinkCause.REFUSED:
-            self._enter(PlantLinkState.NOT_TAKEN, cause)
+            self._enter(PlantLinkState.REJECTED, cause)
         elif cause in (LinkCause.DAMAGED, LinkCause.IMPLAUSIBLE):
             self._enter(PlantLinkState.JOINING, cause)
         else:
             self._enter(PlantLinkState.SEARCHING, cause)
 
-    def overslept(self) -> None:
-        """Note that this program stood still: what the rack has done meanwhile is not known."""
-        if self.in_step:
-            self._enter(PlantLinkState.JOINING, LinkCause.OVERSLEPT)
+    def missed_scans(self) -> None:
+        """Note that this program missed scans: the rack's state is unknown."""
+        if self.synchronised:
+            self._enter(PlantLinkState.JOINING, LinkCause.MISSED_SCANS)
 
     def repaced(self) -> None:
-        """Note that the time base was changed: where the rack is, and how fast it moves, is found out anew."""
+        """Note that the time base was changed: tick and speed of the rack are determined again."""
         self._moved_at = None
-        if self.in_step:
-            self._enter(PlantLinkState.JOINING, LinkCause.PACE)
+        if self.synchronised:
+            self._enter(PlantLinkState.JOINING, LinkCause.TIME_BASE)
 
     def compare(self, reading: Measurement, session: int, now: float | None) -> None:
-        """Note whether a reading that was asked for without writing confirms the one before.
+        """Note whether a reading without a write confirms the one before.
 
         Args:
             reading: What the rack answered, its seal intact.
@@ -157,12 +157,12 @@ class PlantLink:
         else:
             moved = reading.tick + reading.age - earlier.tick - earlier.age
             waits = reading.tick == earlier.tick == 0  # for the first outputs
-            in_time = waits or 0 < moved <= now - at + self.frozen_ticks  # an old answer that is repeated stands still
+            in_time = waits or 0 < moved <= now - at + self.frozen_ticks  # a repeated old answer does not advance
         in_time = in_time and not self._is_old(reading, now)
         self.is_confirmed = same and (in_time or reading.session != session)
 
     def read_back(self, reading: Measurement, session: int, now: float | None) -> bool:
-        """Judge a reading that was compared; tell whether outputs may be written from it on."""
+        """Judge a reading that was compared; return whether outputs may be written from it on."""
         stopped = self._clock_stopped(reading, now)
         self.refused = reading.refused
         if not all(map(math.isfinite, reading.u)):
@@ -172,9 +172,9 @@ class PlantLink:
         elif not self.is_confirmed:
             return False
         elif reading.session != session or not session:
-            self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
+            self._enter(PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION)
         else:
-            if self.generation not in (0, reading.generation):  # somebody else, or its watchdog, has moved the outputs
+            if self.generation not in (0, reading.generation):  # another master, or its watchdog, has moved the outputs
                 self._alarms.raised(AlarmKind.PLANT_LOST, LinkCause.CHANGED)
             self.generation, self._read = reading.generation, None
             self._known_place = reading.tick + reading.age
@@ -186,41 +186,41 @@ class PlantLink:
         return outputs._replace(holder=self.holder, generation=self.generation)
 
     def joined(self) -> None:
-        """The program goes on from what was read back: outputs may be written."""
-        self._enter(PlantLinkState.IN_STEP, self.cause)
+        """The program has resumed from what was read back: outputs may be written."""
+        self._enter(PlantLinkState.SYNCHRONISED, self.cause)
 
     def exchanged(self, sent: Actuators, answer: Measurement, now: float | None) -> bool:
-        """Judge the answer to outputs; tell whether they are what the rack applies, at their tick.
+        """Judge the answer to outputs; return whether they are what the rack applies, at their tick.
 
         In real time the rack's tick may differ by one: it changes between two scans, and a scan may be late.
         """
         stopped = self._clock_stopped(answer, now)
         self._watch_others(answer)
-        if answer.verdict != OutputVerdict.TAKEN:
-            self._enter(*REFUSED_OUTPUTS.get(answer.verdict, NOT_TAKEN))
+        if answer.verdict != OutputVerdict.ACCEPTED:
+            self._enter(*REFUSED_OUTPUTS.get(answer.verdict, OUTPUTS_REJECTED))
         elif answer.session != sent.session:
-            self._enter(PlantLinkState.FOREIGN, LinkCause.WRONG_SESSION)
+            self._enter(PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION)
         elif answer.u != sent[1:4] or answer.holder != self.holder or answer.generation != self.generation:
             self._enter(PlantLinkState.JOINING, LinkCause.CHANGED)
         elif stopped:
             self._enter(PlantLinkState.FROZEN, LinkCause.STOPPED)
         elif abs(answer.tick - sent.tick) > (now is not None):
-            self._enter(PlantLinkState.JOINING, LinkCause.LEAPT)
+            self._enter(PlantLinkState.JOINING, LinkCause.TIME_JUMP)
         else:
             self._known_place = answer.tick + answer.age
             return True
         return False
 
     def settled(self) -> None:
-        """Note a scan that was taken: what was wrong with the rack is over."""
-        if self._noted is not PlantLinkState.IN_STEP:
-            self._note(PlantLinkState.IN_STEP)
+        """Note an accepted scan: the fault of the rack is over."""
+        if self._noted is not PlantLinkState.SYNCHRONISED:
+            self._note(PlantLinkState.SYNCHRONISED)
         self._return_alarms()
 
     # -- inside --------------------------------------------------------------------------------------------------------
 
     def _is_old(self, reading: Measurement, now: float | None) -> bool:
-        """Tell whether a reading is of a time before what is known, as from a gateway that is behind.
+        """Return whether a reading is of a time before what is known, as from a gateway that is behind.
 
         A rack that was started again may be back in time: it is believed when it has been seen there for long enough.
         """
@@ -232,14 +232,14 @@ class PlantLink:
         return reading.tick > 0 and now - self._old_since < self.frozen_ticks
 
     def _watch_others(self, answer: Measurement) -> None:
-        """Raise the alarm when two answers say that the rack has refused somebody else's outputs."""
+        """Raise the alarm when two answers show that the rack has refused another master's outputs."""
         before, self._has_refused_more = self._has_refused_more, answer.refused != self.refused
         if before and self._has_refused_more:
             self.refused, self._has_refused_more = answer.refused, False
-            self._alarms.happened(AlarmKind.SECOND_WRITER, SECOND_MASTER)
+            self._alarms.pulse(AlarmKind.SECOND_WRITER, SECOND_MASTER)
 
     def _clock_stopped(self, reading: Measurement, now: float | None) -> bool:
-        """Note where the rack is; tell whether its clock has stopped. At tick 0 it waits for the first outputs."""
+        """Note where the rack is; return whether its clock has stopped. At tick 0 it waits for the first outputs."""
         moved = (reading.session, reading.tick) != (self.session, self.tick)
         self.session, self.tick = reading.session, reading.tick
         if now is None or moved or reading.tick == 0 or self._moved_at is None:
@@ -256,8 +256,8 @@ class PlantLink:
             self._alarm(state, cause if before in HARMLESS else before)
             return
         self.since = self._alarms.now
-        if state not in (PlantLinkState.IN_STEP, self._noted):
-            self.breaks += self._noted is PlantLinkState.IN_STEP
+        if state not in (PlantLinkState.SYNCHRONISED, self._noted):
+            self.breaks += self._noted is PlantLinkState.SYNCHRONISED
             self._note(state)
         self._alarm(state, cause)
 

@@ -19,7 +19,7 @@ class UpdatePhase(IntEnum):
     LATCHED   ->  PLANNED                                       the optimiser has decided the period
     PLANNED   ->  ANSWERED or REFUSED                           its sequence was accepted, or not
     REFUSED   ->  ANSWERED                                      another one was accepted in time
-    any       ->  ABANDONED                                     given up: nobody waits for its answer
+    any       ->  ABANDONED                                     given up: its answer is no longer awaited
     any       ->  LATCHED                                       the next updating instant, or a load step
     """
 
@@ -79,18 +79,18 @@ class SequencePlayer:
 
     @property
     def answering(self) -> bool:
-        """The optimiser has planned the update under way, so its sequence is to be expected."""
+        """The optimiser has planned the current update: a sequence is expected."""
         return self.phase in (UpdatePhase.PLANNED, UpdatePhase.ANSWERED)
 
     @property
     def given_up(self) -> bool:
-        """No sequence is to be expected for the last update: it was abandoned, or what was sent for it refused."""
+        """No sequence is expected for the last update: it was abandoned, or its sequence rejected."""
         return self.phase in (UpdatePhase.NONE, UpdatePhase.REFUSED, UpdatePhase.ABANDONED)
 
     # -- scan ----------------------------------------------------------------------------------------------------------
 
     def begin(self, tick: int) -> bool:
-        """Tell whether a sequence begins at this tick; an updating instant without one is a miss."""
+        """Return whether a sequence begins at this tick; an updating instant without one is a miss."""
         self.broken_promise = False
         spare = self._spare
         if spare is not None and spare.header.first_tick <= tick:
@@ -111,14 +111,14 @@ class SequencePlayer:
         self._missed = self.next_update_tick
 
     def row(self, tick: int) -> SequenceRow | None:
-        """Return the row that is to be played at this tick, if there is one."""
+        """Return the row to be played at this tick, if any."""
         playing = self._playing
         if playing is None or not 0 <= tick - playing.header.first_tick < len(playing.rows):
             return None
         return playing.rows[tick - playing.header.first_tick]
 
     def latches(self, tick: int, load: float) -> bool:
-        """Tell whether an update is to be latched at the end of this scan: its instant, or a load step that cuts it."""
+        """Return whether to latch an update at the end of this scan: its instant, or an interrupting load step."""
         if not self.invited:
             return False
         if self._interrupted_by(load):
@@ -129,13 +129,13 @@ class SequencePlayer:
     def latch(self, update: Update) -> Update:
         """Begin an update; return it with its number."""
         self.update = update._replace(update=self._updates, playing=self.playing)
-        self._updates = self._updates + 1 if self._updates < LAST_NUMBER else 0  # as when a session begins anew
+        self._updates = self._updates + 1 if self._updates < LAST_NUMBER else 0  # as at the start of a session
         self.next_update_tick = update.tick + TICKS_PER_SAMPLE  # until the optimiser has planned another
         self.phase = UpdatePhase.LATCHED
         return self.update
 
     def _interrupted_by(self, load: float) -> bool:
-        """Tell whether the load has left the one that the update under way was latched with."""
+        """Return whether the load has left the one that the update under way was latched with."""
         if self.update is None or self.phase not in (*PROMISED, UpdatePhase.ANSWERED) or not self._load_step:
             return False
         return abs(load - self.update.load) > self._load_step
@@ -163,7 +163,7 @@ class SequencePlayer:
         return self._updates
 
     def is_ordinary(self, tick: int) -> bool:
-        """Tell whether a sequence is being played in time, and the update under way is planned."""
+        """Return whether a sequence is being played in time, and the update under way is planned."""
         if self._playing is None or self.late or not self.invited or self.next_update_tick < tick:
             return False
         if self._spare is None:
@@ -176,7 +176,7 @@ class SequencePlayer:
         return self._load_step
 
     def take_over(self, playing: InputSequence, update: Update, next_update_tick: int, sequences: int) -> None:
-        """Go on after so many more sequences were accepted: the last one is being played, and its update is planned."""
+        """Resume after so many more accepted sequences: the last one is being played, and its update is planned."""
         self._playing, self.update = playing, update
         self._updates = update.update + 1
         self.next_update_tick = next_update_tick
@@ -199,17 +199,17 @@ class SequencePlayer:
         self.next_update_tick = tick
 
     def drop(self) -> None:
-        """Forget the sequence that has been played to its end: somebody else moves the inputs now."""
+        """Drop the sequence that has been played to its end: another mode moves the inputs now."""
         self._playing = None
 
     def resume(self, sequence: InputSequence | None, tick: int) -> None:
-        """Go on after a restart with the rest of what was played, and latch an update at the next scan."""
+        """Resume the rest of the sequence after a restart, and latch an update at the next scan."""
         self._playing = sequence
         self.late = sequence is not None
         self.invite(tick)
 
     def set_back(self, tick: int) -> None:
-        """Begin again at a tick long before the present one: what was sent was for a time that is to come again."""
+        """Start over at a tick long before the present one: all sequences were for a time that will come again."""
         self._playing = self._spare = self.update = None
         self.late = False
         if self.invited:
@@ -218,7 +218,7 @@ class SequencePlayer:
     # -- the optimiser's side ------------------------------------------------------------------------------------------
 
     def accept_plan(self, plan: Plan, earliest: int) -> bool:
-        """Take the updating period of the last update; tell whether it was acceptable."""
+        """Take the updating period of the last update; return whether it was acceptable."""
         update = self.update
         if not self.invited or update is None or self.phase is not UpdatePhase.LATCHED or plan.update != update.update:
             return False

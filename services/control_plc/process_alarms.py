@@ -35,24 +35,24 @@ class ProcessAlarms:
         Args:
             tick: Of the scan.
             y: Outputs, bad ones substituted.
-            ladder: Says who decides the outputs, and why.
-            late: What is played is the rest of a sequence.
-            optimizer: It shows signs of life.
+            ladder: Mode and its cause.
+            late: The rest of a sequence is being played.
+            optimizer: Its heartbeat is present.
             bad: Outputs that are substituted.
         """
-        holds = self._panel.holds
+        report = self._panel.report
         for kind, value, (low, high) in (
             (AlarmKind.LEVEL_BAND, y[L1], self._bands.level_band),
             (AlarmKind.T5_BAND, y[T5], self._bands.t5_band),
         ):
-            holds(kind, condition=not low <= value <= high)
+            report(kind, condition=not low <= value <= high)
         mode, cause = ladder.mode, ladder.cause
         fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR)
-        holds(AlarmKind.MODE, condition=fallen, cause=cause)
+        report(AlarmKind.MODE, condition=fallen, cause=cause)
         exhausted = mode is not Mode.MPC and cause in (Cause.SEQUENCE_EXHAUSTED, Cause.HOLD_EXPIRED)
-        holds(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
-        holds(AlarmKind.SEQUENCE_LATE, condition=late)
-        holds(AlarmKind.OPTIMIZER_LOST, condition=not optimizer)
+        report(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
+        report(AlarmKind.SEQUENCE_LATE, condition=late)
+        report(AlarmKind.OPTIMIZER_LOST, condition=not optimizer)
         self._watch_sensors(tick, frozenset(bad))
 
     def _watch_sensors(self, tick: int, bad: frozenset[int]) -> None:

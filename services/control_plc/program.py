@@ -37,7 +37,7 @@ from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 from control_plc.classical import ClassicalLoops
 from control_plc.guard import OutputGuard
-from control_plc.ladder import Ladder, Situation
+from control_plc.ladder import Ladder, LadderInputs
 from control_plc.player import SequencePlayer
 from control_plc.process_alarms import ProcessAlarms
 from control_plc.sensors import SensorMonitor
@@ -46,11 +46,11 @@ from control_plc.settings import ControlSection, ControlStrategy
 SEEN = 0.1
 """Share of its rate by which an input must have moved for the process to show it."""
 HANDSHAKE_TICKS = TICKS_PER_SAMPLE
-"""For no longer are the classical loops held for a sequence that is to come."""
+"""Longest time that the classical loops wait for an announced sequence."""
 HANDSHAKE_PAUSE_S = 30.0
 """After a handshake that came to nothing the classical loops are not held again for so long."""
 SET_BACK_TICKS = TICKS_PER_SAMPLE
-"""Time that goes back by more than this begins anew: what was sent was for a time that is to come again."""
+"""Time set back by more than this drops all sequences: they were for a time that will come again."""
 LOST_TICKS = 4
 """A rack that has been out of step for longer takes no new sequences: they would be played late."""
 
@@ -88,7 +88,7 @@ class ControlProgram:
 
     def restart(self, session: int) -> None:
         """Begin a session at tick 0 with the initial inputs applied."""
-        self.nobody_drives()
+        self.reset_operating_mode()
         self._begin(session, 0, self._initial, updates=0)
         classical = self._section.driver is ControlStrategy.CLASSICAL
         mode = Mode.CLASSICAL if classical else Mode.HOLD
@@ -96,7 +96,7 @@ class ControlProgram:
         if session:
             self._note_mode(0)
 
-    def nobody_drives(self) -> None:
+    def reset_operating_mode(self) -> None:
         """Let those drive whom the configuration names: no operator has said anything."""
         classical = self._section.driver is ControlStrategy.CLASSICAL
         self.operator = Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, *self._initial)
@@ -105,7 +105,7 @@ class ControlProgram:
         """Take over what operators had said before a restart, and the alarms; the session is resumed later.
 
         Args:
-            operator: Who drives.
+            operator: Operating mode and setpoints.
             alarms: All alarms.
             watchdog: Time-out of the optimiser's watchdog, in ticks.
             tick: The last one.
@@ -125,12 +125,12 @@ class ControlProgram:
         operator: Operator,
         playing: InputSequence | None = None,
     ) -> None:
-        """Go on with a session after a restart.
+        """Resume a session after a restart.
 
         Args:
             session: Its number.
             tick: Where the rack is.
-            applied: What it applies.
+            applied: Its applied outputs.
             updates: Number of the next update.
             operator: What operators have said.
             playing: What was being played. Its rest is played on, if what the rack applies is of it: a state that was
@@ -232,7 +232,7 @@ class ControlProgram:
         before = self.ladder.mode
         changed = self.ladder.step(
             tick,
-            Situation(
+            LadderInputs(
                 operator=OperatorMode(self.operator.mode),
                 sensors_unusable=not self._usable,
                 row=row is not None,
@@ -254,7 +254,7 @@ class ControlProgram:
         self.journal.note(tick, EventKind.MODE, self.ladder.mode, self.ladder.cause)
 
     def _wanted(self, tick: int, row: SequenceRow | None) -> SequenceRow:
-        """Return what is asked for by whom the ladder has chosen."""
+        """Return the outputs requested in the mode of the ladder."""
         mode = self.ladder.mode
         if mode is Mode.MANUAL:
             return SequenceRow(*self.operator[1:])
@@ -263,7 +263,7 @@ class ControlProgram:
         return self.guard.applied if row is None else row
 
     def _handing_over(self, tick: int) -> bool:
-        """Tell whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows.
+        """Return whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows.
 
         A handshake fails when its update is abandoned or its sequence refused, and in any case after `HANDSHAKE_TICKS`.
         """
@@ -315,10 +315,10 @@ class ControlProgram:
         self._in_scan = False
 
     def rejoin(self, tick: int, applied: Sequence[float], passed: int | None = None) -> None:
-        """Go on at another tick: the rack was away, or time has leapt.
+        """Continue at another tick: the rack was away, or time has jumped.
 
         Forward, all timers count the time that has passed. Back by a little, they begin at the present tick at the
-        latest; back by more than `SET_BACK_TICKS`, sequences are dropped too, and the optimiser is invited anew.
+        latest; back by more than `SET_BACK_TICKS`, sequences are dropped too, and the optimiser is invited again.
 
         Args:
             tick: Tick of the next scan.
@@ -349,17 +349,17 @@ class ControlProgram:
         self.watchdog.trigger(max(self.tick, self.alarms.now))
 
     def optimizer_lost(self) -> None:
-        """Go on without the optimiser until it shows a sign of life; the alarm is raised by the next scan's end."""
+        """Continue without the optimiser until its next heartbeat; the alarm is raised by the end of the next scan."""
         self.optimizer_present = False
 
     def heartbeat(self, beat: Heartbeat) -> None:
-        """Take a sign of life that tells the optimiser's model."""
+        """Take a heartbeat, which names the optimiser's model."""
         self.optimizer_seen()
         wrong = beat.model_digest != self._point.model_digest
-        self.alarms.holds(AlarmKind.MODEL_MISMATCH, condition=wrong)
+        self.alarms.report(AlarmKind.MODEL_MISMATCH, condition=wrong)
 
     def accept_plan(self, plan: Plan) -> bool:
-        """Take the updating period of the last update; tell whether it was acceptable."""
+        """Take the updating period of the last update; return whether it was acceptable."""
         self.optimizer_seen()
         return self.player.accept_plan(plan, self._earliest)
 
@@ -373,15 +373,15 @@ class ControlProgram:
         lost = self.alarms.now - self.tick > LOST_TICKS
         answer = self.player.offer(sequence, self._earliest, plant_lost=lost)
         accepted = answer.verdict == Verdict.ACCEPTED
-        self.alarms.holds(AlarmKind.SEQUENCE_REJECTED, condition=not accepted, cause=answer.verdict)
+        self.alarms.report(AlarmKind.SEQUENCE_REJECTED, condition=not accepted, cause=answer.verdict)
         if accepted or answer.verdict == Verdict.WRONG_MODEL:
-            self.alarms.holds(AlarmKind.MODEL_MISMATCH, condition=not accepted)
+            self.alarms.report(AlarmKind.MODEL_MISMATCH, condition=not accepted)
         return answer
 
     # -- the operator's side -------------------------------------------------------------------------------------------
 
     def track(self) -> bool:
-        """Let the manual setpoints follow what is applied, so that manual begins without a bump; tell if they moved."""
+        """Let the manual setpoints follow the applied inputs for a bumpless change; return whether they moved."""
         applied = self.guard.applied
         if self.operator.mode == OperatorMode.MANUAL or self.operator[1:] == applied[:]:
             return False
@@ -389,13 +389,13 @@ class ControlProgram:
         return True
 
     def operate(self, operator: Operator) -> None:
-        """Let an operator decide who drives, from the next scan on."""
+        """Set the operating mode from the next scan on."""
         self.operator = operator
         self._let_play(usable=self._usable)
 
 
 def _are_states(x: Sequence[float]) -> bool:
-    """Tell whether these can be states: an update that has others is none."""
+    """Return whether these can be states; otherwise the update is invalid."""
     return math.isfinite(sum(x)) and min(x) >= -MAX_STATE and max(x) <= MAX_STATE
 
 

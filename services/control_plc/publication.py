@@ -21,7 +21,7 @@ from control_plc.sessions import Sessions
 log = logging.getLogger("coldloop.control_plc")
 
 
-class Publication:
+class ControlPublication:
     """Puts the program's state into the registers.
 
     `keep` is called with new events, so that no number of an event is given out twice, and what an operator has said
@@ -56,7 +56,7 @@ class Publication:
         """That of the optimiser."""
 
     def begin(self) -> None:
-        """Count anew: a session begins."""
+        """Reset the counters: a session begins."""
         self.overruns = 0
         self.lateness = LatenessRecord()
         self.skew, self.offset_ms = Skew(0.0, math.inf), 0.0

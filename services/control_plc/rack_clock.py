@@ -1,8 +1,8 @@
 """One time: the control PLC's scans follow the clock of the rack.
 
-In real time both count ticks by clocks of their own, and two clocks never agree: 50 ppm are a whole tick after an hour
-and a half. Each measurement tells how far the rack is, so the schedule of the scans is corrected a little with each of
-them (a second-order tracking loop, whose correction is bounded), and the skew of the clocks is estimated beside it.
+In real time each counts ticks by its own clock, and two clocks never agree: 50 ppm are a whole tick after an hour
+and a half. Each measurement has the rack's tick and age, and corrects the schedule of the scans a little
+(a second-order tracking loop, whose correction is bounded), and the skew of the clocks is estimated as well.
 """
 
 import math
@@ -87,7 +87,7 @@ class RackClock:
         self.begin(factor, now)
 
     def begin(self, factor: float, now: float) -> None:
-        """Begin anew with another factor: nothing is known of the rack."""
+        """Reset with another factor: nothing is known of the rack."""
         self.tick_s = TICK_S / factor
         self.offset = 0.0
         """Last phase error, in ticks: positive when the rack is ahead of our schedule."""
@@ -110,9 +110,9 @@ class RackClock:
         return self._position + (now - self._at) * (1.0 + self._rate) / self.tick_s
 
     def synchronise(self, position: float, at: float) -> None:
-        """Go by the rack from here on: the link was broken, or time has leapt. The rate found so far is kept.
+        """Resynchronise with the rack: the link was broken, or time has jumped. The estimated rate is kept.
 
-        So is the skew, unless the rack is not where its clock would have taken it: then it has leapt.
+        So is the skew, unless the rack is not where its clock would have taken it: then it has jumped.
         """
         if abs(position - self.position_at(at)) > LEAP:
             self._skew = SkewEstimator()
@@ -122,7 +122,7 @@ class RackClock:
     def observe(self, position: float, at: float, uncertainty_s: float = SUREST_S) -> None:
         """Take where the rack was.
 
-        Further than `LEAP` from where it should be its clock has leapt, or it tells nonsense: the schedule follows by
+        Further than `LEAP` from the expected tick its clock has jumped, or it is wrong: the schedule follows by
         no more than the bound, and nothing is learnt about the rate.
 
         Args:

@@ -20,7 +20,7 @@ log = logging.getLogger("coldloop.control_plc")
 SEARCH_S: Final = 0.5
 """How long one attempt to reach a lost rack may take, at least."""
 LOOK_PAUSE_S: Final = 0.1
-"""Between two looks at a rack that is not in step."""
+"""Between two reads of a rack that is not synchronised."""
 AT_ONCE: Final = 2
 """Looks after a break without a pause: the second confirms what the first has shown."""
 
@@ -48,12 +48,12 @@ class RackFinder:
         self.reached = False
         """The rack has answered at least once since the start."""
 
-    def look_at_once(self) -> None:
+    def read_soon(self) -> None:
         """Make the next looks without a pause before them."""
         self._looks = 0
 
     async def reach(self) -> bool:
-        """Try once to reach the rack, without a session; tell whether it answers."""
+        """Try once to reach the rack, without a session; return whether it answers."""
         try:
             await self._rack.connect(SEARCH_S)
         except LinkError as error:
@@ -63,7 +63,7 @@ class RackFinder:
         return True
 
     async def look(self, changed: asyncio.Event, patience_s: float | None) -> bool:
-        """Read what the rack applies, once; tell whether it has answered, and nobody else drives it.
+        """Read what the rack applies, once; return whether it has answered and has no other master.
 
         Args:
             changed: What ends the pause between two looks.
@@ -102,7 +102,7 @@ class RackFinder:
         return None if held else reading, (asked_at + time.monotonic()) / 2
 
     def _is_held_by_another(self, lease: LeaseStatus, reading: Measurement) -> bool:
-        """Tell whether the control PLC that we were refused for still holds the lease of the rack.
+        """Return whether the control PLC that we were refused for still holds the lease of the rack.
 
         One that has our number is another one if the rack has counted that it refused us.
         """
@@ -111,9 +111,9 @@ class RackFinder:
         return lease.state in (LeaseState.HELD, LeaseState.LINGERING)
 
     def _take(self, reading: Measurement, at: float, *, realtime: bool) -> None:
-        """Go on from a reading, where that may be done; `at` is when the rack was read, s."""
+        """Resume from a reading if allowed; `at` is when the rack was read, s."""
         self._cycle.answered(reading, at / self._clock.tick_s if realtime else None)
-        if self._link.in_step:
+        if self._link.synchronised:
             # at tick 0 the rack's clock waits for the first outputs
             self._clock.synchronise(reading.tick + (reading.age or (0.0 if reading.tick else PHASE)), at)
 
@@ -130,4 +130,4 @@ class RackFinder:
             self._link.starting()
             return
         self._cycle.failed(error)
-        log.warning("plant not in step", extra={"reason": str(error), "tick": self._link.tick})
+        log.warning("plant not synchronised", extra={"reason": str(error), "tick": self._link.tick})

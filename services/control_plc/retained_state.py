@@ -18,7 +18,7 @@ from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.safety.retained_writer import RetainedStateWriter
 from coldloop.safety.sequence import InputSequence, checksum
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")
@@ -32,7 +32,7 @@ OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing")
 Count = Annotated[int, Field(ge=0, lt=2**32)]
 
 
-class RetainedState(BaseModel):
+class RetainedControlState(BaseModel):
     """The session, how far it has got, what is being played, what operators have said, the alarms, and who we are."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -45,7 +45,7 @@ class RetainedState(BaseModel):
     """Number of the last event."""
     session: Count
     tick: Annotated[int, Field(ge=0, le=LAST_TICK)]
-    pace: Pace
+    pace: TimeBase
     updates: Annotated[int, Field(ge=0, le=LAST_NUMBER)]
     """Number of the next update."""
     playing: tuple[SequenceHeader, Annotated[str, Field(max_length=2 * SEQUENCE_ROWS * ROW.size)]] | None
@@ -88,7 +88,7 @@ class RetainedState(BaseModel):
         return InputSequence(header, rows) if checksum(header, rows) == header.crc else None
 
 
-class Memory:
+class ControlStateStore:
     """Keeps the state in a file, if one is configured; what cannot be trusted or written is logged once.
 
     Writing is done by a thread: a scan never waits for a disk.
@@ -99,17 +99,17 @@ class Memory:
         self._writer = RetainedStateWriter(self._file) if self._file else None
         self._packed: tuple[InputSequence, tuple[SequenceHeader, str]] | None = None
         self.refused = False
-        """There was a state before, and it is not used."""
+        """A previous state exists and is not used."""
         self.boot = 1
         self.holder = secrets.randbelow(2**32 - 1) + 1
 
-    def recall(self) -> RetainedState | None:
-        """Return the state of before, if there is one; boot and holder go on from it."""
+    def recall(self) -> RetainedControlState | None:
+        """Return the previous state, if any; boot and holder continue from it."""
         if self._file is None:
             return None
         try:
             content = self._file.load()
-            state = None if content is None else RetainedState.parsed(content)
+            state = None if content is None else RetainedControlState.parsed(content)
         except RetainedStateError as error:
             self.refused = True
             log.warning("retained state refused", extra={"reason": str(error), "file": self._file.set_aside()})
@@ -123,7 +123,7 @@ class Memory:
         """Why the state cannot be written at present."""
         return self._writer.failed if self._writer else None
 
-    def keep(self, program: ControlProgram, pace: Pace, pending: RetainedState | None = None) -> None:
+    def keep(self, program: ControlProgram, pace: TimeBase, pending: RetainedControlState | None = None) -> None:
         """Keep the state of now; of a `pending` session, which is still to be resumed, what was retained of it."""
         if self._writer is None:
             return
@@ -132,7 +132,7 @@ class Memory:
             content |= {name: getattr(pending, name) for name in OF_THE_SESSION}
         self._writer.keep(content)
 
-    def content(self, program: ControlProgram, pace: Pace) -> dict[str, Any]:
+    def content(self, program: ControlProgram, pace: TimeBase) -> dict[str, Any]:
         """Return the state of a program, as a file holds it; nothing in it changes later."""
         return {
             "boot": self.boot, "holder": self.holder, "events": program.journal.count, "session": program.session,

@@ -1,8 +1,8 @@
 """The control PLC on the bus: client of the plant's rack, server of the optimiser and of operators.
 
-A scan makes one exchange (FC23) with the rack, and only while the link to it is in step (`plant_link.py`); out of step
+A scan makes one exchange (FC23) with the rack, and only while the link is synchronised (`plant_link.py`); otherwise
 the rack is read until it is. In lock-step the next scan waits for what it needs: the operator's grant, the optimiser's
-plan, and at an updating instant its sequence, as long as an optimiser is there. In real time it waits for the clock
+plan, and at an updating instant its sequence, while an optimiser is connected. In real time it waits for the clock
 only, which follows that of the rack (`rack_clock.py`).
 """
 
@@ -30,15 +30,15 @@ from coldloop.service.logs import dropped
 from coldloop.service.metrics_server import MetricsServer
 from coldloop.service.start import SERVING
 from coldloop.service.telemetry import Telemetry
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.certificate_watch import CertificateWatch
 from control_plc.client_requests import Clients
 from control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
 from control_plc.program import make_program
-from control_plc.publication import Publication
+from control_plc.publication import ControlPublication
 from control_plc.rack_clock import PHASE, RackClock
 from control_plc.rack_finder import RackFinder
-from control_plc.retained_state import Memory
+from control_plc.retained_state import ControlStateStore
 from control_plc.scan_cycle import ScanCycle
 from control_plc.scan_watch import LOOK_S, ScanWatch
 from control_plc.sessions import Sessions
@@ -48,7 +48,7 @@ log = logging.getLogger("coldloop.control_plc")
 
 TICKS_PER_SECOND: Final = round(1 / TICK_S)
 ANSWER_TICKS: Final = 8
-"""In real time an answer that takes longer is of no use: the rack is looked at anew."""
+"""In real time a later answer is stale: the rack is read again."""
 SHORTEST_PATIENCE_S: Final = 0.1
 LONGEST_SLEEP_S: Final = 0.25
 """In real time it is seen so often whether an operator has called meanwhile."""
@@ -67,14 +67,14 @@ class ControlPlc:
         header = read_header(settings.model.file)
         section = settings.control_plc
         self._settings = settings
-        self._memory = Memory(section.retain.file, header.short_digest)
-        recalled = self._memory.recall()
+        self._store = ControlStateStore(section.retain.file, header.short_digest)
+        recalled = self._store.recall()
         self._program = program = make_program(header, section, settings.limits)
-        program.journal.continue_from(self._memory.boot, recalled.events if recalled else 0)
+        program.journal.continue_from(self._store.boot, recalled.events if recalled else 0)
         if recalled is not None:
             program.recall(recalled.operator, recalled.alarms, recalled.watchdog, recalled.tick)
         self.sessions = Sessions(program, settings.session, recalled)
-        self._link = PlantLink(program.alarms, program.journal, self._memory.holder)
+        self._link = PlantLink(program.alarms, program.journal, self._store.holder)
         self._cycle = ScanCycle(program, self._link, self._adopt)
         self._plant = RegisterClient.at(PLANT_MAP, section.plant)
         self._clock = RackClock(self.sessions.pace.factor, time.monotonic())
@@ -83,7 +83,9 @@ class ControlPlc:
         self._finder = RackFinder(self._plant, self._link, self._cycle, self._clock, power_up_s=section.power_up_s)
         self.bank = RegisterBank(CONTROL_MAP, section.word_order)
         publish_configuration(self.bank, selected(settings, SHOWN))
-        self.publication = Publication(program, self.sessions, self._link, self.bank, header.short_digest, self._keep)
+        self.publication = ControlPublication(
+            program, self.sessions, self._link, self.bank, header.short_digest, self._keep
+        )
         self.clients = Clients(program, settings.limits, self.bank, self.publication, self.sessions)
         certificates = [tls for tls in (section.server.tls, section.plant.tls) if tls is not None]
         self.certificates = CertificateWatch(certificates, program, self.publication.safety)
@@ -92,18 +94,18 @@ class ControlPlc:
         self._awaiting_since: float | None = None
         self.bank.put(program.operator)
         self.bank.put(WatchdogTime(program.watchdog.time))
-        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._memory.refused))
+        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._store.refused))
         if self.sessions.kept is not None:
-            self._link.starting()  # nobody is to take us for one that has no session
-        if self._memory.refused:
+            self._link.starting()  # other clients must not take this for a PLC without a session
+        if self._store.refused:
             program.alarms.raised(AlarmKind.STATE_NOT_RETAINED, STATE_REFUSED)
         self._publish()
 
     def close(self) -> None:
-        """Let go of the rack, and keep what is to be kept."""
+        """Disconnect from the rack, and save the retained state."""
         self._plant.close()
         self._keep()
-        self._memory.close()
+        self._store.close()
 
     # -- scan cycle ----------------------------------------------------------------------------------------------------
 
@@ -112,13 +114,13 @@ class ControlPlc:
         while True:
             if self.clients.asked is not None:
                 self._start(self.clients.asked)
-            elif self.clients.asked_pace is not None:
-                self._change_pace(self.clients.asked_pace)
+            elif self.clients.pending_time_base is not None:
+                self._change_pace(self.clients.pending_time_base)
             elif not self.sessions.expected:
                 await self._stand_by()
             elif self.sessions.pace.paused and self.sessions.kept is None:
                 await self._while_paused()
-            elif not self._link.in_step:
+            elif not self._link.synchronised:
                 await self._look()
             elif await (self._until_clock() if self.sessions.pace.realtime else self._until_granted()):
                 await self._scan()
@@ -136,7 +138,7 @@ class ControlPlc:
         self._publish()
 
     async def _until_clock(self) -> bool:
-        """Wait for the scan's time; tell whether it may begin: after a whole tick slept through, the rack is looked at.
+        """Wait for the scan's time; return whether it may begin: after a missed tick, the rack is read first.
 
         It always yields, however late it is.
         """
@@ -152,15 +154,15 @@ class ControlPlc:
         self.publication.lateness.add(lateness)
         if lateness * 1000 > self._settings.control_plc.scan_tolerance_ms:
             self.publication.overruns += 1
-            program.alarms.happened(AlarmKind.SCAN_OVERRUN)
+            program.alarms.pulse(AlarmKind.SCAN_OVERRUN)
         if lateness > self._clock.tick_s and program.tick:  # at tick 0 the rack's clock waits for us
-            self._link.overslept()
-        return self._link.in_step
+            self._link.missed_scans()
+        return self._link.synchronised
 
     @property
     def _is_called(self) -> bool:
-        """An operator has asked for another session, or another time base."""
-        return self.clients.asked is not None or self.clients.asked_pace is not None
+        """An operator has requested another session, or another time base."""
+        return self.clients.asked is not None or self.clients.pending_time_base is not None
 
     async def _while_paused(self) -> None:
         """Wait until an operator writes something; the connection to the rack is kept open meanwhile."""
@@ -169,11 +171,11 @@ class ControlPlc:
             async with asyncio.timeout(KEEP_ALIVE_S):
                 await self.clients.changed.wait()
         except TimeoutError:
-            with contextlib.suppress(LinkError):  # when time goes on, the rack is looked at
+            with contextlib.suppress(LinkError):  # the rack is read when time resumes
                 await self._plant.read(Measurement)
 
     async def _until_granted(self) -> bool:
-        """Wait until the next scan in lock-step has what it needs; tell whether it may begin."""
+        """Wait until the next scan in lock-step has what it needs; return whether it may begin."""
         program = self._program
         if self._is_called:
             return False
@@ -191,7 +193,7 @@ class ControlPlc:
         return False
 
     async def _until_answered(self) -> None:
-        """Wait until somebody writes something; an optimiser that is waited for too long is lost."""
+        """Wait for a client's write; an optimiser that keeps us waiting too long is lost."""
         now = time.monotonic()
         since = self._awaiting_since = self._awaiting_since or now
         try:
@@ -220,10 +222,10 @@ class ControlPlc:
         answered_at = time.monotonic()
         at = (asked_at + answered_at) / 2
         update = self._cycle.answered(answer, self._in_ticks(at))
-        if not self._link.in_step:
+        if not self._link.synchronised:
             self._publish()
             return
-        self._finder.look_at_once()
+        self._finder.read_soon()
         self._watch.scanned()
         if self.sessions.pace.realtime and answer.tick:
             self._clock.observe(answer.tick + answer.age, at, (answered_at - asked_at) / 2)
@@ -232,7 +234,7 @@ class ControlPlc:
         self._after_scan(latched=update is not None)
 
     def _after_scan(self, *, latched: bool) -> None:
-        """Show what is new, and keep what is to be kept."""
+        """Publish what has changed, and save the retained state."""
         program, publication = self._program, self.publication
         on_the_second = program.tick % TICKS_PER_SECOND == 0
         if program.track():
@@ -250,8 +252,8 @@ class ControlPlc:
         self._keep()
 
     def _keep(self) -> None:
-        """Keep the state of now; of a session that is still to be gone on with, that of before the restart."""
-        self._memory.keep(self._program, self.sessions.pace, self.sessions.kept)
+        """Save the present state; for a session still to be resumed, the state before the restart."""
+        self._store.keep(self._program, self.sessions.pace, self.sessions.kept)
 
     def _watch_ourselves(self) -> None:
         """Raise the alarms about clock and memory, and note log lines that were lost."""
@@ -260,15 +262,15 @@ class ControlPlc:
             self.publication.offset_ms = self._clock.offset * self._clock.tick_s * 1000
             limit = self._settings.control_plc.skew_alarm_ppm
             known = skew.error_ppm < limit / 4
-            self._program.alarms.holds(AlarmKind.CLOCK_SKEW, condition=known and abs(skew.ppm) > limit)
+            self._program.alarms.report(AlarmKind.CLOCK_SKEW, condition=known and abs(skew.ppm) > limit)
         program, lost = self._program, dropped()
-        program.alarms.holds(AlarmKind.STATE_NOT_RETAINED, condition=self._memory.failure is not None)
+        program.alarms.report(AlarmKind.STATE_NOT_RETAINED, condition=self._store.failure is not None)
         if lost > self._lost_lines:
             program.journal.note(program.tick, EventKind.LOST, value=lost - self._lost_lines)
             self._lost_lines = lost
 
     async def watch_scans(self) -> None:
-        """Raise an alarm while scans are not made, until cancelled: by a clock of its own."""
+        """Raise an alarm while no scans are made, until cancelled: by an independent clock."""
         while True:
             await asyncio.sleep(LOOK_S)
             self._look_for_scans()
@@ -279,7 +281,7 @@ class ControlPlc:
             self._watch.scanned()
         stopped = self._watch.look(self._clock.tick_s) and not self._link.is_alarmed
         if stopped is not bool(alarms.rows[AlarmKind.SCANS_STOPPED].active):
-            alarms.holds(AlarmKind.SCANS_STOPPED, condition=stopped)
+            alarms.report(AlarmKind.SCANS_STOPPED, condition=stopped)
             self.publication.safety()
 
     @property
@@ -297,10 +299,10 @@ class ControlPlc:
     # -- out of step ---------------------------------------------------------------------------------------------------
 
     async def _look(self) -> None:
-        """Read what the rack applies; in step with it, go on from there."""
+        """Read what the rack applies; once synchronised, resume from there."""
         realtime = self.sessions.pace.realtime
         answered = await self._finder.look(self.clients.changed, self._patience_s if realtime else None)
-        if not self._link.in_step:
+        if not self._link.synchronised:
             if answered and self._link.is_confirmed and not self.sessions.rack_answered():
                 self.bank.put(self._program.operator)
                 self._link.end()
@@ -321,16 +323,16 @@ class ControlPlc:
         return adopted
 
     def _start(self, asked: ControlSession) -> None:
-        """Begin the session that an operator has asked for; nothing is written before the rack has been read."""
+        """Begin the session requested by an operator; nothing is written before the rack has been read."""
         self.clients.asked = None
         self.sessions.start(asked)
         self._begin()
         self._link.begin()
         self._publish()
 
-    def _change_pace(self, pace: Pace) -> None:
-        """Go on by another time base; before the next scan the rack is looked at."""
-        self.clients.asked_pace = None
+    def _change_pace(self, pace: TimeBase) -> None:
+        """Switch to another time base; the rack is read before the next scan."""
+        self.clients.pending_time_base = None
         self.sessions.pace = pace
         self._set_clock()
         self._link.repaced()
@@ -349,7 +351,7 @@ class ControlPlc:
 
     def _set_clock(self) -> None:
         self._clock.begin(self.sessions.pace.factor, time.monotonic())
-        self._finder.look_at_once()
+        self._finder.read_soon()
         self._cycle.begin_time()
         self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
 

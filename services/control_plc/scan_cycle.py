@@ -1,7 +1,7 @@
-"""A scan with the rack: what is sent, and what becomes of the program with what comes back.
+"""A scan with the rack: the outputs to send, and the program's reaction to the answer.
 
-Pure: the runtime sends what `begin` returns (outputs, or a mere reading) and tells what happened, and so does a test
-that has a rack of its own. Time is the rack's: after a break the program goes on at the tick that the rack shows.
+Pure: the runtime sends what `begin` returns (outputs, or a mere reading) and reports the result, and so does a test
+with its own rack. Time is the rack's: after a break the program resumes at the rack's tick.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from control_plc.program import ControlProgram
 from control_plc.rack_clock import PHASE
 
 Adopt = Callable[[Measurement], bool]
-"""Takes a reading of a rack in another session; tells whether the program has gone over to that session."""
+"""Takes a reading of a rack in another session; returns whether the program has changed to that session."""
 
 
 def cause_of(error: LinkError) -> LinkCause:
@@ -44,16 +44,16 @@ class ScanCycle:
         self._adopt = adopt
         self._sent: Actuators | None = None
         self._scanned_at: float | None = None
-        """Real time of the last scan, or of the last reading that was gone on from, in ticks."""
+        """Real time of the last scan, or of the last reading resumed from, in ticks."""
 
     def begin_time(self) -> None:
-        """Note that real time is counted anew: a session begins, or ticks last longer or shorter."""
+        """Reset the count of real time: a session begins, or the duration of a tick changes."""
         self._scanned_at = None
 
     def begin(self) -> Actuators | None:
-        """Return the outputs to be written now, or None: the rack is to be read, and nothing written."""
+        """Return the outputs to be written now, or None to read the rack only."""
         self._sent = None
-        if self._link.in_step:
+        if self._link.synchronised:
             self._sent = self._link.addressed(self._program.begin_scan())
         return self._sent
 
@@ -64,7 +64,7 @@ class ScanCycle:
         self._link.unanswered(cause_of(error))
 
     def answered(self, answer: Measurement, now: float | None) -> Update | None:
-        """Go on with the rack's answer; return the update if one was latched.
+        """Process the rack's answer; return the update if one was latched.
 
         Args:
             answer: The measurement, its seal intact.

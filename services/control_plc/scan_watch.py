@@ -12,16 +12,16 @@ SCANS: Final = 8
 
 
 class ScanWatch:
-    """Counts looks, and starts anew with each scan."""
+    """Counts checks since the last scan."""
 
     def __init__(self) -> None:
         self._looks = 0
 
     def scanned(self) -> None:
-        """Note that a scan was made, or that none is to be expected."""
+        """Note that a scan was made, or that none is expected."""
         self._looks = 0
 
     def look(self, tick_s: float) -> bool:
-        """Tell, `LOOK_S` after the last look, whether scans have stopped; a tick lasts `tick_s` of real time."""
+        """Return, `LOOK_S` after the last check, whether scans have stopped; a tick lasts `tick_s` of real time."""
         self._looks += 1
         return self._looks > max(LOOKS, SCANS * tick_s / LOOK_S)

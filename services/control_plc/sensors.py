@@ -20,7 +20,7 @@ RECOVERY_TICKS = 8
 
 
 class SensorCheckSettings(BaseModel):
-    """What a sensor can tell, and how long a bad one is bridged."""
+    """Ranges of sensors, and how long a bad one is bridged."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -36,7 +36,7 @@ class SensorCheckSettings(BaseModel):
     """A controlled output that does not change for so long, while others move, is frozen."""
     may_rest: bool = True
     """While its inputs do not move a plant may stand still bit for bit, as a simulated one with exact sensors does.
-    False for sensors that always tremble: an image that stands for `frozen_s` is then an old one in any case."""
+    False for sensors that are always noisy: an image unchanged for `frozen_s` is then stale in any case."""
     bridged_s: Annotated[float, Field(ge=0)] = 10.0
     """How long the last good value of a controlled output is worked with; then what needs it is left."""
 
@@ -48,28 +48,28 @@ class SensorCheckSettings(BaseModel):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if any(low >= high for low, high in self.ranges):
-            raise ValueError("each range begins below its end")
+            raise ValueError("each range must begin below its end")
         return self
 
 
 def are_inside(y: Numbers, low: Numbers, high: Numbers) -> bool:
-    """Tell whether all measurements are numbers within their ranges; the rig compiles this function, and the next."""
+    """Return whether all measurements are numbers within their ranges; the rig compiles this function, and the next."""
     inside = True
     for output in range(len(y)):
         inside = inside and low[output] <= y[output] <= high[output]
     return inside
 
 
-def watch_standing(stands: MutableSequence[int], before: MutableSequence[float], y: Numbers, elapsed: int) -> None:
-    """Sum up for how many ticks each controlled output has stood while most of the others moved.
+def count_unchanged(unchanged: MutableSequence[int], before: MutableSequence[float], y: Numbers, elapsed: int) -> None:
+    """Count for how many ticks each controlled output is unchanged while most of the others moved.
 
     `before` (22) becomes `y`, the measurements `elapsed` ticks later.
     """
     for place in range(len(CONTROLLED)):
         if y[CONTROLLED[place]] != before[CONTROLLED[place]]:
-            stands[place] = 0
+            unchanged[place] = 0
         elif 2 * moved(before, y) > len(y):
-            stands[place] += elapsed
+            unchanged[place] += elapsed
     before[:] = y
 
 
@@ -82,11 +82,11 @@ def moved(before: Numbers, y: Numbers) -> int:
 
 
 class ImageWatch:
-    """Looks at all that is measured at once: for how many ticks it has stood, and whether the inputs have moved.
+    """Watches the whole image: for how many ticks it is unchanged, and whether the inputs have moved.
 
     Args:
         moves: How far each input must have moved for something to be seen of it.
-        may_rest: Otherwise nothing may stand still, whatever the inputs do.
+        may_rest: Whether an image may be unchanged while the inputs are.
     """
 
     def __init__(self, moves: Sequence[float], *, may_rest: bool) -> None:
@@ -95,29 +95,23 @@ class ImageWatch:
         self.begin()
 
     def begin(self) -> None:
-        """Begin anew: nothing is known of before."""
+        """Reset: nothing is known of earlier ticks."""
         self._image: tuple[Sequence[float], ...] = ()
         self._inputs: Sequence[float] = ()
-        self._stands = 0
+        self._unchanged = 0
         self._moved = False
 
-    def stands(self, inputs: Sequence[float], *image: Sequence[float], elapsed: int) -> int:
-        """Return for how many ticks the image has stood although the inputs have moved.
-
-        Args:
-            inputs: Being applied.
-            image: All that is measured.
-            elapsed: Ticks since the last one.
-        """
+    def unchanged(self, inputs: Sequence[float], *image: Sequence[float], elapsed: int) -> int:
+        """Return for how many ticks the image (all measurements) is unchanged although the inputs have moved."""
         if image != self._image:  # NaN is not the same as NaN: a sensor that fails is for others to find
             self._image, self._inputs = image, inputs
-            self._stands, self._moved = 0, not self._may_rest
+            self._unchanged, self._moved = 0, not self._may_rest
             return 0
-        self._stands += elapsed
+        self._unchanged += elapsed
         if not self._moved:
             pairs = zip(inputs, self._inputs, self._moves, strict=True)
             self._moved = any(abs(now - before) > move for now, before, move in pairs)
-        return self._stands if self._moved else 0
+        return self._unchanged if self._moved else 0
 
 
 class SensorMonitor:
@@ -126,7 +120,7 @@ class SensorMonitor:
     `bad` holds the outputs that are substituted now, and since which tick.
 
     Args:
-        settings: What sensors can tell.
+        settings: Ranges of sensors.
         initial: The outputs at rest.
         moves: How far an input must have moved for something to be seen of it.
     """
@@ -139,7 +133,7 @@ class SensorMonitor:
         self.before = list(initial)
         self._tick: int | None = None
         self._now = 0
-        self.stands = [0] * len(CONTROLLED)
+        self.unchanged = [0] * len(CONTROLLED)
         self._image = ImageWatch(moves, may_rest=settings.may_rest)
         self._recovering: dict[int, int] = {}
         """Output, and since which tick its measurements have been good again."""
@@ -157,12 +151,12 @@ class SensorMonitor:
             others: What else was measured.
         """
         elapsed = 1 if self._tick is None else max(0, tick - self._tick)
-        watch_standing(self.stands, self.before, y, elapsed)
+        count_unchanged(self.unchanged, self.before, y, elapsed)
         self._tick = self._now = tick
         frozen: Collection[int] = [
-            output for output, ticks in zip(CONTROLLED, self.stands, strict=True) if ticks >= self.frozen_ticks
+            output for output, ticks in zip(CONTROLLED, self.unchanged, strict=True) if ticks >= self.frozen_ticks
         ]
-        if self._image.stands(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
+        if self._image.unchanged(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
             frozen = range(len(y))
         if not self.bad and not frozen and are_inside(y, self.low, self.high):
             self._good[:] = y
@@ -174,7 +168,7 @@ class SensorMonitor:
         return tuple(self._good)
 
     def set_back(self, tick: int) -> None:
-        """Go on at a tick before the present one: what has lasted until now begins there."""
+        """Set the time back to `tick`: conditions that hold now begin there."""
         self._tick = None
         self.bad = {output: min(since, tick) for output, since in self.bad.items()}
         self._recovering = {output: min(since, tick) for output, since in self._recovering.items()}

@@ -1,6 +1,6 @@
 """Which session the control PLC is in, and by which time base.
 
-It is the one that an operator asks for, the one retained over a restart, or with `session.autostart` that of the rack.
+It is the one requested by an operator, the one retained over a restart, or with `session.autostart` that of the rack.
 """
 
 import logging
@@ -9,10 +9,10 @@ from typing import Final
 
 from coldloop.registers.control_plc import ControlSession
 from coldloop.registers.plant import Measurement
-from coldloop.session.pace import Pace
 from coldloop.session.settings import SessionSettings, TimeMode
+from coldloop.session.time_base import TimeBase
 from control_plc.program import ControlProgram
-from control_plc.retained_state import RetainedState
+from control_plc.retained_state import RetainedControlState
 
 log = logging.getLogger("coldloop.control_plc")
 
@@ -33,11 +33,13 @@ class Sessions:
         recalled: State of before a restart.
     """
 
-    def __init__(self, program: ControlProgram, configured: SessionSettings, recalled: RetainedState | None) -> None:
+    def __init__(
+        self, program: ControlProgram, configured: SessionSettings, recalled: RetainedControlState | None
+    ) -> None:
         self._program = program
         self._configured = configured
         self.kept = recalled if recalled is not None and recalled.session else None
-        """The session to be gone on with, until the rack has been found in it, or in another one."""
+        """The session to be resumed, until the rack has been found in it, or in another one."""
         self.pace = self.kept.pace if self.kept else self._configured_pace
         """Time base of the present session."""
         self.running = False
@@ -46,24 +48,24 @@ class Sessions:
         """Another session that the rack was found in while ours ran, since when, and when it was seen there last (s)"""
 
     @property
-    def _configured_pace(self) -> Pace:
-        return Pace(self._configured.mode is TimeMode.REALTIME, self._configured.factor)
+    def _configured_pace(self) -> TimeBase:
+        return TimeBase(self._configured.mode is TimeMode.REALTIME, self._configured.factor)
 
     @property
     def expected(self) -> bool:
-        """There is a session, or the rack may have one that is to be gone on with."""
+        """There is a session, or one to be resumed if the rack is in it."""
         return self.running or self._configured.autostart or self.kept is not None
 
     def start(self, asked: ControlSession) -> None:
-        """Begin the session that an operator has asked for."""
+        """Begin the session requested by an operator."""
         self.forget_kept()
         self._program.restart(asked.session)
-        self.pace = Pace(bool(asked.realtime), asked.factor)
+        self.pace = TimeBase(bool(asked.realtime), asked.factor)
         self._begin()
         log.info("session started", extra={"session": asked.session, "realtime": bool(asked.realtime)})
 
     def adopt(self, reading: Measurement) -> bool:
-        """Go over to the session of the rack, where that is ours to do; tell whether it was."""
+        """Go over to the session of the rack, where that is ours to do; return whether it was."""
         program, kept = self._program, self.kept
         if kept is not None and kept.session == reading.session != 0:
             self.kept = None
@@ -85,7 +87,7 @@ class Sessions:
         return True
 
     def rack_answered(self) -> bool:
-        """Note that the rack is in no session of ours; tell whether there is one to go on looking for."""
+        """Note that the rack is in no session of ours; return whether to keep looking for one."""
         if not self.running and not self._configured.autostart:
             self.forget_kept()  # the rack has left the session that was retained
         return self.expected
@@ -97,10 +99,10 @@ class Sessions:
             return
         self.pace = self._configured_pace
         if self._program.operator == kept.operator:
-            self._program.nobody_drives()
+            self._program.reset_operating_mode()
 
     def _is_ours_to_adopt(self, session: int) -> bool:
-        """Tell whether a session of the rack has not been asked for by an operator, as far as one can tell by now."""
+        """Return whether a session of the rack was not requested by an operator, as far as is known now."""
         if not session or not self.running:
             return session > 0
         now = time.monotonic()

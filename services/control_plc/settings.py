@@ -39,7 +39,7 @@ class PlantEndpoint(Endpoint):
 
 
 class ControlStrategy(StrEnum):
-    """Who drives the inputs."""
+    """Operating mode at the start."""
 
     MPC = "mpc"
     """The optimiser's sequences."""

@@ -1,4 +1,4 @@
-"""`python -m hmi`: the operator's page as a service of its own."""
+"""`python -m hmi`: the operator's page as a service."""
 
 import sys
 from importlib.util import find_spec

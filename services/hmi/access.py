@@ -1,4 +1,4 @@
-"""Who is asking: sessions, the rate of requests, and where a request comes from. No sockets, no clock of its own."""
+"""Sessions, request rates and origin of requests. No sockets; the clock is given."""
 
 import hashlib
 import re
@@ -43,8 +43,8 @@ class LoginSession:
         return self.user.role is PageRole.OPERATE
 
 
-class Sessions:
-    """Sessions by their tokens, of which only digests are kept.
+class LoginSessions:
+    """LoginSessions by their tokens, of which only digests are kept.
 
     Args:
         now: Monotonic clock, s.
@@ -96,13 +96,13 @@ def _digest(token: str) -> str:
     return hashlib.sha256(token.encode(errors="surrogatepass")).hexdigest()
 
 
-class RateLimit:
+class ClientLimit:
     """A bucket of requests for each address or party.
 
     Args:
         now: Monotonic clock, s.
         per_second: Rate at which it fills.
-        burst: What it holds.
+        burst: Its capacity.
     """
 
     def __init__(self, now: Callable[[], float], per_second: float, burst: float) -> None:
@@ -142,7 +142,7 @@ def port_of(header: str) -> int | None:
 
 
 def is_own_origin(origin: str | None, host: str) -> bool:
-    """Tell whether a request that changes something comes from the page itself: `Origin` names the address asked for.
+    """Return whether a request that changes something comes from the page itself: `Origin` names the address asked for.
 
     A request without `Origin` is not: browsers send it with every POST. A proxy in front may add HTTPS.
     """

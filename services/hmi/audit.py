@@ -17,12 +17,12 @@ log = logging.getLogger("coldloop.hmi.audit")
 
 KEPT: Final = 500
 STRANGERS_KEPT: Final = 100
-"""Entries about requests of nobody who has logged in: they never push out those of users."""
+"""Entries about requests without a login: they never push out those of users."""
 LONGEST_DETAIL: Final = 300
 REPEATS_S: Final = 60.0
 """Refusals that are alike within this time are one entry, and a second one that says how many there were."""
 MOST_KINDS: Final = 20
-"""Kinds of refusals of strangers that have entries of their own in this time; all others have one together."""
+"""Kinds of refusals without a login that have their own entries in this time; all others share one."""
 LARGEST_FILE: Final = 8_000_000
 OLDER_FILES: Final = 4
 
@@ -88,11 +88,11 @@ class Audit:
         """Add an entry.
 
         Args:
-            what: What was asked for: login, logout, command, request.
+            what: Kind of request: login, logout, command, request.
             who: The user who has logged in.
             address: Where the request came from.
             outcome: done, refused, or uncertain when it is not known.
-            detail: The command in words, what came back, or why not.
+            detail: The command in words, its result, or the reason of a refusal.
         """
         self._sum_up()
         self._add(_entry(what, who, address, outcome, detail), self._of_users)
@@ -101,7 +101,7 @@ class Audit:
         """Add a refusal, or count it where one like it has an entry already.
 
         Args:
-            what: What was asked for.
+            what: Kind of request.
             who: The user; of a login, the name that was given.
             address: Where the request came from.
             reason: Why; refusals of one reason to one user or address are alike.

@@ -1,4 +1,4 @@
-"""One stream of changes for all browsers: encoded once, sent to each; for a slow browser nobody waits."""
+"""One stream of changes for all browsers: encoded once, sent to each; a slow browser delays no other."""
 
 import asyncio
 from collections import Counter

@@ -67,7 +67,7 @@ class Commanding:
         asked = await _document(request)
         name, password = asked.get("user"), asked.get("password")
         if not isinstance(name, str) or not isinstance(password, str):
-            return refusal(400, "user and password are texts")
+            return refusal(400, "user and password must be text")
         address = request.remote or ""
         user = await self._guard.log_in(name, password, address)
         if isinstance(user, web.Response):
@@ -111,7 +111,7 @@ class Commanding:
         return web.json_response({"token": token, "text": text})
 
     async def confirm(self, request: web.Request) -> web.Response:
-        """Carry out a command that was prepared; answer with what was asked and what came of it."""
+        """Carry out a prepared command; answer with the command and its result."""
         operator = self._operator(request)
         if isinstance(operator, web.Response) or self._desk is None:
             return operator if isinstance(operator, web.Response) else refusal(409, "a recorded run takes no commands")
@@ -131,11 +131,11 @@ class Commanding:
         """Return the session of an operator, or the refusal."""
         session = self._guard.session(request)
         if session is None:
-            self._refuse(request, "nobody has logged in, or the session has ended")
+            self._refuse(request, "not logged in, or the session has ended")
             return refusal(401, "log in first: the session has ended, or there was none")
         if not session.may_operate:
-            self._refuse(request, "the user may only look")
-            return refusal(403, f"{session.user.name} may look, and not operate")
+            self._refuse(request, "the user may only view")
+            return refusal(403, f"{session.user.name} may view, but not operate")
         return session
 
     def _refuse(self, request: web.Request, reason: str) -> None:

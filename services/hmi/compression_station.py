@@ -21,7 +21,7 @@ LIMITS: Final[Mapping[str, tuple[str | None, str | None]]] = {
 
 
 def plant_document(model: Model) -> dict[str, Any]:
-    """Return the kind of the plant as it tells it; of a refrigerator also the state of its station."""
+    """Return the kind of the plant as it reports it; of a refrigerator also the state of its station."""
     kind = model.configuration.get(KIND, "")
     if kind != REFRIGERATOR:
         return {"kind": kind}

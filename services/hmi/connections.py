@@ -22,7 +22,7 @@ class Use:
     is_busy: bool = False
     is_stream: bool = False
     has_session: bool = False
-    """Its last request was made by somebody who has logged in."""
+    """Its last request had a login."""
 
     def rank(self, now: float) -> int | None:
         """Return how soon it gives way, 0 first; None keeps its place."""
@@ -35,7 +35,7 @@ class Connections:
     """Connections of one server, at most so many.
 
     A newcomer takes the place of a connection that only waits: strangers' first, and of these one from the address
-    that has most of them. So a crowd of idle connections or of half requests keeps nobody out.
+    that has most of them. So idle connections or incomplete requests lock out no user.
 
     Args:
         most: Connections at a time.
@@ -64,7 +64,7 @@ class Connections:
         first = min(ranks, key=lambda one: (ranks[one], -crowd[_address(one)], self._uses[one].since))
         transport = first.transport
         if transport is not None:
-            transport.abort()  # what it has not read yet is not waited for
+            transport.abort()  # do not wait for unread data
         first.force_close()
         return True
 

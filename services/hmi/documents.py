@@ -18,7 +18,7 @@ from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriori
 from coldloop.service.event_text import alarm_cause, word
 from hmi.compression_station import plant_document
 from hmi.explanation import explain
-from hmi.process_image import Model, Told
+from hmi.process_image import JournalEntry, Model
 from hmi.sentences import sentence
 from hmi.signals import signals_of
 from hmi.trends import NAMES, Gap, mode_name, rounded, thin
@@ -122,12 +122,12 @@ def alarms_document(model: Model) -> list[Document]:
     return [alarm_document(kind, alarm) for kind, alarm in rows]
 
 
-def event_document(told: Told) -> Document:
+def event_document(entry: JournalEntry) -> Document:
     """Return one event in words."""
-    text = told.text
+    text = entry.text
     return {
-        "service": told.service, "number": told.number, "boot": told.boot, "utc": told.utc, "tick": told.tick,
-        "time_s": told.tick * TICK_S, "kind": text.kind, "subject": text.subject, "cause": text.cause,
+        "service": entry.service, "number": entry.number, "boot": entry.boot, "utc": entry.utc, "tick": entry.tick,
+        "time_s": entry.tick * TICK_S, "kind": text.kind, "subject": text.subject, "cause": text.cause,
         "value": text.value, "unit": text.unit, "who": text.who, "sentence": text.sentence,
     }  # fmt: skip
 
@@ -169,13 +169,7 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
 
 
 def explanation_document(model: Model, number: int | None, at_tick: int | None = None) -> Document | None:
-    """Return why an updating period is as long as it is; None without such an update.
-
-    Args:
-        model: What is known.
-        number: Of the update; None is the last one.
-        at_tick: The update whose period this tick is in, in the place of a number.
-    """
+    """Return the explanation of the period of an update: by number, at a tick, or the last one; None without it."""
     updates = model.updates
     place = len(updates) - 1
     if at_tick is not None:
@@ -277,13 +271,13 @@ def _some(predictions: list[Prediction]) -> list[Prediction]:
 
 
 def _marks(model: Model, start: int, end: int) -> list[Document]:
-    begun = max((told.utc for told in model.events if told.service == "plant" and told.text.kind == BEGUN), default="")
+    begun = max((e.utc for e in model.events if e.service == "plant" and e.text.kind == BEGUN), default="")
     found = [
-        told
-        for told in model.events
-        if told.text.kind in MARKED and start <= told.tick <= end and told.utc >= begun  # not of a session before
+        entry
+        for entry in model.events
+        if entry.text.kind in MARKED and start <= entry.tick <= end and entry.utc >= begun  # not of a session before
     ]
     return [
-        {"time": told.tick * TICK_S, "kind": MARKED[told.text.kind], "text": told.text.sentence}
-        for told in found[-MOST_MARKS:]
+        {"time": entry.tick * TICK_S, "kind": MARKED[entry.text.kind], "text": entry.text.sentence}
+        for entry in found[-MOST_MARKS:]
     ]

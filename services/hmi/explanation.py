@@ -1,4 +1,4 @@
-"""Why an updating period is as long as it is: from what was recorded of an update to the branch that decided, in words.
+"""Explains an updating period: from the record of an update to the branch that decided it.
 
 A pure function of registers: it works on a running rig and on a recorded run alike. Symbols are those of Algorithm 1
 (`optimizer_plc/rules/`): the quantities of update i were found at t_i, of the period that ended there.
@@ -22,14 +22,14 @@ LONGEST_TICKS: Final = TICKS_PER_SAMPLE
 
 
 class Branch(StrEnum):
-    """What decided the number of iterations."""
+    """Branch that decided the number of iterations."""
 
     FIXED = "fixed"
     """The period is fixed."""
     FIRST = "first"
     """There is no period before this one."""
     BEGUN_AGAIN = "begun again"
-    """The optimiser had lost the thread: others have moved the inputs, or it was restarted."""
+    """The optimiser was restarted, or another client has moved the inputs."""
     INTERRUPTED = "interrupted"
     """A load step ended the period before."""
     LATE = "late"
@@ -93,7 +93,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Why an updating period is as long as it is."""
+    """Explanation of an updating period."""
 
     update: Optimization
     before: Optimization | None
@@ -154,7 +154,7 @@ def period_ticks(iterations: int, rule: UpdatingRuleStatus) -> int:
 
 
 def is_rounded_to_one(update: Optimization) -> bool:
-    """Tell whether K was below 1, and is 1 in the single precision of the registers: Gamma is no slope of K then."""
+    """Return whether K was below 1, and is 1 in the single precision of the registers: Gamma is no slope of K then."""
     return update.contraction == 1.0 and abs(update.gamma) >= STEEPEST
 
 

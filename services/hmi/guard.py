@@ -14,10 +14,10 @@ from hmi.access import (
     LOGINS_A_MINUTE,
     REQUEST_BURST,
     REQUESTS_A_BROWSER,
+    ClientLimit,
     LoginSession,
+    LoginSessions,
     Party,
-    RateLimit,
-    Sessions,
     host_of,
     is_own_origin,
     port_of,
@@ -44,10 +44,10 @@ OPEN: Final = frozenset({"/", "/healthz", "/metrics", "/api/catalog", "/api/logi
 """What is served without a login; `/metrics` looks at it itself."""
 FILES: Final = frozenset({"/", "/api/catalog", "/favicon.ico"})
 UNLIMITED: Final = frozenset({"/api/login", "/healthz"})
-"""Attempts to log in have a limit of their own; whether the page is well costs no more than a refusal."""
+"""Attempts to log in have a limit of their own; the health check costs no more than a refusal."""
 STREAM: Final = "/api/stream"
 LARGEST_OF_STRANGERS: Final = 4096
-"""Bytes of a request of somebody who has not logged in: a name and a password, where a replay shall go."""
+"""Bytes of a request without a login: a name and a password, or a replay position."""
 BODY_S: Final = 5.0
 """Within this time a request is here as a whole."""
 PASSWORDS_AT_ONCE: Final = 2
@@ -73,7 +73,7 @@ def cookie_name(request: web.Request) -> str:
     return f"coldloop_session_{port_of(host_header(request)) or 'default'}"
 
 
-def path_in_exhibit(request: web.Request) -> str:
+def path_in_site(request: web.Request) -> str:
     """Return what is asked for of one rig or run, without the number of the run among several."""
     return _RUN.sub("/", request.path, count=1)
 
@@ -85,7 +85,7 @@ class Guard:
         settings: Of the page.
         audit: Where refusals are noted.
         users: Who may log in.
-        connections: Are told of requests under way.
+        connections: Informed of requests under way.
     """
 
     def __init__(self, settings: HmiSection, audit: Audit, users: Users, connections: Connections) -> None:
@@ -95,20 +95,20 @@ class Guard:
         self._connections = connections
         self._checking = asyncio.Semaphore(PASSWORDS_AT_ONCE)
         login = settings.login
-        self.sessions = Sessions(time.monotonic, login.idle_minutes * 60, login.longest_minutes * 60)
-        self.logins = RateLimit(time.monotonic, LOGINS_A_MINUTE / 60, LOGIN_BURST)
-        self._requests = RateLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
-        self._files = RateLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
+        self.sessions = LoginSessions(time.monotonic, login.idle_minutes * 60, login.longest_minutes * 60)
+        self.logins = ClientLimit(time.monotonic, LOGINS_A_MINUTE / 60, LOGIN_BURST)
+        self._requests = ClientLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
+        self._files = ClientLimit(time.monotonic, REQUESTS_A_BROWSER * settings.browsers, REQUEST_BURST)
         self._hosts = LOCAL_NAMES | {settings.host, *map(str.lower, settings.allowed_hosts)}
 
     def session(self, request: web.Request) -> LoginSession | None:
         """Return the session of a request."""
         return self.sessions.find(
-            request.cookies.get(cookie_name(request)), is_use=path_in_exhibit(request) not in BY_ITSELF
+            request.cookies.get(cookie_name(request)), is_use=path_in_site(request) not in BY_ITSELF
         )
 
     def who(self, request: web.Request) -> str:
-        """Return the user of a request; empty when nobody has logged in."""
+        """Return the user of a request; empty without a login."""
         session = self.sessions.find(request.cookies.get(cookie_name(request)), is_use=False)
         return session.user.name if session else ""
 
@@ -142,16 +142,16 @@ class Guard:
 
     def _judge(self, request: web.Request) -> web.Response | None:
         """Return why a request is refused; None when it is not."""
-        path, host = path_in_exhibit(request), host_header(request)
+        path, host = path_in_site(request), host_header(request)
         is_file = path in FILES or path.startswith("/static/")
         limit = self._files if is_file else self._requests
         if path not in UNLIMITED and not limit.allows(self.party(request)):
             return self._refused(request, 429, "too many requests: wait a little")
         if host_of(host) not in self._hosts:
-            reason = "a name that is not the page's"
-            return self._refused(request, 421, reason, f"the page is not called '{host}': name it in hmi.allowed_hosts")
+            reason = "host name not allowed"
+            return self._refused(request, 421, reason, f"host '{host}' is not allowed: add it to hmi.allowed_hosts")
         if request.method not in SAFE and not is_own_origin(request.headers.get(hdrs.ORIGIN), host):
-            return self._refused(request, 403, "a command comes from the page itself, not from another site")
+            return self._refused(request, 403, "commands are accepted from the page itself only, not from another site")
         is_open = path in OPEN or is_file
         if not is_open and not self._settings.login.anonymous_view and self.session(request) is None:
             return refusal(401, "log in first")
@@ -166,9 +166,9 @@ class Guard:
             async with asyncio.timeout(BODY_S):
                 await request.read()
         except TimeoutError:
-            return refusal(408, f"a request is sent within {BODY_S:g} s")
+            return refusal(408, f"the request was not complete within {BODY_S:g} s")
         except web.RequestPayloadError:
-            return refusal(400, "the request is damaged")
+            return refusal(400, "the request is malformed")
         return None
 
     @web.middleware
@@ -178,7 +178,7 @@ class Guard:
         try:
             answer = answer or await self._receive(request)
             if answer is None:
-                is_stream = path_in_exhibit(request) == STREAM
+                is_stream = path_in_site(request) == STREAM
                 has_session = self.party(request).has_session
                 with self._connections.serving(request, is_stream=is_stream, has_session=has_session):
                     answer = await handler(request)

@@ -1,4 +1,4 @@
-"""Requests that compute for long take turns, so that nobody else waits for more than one of them."""
+"""Long requests take turns, so that other requests wait for at most one of them."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -40,7 +40,7 @@ class LongReads:
         """
         queue = self._queues[has_session]
         if queue.waiting >= MOST_WAITING:
-            raise web.HTTPServiceUnavailable(reason="too many ask for trends and tables: wait a little")
+            raise web.HTTPServiceUnavailable(reason="too many requests for trends and tables: wait a little")
         queue.waiting += 1
         try:
             async with queue.turn:

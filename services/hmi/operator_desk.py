@@ -48,7 +48,7 @@ class Prepared(NamedTuple):
     until: float
 
 
-class Outcome(NamedTuple):
+class CommandResult(NamedTuple):
     """What became of a command: one of the last three says it."""
 
     asked: str
@@ -123,14 +123,14 @@ class OperatorDesk:
         if pace is None or not pace.session:
             return ""
         if not pace.realtime:
-            return " of plant time, which goes as far as it is granted"
+            return " of plant time, which advances as it is granted"
         if pace.paused:
-            return " of plant time, which stands still now"
+            return " of plant time, which is paused"
         if pace.factor == 1.0 or pace.factor <= 0.0:
             return ""
         return f" of plant time, {duration_text(seconds / pace.factor)} by the clock at factor {pace.factor:g}"
 
-    async def confirm(self, token: str, user: str) -> Outcome:
+    async def confirm(self, token: str, user: str) -> CommandResult:
         """Carry out a command that was prepared, once.
 
         Raises:
@@ -139,25 +139,25 @@ class OperatorDesk:
         prepared = self._prepared.get(token)
         if prepared is None or prepared.user != user or self._now() > prepared.until:
             raise UsageError(
-                f"nothing to confirm: a command is confirmed once, within {CONFIRM_WITHIN_S:g} s, by who prepared it"
+                f"nothing to confirm: a command is confirmed once, within {CONFIRM_WITHIN_S:g} s, by its own user"
             )
         del self._prepared[token]
         async with self._turn:
             return await self._carry_out(prepared.command, prepared.text)
 
-    async def _carry_out(self, command: Command, asked: str) -> Outcome:
+    async def _carry_out(self, command: Command, asked: str) -> CommandResult:
         services, work = WORK[type(command)]
         clients = self._clients(services)
         try:
             async with connected(clients):
-                return Outcome(asked, applied=await work(clients, command))
+                return CommandResult(asked, applied=await work(clients, command))
         except NotTakenError as error:
-            return Outcome(asked, refused_because=str(error))
+            return CommandResult(asked, refused_because=str(error))
         except (LinkError, UsageError) as error:
             if any(client.has_written for client in clients.values()):
-                reason = f"{reason_of(error)}; look what has become of it before asking again"
-                return Outcome(asked, uncertain_because=reason)
-            return Outcome(asked, refused_because=reason_of(error))
+                reason = f"{reason_of(error)}; check its effect before repeating it"
+                return CommandResult(asked, uncertain_because=reason)
+            return CommandResult(asked, refused_because=reason_of(error))
 
     def _clients(self, services: Iterable[str]) -> dict[str, CommandClient]:
         return clients_of(

@@ -1,4 +1,4 @@
-"""What the page tells Prometheus: all registers that it reads, alarms, the last update, and the page itself."""
+"""Metrics of the page for Prometheus: all registers it reads, alarms, the last update, and the page itself."""
 
 from collections.abc import Iterator
 
@@ -23,7 +23,7 @@ def page_families(model: Model, browsers: int) -> Iterator[Metric]:
         label="service",
     )
     ages = {service: age for service in MAPS if (age := model.age_s(service)) is not None}
-    yield gauge("coldloop_age_seconds", "Time since a service answered last", ages, label="service")
+    yield gauge("coldloop_age_seconds", "Time since the last answer of a service", ages, label="service")
     yield gauge("coldloop_page_browsers", "Streams to browsers", browsers)
     for service in live:
         for block in MAPS[service].blocks:

@@ -35,7 +35,7 @@ LINGERING_S: Final = 1.0
 """How long the rest of a request that was refused is read, so that the refusal arrives."""
 
 
-class Exhibit(NamedTuple):
+class PageSite(NamedTuple):
     """One rig, or one recorded run, and what can be done with it."""
 
     model: Model
@@ -56,7 +56,7 @@ class PageServer:
         ConfigurationError: A file of the settings cannot be used.
     """
 
-    def __init__(self, settings: HmiSection, *exhibits: Exhibit) -> None:
+    def __init__(self, settings: HmiSection, *exhibits: PageSite) -> None:
         self._settings = settings
         self._audit = Audit(settings.audit)
         self._users = Users(settings.login.users)
@@ -79,7 +79,7 @@ class PageServer:
         self._listener: asyncio.Server | TlsListener | None = None
         self.port = 0
 
-    def _routes(self, exhibit: Exhibit) -> list[web.AbstractRouteDef]:
+    def _routes(self, exhibit: PageSite) -> list[web.AbstractRouteDef]:
         model, desk, extra = exhibit
         broadcast = Broadcast(lambda: message(state_document(model)), self._settings.browsers)
         news = asyncio.Event()
@@ -93,7 +93,7 @@ class PageServer:
         """Listen.
 
         Raises:
-            PortInUseError: Somebody else does already.
+            PortInUseError: Another program already does.
             ConfigurationError: The files for HTTPS cannot be used.
         """
         settings = self._settings

@@ -1,4 +1,4 @@
-"""Reads the three services over Modbus, once for all browsers, and goes on looking when one is silent."""
+"""Reads the three services over Modbus, once for all browsers, and keeps polling a silent one."""
 
 import asyncio
 import logging
@@ -17,7 +17,7 @@ from coldloop.registers.optimizer_plc import HISTORY_ROWS, ControlLinkStatus, Op
 from coldloop.registers.plant import LoadStatus, StationStatus
 from coldloop.registers.safety import Alarm, AlarmKind
 from hmi.compression_station import KIND, REFRIGERATOR
-from hmi.process_image import Model, Told
+from hmi.process_image import JournalEntry, Model
 from hmi.signals import shown_blocks
 
 log = logging.getLogger("coldloop.hmi")
@@ -43,7 +43,7 @@ class Poller:
     Args:
         service: Which one.
         endpoint: Where it is.
-        model: What is told of it.
+        model: Receives what is read.
         poll_s: Time between two looks.
     """
 
@@ -121,7 +121,7 @@ class Poller:
         for record in self._slow:
             try:
                 self._model.put(self._service, await self._client.read(record))
-            except (DamagedAnswerError, RequestRefusedError):  # not sealed: nobody has written it yet
+            except (DamagedAnswerError, RequestRefusedError):  # not sealed: not written yet
                 continue
         if self._service == "plant":
             await self._read_configuration()
@@ -155,7 +155,7 @@ class Poller:
         self._model.put("optimizer_plc", await self._client.read(Prediction))
 
     async def _check_journal(self) -> None:
-        """Begin with the first event again where the last one is not known any more: the service counts anew."""
+        """Begin with the first event again if the last one is unknown: the service has restarted its count."""
         last = self._last_event
         if last is not None and await self._client.read_rows(Event, last.number % EVENT_ROWS, 1) != [last]:
             self._next_event, self._last_event = 0, None
@@ -164,13 +164,13 @@ class Poller:
         page = self._model.record(self._service, JournalPage)
         if page is None or page.newest + 1 == self._next_event:
             return
-        if page.newest < self._next_event:  # it counts anew
+        if page.newest < self._next_event:  # it has restarted its count
             self._next_event = 0
         first = max(self._next_event, page.newest - EVENTS_AT_ONCE + 1, 1)
         rows = await self._rows(Event, first, page.newest, EVENT_ROWS)
         news = sorted(row for row in rows if first <= row.number <= page.newest)
         self._last_event = news[-1] if news else self._last_event
-        self._model.put_events(Told.of(self._service, row) for row in news)
+        self._model.put_events(JournalEntry.of(self._service, row) for row in news)
         self._next_event = page.newest + 1
 
     async def _rows(self, record: type[Any], first: int, last: int, ring: int) -> list[Any]:

@@ -1,6 +1,6 @@
 """What the page knows: the newest record of each block, trends, updates, predictions and events.
 
-Whoever reads a rig, or a recorded run, writes into it; the pages are made from it. Nothing here uses a socket.
+Readers of a rig or of a recorded run write into it; the pages are made from it. No sockets here.
 """
 
 from collections import deque
@@ -29,7 +29,7 @@ STALE_S: Final = 1.5
 """A value whose source has been silent for this long is crossed out."""
 
 
-class Told(NamedTuple):
+class JournalEntry(NamedTuple):
     """An event in words, and the service whose journal it is from."""
 
     service: str
@@ -40,7 +40,7 @@ class Told(NamedTuple):
     text: EventText
 
     @classmethod
-    def of(cls, service: str, event: Event) -> "Told":
+    def of(cls, service: str, event: Event) -> "JournalEntry":
         """Return an event of a journal."""
         return cls(service, event.number, event.boot, utc_text(event), event.tick, describe(event))
 
@@ -77,13 +77,13 @@ class Model:
         self.updates: deque[Optimization] = deque(maxlen=UPDATES_KEPT)
         self.predictions: deque[Prediction] = deque(maxlen=PREDICTIONS_KEPT)
         self.alarms: list[Alarm] = []
-        self.events: deque[Told] = deque(maxlen=EVENTS_KEPT)
+        self.events: deque[JournalEntry] = deque(maxlen=EVENTS_KEPT)
         self.events_told = 0
         """Events so far; the last ones are in `events`."""
         self.changed: set[str] = set()
         """Names of signals, `alarms`, `updates`, `prediction`: what changed since it was last looked at."""
         self.configuration: Mapping[str, Any] = {}
-        """What the plant's registers tell of its configuration, by dotted key."""
+        """The plant's configuration from its registers, by dotted key."""
         self._values: dict[str, float | int | str] = {}
         self._session = 0
         self.replay: dict[str, object] | None = None
@@ -106,7 +106,7 @@ class Model:
         if isinstance(record, Identity):
             self._identity(service, record)
         elif isinstance(record, Process):
-            is_after_gap = source.was_silent or self._is_silent(source) or self.stands_still(service)
+            is_after_gap = source.was_silent or self._is_silent(source) or self.is_stopped(service)
             source.was_silent = False
             self._moved(source, record.tick)
             station = self.record("plant", StationStatus)
@@ -114,7 +114,7 @@ class Model:
             self.trends.add(record, self.mode, self.bad_sensors, values, is_after_gap=is_after_gap)
         elif isinstance(record, Prediction):
             self._predicted(record)
-        elif isinstance(record, SessionPace):  # ticks go on from now by another clock
+        elif isinstance(record, SessionPace):  # from now on ticks follow another clock
             for each in self.sources.values():
                 each.moved = self.now()
 
@@ -157,10 +157,10 @@ class Model:
             self.updates.append(update)
             self.changed.add("updates")
 
-    def put_events(self, events: Iterable[Told]) -> None:
+    def put_events(self, events: Iterable[JournalEntry]) -> None:
         """Take events that are new, oldest first."""
-        for told in events:
-            self.events.append(told)
+        for entry in events:
+            self.events.append(entry)
             self.events_told += 1
 
     def heard(self, service: str) -> None:
@@ -198,7 +198,7 @@ class Model:
 
     @property
     def bad_sensors(self) -> int:
-        """Outputs for which the last good value stands in, a bit for each."""
+        """Outputs substituted by their last good value, a bit for each."""
         ladder = self.record("control_plc", LadderStatus)
         return ladder.bad_sensors if ladder else 0
 
@@ -224,12 +224,12 @@ class Model:
         return None if heard is None else max(0.0, self.now() - heard)
 
     def is_live(self, service: str) -> bool:
-        """Tell whether a service answers."""
+        """Return whether a service answers."""
         age = self.age_s(service)
         return age is not None and age < STALE_S
 
-    def stands_still(self, service: str) -> bool:
-        """Tell whether the tick of a service does not move although its session goes on by the clock."""
+    def is_stopped(self, service: str) -> bool:
+        """Return whether the tick of a service does not move although its session runs in real time."""
         pace = self.record("plant", SessionPace)
         if pace is None or not pace.realtime or pace.paused or not pace.session or not pace.factor > 0:
             return False
@@ -244,9 +244,9 @@ class Model:
         stale = [f"{service}." for service in MAPS if not self.is_live(service)]
         identity = self.record("control_plc", Identity)
         is_looking = identity is not None and not identity.session  # for its session: nothing is measured
-        if self.is_live("control_plc") and (is_looking or self.stands_still("control_plc")):
+        if self.is_live("control_plc") and (is_looking or self.is_stopped("control_plc")):
             stale.append("control_plc.process.")
-        if self.is_live("plant") and self.stands_still("plant"):
+        if self.is_live("plant") and self.is_stopped("plant"):
             stale += ["plant.measurement.", "plant.station."]
         if self.mode != Mode.MPC and self.record("control_plc", LadderStatus) is not None:
             stale.append("update")

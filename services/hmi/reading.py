@@ -29,7 +29,7 @@ from hmi.documents import (
 from hmi.guard import Guard, add_headers, refusal
 from hmi.long_reads import LongReads
 from hmi.page_metrics import page_families
-from hmi.process_image import Model, Told
+from hmi.process_image import JournalEntry, Model
 from hmi.settings import HmiSection
 from hmi.trends import NAMES
 
@@ -102,7 +102,7 @@ class Reading:
         """Answer with the state and its changes, as server-sent events, until the browser goes or its session ends."""
         stream = self._broadcast.begin(self._guard.party(request))
         if stream is None:
-            return refusal(503, f"{len(self._broadcast)} browsers look already: close some, or raise hmi.browsers")
+            return refusal(503, f"{len(self._broadcast)} browsers are connected: close some, or raise hmi.browsers")
         answer = web.StreamResponse(headers={hdrs.CONTENT_TYPE: "text/event-stream"})
         add_headers(answer)
         try:
@@ -125,7 +125,7 @@ class Reading:
         names = list(dict.fromkeys(name for name in query.get("names", "").split(",") if name)) or ["L1", "T5", "load"]
         unknown = [name for name in names if name not in NAMES]
         if unknown:
-            raise web.HTTPBadRequest(reason=f"no trend is called {printable(unknown[0])}")
+            raise web.HTTPBadRequest(reason=f"unknown trend {printable(unknown[0])}")
         if len(names) > MOST_NAMES:
             raise web.HTTPBadRequest(reason=f"a trend has at most {MOST_NAMES} signals, not {len(names)}")
         try:
@@ -134,7 +134,7 @@ class Reading:
             points = max(10, min(int(query.get("points", POINTS)), MOST_POINTS))
             return names, end - round(seconds / TICK_S), end, points
         except (ValueError, OverflowError):
-            raise web.HTTPBadRequest(reason="seconds, end and points are numbers") from None
+            raise web.HTTPBadRequest(reason="seconds, end and points must be numbers") from None
 
     async def trend(self, request: web.Request) -> web.Response:
         """Answer with what is drawn in a window; browsers that ask for the same share one answer."""
@@ -158,7 +158,7 @@ class Reading:
         add_headers(answer)
         await answer.prepare(request)
         await answer.write(",".join(["time_s", *names, "substituted"]).encode() + b"\n")
-        with suppress(ConnectionError, TimeoutError):  # nobody takes the rest
+        with suppress(ConnectionError, TimeoutError):  # the client has gone
             while start <= end:
                 async with self._turn(request):
                     rows, start = self._trend_rows(names, start, end)
@@ -180,13 +180,13 @@ class Reading:
         return text.getvalue().encode(), following
 
     async def explanation(self, request: web.Request) -> web.Response:
-        """Answer with why an updating period is as long as it is."""
+        """Answer with the explanation of an updating period."""
         number, at = request.query.get("update", ""), request.query.get("at", "")
         try:
             at_tick = round(float(at) / TICK_S) if at else None
             document = explanation_document(self._model, int(number) if number else None, at_tick)
         except (ValueError, OverflowError):
-            raise web.HTTPBadRequest(reason="update and at are numbers") from None
+            raise web.HTTPBadRequest(reason="update and at must be numbers") from None
         if document is None:
             wanted = printable(number or at) or "(the last one)"
             return refusal(404, f"update {wanted} is not known: only the newest are kept")
@@ -196,21 +196,21 @@ class Reading:
         """Answer with all alarms."""
         return json_answer(encoded({"alarms": alarms_document(self._model)}))
 
-    def _events(self, query: Mapping[str, str]) -> list[Told]:
+    def _events(self, query: Mapping[str, str]) -> list[JournalEntry]:
         wanted, service = query.get("search", "").lower(), query.get("service", "")
         found = []
-        for told in reversed(self._model.events):
-            if service and told.service != service:
+        for entry in reversed(self._model.events):
+            if service and entry.service != service:
                 continue
-            if not wanted or wanted in f"{told.text.sentence} {told.utc} {told.service}".lower():
-                found.append(told)
+            if not wanted or wanted in f"{entry.text.sentence} {entry.utc} {entry.service}".lower():
+                found.append(entry)
         return found
 
     async def events(self, request: web.Request) -> web.Response:
         """Answer with the newest events that a search finds."""
         async with self._turn(request):
             found = self._events(request.query)
-            document = encoded({"found": len(found), "events": [event_document(told) for told in found[:EVENTS_SHOWN]]})
+            document = encoded({"found": len(found), "events": [*map(event_document, found[:EVENTS_SHOWN])]})
         return json_answer(document)
 
     async def events_table(self, request: web.Request) -> web.Response:
@@ -218,7 +218,7 @@ class Reading:
         async with self._turn(request):
             return self._events_as_table(self._events(request.query))
 
-    def _events_as_table(self, found: list[Told]) -> web.Response:
+    def _events_as_table(self, found: list[JournalEntry]) -> web.Response:
         text = io.StringIO()
         names = (
             "service",
@@ -236,8 +236,8 @@ class Reading:
         )
         writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
-        for told in found:
-            row = event_document(told)
+        for entry in found:
+            row = event_document(entry)
             writer.writerow({name: safe_cell(row[name]) for name in names})
         return web.Response(body=text.getvalue().encode(), headers=csv_headers("coldloop-events.csv"))
 
@@ -294,7 +294,7 @@ def csv_headers(name: str) -> dict[str, str]:
 
 
 def printable(text: str) -> str:
-    """Return what somebody asked for as a message names it: short, and on one line."""
+    """Return a request's text for a message: short, and on one line."""
     return "".join(one if one.isprintable() else "?" for one in text[:LONGEST_NAME])
 
 

@@ -18,8 +18,8 @@ from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Upda
 from coldloop.registers.plant import LoadStatus, StationSample, StationStatus
 from coldloop.registers.safety import Alarm
 from hmi.guard import refusal
-from hmi.page_server import Exhibit, PageServer
-from hmi.process_image import Model, Told
+from hmi.page_server import PageServer, PageSite
+from hmi.process_image import JournalEntry, Model
 from hmi.settings import HmiSection
 from hmi.trends import NO_STATION, station_values
 
@@ -28,7 +28,7 @@ MOST_AT_ONCE: Final = 400
 """Ticks that one step of a fast replay draws; of more some are left out."""
 
 
-class Frame(NamedTuple):
+class ReplayFrame(NamedTuple):
     """One tick of a run."""
 
     process: Process
@@ -52,7 +52,7 @@ class RecordedRun(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Its name."""
 
     @property
     def ticks(self) -> int:
@@ -63,7 +63,7 @@ class RecordedRun(Protocol):
         """Updates in their order."""
 
     @property
-    def events(self) -> Sequence[Told]:
+    def events(self) -> Sequence[JournalEntry]:
         """Events in the order of their ticks."""
 
     @property
@@ -76,16 +76,16 @@ class RecordedRun(Protocol):
 
     @property
     def configuration(self) -> Mapping[str, Any]:
-        """What it was run with, by dotted key."""
+        """Its configuration, by dotted key."""
 
-    def frame(self, tick: int) -> Frame | None:
+    def frame(self, tick: int) -> ReplayFrame | None:
         """Return one tick; None if it is missing in the recording."""
 
-    def alarms(self, events: Sequence[Told]) -> list[Alarm]:
+    def alarms(self, events: Sequence[JournalEntry]) -> list[Alarm]:
         """Return the alarms after these events, by number."""
 
 
-class Wish(BaseModel):
+class ReplayRequest(BaseModel):
     """What a browser asks of a replay."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -127,7 +127,7 @@ class Replay:
     async def steer(self, request: web.Request) -> web.Response:
         """Play, stand still, go elsewhere."""
         try:
-            wish = Wish.model_validate_json(await request.read())
+            wish = ReplayRequest.model_validate_json(await request.read())
         except ValidationError as error:
             first = error.errors()[0]
             return refusal(422, f"{'.'.join(map(str, first['loc'])) or 'request'}: {first['msg']}")
@@ -149,7 +149,7 @@ class Replay:
             self._show()
             await asyncio.sleep(STEP_S)
             now = time.monotonic()
-            if int(position) != self._tick:  # somebody went elsewhere
+            if int(position) != self._tick:  # a user has moved the position
                 position = float(self._tick)
             if self._playing:
                 position = min(self._run.ticks - 1.0, position + (now - last) * self._speed / TICK_S)
@@ -157,7 +157,7 @@ class Replay:
                 self._playing = self._tick < self._run.ticks - 1
             last = now
 
-    # -- what the model is told ----------------------------------------------------------------------------------------
+    # -- updates of the model ------------------------------------------------------------------------------------------
 
     def _begin(self) -> None:
         model = self._model
@@ -177,7 +177,7 @@ class Replay:
         started = self._tick
         updates, events = self._run.updates, self._run.events
         model.put_updates(updates[: bisect_right(updates, started, key=lambda update: update.tick)])
-        model.put_events(events[: bisect_right(events, started, key=lambda told: told.tick)])
+        model.put_events(events[: bisect_right(events, started, key=lambda entry: entry.tick)])
         self._advance(tick, tick - started)
 
     def _advance(self, tick: int, points: int = MOST_AT_ONCE) -> None:
@@ -200,11 +200,11 @@ class Replay:
         updates, events = run.updates, run.events
         first, last = (bisect_right(updates, one, key=lambda update: update.tick) for one in (before, tick))
         model.put_updates(updates[first:last])
-        first, last = (bisect_right(events, one, key=lambda told: told.tick) for one in (before, tick))
+        first, last = (bisect_right(events, one, key=lambda entry: entry.tick) for one in (before, tick))
         model.put_events(events[first:last])
         model.put_alarms(run.alarms(events[:last]))
 
-    def _put(self, frame: Frame) -> None:
+    def _put(self, frame: ReplayFrame) -> None:
         model, process = self._model, frame.process
         model.put("control_plc", LadderStatus(frame.mode, frame.cause, frame.since, 1, frame.bad_sensors, 0))
         model.put("control_plc", process)
@@ -231,12 +231,12 @@ async def serve_replays(runs: Sequence[RecordedRun], settings: HmiSection, annou
     """Serve one run, or several side by side, until cancelled.
 
     Raises:
-        PortInUseError: Somebody else listens there.
+        PortInUseError: Another program listens there.
         ConfigurationError: A file of the settings cannot be used.
     """
     models = [Model(time.monotonic, settings.kept_s) for _ in runs]
     replays = [Replay(run, model, settings.kept_s) for run, model in zip(runs, models, strict=True)]
-    server = PageServer(settings, *(Exhibit(m, None, r.routes()) for m, r in zip(models, replays, strict=True)))
+    server = PageServer(settings, *(PageSite(m, None, r.routes()) for m, r in zip(models, replays, strict=True)))
     await server.start()
     announce(server.address)
     try:

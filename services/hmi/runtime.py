@@ -7,7 +7,7 @@ import time
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.registers.maps import MAPS
 from hmi.operator_desk import OperatorDesk
-from hmi.page_server import Exhibit, PageServer
+from hmi.page_server import PageServer, PageSite
 from hmi.polling import Poller
 from hmi.process_image import Model
 from hmi.settings import HmiSection, HmiSettings
@@ -20,12 +20,12 @@ async def serve(settings: HmiSettings) -> None:
 
     Raises:
         ConfigurationError: A file of the settings cannot be used.
-        PortInUseError: Somebody else listens there.
+        PortInUseError: Another program listens there.
     """
     hmi = settings.hmi
     model = Model(time.monotonic, hmi.kept_s)
     desk = OperatorDesk(operator_endpoints(hmi), model, time.monotonic, training=hmi.training)
-    server = PageServer(hmi, Exhibit(model, desk))
+    server = PageServer(hmi, PageSite(model, desk))
     pollers = [Poller(service, getattr(hmi, service), model, hmi.poll_s) for service in MAPS]
     await server.start()
     log.info("serving", extra={"host": hmi.host, "port": server.port, "address": server.address})

@@ -1,4 +1,4 @@
-"""One sentence that says why an updating period is as long as it is."""
+"""One sentence that explains the length of an updating period."""
 
 from collections.abc import Callable, Mapping
 from typing import Final
@@ -14,7 +14,7 @@ AT_REST: Final = 1e-9
 
 
 def sentence(found: Explanation, rule: UpdatingRuleStatus) -> str:
-    """Return why the period is as long as it is, in one sentence or two."""
+    """Return the explanation of the period in one or two sentences."""
     text = _WORDS[found.branch](found, rule)
     if found.spare_s and found.branch is not Branch.FIXED:
         text += (
@@ -46,7 +46,7 @@ def _first(found: Explanation, rule: UpdatingRuleStatus) -> str:
 
 def _begun_again(found: Explanation, rule: UpdatingRuleStatus) -> str:
     return (
-        f"{_change(found)} because the optimiser had to begin again (a restart, or somebody else moved the inputs): "
+        f"{_change(found)} because the optimiser had to start over (a restart, or another client moved the inputs): "
         f"q starts at {rule.q_first}."
     )
 
@@ -62,7 +62,7 @@ def _interrupted(found: Explanation, rule: UpdatingRuleStatus) -> str:
     elapsed = (found.update.tick - found.before.tick) * TICK_S if found.before else 0.0
     return (
         f"{_change(found)} because a load step ended the period before after {elapsed:g} s of "
-        f"{found.period_before_s:g} s: what was learnt is void and q starts at {rule.q_first}."
+        f"{found.period_before_s:g} s: what was learned is discarded and q starts at {rule.q_first}."
     )
 
 
@@ -78,7 +78,7 @@ def _late(found: Explanation, _rule: UpdatingRuleStatus) -> str:
 def _algorithm_1(found: Explanation, _rule: UpdatingRuleStatus) -> str:
     K, gamma = found.update.contraction, found.update.gamma
     if is_rounded_to_one(found.update):
-        looks = "K is 1 to the precision of the registers (the cost stands still), and Gamma"
+        looks = "K is 1 to the precision of the registers (the cost does not change), and Gamma"
     elif K >= 1.0:
         looks = f"K = {K:.6g} is not below 1 (the cost does not fall), so K itself is to fall: dK/dq"
     else:
@@ -105,8 +105,8 @@ def _contraction(found: Explanation, rule: UpdatingRuleStatus) -> str:
     if q == rule.q_max and before is not None and found.update.j_effective > before.j_delivered:
         ratio = found.update.j_effective / before.j_delivered
         return (
-            f"{_change(found)} because the cost that was reached is {ratio:.3g} times the one predicted: a surprise is "
-            f"answered by one long solve of q = {q}."
+            f"{_change(found)} because the cost that was reached is {ratio:.3g} times the one predicted: a mismatch "
+            f"triggers one long solve of q = {q}."
         )
     return (
         f"{_change(found)} because of how much successive profiles have improved lately: the contraction rule goes "

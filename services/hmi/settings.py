@@ -49,7 +49,7 @@ class LoginSettings(BaseModel):
     """Who may do what.
 
     Args:
-        users: File with a line `name:role:hash` for each user; `python -m hmi.users` writes it. None: nobody operates.
+        users: File with a line `name:role:hash` for each user; `python -m hmi.users` writes it. None: no operators.
         anonymous_view: Everybody who reaches the page may look at it; only commands need a login.
         idle_minutes: A session without a request for so long ends.
         longest_minutes: Every session ends after this time.

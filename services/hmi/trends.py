@@ -21,7 +21,7 @@ SPARE_ROWS: Final = 4096
 """Rows that are removed at a time, so that removing costs little."""
 
 
-class Stretch(NamedTuple):
+class ModeInterval(NamedTuple):
     """A stretch of plant time with one mode."""
 
     start: float
@@ -30,7 +30,7 @@ class Stretch(NamedTuple):
 
 
 class Substitution(NamedTuple):
-    """A stretch of plant time in which another value stands in for that of a bad sensor."""
+    """A stretch of plant time in which the value of a bad sensor is substituted."""
 
     start: float
     end: float
@@ -130,11 +130,11 @@ class TrendStore:
         edges = [gap.end * TICK_S for gap in self.gaps(start, end)]
         return thin(times, columns, points, edges)
 
-    def modes(self, start: int, end: int) -> list[Stretch]:
+    def modes(self, start: int, end: int) -> list[ModeInterval]:
         """Return the modes between two ticks, stretch by stretch."""
         rows = self.between(start, end)
         after_gap = {gap.end * TICK_S for gap in self.gaps(start, end)}
-        found: list[Stretch] = []
+        found: list[ModeInterval] = []
         for tick, value in zip(self.ticks[rows.start : rows.stop], self.column("mode", rows), strict=True):
             time, mode = tick * TICK_S, int(value)
             if found and found[-1].mode == mode and time not in after_gap:
@@ -142,11 +142,11 @@ class TrendStore:
             else:
                 if found and time not in after_gap:
                     found[-1] = found[-1]._replace(end=time)
-                found.append(Stretch(time, time, mode))
+                found.append(ModeInterval(time, time, mode))
         return found
 
     def substituted(self, start: int, end: int) -> dict[str, list[Substitution]]:
-        """Return when another value stood in for outputs between two ticks, by name."""
+        """Return the intervals in which outputs were substituted between two ticks, by name."""
         rows = self.between(start, end)
         bad = self._bad[rows.start : rows.stop]
         if not any(bad):
@@ -157,7 +157,7 @@ class TrendStore:
         return {name: stretches for name, stretches in found.items() if stretches}
 
     def substituted_at(self, row: int) -> list[str]:
-        """Return the outputs for which another value stood in."""
+        """Return the substituted outputs."""
         bad = self._bad[row]
         return [name for bit, name in enumerate(OUTPUT_NAMES) if bad >> bit & 1]
 

@@ -49,7 +49,7 @@ def hash_password(password: str) -> str:
 
 
 def is_password(password: str, stored: str) -> bool:
-    """Tell whether a password has this hash."""
+    """Return whether a password has this hash."""
     _, cost, block_size, salt, digest = stored.split("$")
     found = _scrypt(password, base64.b64decode(salt), int(cost), int(block_size))
     return hmac.compare_digest(found, base64.b64decode(digest))
@@ -95,7 +95,7 @@ class Users:
                 f"hmi.login.users: {file}: {reason}; `python -m hmi.users {file} NAME operate` writes it"
             ) from None
         if mode & stat.S_IWOTH:
-            raise ConfigurationError(f"hmi.login.users: {file}: everybody may write to it; `chmod o-w {file}`")
+            raise ConfigurationError(f"hmi.login.users: {file}: everyone can write to it; `chmod o-w {file}`")
         for number, line in enumerate(lines, 1):
             if line.strip() and not line.startswith("#"):
                 user = _user(line, f"{file}:{number}")
@@ -123,7 +123,7 @@ def _user(line: str, place: str) -> User:
 
 
 def _is_hash(stored: str) -> bool:
-    """Tell whether a password can be compared with this hash: it is whole, and scrypt takes its cost."""
+    """Return whether a password can be compared with this hash: it is whole, and scrypt takes its cost."""
     fields = stored.split("$")
     if len(fields) != HASH_FIELDS or fields[0] != "scrypt":
         return False

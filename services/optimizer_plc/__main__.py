@@ -1,4 +1,4 @@
-"""`python -m optimizer_plc`: the optimiser PLC as a service of its own."""
+"""`python -m optimizer_plc`: the optimiser PLC as a service."""
 
 import sys
 

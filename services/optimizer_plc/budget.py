@@ -62,5 +62,5 @@ class PlcBudget:
         return self._settings.preparation_s / self._settings.power + iterations * self._iteration_s
 
     def is_enough(self, ticks: int) -> bool:
-        """Tell whether an answer of one iteration is there within an updating period of `ticks` ticks."""
+        """Return whether an answer of one iteration is there within an updating period of `ticks` ticks."""
         return self.answer_after_s(1) <= ticks * TICK_S

@@ -60,7 +60,7 @@ class EstimatorSettings(BaseModel):
     """Longest run of the Riccati recursion for a stationary gain, in periods."""
 
     @model_validator(mode="after")
-    def _someone_estimates(self) -> Self:
+    def _load_is_estimated(self) -> Self:
         if self.kind is EstimatorKind.STATE_FEEDBACK and not self.load_known:
             raise ValueError("state-feedback estimates no load; choose kind = kalman for load_known = false")
         return self

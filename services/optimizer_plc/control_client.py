@@ -24,7 +24,7 @@ from optimizer_plc.control_link import ControlLink
 T = TypeVar("T")
 
 ATTEMPTS: Final = 3
-"""Times that something is asked for that arrives damaged: on the way there (exception 03, bad CRC), or back."""
+"""Attempts of a request whose data arrive damaged: on the way there (exception 03, bad CRC), or back."""
 ILLEGAL_VALUE: Final = 3
 DAMAGED_THERE: Final = (Verdict.BAD_CRC, Verdict.WRONG_LENGTH)
 """Verdicts on a sequence that is not as it was sent; its number may not be either."""
@@ -63,7 +63,7 @@ class ControlClient:
         self._client.close()
 
     def reload_certificates(self) -> None:
-        """Begin anew with the files for TLS as they are now: they may have been renewed.
+        """Start over with the present files for TLS: they may have been renewed.
 
         Raises:
             ConfigurationError: They cannot be used.
@@ -75,7 +75,7 @@ class ControlClient:
     # -- who is there --------------------------------------------------------------------------------------------------
 
     async def introduce(self) -> None:
-        """Connect, tell who we are and which model we have, and make sure that the control PLC has the same.
+        """Connect, send our number and the digest of our model, and check that the control PLC has the same model.
 
         Raises:
             ModelFileError: It has another.
@@ -119,7 +119,7 @@ class ControlClient:
         return await self._again(waiting)
 
     async def plan(self, plan: Plan) -> None:
-        """Tell the updating period."""
+        """Send the updating period."""
         await self._again(lambda: self._client.write(plan))
 
     async def newest(self) -> LatchedUpdate:
@@ -159,7 +159,7 @@ class ControlClient:
     # -- again ---------------------------------------------------------------------------------------------------------
 
     async def _again(self, request: Callable[[], Awaitable[T]]) -> T:
-        """Make a request; a connection that was opened since the introduction tells whose it is, and tries again."""
+        """Make a request; a connection opened since the introduction introduces itself and tries again."""
         try:
             return await self._undamaged(request)
         except RequestRefusedError as error:

@@ -5,7 +5,7 @@ SEARCHING ──answers──> INTRODUCING ──ours, our model──> WAITING 
     │ no answer, or none that makes sense                 v          answer computed    │
     └───────────── any state                          COMPUTING ──────────────────> DELIVERING
                                                           └── newer update: WAITING
-any state ──the lease is held by another──> FOREIGN ──lease granted──> WAITING
+any state ──the lease is held by another──> OTHER_MASTER ──lease granted──> WAITING
 any state ──another model there──> WRONG_MODEL ──our model──> WAITING
 """
 
@@ -31,12 +31,12 @@ _NEXT: Final = {
     _S.WAITING: {_S.COMPUTING},
     _S.COMPUTING: {_S.WAITING, _S.DELIVERING},
     _S.DELIVERING: {_S.WAITING},
-    _S.FOREIGN: {_S.WAITING},
+    _S.OTHER_MASTER: {_S.WAITING},
     _S.WRONG_MODEL: {_S.WAITING},
 }
 """States that may follow, besides the three that a failure leads to."""
 _UP: Final = {_S.WAITING, _S.COMPUTING, _S.DELIVERING}
-_PAUSES_S: Final = {_S.SEARCHING: 0.2, _S.FOREIGN: 1.0, _S.WRONG_MODEL: 1.0}
+_PAUSES_S: Final = {_S.SEARCHING: 0.2, _S.OTHER_MASTER: 1.0, _S.WRONG_MODEL: 1.0}
 """Real time between the beginnings of two attempts after a failure of each kind."""
 
 
@@ -117,7 +117,7 @@ class ControlLink:
         if isinstance(error, ModelFileError):
             state = _S.WRONG_MODEL
         elif isinstance(error, RequestRefusedError) and error.exception_code == BUSY:
-            state = _S.FOREIGN
+            state = _S.OTHER_MASTER
         self._set(state, breaks=int(self.state in _UP), damaged=int(isinstance(error, DamagedAnswerError)))
 
     # -- when to try again, and when to say so -------------------------------------------------------------------------
@@ -127,7 +127,7 @@ class ControlLink:
         return max(0.0, self._attempted_at + _PAUSES_S.get(self.state, 0.0) - now)
 
     def is_worth_logging(self, reason: str, now: float) -> bool:
-        """Tell whether something is to be logged at `now`, s: for a new reason, or an old one after `REPEAT_S`."""
+        """Return whether to log at `now`, s: for a new reason, or an old one after `REPEAT_S`."""
         if now - self._logged_at.get(reason, -math.inf) < REPEAT_S:
             return False
         if len(self._logged_at) >= MOST_REASONS:

@@ -59,13 +59,13 @@ def estimator_of(prediction: PredictionModel, settings: EstimatorSettings, real:
     """Return the estimator that the settings name.
 
     Raises:
-        ConfigurationError: The simulated state is to be believed, and is not that of the model.
+        ConfigurationError: The simulated state is used, and is not that of the model.
     """
     kalman = settings.kind is EstimatorKind.KALMAN
     if not kalman and prediction.n_states > len(STATE_NAMES):
         raise ConfigurationError(
-            "optimizer_plc.program.estimator.kind=state-feedback: the model has states that the plant does not"
-            " tell; use kalman"
+            "optimizer_plc.program.estimator.kind=state-feedback: the model has more states than the plant reports; "
+            "use kalman"
         )
     m = prediction.rounded(real)
     gains = np.array(list(stationary_gains(prediction, settings).values())) if kalman else np.zeros((1, 1, 1))
@@ -206,7 +206,7 @@ def stationary_gain(A: Array, C: Array, process: Array, sensors: Array, P: Array
 
 @kernel
 def _settled(columns: Array, previous: Array) -> bool:
-    """Tell whether no state's gains (a column each) have changed by more than 1e-10 of its largest; remember them."""
+    """Return whether no state's gains (a column each) have changed by more than 1e-10 of its largest; remember them."""
     settled = True
     for i in range(columns.shape[1]):
         change, size = 0.0, 0.0

@@ -30,9 +30,9 @@ from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import estimator_of
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, Situation
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from optimizer_plc.rules import UpdatingRule, make_rule
-from optimizer_plc.session_state import empty_memory
+from optimizer_plc.session_state import empty_state
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import KernelSolver, make_solver
 
@@ -58,9 +58,9 @@ class OptimizerProgram:
             self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
             self.solver = make_solver(settings)
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
-            self.state = empty_memory(prediction.n_states, self.problem.size, self._real)
+            self.state = empty_state(prediction.n_states, self.problem.size, self._real)
             estimator = estimator_of(prediction, settings.estimator, self._real)
-            at_rest = self.problem.at(Situation(self.state.belief.x, self._real(0.0), self.state.u))
+            at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
             self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
             self.constants = scheme.constants_of(estimator, self.problem, self.solver.alpha, settings, self.budget)
             self._compile_kernels(model)
@@ -139,7 +139,7 @@ class OptimizerProgram:
         return Plan(update.update, update.tick + int(now["ticks"]), load_step)
 
     def _knows_what_is_played(self, update: Update) -> bool:
-        """Tell whether the control PLC plays something of ours, or has not begun to."""
+        """Return whether the control PLC plays something of ours, or has not begun to."""
         ours = [one["number"] for one in (self._playing, self._sent) if one["length"]]
         return not self._playing["length"] or update.playing in ours
 
@@ -153,7 +153,7 @@ class OptimizerProgram:
         self._now["planned"] = False
 
     def _is_interrupted(self, update: Update) -> bool:
-        """Tell whether a load step has cut the last period off."""
+        """Return whether a load step has cut the last period off."""
         now = self._now
         if not now["planned"]:
             return False
@@ -162,7 +162,7 @@ class OptimizerProgram:
         return stepped and 0 < elapsed < int(now["ticks"])
 
     def _follow(self, update: Update) -> bool:
-        """Find out which profile is played from this instant on; tell whether it is the last answer, in time."""
+        """Find out which profile is played from this instant on; return whether it is the last answer, in time."""
         sent, playing = self._sent, self.state.playing
         late = 0
         if begun := bool(sent["length"] and sent["number"] == update.playing):
@@ -191,7 +191,7 @@ class OptimizerProgram:
     @property
     def _iterations(self) -> int:
         if not self._now["planned"]:
-            raise RuntimeError("solve and answer_after_s follow plan")
+            raise RuntimeError("call plan before solve and answer_after_s")
         return int(self._now["iterations"])
 
     def solve(self) -> InputSequence:
@@ -235,9 +235,9 @@ class OptimizerProgram:
         """Return what the last profile is expected to lead to."""
         header, sent = self._sent, self.state.sent
         if not header["length"]:
-            raise RuntimeError("prediction follows solve")
+            raise RuntimeError("call solve before prediction")
         horizon = self.problem.design.horizon
-        outputs = self.problem.outputs(sent.z, Situation(sent.x, header["w"], sent.u_before))
+        outputs = self.problem.outputs(sent.z, QpParameters(sent.x, header["w"], sent.u_before))
         inputs = self.problem.inputs(sent.z, horizon)
         shown = outputs[[min(sample, horizon) - 1 for sample in PREDICTED_SAMPLES]]
         planned = inputs[[min(sample, horizon) - 1 for sample in INPUT_SAMPLES]]
@@ -259,7 +259,7 @@ class OptimizerProgram:
     def report(self, verdict: Verdict) -> Optimization:
         """Return what was done with the last update, once the control PLC has answered."""
         if not self._sent["length"]:
-            raise RuntimeError("report follows solve")
+            raise RuntimeError("call solve before report")
         now, sent = self._now, self._sent
         return Optimization(
             update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]),

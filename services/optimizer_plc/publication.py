@@ -19,14 +19,14 @@ from coldloop.registers.optimizer_plc import (
     UpdatingRuleStatus,
 )
 from coldloop.service.journal import Journal, JournalPublication
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.control_link import ControlLink
 
 SHORTEST_PERIOD_TICKS: Final = 2
 
 
-class Publication:
+class OptimizerPublication:
     """Registers and journal of the optimiser PLC.
 
     Args:
@@ -45,7 +45,7 @@ class Publication:
         self.bank.put_sealed(Prediction())
         self.bank.judged_by(self._judge, OptimizerSession)
         self.bank.judged_by(self._judge_pace, SessionPace)
-        self.pace = Pace(realtime=False, factor=1.0)
+        self.pace = TimeBase(realtime=False, factor=1.0)
         """Time base of the session under way."""
         self._budget = budget
         self._model_digest = model_digest
@@ -99,7 +99,7 @@ class Publication:
 
     # -- what is shown -------------------------------------------------------------------------------------------------
 
-    def session_started(self, session: int, pace: Pace, rule: UpdatingRuleStatus) -> None:
+    def session_started(self, session: int, pace: TimeBase, rule: UpdatingRuleStatus) -> None:
         """Show that a session has begun."""
         who = self._asked_by if self.asked_for(session) is not None else ""
         self._session, self._last = session, None

@@ -30,11 +30,11 @@ from coldloop.safety.sequence import InputSequence
 from coldloop.service.metrics_server import MetricsServer
 from coldloop.service.start import SERVING
 from coldloop.service.telemetry import Telemetry
-from coldloop.session.pace import Pace
 from coldloop.session.settings import TimeMode
+from coldloop.session.time_base import TimeBase
 from optimizer_plc.control_client import ControlClient
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.publication import Publication
+from optimizer_plc.publication import OptimizerPublication
 from optimizer_plc.settings import SHOWN, OptimizerSettings
 
 log = logging.getLogger("coldloop.optimizer_plc")
@@ -42,11 +42,11 @@ log = logging.getLogger("coldloop.optimizer_plc")
 LOOK_OUT_S: Final = TICK_S / 8
 """Plant time between two looks for a load step in real time: the new computation begins so much later."""
 HEARTBEAT_S: Final = 1.0
-"""Plant time between two signs of life while an answer is computed."""
+"""Plant time between two heartbeats while an answer is computed."""
 SHORTEST_PAUSE_S: Final = 0.001
 """Real time between two such requests, however high the factor: others want to be served too."""
 LONGEST_PAUSE_S: Final = 1.0
-"""The same, however low the factor: a new session does not wait for an answer that nobody wants any more."""
+"""Lower limit of it at low factors: a new session does not wait for an obsolete answer."""
 SHORTEST_WAIT_S: Final = 0.02
 """An answer without a new update that comes sooner, in real time, is followed by a pause: it should have waited."""
 FRESH_UPDATE: Final = AwaitUpdate(session=0, update=0)
@@ -82,19 +82,19 @@ class OptimizerPlc:
         self._settings = settings
         self._program = OptimizerProgram(load(settings.model.file), section.program, settings.limits)
         digest, holder = self._program.model_digest, 1 + secrets.randbelow(0xFFFFFFFF)
-        self.publication = Publication(
+        self.publication = OptimizerPublication(
             section.word_order, self._program.budget, self._program.operating_limits, digest, holder
         )
         publish_configuration(self.publication.bank, selected(settings, SHOWN))
         self._link = self.publication.link
         self._control = ControlClient(section.control_plc, self._link, digest, str(settings.model.file))
-        self._configured_pace = Pace(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
+        self._configured_pace = TimeBase(settings.session.mode is TimeMode.REALTIME, settings.session.factor)
         self._session = 0
         self._wanted = FRESH_UPDATE
         self._kept: _Answer | None = None
 
     def close(self) -> None:
-        """Let go of the control PLC."""
+        """Disconnect from the control PLC."""
         self._control.close()
 
     # -- the link ------------------------------------------------------------------------------------------------------
@@ -123,13 +123,13 @@ class OptimizerPlc:
 
     def _lose(self, error: ColdloopError) -> None:
         """Note why the link is lost, and prepare the next attempt."""
-        was_foreign = self._link.state is ControlLinkState.FOREIGN
+        was_foreign = self._link.state is ControlLinkState.OTHER_MASTER
         self._link.failed(error)
         state, reason = self._link.state, str(error)
-        if state is not ControlLinkState.FOREIGN:  # its connection may stay: nothing is wrong with it
+        if state is not ControlLinkState.OTHER_MASTER:  # its connection may stay: nothing is wrong with it
             self._control.close()
         if isinstance(error, (RequestRefusedError, UnfitValueError)):
-            self._session = 0  # what it goes on from leads to what is refused: begin the session anew
+            self._session = 0  # its state leads to rejected sequences: restart the session
         if state is not ControlLinkState.SEARCHING:  # others may have had the lease meanwhile
             self._wanted, self._kept = FRESH_UPDATE, None
         else:
@@ -137,7 +137,7 @@ class OptimizerPlc:
                 self._control.reload_certificates()
             except ConfigurationError as unusable:
                 reason = f"{reason}; {unusable}"
-        still_foreign = was_foreign and state is ControlLinkState.FOREIGN
+        still_foreign = was_foreign and state is ControlLinkState.OTHER_MASTER
         if not still_foreign and self._link.is_worth_logging(reason, time.monotonic()):
             log.warning("control PLC lost", extra={"link": state.name.lower(), "reason": reason})
 
@@ -172,7 +172,7 @@ class OptimizerPlc:
                 await asyncio.sleep(SHORTEST_WAIT_S)
 
     def _is_news(self, update: Update) -> bool:
-        """Tell an awaited update from the old one that the control PLC answers with when nothing happens."""
+        """Distinguish an awaited update from the old one that the control PLC returns when nothing happens."""
         if not update.session:
             return False
         if update.session != self._session:
@@ -186,7 +186,7 @@ class OptimizerPlc:
         period_s = self._settings.optimizer_plc.program.updating_period_s
         asked = self.publication.asked_for(session)
         if asked is not None:
-            pace = Pace(bool(asked.realtime), asked.factor)
+            pace = TimeBase(bool(asked.realtime), asked.factor)
             period_s = asked.updating_period * TICK_S
         self._program.restart(period_s)
         self.publication.session_started(session, pace, self._program.rule_status())
@@ -239,7 +239,7 @@ class OptimizerPlc:
         self._wanted = FRESH_UPDATE if begin_again else AwaitUpdate(update.session, update.update + 1)
 
     async def _is_computed(self, answer: _Answer) -> bool:
-        """Wait until the PLC would have its answer; tell whether no load step or session has cut it off before."""
+        """Wait until the PLC would have its answer; return whether no load step or session has cut it off before."""
         spacing_s = (LOOK_OUT_S if answer.interruptible else HEARTBEAT_S) / self.publication.pace.factor
         look_s = min(max(spacing_s, SHORTEST_PAUSE_S), LONGEST_PAUSE_S)
         while (remaining := answer.ready - time.monotonic()) > 0.0:
@@ -255,7 +255,7 @@ class OptimizerPlc:
         return True
 
     async def _is_superseded(self, update: Update) -> bool:
-        """Tell whether the control PLC has latched another update since, and give it a sign of life."""
+        """Return whether the control PLC has latched another update since, and give it a sign of life."""
         newest = await self._control.newest()
         return newest.session != update.session or newest.update > update.update
 

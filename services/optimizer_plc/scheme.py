@@ -1,7 +1,7 @@
 """The implementation scheme as kernels: steps (2) to (5) of the paper's section II on the state of a session.
 
 `plan` are steps (4), (5) and (2); `solve`, which is `pose`, a solver and `deliver`, is step (3). They take single and
-double precision alike. What is decided beside the arithmetic is in `program.py`.
+double precision alike. Decisions outside the arithmetic are in `program.py`.
 """
 
 from typing import Any, Final, NamedTuple
@@ -19,7 +19,7 @@ from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.qp.profile import inputs_of, shifted
 from optimizer_plc.rules.assessment import Observation, assessed
 from optimizer_plc.rules.interface import UpdatingRule, decide_by
-from optimizer_plc.session_state import Delivery, Memory
+from optimizer_plc.session_state import Delivery, OptimizerState
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers.interface import Answer, Costs
 from optimizer_plc.solvers.kernel_solver import solve_by
@@ -104,7 +104,7 @@ def problem_at(c: Constants, x: Array, w: float, u_before: Array, share: float) 
 
 
 @kernel
-def predict_played(c: Constants, m: Memory, ticks: int) -> Array:
+def predict_played(c: Constants, m: OptimizerState, ticks: int) -> Array:
     """Predict so many ticks on from the update under way under what is played; return the last input, (3,)."""
     begin_prediction(m.belief)
     p, rows = m.playing.numbers[0], m.playing.rows
@@ -133,12 +133,12 @@ def row_at(tick: int, first_tick: int, length: int) -> int:
 
 @kernel
 def same_inputs(one: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
-    """Tell whether two rows (3) are the same."""
+    """Return whether two rows (3) are the same."""
     return bool(one[0] == other[0] and one[1] == other[1] and one[2] == other[2])
 
 
 @kernel
-def pose(c: Constants, m: Memory) -> tuple[QuadraticProblem, Array]:
+def pose(c: Constants, m: OptimizerState) -> tuple[QuadraticProblem, Array]:
     """Predict the state at t_{k+1}; return the problem there and the guess, the shifted profile."""
     ticks, sent = m.numbers[0].ticks, m.sent
     sent.u_before[:] = predict_played(c, m, ticks)
@@ -149,7 +149,7 @@ def pose(c: Constants, m: Memory) -> tuple[QuadraticProblem, Array]:
 
 
 @kernel
-def deliver(c: Constants, m: Memory, qp: QuadraticProblem, answer: Answer) -> None:
+def deliver(c: Constants, m: OptimizerState, qp: QuadraticProblem, answer: Answer) -> None:
     """Make the sequence of an answer after q - 1 and q iterations, and judge its profile."""
     now, sent = m.numbers[0], m.sent
     s = sent.numbers[0]
@@ -166,7 +166,7 @@ def deliver(c: Constants, m: Memory, qp: QuadraticProblem, answer: Answer) -> No
 
 
 @kernel
-def solve(c: Constants, method: Any, m: Memory) -> None:  # noqa: ANN401 of any solver of our own
+def solve(c: Constants, method: Any, m: OptimizerState) -> None:  # noqa: ANN401 of any solver of our own
     """Pose the problem, do q iterations by the method of a solver of our own, deliver the answer."""
     now = m.numbers[0]
     qp, guess = pose(c, m)
@@ -190,7 +190,7 @@ def write_rows(c: Constants, z: Array, ticks: int, rows: NDArray[np.float32]) ->
 
 
 @kernel
-def begin_sent(m: Memory) -> None:
+def begin_sent(m: OptimizerState) -> None:
     """Let the last answer be what is played: its sequence begins."""
     copy_delivery(m.sent, m.playing)
 
@@ -207,7 +207,7 @@ def copy_delivery(source: Delivery, target: Delivery) -> None:
 def plan(
     c: Constants,
     rule: UpdatingRule,
-    m: Memory,
+    m: OptimizerState,
     wanted: int,
     update: int,
     tick: int,

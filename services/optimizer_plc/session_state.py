@@ -35,7 +35,7 @@ guessed_before, delivered_before: J+ and Jhat of the problem before, infinite wh
 
 
 class Delivery(NamedTuple):
-    """A profile, the situation that it was computed for, and the rows that tell it to the control PLC."""
+    """A profile, the parameters it was computed for, and its rows for the control PLC."""
 
     numbers: Any
     """`DELIVERY`, shape (1,)."""
@@ -49,7 +49,7 @@ class Delivery(NamedTuple):
     """Inputs as the link carries them, a row a tick, shape (240, 3)."""
 
 
-class Memory(NamedTuple):
+class OptimizerState(NamedTuple):
     """State of the optimiser between two updates, and between a plan and its answer."""
 
     numbers: Any
@@ -65,7 +65,7 @@ class Memory(NamedTuple):
     """What the rule of the updating period remembers, shape (2,)."""
 
 
-def empty_memory(n_states: int, size: int, real: Real) -> Memory:
+def empty_state(n_states: int, size: int, real: Real) -> OptimizerState:
     """Return room for the state, for so many states of the model and variables of the problem."""
 
     def numbers(fields: tuple[tuple[str, str], ...]) -> Any:  # noqa: ANN401 a record
@@ -76,7 +76,7 @@ def empty_memory(n_states: int, size: int, real: Real) -> Memory:
         x, u, z = (np.zeros(n, real) for n in (n_states, N_INPUTS, size))
         return Delivery(numbers(DELIVERY), x, u, z, rows)
 
-    return Memory(
+    return OptimizerState(
         numbers(PERIOD), no_belief(n_states, real), delivery(), delivery(), np.zeros(N_INPUTS, real),
         np.zeros(MEMORY, real),
     )  # fmt: skip

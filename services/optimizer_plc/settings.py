@@ -37,7 +37,7 @@ ADAPTIVE = 0
 
 
 class SolverName(StrEnum):
-    """Solvers that can be asked for."""
+    """Names of the solvers."""
 
     ODE = "ode"
     QPOASES = "qpoases"
@@ -150,7 +150,7 @@ class ProgramSettings(BaseModel):
     def _completed(self) -> Self:
         """Take what was not set from the preset, and alpha of the solvers from the penalties."""
         for name, values in PRESETS[self.preset].items():
-            self.__dict__[name] = completed(getattr(self, name), values)  # before anybody sees it: it is frozen then
+            self.__dict__[name] = completed(getattr(self, name), values)  # before it is used: it is frozen then
         alpha = alpha_of(self.penalties, self.design)
         for key in ALPHAS:
             name = key.partition(".")[0]

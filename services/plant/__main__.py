@@ -1,4 +1,4 @@
-"""`python -m plant`: the plant as a service of its own."""
+"""`python -m plant`: the plant as a service."""
 
 import sys
 

@@ -32,14 +32,14 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
             raise ModelFileError(f"model.file: a model of the {header.plant}; set plant.kind to that, or take another")
         return partial(make_program, header, section.sensors, mismatch=section.mismatch)
     if section.mismatch != NO_MISMATCH:
-        raise ConfigurationError("plant.mismatch: of a cold box alone; set plant.kind to cold-box, or leave it out")
+        raise ConfigurationError("plant.mismatch: for a cold box alone; set plant.kind to cold-box, or leave it out")
     from plant.refrigerator.file import SHIPPED, read_refrigerator_file  # noqa: PLC0415 a cold box starts without it
 
     path = section.refrigerator.file or SHIPPED
     file = read_refrigerator_file(path)
     if section.station.control is StationControlKind.LQ and section.station.weights != file.weights:
         raise ConfigurationError(
-            f"plant.station.weights: the gains in {path} are of other weights; make a file with"
+            f"plant.station.weights: the gains in {path} belong to other weights; make a file with"
             " `python -m plant.refrigerator.model FILE` and name it in plant.refrigerator.file"
         )
     return partial(_make_refrigerator, header, section, file)

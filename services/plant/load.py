@@ -16,7 +16,7 @@ from coldloop.process.signals import TICK_S
 HOUR_TICKS: Final = int(3600 / TICK_S)
 
 
-class Family(NamedTuple):
+class LoadFamily(NamedTuple):
     """A family of random telegraphs: steps from the mean load (W), and how long they last (s)."""
 
     steps: tuple[float, ...]
@@ -28,16 +28,16 @@ class Family(NamedTuple):
 
 
 HOURS: Final = {
-    "a": Family((0.0, 60.0, -60.0), 60.0, 400.0, 11),
-    "b": Family((0.0, 75.0, -75.0, 100.0, -100.0), 40.0, 300.0, 12),
-    "c": Family((0.0, 60.0, -60.0, 100.0, -150.0), 20.0, 200.0, 13),
-    "d": Family((0.0, 150.0, -75.0, -75.0), 40.0, 240.0, 14),
-    "e": Family((0.0, 200.0, -100.0, -100.0, -60.0), 20.0, 120.0, 15),
-    "f": Family((0.0, 75.0, -75.0, 100.0, -60.0, 150.0, -200.0), 20.0, 160.0, 16),
+    "a": LoadFamily((0.0, 60.0, -60.0), 60.0, 400.0, 11),
+    "b": LoadFamily((0.0, 75.0, -75.0, 100.0, -100.0), 40.0, 300.0, 12),
+    "c": LoadFamily((0.0, 60.0, -60.0, 100.0, -150.0), 20.0, 200.0, 13),
+    "d": LoadFamily((0.0, 150.0, -75.0, -75.0), 40.0, 240.0, 14),
+    "e": LoadFamily((0.0, 200.0, -100.0, -100.0, -60.0), 20.0, 120.0, 15),
+    "f": LoadFamily((0.0, 75.0, -75.0, 100.0, -60.0, 150.0, -200.0), 20.0, 160.0, 16),
     **{
-        str(hour): Family((0.0, 60.0, -60.0, 100.0, -100.0, 150.0), 60.0, 400.0, 20 + hour) for hour in range(1, 9)
+        str(hour): LoadFamily((0.0, 60.0, -60.0, 100.0, -100.0, 150.0), 60.0, 400.0, 20 + hour) for hour in range(1, 9)
     },  # sustained loads, under which throttled qpOASES predicts violations as large as in the paper (c1 of 20)
-    "pulses": Family((-45.0, 135.0), 150.0, 450.0, 30, in_turn=True),  # as a tokamak's magnets load their refrigerator
+    "pulses": LoadFamily((-45.0, 135.0), 150.0, 450.0, 30, in_turn=True),  # like the magnets of a tokamak
 }
 
 NAMED: Final = {
@@ -53,7 +53,7 @@ DRAW_SEEDS: Final = 1000
 """Between the seed of a family's draw and that of the next."""
 
 
-def telegraph(family: Family, mean_w: float) -> LoadProfile:
+def telegraph(family: LoadFamily, mean_w: float) -> LoadProfile:
     """Return one hour of a family about `mean_w`, in whole ticks, starting at the mean."""
     draw = random.Random(family.seed).random  # noqa: S311 not for secrets; the one generator stable over versions
     if family.in_turn:
@@ -69,7 +69,7 @@ def telegraph(family: Family, mean_w: float) -> LoadProfile:
     return LoadProfile(tuple(times), tuple(watts))
 
 
-def _pulses(family: Family, mean_w: float, phase: float) -> LoadProfile:
+def _pulses(family: LoadFamily, mean_w: float, phase: float) -> LoadProfile:
     """Return an hour of pulses that begins at the mean for a share `phase` (0 to 1) of the longest time."""
     (low, high), times, watts = family.steps, [0], [mean_w]
     tick = 1 + round(phase * family.longest_s / TICK_S)
@@ -93,7 +93,7 @@ def concatenated(hours: list[LoadProfile]) -> LoadProfile:
     return LoadProfile(tuple(times), tuple(watts))
 
 
-def named_families(name: str) -> list[Family] | None:
+def named_families(name: str) -> list[LoadFamily] | None:
     """Return the family of each hour of a load's name, such as `2h` or `2h@3` for its third draw; None for others.
 
     Raises:
@@ -103,7 +103,7 @@ def named_families(name: str) -> list[Family] | None:
     if base not in NAMED:
         return None
     if at and not (draw.isdecimal() and 1 <= int(draw) <= 10**6):
-        raise LoadFileError(f"load {name}: '{draw}' is no draw; write {base}@2 for the second one")
+        raise LoadFileError(f"load {name}: '{draw}' is not a draw; write {base}@2 for the second one")
     seeds = DRAW_SEEDS * (int(draw) - 1 if at else 0)
     return [HOURS[hour]._replace(seed=HOURS[hour].seed + seeds) for hour in NAMED[base]]
 

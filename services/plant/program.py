@@ -25,7 +25,7 @@ class HeatLoad(Protocol):
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """White Gaussian noise on the outputs, one draw a tick whoever reads them, and a bias.
+    """White Gaussian noise on the outputs, one draw per tick for all readers, and a bias.
 
     Raises:
         ValueError: not one standard deviation and one bias per output, or one that is negative or not finite.
@@ -100,7 +100,7 @@ class PlantProgram:
     def resume(
         self, tick: int, x: Sequence[float], u: Sequence[float], y: Sequence[float], noise_state: Mapping[str, Any]
     ) -> None:
-        """Go on from what `retained` returned.
+        """Resume from what `retained` returned.
 
         Raises:
             ValueError: it is not of this plant.
@@ -125,7 +125,7 @@ class PlantProgram:
         return self._x.copy(), self._slope.copy(), np.array(self._held)
 
     def take_over(self, tick: int, x: RealArray, slope: RealArray, held: RealArray, y: RealArray) -> None:
-        """Go on at another tick with what `between_ticks` and `measure` would have told there."""
+        """Resume at another tick with what `between_ticks` and `measure` would return there."""
         self.tick, self._x, self._slope, self._u = tick, x.copy(), slope.copy(), held[:3].copy()
         self._held, self._measured = tuple(held.tolist()), tuple(y.tolist())
 
@@ -133,7 +133,7 @@ class PlantProgram:
     def noise(self, ticks: int) -> Iterator[RealArray]:
         """Lend the draws of the next `ticks` ticks, shape (ticks, 22), or (0, 22) without noise; those used are gone.
 
-        How many were used is told by the tick afterwards.
+        The tick afterwards shows how many were used.
         """
         before, start = self._generator.bit_generator.state, self.tick
         outputs = len(OUTPUT_NAMES)

@@ -92,7 +92,7 @@ class PlantRuntime:
         self._clock.add_done_callback(self._clock_ended)
 
     def _change_pace(self) -> None:
-        """Go on, or stand still, from where time is now."""
+        """Pause or resume at the present time."""
         if self._schedule is not None:
             self._position = self._schedule.position(time.monotonic())
         self._stop_clock()

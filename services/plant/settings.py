@@ -120,7 +120,7 @@ class PlantKind(StrEnum):
 
 
 class RefrigeratorSettings(BaseModel):
-    """What happens to a refrigerator."""
+    """Disturbances of a refrigerator."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -157,7 +157,7 @@ class PlantSection(BaseModel):
     """How much too fast the rack's clock is in real time, in millionths: for tests of those who follow it."""
     watchdog: WatchdogSettings = WatchdogSettings()
     rate_limited: bool = True
-    """No output moves by more than `limits.rate` in one tick of the rack, whoever writes; the safe state does."""
+    """No output moves by more than `limits.rate` in one tick of the rackfor any writer; the safe state does."""
     retain: RetainSettings = RetainSettings()
 
 

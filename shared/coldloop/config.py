@@ -1,7 +1,7 @@
 """Configuration: a TOML file, then the environment, then the command line, each overriding the one before.
 
 The environment spells `COLDLOOP__SECTION__KEY=value`, the command line `--set section.key=value`; both read the
-value as TOML, and as text when it is none. Every value remembers where it came from.
+value as TOML, or else as text. Every value remembers where it came from.
 
 Some settings decide others, as a preset does. A section says so in a class variable `decides`: by key, the keys that
 follow from it, both relative to the section. Such a setting on the command line also replaces what the environment and
@@ -131,9 +131,9 @@ def load_configuration(
         if not _is_finite(value):
             raise ConfigurationError(f"{_where(key, layers.sources)}: input should be finite (got {value!r})")
         if _has_nul(value):
-            raise ConfigurationError(f"{_where(key, layers.sources)}: there is a NUL character in it; leave it out")
+            raise ConfigurationError(f"{_where(key, layers.sources)}: contains a NUL character; remove it")
         if value == Path():  # an empty text
-            raise ConfigurationError(f"{_where(key, layers.sources)}: names no file; leave the key out, or name one")
+            raise ConfigurationError(f"{_where(key, layers.sources)}: is empty; name a file, or leave the key out")
     return Configuration(settings, layers.sources)
 
 
@@ -158,7 +158,7 @@ def _is_finite(value: object) -> bool:
 
 
 def _has_nul(value: object) -> bool:
-    """Tell whether a text or a path has a character in it that no file's name can have."""
+    """Return whether a text or a path has a character in it that no file's name can have."""
     if isinstance(value, Mapping | list | tuple):
         return any(map(_has_nul, value.values() if isinstance(value, Mapping) else value))
     return isinstance(value, str | Path) and "\0" in str(value)
@@ -236,7 +236,7 @@ def _read_toml(file: Path) -> dict[str, Any]:
         with file.open("rb") as content:  # a pipe will do, a device without an end will not
             data = content.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
-            raise ConfigurationError(f"{file}: more than {MOST_BYTES} bytes are no configuration")
+            raise ConfigurationError(f"{file}: not a configuration: more than {MOST_BYTES} bytes")
         return parsed_toml(data.decode("utf-8"))
     except OSError as error:
         raise ConfigurationError(f"{file}: {error.strerror}; name a readable TOML file with --config") from None

@@ -1,7 +1,7 @@
 """Everything that Coldloop raises on purpose.
 
     ColdloopError
-    ├── UsageError                  exit code 2: what the caller asked for cannot be done
+    ├── UsageError                  exit code 2: the request cannot be carried out
     │   ├── ConfigurationError      a key, a value or a configuration file
     │   └── LoadFileError           a load profile
     ├── ResultsError                the files of a run cannot be written
@@ -11,7 +11,7 @@
     └── LinkError                   the bus: a port, a peer, an answer
         ├── PortInUseError
         ├── PeerUnreachableError
-        │   └── UntrustedPeerError  its certificate does not hold
+        │   └── UntrustedPeerError  its certificate is invalid
         ├── DamagedAnswerError      the seal of an answer is broken, or missing
         │   └── ImplausibleAnswerError  it has a value that its register cannot have
         ├── UnfitValueError         a value of our own that its register cannot hold
@@ -23,16 +23,16 @@ A message is one line that says what, where, and what to do.
 from typing import Final
 
 BUSY: Final = 6
-"""Modbus exception code of a server at which somebody else holds the lease of the role."""
+"""Modbus exception code of a server at which another client holds the lease of the role."""
 
 
 def printable(text: str) -> str:
-    """Return a text as one line for a terminal: what a peer or a file put into it neither ends it nor controls it."""
+    """Return a text as one printable line: without line ends and control characters."""
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
 class ColdloopError(Exception):
-    """Root of the tree; `exit_code` is what a program ends with when it cannot go on."""
+    """Root of the tree; `exit_code` is what a program ends with when it cannot continue."""
 
     exit_code = 1
 
@@ -42,7 +42,7 @@ class ColdloopError(Exception):
 
 
 class UsageError(ColdloopError):
-    """What the caller asked for cannot be done."""
+    """The request cannot be carried out."""
 
     exit_code = 2
 
@@ -80,7 +80,7 @@ class LinkError(ColdloopError):
 
 
 class PortInUseError(LinkError):
-    """A server cannot listen where it is to."""
+    """A server cannot listen at its address."""
 
 
 class PeerUnreachableError(LinkError):
@@ -88,7 +88,7 @@ class PeerUnreachableError(LinkError):
 
 
 class UntrustedPeerError(PeerUnreachableError):
-    """A peer cannot show that it is who it should be; trying again does not help."""
+    """A peer cannot prove its identity; trying again does not help."""
 
 
 class DamagedAnswerError(LinkError):
@@ -100,7 +100,7 @@ class ImplausibleAnswerError(DamagedAnswerError):
 
 
 class UnfitValueError(LinkError):
-    """What was to be written does not fit its register: a number at its end, or too large."""
+    """A value to be written does not fit its register: at its limit, or too large."""
 
 
 class RequestRefusedError(LinkError):

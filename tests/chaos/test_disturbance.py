@@ -5,7 +5,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.chaos.disturbance import Mangler, Outcome, take_frames
+from rig.chaos.disturbance import FrameAction, Mangler, take_frames
 from rig.chaos.faults import Delay, Direction, Drop, Duplicate, Flip, FrameFault, Reorder, Truncate
 
 PDUS = st.binary(min_size=1, max_size=253)
@@ -17,19 +17,19 @@ SHARES = st.floats(0.01, 1.0)
 COMMON = {"link": "plant", "duration_s": 1.0}
 
 
-def passed(frames: list[bytes], fault: FrameFault | None, seed: str) -> tuple[list[Outcome], bytes]:
+def passed(frames: list[bytes], fault: FrameFault | None, seed: str) -> tuple[list[FrameAction], bytes]:
     """Return what is decided about each frame, and what is held back at the end."""
     mangler = Mangler(Direction.REQUESTS, seed)
     return [mangler.decide(frame, [fault] if fault else []) for frame in frames], mangler.release()
 
 
-def data(outcomes: list[Outcome]) -> bytes:
+def data(outcomes: list[FrameAction]) -> bytes:
     return b"".join(outcome.data for outcome in outcomes)
 
 
 @given(FRAMES, SEEDS)
 def test_an_undisturbed_link_passes_everything_at_once(frames: list[bytes], seed: str) -> None:
-    assert passed(frames, None, seed) == ([Outcome(frame) for frame in frames], b"")
+    assert passed(frames, None, seed) == ([FrameAction(frame) for frame in frames], b"")
 
 
 @given(FRAMES, SEEDS, SHARES)

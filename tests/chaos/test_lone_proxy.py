@@ -14,7 +14,7 @@ from pymodbus.pdu import ModbusPDU
 
 from rig.chaos.disturbance import Mangler
 from rig.chaos.faults import Direction
-from rig.chaos.link_plan import Change, LinkPlan
+from rig.chaos.link_plan import FaultTransition, LinkPlan
 from rig.chaos.plan import find_link_plan
 from tests.harness.processes import Process, Processes
 
@@ -56,8 +56,8 @@ def test_faults_begin_and_end_in_the_order_of_time() -> None:
     )
     drop, freeze = plan.faults
     assert plan.changes() == [
-        Change(0.0, begins=True, fault=freeze), Change(2.0, begins=True, fault=drop),
-        Change(4.0, begins=False, fault=freeze), Change(5.0, begins=False, fault=drop),
+        FaultTransition(0.0, begins=True, fault=freeze), FaultTransition(2.0, begins=True, fault=drop),
+        FaultTransition(4.0, begins=False, fault=freeze), FaultTransition(5.0, begins=False, fault=drop),
     ]  # fmt: skip
 
 

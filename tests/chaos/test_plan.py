@@ -4,7 +4,7 @@ import pytest
 
 from coldloop.errors import LoadFileError, UsageError
 from rig.chaos.faults import Drop, Kill, Reset
-from rig.chaos.plan import SPREAD_S, Plan, find_plan, parse_plan, shipped_plans
+from rig.chaos.plan import SPREAD_S, ChaosPlan, find_plan, parse_plan, shipped_plans
 
 KINDS = {
     "delay", "drop", "duplicate", "reorder", "reset", "freeze", "truncate", "abort", "flip",
@@ -36,14 +36,14 @@ def test_the_shipped_plans_are_sound_and_have_all_kinds() -> None:
         (with_fault('kind = "drop"', 'link = "plant"', "at_s = 3", "duration_s = 1", "share = 1.5"), "less than or"),
         (with_fault('kind = "clock"', "duration_s = 3"), "each of `faults` needs at_s"),
         (with_fault('kind = "clock"', "at_s = 600", "duration_s = 3"), "begins after the end of the run"),
-        (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T5"', 'shows = "value"'), "a value"),
-        (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T99"', 'shows = "nan"'), "no output"),
+        (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T5"', 'shows = "value"'), "`value`"),
+        (with_fault('kind = "sensor"', "at_s = 1", "duration_s = 3", 'output = "T99"', 'shows = "nan"'), "unknown"),
         (with_fault('kind = "given"', "at_s = 1", "duration_s = 3", 'target = "nc1"', "value = 0"), "refrigerator"),
         ('plant = "refrigerator"\n' + with_fault('kind = "given"', "at_s = 1", "duration_s = 3", 'target = "leak"',
                                                  "value = 99"), "outside 0 to 50"),
         (with_fault('kind = "kill"', "at_s = 1", "duration_s = 9", 'process = "plant"')
          + '\n[[faults]]\nkind = "clock"\nat_s = 5\nduration_s = 1', "begins before 'kill plant' has ended"),
-        (HEAD + "every_s = 60", "every_s and `draw` go together"),
+        (HEAD + "every_s = 60", "give every_s and `draw` together"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_in_one_line(text: str, complaint: str) -> None:
@@ -58,8 +58,8 @@ def test_a_shorter_run_leaves_out_the_faults_behind_its_end() -> None:
     assert [fault.label for fault in plan.faults] == ["kill optimizer"]
 
 
-def drawing(seed: int) -> Plan:
-    return Plan(
+def drawing(seed: int) -> ChaosPlan:
+    return ChaosPlan(
         name="x", description="x", duration_s=3600, every_s=600, seed=seed,
         draw=(
             Kill(kind="kill", process="optimizer", duration_s=60),
@@ -78,7 +78,7 @@ def test_drawn_faults_come_every_so_often_and_follow_the_seed() -> None:
 
 
 def test_named_loads_follow_each_other_and_files_do_not() -> None:
-    plan = Plan(name="x", description="x", duration_s=7200, load=("a", "b"))
+    plan = ChaosPlan(name="x", description="x", duration_s=7200, load=("a", "b"))
     assert plan.scenario(385.0).load == plan.model_copy(update={"load": "2h"}).scenario(385.0).load
     with pytest.raises(LoadFileError, match="only named loads"):
         plan.model_copy(update={"load": ("a", "mine.csv")}).scenario(385.0)

@@ -279,7 +279,7 @@ def test_whatever_stands_before_the_equals_sign_is_a_key_or_a_refusal_in_one_lin
 def test_a_text_with_a_nul_is_no_name_of_a_file(key: str, tmp_path: Path) -> None:
     file = tmp_path / "nul.toml"
     file.write_text(f'{key} = "a\\u0000b"\n')
-    with pytest.raises(ConfigurationError, match="NUL character in it; leave it out") as failure:
+    with pytest.raises(ConfigurationError, match="contains a NUL character; remove it") as failure:
         load_configuration(Settings, file=file, environment={})
     assert key in str(failure.value)
     assert "\n" not in str(failure.value)

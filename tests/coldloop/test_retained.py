@@ -43,7 +43,7 @@ def sealed_nonsense(content: bytes) -> bytes:
 def test_what_is_sealed_and_no_state_is_refused(tmp_path: Path, content: bytes) -> None:
     file = kept(tmp_path / "state")
     file.path.write_bytes(sealed_nonsense(content))
-    with pytest.raises(RetainedStateError, match="no state"):
+    with pytest.raises(RetainedStateError, match="no valid state"):
         file.load()
     assert file.set_aside() == "set aside as state.refused"
     assert file.load() is None

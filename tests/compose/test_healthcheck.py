@@ -129,7 +129,7 @@ async def test_one_that_stands_is_not_though_it_answers(service: str, order: Wor
         done = await one.check()
     assert done.code == 1
     assert f"{service} on port" in done.complaint
-    assert "stands at tick 7" in done.complaint
+    assert "stays at tick 7" in done.complaint
 
 
 async def test_in_lock_step_a_service_may_stand_whatever_its_configuration_says(standing: Show) -> None:

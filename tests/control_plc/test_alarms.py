@@ -256,7 +256,7 @@ def course(settings: AlarmSettings, conditions: Sequence[tuple[int, bool]]) -> l
     journal = Journal()
     panel = AlarmPanel(journal, settings)
     for panel.now, condition in conditions:
-        panel.holds(KIND, condition=condition)
+        panel.report(KIND, condition=condition)
         panel.pass_by()
     return notes(journal)
 
@@ -310,7 +310,7 @@ def test_timers_neither_run_backwards_nor_beyond_the_plant_time_that_has_passed(
         panel.now = tick
         if condition is not asked:
             asked, since = condition, passed
-        panel.holds(KIND, condition=condition)
+        panel.report(KIND, condition=condition)
         panel.pass_by()
         row = panel.rows[KIND]
         due = passed - since >= (20 if condition else 8)
@@ -332,14 +332,14 @@ def test_what_happens_again_and_again_is_one_alarm_until_a_minute_after_the_last
     panel = AlarmPanel(journal)
     for panel.now in range(1000):
         if panel.now < 500:
-            panel.happened(AlarmKind.SCAN_OVERRUN)
+            panel.pulse(AlarmKind.SCAN_OVERRUN)
         panel.pass_by()
     assert notes(journal) == [(EventKind.ALARM_RAISED, 0), (EventKind.ALARM_RETURNED, 499 + round(60 / TICK_S))]
 
 
 def test_what_happened_at_an_instant_passes_by_also_over_a_restart_and_a_new_session(panel: AlarmPanel) -> None:
     panel.now = 1000
-    panel.happened(AlarmKind.ACCESS_REFUSED)
+    panel.pulse(AlarmKind.ACCESS_REFUSED)
     again = AlarmPanel(Journal())
     again.begin_at(1010)
     again.restore(panel.rows)
@@ -380,7 +380,7 @@ def test_each_alarm_has_a_rule_and_the_configuration_changes_what_it_names() -> 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"rules": {"sensor_worse": {}}}, "no alarm is called 'sensor_worse'; there are mode, level_band"),
+        ({"rules": {"sensor_worse": {}}}, "unknown alarm 'sensor_worse'; choose from mode, level_band"),
         ({"rules": {"mode": {"priority": "urgent"}}}, "'low', 'medium', 'high' or 'critical'"),
         ({"rules": {"mode": {"on_delay_s": -1}}}, "greater than or equal to 0"),
         ({"rules": {"mode": {"on_delay_s": "nan"}}}, "finite number"),

@@ -36,11 +36,11 @@ from coldloop.registers.safety import LeaseState
 from coldloop.safety.lease import Lease
 from coldloop.safety.sequence import InputSequence, with_checksum
 from coldloop.service.journal import Journal
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.plant_link import PlantLink
 from control_plc.program import make_program
 from control_plc.rack_clock import PHASE, RackClock
-from control_plc.retained_state import Memory, RetainedState
+from control_plc.retained_state import ControlStateStore, RetainedControlState
 from control_plc.scan_cycle import ScanCycle
 from control_plc.settings import ControlSection
 from plant.rack.rack import Rack, Session
@@ -104,7 +104,7 @@ class FakeRack:
         self.own_steps: list[tuple[float, ...]] = []
 
     def session(self, number: int) -> Session:
-        return Session(number, Pace(self.realtime, 1.0), LoadProfile((0,), (HEADER.w0,)), 1)
+        return Session(number, TimeBase(self.realtime, 1.0), LoadProfile((0,), (HEADER.w0,)), 1)
 
     def passes(self, seconds: float) -> None:
         """Let real time pass; in real time the plant moves with it."""
@@ -124,7 +124,7 @@ class FakeRack:
         self.lease.take(caller, outputs.holder)
         before, outputs = self.rack.outputs.u, as_transmitted(outputs)
         verdict = self.rack.offer(outputs, caller)
-        if verdict is OutputVerdict.TAKEN and ours:
+        if verdict is OutputVerdict.ACCEPTED and ours:
             self.judge(before, self.rack.outputs.u)
         answer = self.read()
         if not self.realtime and self.rack.moving:
@@ -224,7 +224,7 @@ class RackLink(RuleBasedStateMachine):
         if reading.session != self.session:
             return False
         self.accepted = None
-        kept = RetainedState.parsed(self.kept) if self.kept and self.kept["session"] == reading.session else None
+        kept = RetainedControlState.parsed(self.kept) if self.kept and self.kept["session"] == reading.session else None
         self.program.resume(
             reading.session, reading.tick, reading.u, updates=kept.updates if kept else 0,
             operator=kept.operator if kept else self.program.operator, playing=kept.sequence if kept else None,
@@ -236,10 +236,10 @@ class RackLink(RuleBasedStateMachine):
     def turn(self, fate: str, *, stands_s: float = 0.0, stands_before_sending: bool = False) -> None:
         """Do what the runtime does once: scan when in step and due, else look; perhaps standing still in between."""
         if self.realtime:
-            due = self.clock.due(self.program.tick) if self.link.in_step else self.fake.now + TICK_S
+            due = self.clock.due(self.program.tick) if self.link.synchronised else self.fake.now + TICK_S
             self.fake.passes(max(0.0, due - self.fake.now))
-            if self.link.in_step and self.fake.now - due > self.clock.tick_s:
-                self.link.overslept()
+            if self.link.synchronised and self.fake.now - due > self.clock.tick_s:
+                self.link.missed_scans()
         else:
             self.fake.passes(0.01)
         outputs = self.cycle.begin()
@@ -254,17 +254,17 @@ class RackLink(RuleBasedStateMachine):
         at = self.fake.now
         if not stands_before_sending:
             self.fake.passes(stands_s)
-        joining = not self.link.in_step
+        joining = not self.link.synchronised
         self.cycle.answered(answer, at / TICK_S if self.realtime else None)
-        if self.link.in_step and joining:
+        if self.link.synchronised and joining:
             self.clock.synchronise(answer.tick + (answer.age or (0.0 if answer.tick else PHASE)), at)
-        elif self.link.in_step and self.realtime and answer.tick:
+        elif self.link.synchronised and self.realtime and answer.tick:
             self.clock.observe(answer.tick + answer.age, at)
-        if self.link.in_step and not joining:
+        if self.link.synchronised and not joining:
             self.keep()
 
     def keep(self) -> None:
-        content = Memory(None, HEADER.short_digest).content(self.program, Pace(self.realtime, 1.0))
+        content = ControlStateStore(None, HEADER.short_digest).content(self.program, TimeBase(self.realtime, 1.0))
         content["holder"] = self.holder
         self.kept = json.loads(json.dumps(content)) if self.remembers else None
 
@@ -377,7 +377,7 @@ class RackLink(RuleBasedStateMachine):
 
     @invariant()
     def only_what_is_in_step_writes(self) -> None:
-        assert self.link.in_step or self.cycle.begin() is None
+        assert self.link.synchronised or self.cycle.begin() is None
 
     @invariant()
     def what_was_accepted_is_played_at_its_time(self) -> None:
@@ -387,9 +387,9 @@ class RackLink(RuleBasedStateMachine):
             self.accepted = None
             return
         behind = self.program.tick - sequence.header.first_tick
-        if behind < 0 and self.link.in_step and player.playing < sequence.header.number:
+        if behind < 0 and self.link.synchronised and player.playing < sequence.header.number:
             assert player.has_answer or self.was_set_back(), "an accepted sequence is kept until its tick"
-        elif 0 < behind < sequence.header.length and self.link.in_step and not self.was_set_back():
+        elif 0 < behind < sequence.header.length and self.link.synchronised and not self.was_set_back():
             assert player.playing >= sequence.header.number or player.has_answer, "and begins then"
 
     def was_set_back(self) -> bool:
@@ -399,7 +399,7 @@ class RackLink(RuleBasedStateMachine):
 
     @invariant()
     def a_rack_that_is_well_is_joined(self) -> None:
-        if self.link.state is PlantLinkState.IN_STEP:
+        if self.link.state is PlantLinkState.SYNCHRONISED:
             assert self.link.session == self.program.session
 
     def teardown(self) -> None:
@@ -414,7 +414,7 @@ class RackLink(RuleBasedStateMachine):
             self.link.begin()
         for _ in range(12):
             self.turn("good")
-        assert self.link.in_step, (self.link.state.name, self.link.cause.name)
+        assert self.link.synchronised, (self.link.state.name, self.link.cause.name)
         assert self.fake.rack.outputs.holder == self.link.holder
 
 

@@ -11,9 +11,9 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.signals import L1, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow, Verdict
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.guard import OutputGuard
-from control_plc.retained_state import Memory, RetainedState
+from control_plc.retained_state import ControlStateStore, RetainedControlState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -195,8 +195,8 @@ def test_after_a_restart_the_rest_of_what_was_played_is_played_on(bench: "Bench"
 def test_the_time_of_the_watchdog_that_an_operator_set_outlasts_a_restart(bench: "Bench") -> None:
     program = bench.program
     program.watchdog.set(240, program.tick)
-    content = Memory(None, 0).content(program, Pace(realtime=False, factor=1.0))
-    kept = RetainedState.parsed(json.loads(json.dumps(content)))
+    content = ControlStateStore(None, 0).content(program, TimeBase(realtime=False, factor=1.0))
+    kept = RetainedControlState.parsed(json.loads(json.dumps(content)))
     program.watchdog.set(60, program.tick)
     program.recall(kept.operator, kept.alarms, kept.watchdog, kept.tick)
     assert program.watchdog.registers(program.tick).time == 240

@@ -21,7 +21,7 @@ S, C = PlantLinkState, LinkCause
 
 def reading(tick: int = 5, **changed: object) -> Measurement:
     shown = Measurement(
-        tick, 385.0, (0.0,) * 22, (0.0,) * 28, 1, U, HOLDER, generation=3, verdict=OutputVerdict.TAKEN, age=0.5
+        tick, 385.0, (0.0,) * 22, (0.0,) * 28, 1, U, HOLDER, generation=3, verdict=OutputVerdict.ACCEPTED, age=0.5
     )
     return shown._replace(**changed)  # type: ignore[arg-type]
 
@@ -48,30 +48,30 @@ def link() -> PlantLink:
     assert read_twice(made, reading())
     made.joined()
     made.settled()
-    assert made.in_step
+    assert made.synchronised
     return made
 
 
 @pytest.mark.parametrize(
     ("answer", "state", "cause"),
     [
-        (reading(verdict=OutputVerdict.UNTIMELY), S.NOT_TAKEN, C.UNTIMELY),
-        (reading(verdict=OutputVerdict.NONE), S.NOT_TAKEN, C.REFUSED),
-        (reading(verdict=OutputVerdict.WRONG_SESSION, session=2), S.FOREIGN, C.WRONG_SESSION),
+        (reading(verdict=OutputVerdict.STALE), S.REJECTED, C.STALE),
+        (reading(verdict=OutputVerdict.NONE), S.REJECTED, C.REFUSED),
+        (reading(verdict=OutputVerdict.WRONG_SESSION, session=2), S.OTHER_MASTER, C.WRONG_SESSION),
         (reading(verdict=OutputVerdict.CHANGED, generation=4), S.JOINING, C.CHANGED),
-        (reading(session=2), S.FOREIGN, C.WRONG_SESSION),
+        (reading(session=2), S.OTHER_MASTER, C.WRONG_SESSION),
         (reading(u=(43.0, 76.0, 36.0)), S.JOINING, C.CHANGED),
         (reading(u=(43.0, math.nan, 36.0)), S.JOINING, C.CHANGED),
         (reading(holder=78), S.JOINING, C.CHANGED),
-        (reading(tick=6), S.JOINING, C.LEAPT),
-        (reading(tick=67_111_181), S.JOINING, C.LEAPT),
+        (reading(tick=6), S.JOINING, C.TIME_JUMP),
+        (reading(tick=67_111_181), S.JOINING, C.TIME_JUMP),
     ],
 )
 def test_every_doubt_about_the_answer_to_outputs_leads_out_of_step(
     link: PlantLink, answer: Measurement, state: PlantLinkState, cause: LinkCause
 ) -> None:
     assert not link.exchanged(outputs(), answer, None)
-    assert (link.state, link.cause, link.in_step, link.breaks) == (state, cause, False, 1)
+    assert (link.state, link.cause, link.synchronised, link.breaks) == (state, cause, False, 1)
 
 
 @pytest.mark.parametrize(
@@ -79,8 +79,8 @@ def test_every_doubt_about_the_answer_to_outputs_leads_out_of_step(
     [
         (PeerUnreachableError("no answer"), S.SEARCHING, C.NO_ANSWER),
         (DamagedAnswerError("a wrong CRC"), S.JOINING, C.DAMAGED),
-        (RequestRefusedError("busy", 6), S.FOREIGN, C.SECOND_MASTER),
-        (RequestRefusedError("illegal value", 3), S.NOT_TAKEN, C.REFUSED),
+        (RequestRefusedError("busy", 6), S.OTHER_MASTER, C.SECOND_MASTER),
+        (RequestRefusedError("illegal value", 3), S.REJECTED, C.REFUSED),
     ],
 )
 def test_a_request_that_comes_to_nothing_leads_out_of_step(
@@ -93,8 +93,8 @@ def test_a_request_that_comes_to_nothing_leads_out_of_step(
 @pytest.mark.parametrize(
     ("shown", "state", "cause"),
     [
-        (reading(session=2), S.FOREIGN, C.WRONG_SESSION),
-        (reading(session=0), S.FOREIGN, C.WRONG_SESSION),
+        (reading(session=2), S.OTHER_MASTER, C.WRONG_SESSION),
+        (reading(session=0), S.OTHER_MASTER, C.WRONG_SESSION),
         (reading(u=(math.nan, 75.0, 36.0)), S.JOINING, C.IMPLAUSIBLE),
         (reading(u=(43.0, math.inf, 36.0)), S.JOINING, C.IMPLAUSIBLE),
     ],
@@ -122,7 +122,7 @@ def test_only_finite_readings_of_this_session_lead_back(
 def test_what_one_reading_says_is_not_gone_on_from(link: PlantLink, lie: dict[str, object]) -> None:
     """In lock-step, where no time passes: the lie comes first, or between two that are true, and nobody is alarmed."""
     link.addressed(outputs()._replace(cv155=43.5))
-    link.overslept()
+    link.missed_scans()
     for shown in (reading(**lie), reading(), reading(**lie), reading()):
         assert not read_back(link, shown)
     assert link.state is S.JOINING
@@ -131,7 +131,7 @@ def test_what_one_reading_says_is_not_gone_on_from(link: PlantLink, lie: dict[st
 
 @pytest.mark.parametrize("leap", [-1e6, -20.0, 20.0, 1e6])
 def test_time_that_leaps_in_one_reading_is_not_gone_on_from(link: PlantLink, leap: float) -> None:
-    link.overslept()
+    link.missed_scans()
     at = 1e6 + 100.0
     assert not read_back(link, reading(tick=2_000_000), at)
     assert not read_back(link, reading(tick=2_000_000 + int(leap)), at + 0.01)
@@ -140,20 +140,20 @@ def test_time_that_leaps_in_one_reading_is_not_gone_on_from(link: PlantLink, lea
 
 
 def test_a_reading_before_the_break_confirms_none_after_it(link: PlantLink) -> None:
-    link.overslept()
+    link.missed_scans()
     assert read_twice(link, reading())
     link.joined()
-    link.overslept()
+    link.missed_scans()
     assert not read_back(link, reading())
 
 
 def test_a_gateway_that_is_behind_is_not_gone_on_from_but_a_rack_that_went_back_is(link: PlantLink) -> None:
     assert link.exchanged(outputs(100), reading(tick=100), 200.0)
-    link.overslept()
+    link.missed_scans()
     for late in range(4):
         assert not read_back(link, reading(tick=97 + late), 201.0 + late), "of before the break"
     assert read_back(link, reading(tick=101), 205.0)
-    link.overslept()
+    link.missed_scans()
     assert [read_back(link, reading(tick=50 + later), 206.0 + later) for later in range(6)] == [False] * 5 + [True]
 
 
@@ -167,12 +167,12 @@ def test_in_real_time_the_rack_may_be_a_tick_away_and_no_more(link: PlantLink) -
     assert link.exchanged(outputs(5), reading(tick=6), 6.0)
     assert link.exchanged(outputs(8), reading(tick=7), 8.0)
     assert not link.exchanged(outputs(11), reading(tick=9), 11.0)
-    assert link.cause is LinkCause.LEAPT
+    assert link.cause is LinkCause.TIME_JUMP
 
 
 def test_a_rack_whose_clock_stands_is_found_frozen_and_rejoined_when_it_moves(link: PlantLink) -> None:
     assert link.exchanged(outputs(5), reading(tick=6), 0.0)
-    link.overslept()
+    link.missed_scans()
     for now in (1.0, FROZEN_TICKS - 0.5, FROZEN_TICKS):
         assert not read_back(link, reading(tick=6), now), "what is repeated says nothing new"
     assert link.state is S.FROZEN
@@ -201,7 +201,7 @@ def test_alarms_tell_what_is_wrong_and_return_when_a_scan_is_taken() -> None:
     link.settled()
     assert not any(row.active for row in alarms.rows)
     states = [event.subject for event in journal.since(0) if event.kind == EventKind.PLANT_LINK]
-    assert states == [S.JOINING, S.SEARCHING, S.FOREIGN, S.IN_STEP]
+    assert states == [S.JOINING, S.SEARCHING, S.OTHER_MASTER, S.SYNCHRONISED]
 
 
 def test_a_rack_that_is_powered_up_with_us_is_searched_for_before_it_counts_as_lost(link: PlantLink) -> None:
@@ -217,7 +217,7 @@ def test_a_rack_that_is_powered_up_with_us_is_searched_for_before_it_counts_as_l
 def test_outputs_that_somebody_else_has_moved_during_a_break_raise_the_alarm(link: PlantLink) -> None:
     """A control PLC that stood still until the rack was at its safe state: nothing else tells."""
     alarms = link._alarms  # noqa: SLF001
-    link.overslept()
+    link.missed_scans()
     assert not alarms.rows[AlarmKind.PLANT_LOST].active
     assert read_twice(link, reading(u=(30.0, 50.0, 40.0), generation=4, holder=0))
     row = alarms.rows[AlarmKind.PLANT_LOST]

@@ -156,7 +156,7 @@ def test_nothing_that_a_rack_says_moves_an_output_beyond_its_rate_or_ends_the_co
         site.scan(poisoned.get(tick))
     for before, after in pairwise(site.applied):
         assert all(abs(new - old) <= rate * 1.0001 for old, new, rate in zip(before, after, RATE, strict=True))
-    assert site.link.state is PlantLinkState.IN_STEP
+    assert site.link.state is PlantLinkState.SYNCHRONISED
     assert abs(site.program.tick - site.tick) <= 1
     assert site.outputs.holder == site.link.holder != SIMPLE_CLIENT
 

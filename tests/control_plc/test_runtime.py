@@ -72,7 +72,7 @@ class SmallRack:
             asked = self.bank.get(Actuators)
             if asked.session == self.session:
                 self.written.append(asked)
-                self._show(asked.holder, asked[1:4], OutputVerdict.TAKEN)
+                self._show(asked.holder, asked[1:4], OutputVerdict.ACCEPTED)
             else:
                 self._show(0, (43.0, 75.0, 36.0), OutputVerdict.WRONG_SESSION)
 
@@ -133,7 +133,7 @@ async def test_scans_that_are_not_made_are_alarmed_from_outside_of_them(monkeypa
         monkeypatch.setattr(plc, "_scan", ended.wait)
         watch = asyncio.create_task(plc.watch_scans())
         ask(plc, ControlSession(1, 1, 10.0))
-        await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IN_STEP)
+        await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.SYNCHRONISED)
         await until(lambda: alarm(plc, AlarmKind.SCANS_STOPPED) is AlarmState.UNACKNOWLEDGED)
         ask(plc, ControlSession(2, 0, 1.0))  # in lock-step nobody expects scans
         ended.set()

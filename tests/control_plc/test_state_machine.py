@@ -28,9 +28,9 @@ from coldloop.registers.control_plc import (
 from coldloop.registers.plant import Measurement
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.safety.sequence import InputSequence, with_checksum
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from control_plc.program import ControlProgram, make_program
-from control_plc.retained_state import Memory, RetainedState
+from control_plc.retained_state import ControlStateStore, RetainedControlState
 from control_plc.settings import ControlSection
 
 HEADER = read_header(DEFAULT_MODEL_FILE)
@@ -212,8 +212,9 @@ class Link(RuleBasedStateMachine):
     @precondition(lambda self: self.program.tick > 0)
     @rule()
     def the_control_plc_is_killed_and_comes_back(self) -> None:
-        content = Memory(None, HEADER.short_digest).content(self.program, Pace(realtime=False, factor=1.0))
-        kept = RetainedState.parsed(json.loads(json.dumps(content)))
+        store = ControlStateStore(None, HEADER.short_digest)
+        content = store.content(self.program, TimeBase(realtime=False, factor=1.0))
+        kept = RetainedControlState.parsed(json.loads(json.dumps(content)))
         self.program = self.new_program()
         self.program.alarms.restore(kept.alarms)
         self.program.resume(kept.session, kept.tick, self.trace[-1], updates=kept.updates, operator=kept.operator)

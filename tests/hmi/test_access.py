@@ -14,11 +14,11 @@ from aiohttp.test_utils import make_mocked_request
 from coldloop.errors import ConfigurationError, UsageError
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.modbus.settings import TlsSettings
-from hmi.access import REQUEST_BURST, REQUESTS_A_BROWSER, RateLimit, Sessions, host_of, is_own_origin, port_of
+from hmi.access import REQUEST_BURST, REQUESTS_A_BROWSER, ClientLimit, LoginSessions, host_of, is_own_origin, port_of
 from hmi.audit import Audit
 from hmi.connections import Connections
 from hmi.guard import Guard
-from hmi.page_server import Exhibit, PageServer
+from hmi.page_server import PageServer, PageSite
 from hmi.process_image import Model
 from hmi.settings import HmiSection, LoginSettings
 from hmi.users import PageRole, User, Users, hash_password, write_user
@@ -43,7 +43,7 @@ def test_everybody_may_look_and_nobody_may_operate_without_a_login(site: Site) -
     assert site.ask("/api/state").status == 200
     answer = site.ask("/api/commands", LOAD)
     assert answer.status == 401
-    assert refusals(site, "command", "", "nobody has logged in")
+    assert refusals(site, "command", "", "not logged in")
 
 
 def test_a_wrong_password_is_refused_and_audited_without_the_password(site: Site) -> None:
@@ -59,8 +59,8 @@ def test_who_may_only_look_is_refused(site: Site) -> None:
     cookie = site.log_in(VIEWER)
     answer = site.ask("/api/commands", LOAD, cookie=cookie)
     assert answer.status == 403
-    assert "may look" in answer.document["error"]
-    assert refusals(site, "command", VIEWER[0], "may only look")
+    assert "may view" in answer.document["error"]
+    assert refusals(site, "command", VIEWER[0], "may only view")
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", ""])
@@ -105,8 +105,8 @@ def test_scripts_come_from_the_page_alone(site: Site) -> None:
         ({"kind": "load_file", "content": "time_s,load_w\n0,400\n0.3,400\n"}, "multiple of 0.25"),
         ({"kind": "load_file", "content": "nothing"}, "the first line is time_s,load_w"),
         ({"kind": "load_file", "content": "time_s,load_w\n" + "9" * 200_000}, "write two numbers a line"),
-        ({"kind": "alarm", "alarm": 999, "action": 1}, "no alarm 999"),
-        ({"kind": "sensor_fault", "output": "T99", "fault": 1}, "no output T99"),
+        ({"kind": "alarm", "alarm": 999, "action": 1}, "unknown alarm 999"),
+        ({"kind": "sensor_fault", "output": "T99", "fault": 1}, "unknown output T99"),
         ({"kind": "setpoint", "input": "CV155", "value": 99.0}, "not from 20 to 60"),
         ({"kind": "setpoint", "input": "CV155", "value": 45.0}, "take over in manual first"),
         ([], "JSON object"),
@@ -170,7 +170,7 @@ def test_who_logs_in_again_leaves_no_session_behind(site: Site) -> None:
 async def test_two_pages_on_one_host_do_not_log_each_other_out(tmp_path: Path) -> None:
     write_user(tmp_path / "users", OPERATOR[0], PageRole.OPERATE, OPERATOR[1])
     section = HmiSection(port=0, login=LoginSettings(users=tmp_path / "users"))
-    pages = [PageServer(section, Exhibit(Model(Clock(), 300))) for _ in range(2)]
+    pages = [PageServer(section, PageSite(Model(Clock(), 300))) for _ in range(2)]
     async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as browser:  # keeps cookies of an IP
         for page in pages:
             await page.start()
@@ -201,7 +201,7 @@ class Clock:
 
 def test_a_session_ends_when_nobody_uses_it_and_after_its_longest_time() -> None:
     clock = Clock()
-    sessions = Sessions(clock, idle_s=100, longest_s=250)
+    sessions = LoginSessions(clock, idle_s=100, longest_s=250)
     token = sessions.begin(User("anna", PageRole.OPERATE, ""))
     for clock.time in (90.0, 180.0, 240.0):
         assert sessions.find(token)
@@ -223,7 +223,7 @@ def guard() -> Guard:
 
 def test_an_open_list_of_alarms_is_no_sign_of_life(guard: Guard) -> None:
     clock = Clock()
-    guard.sessions = Sessions(clock, idle_s=100, longest_s=1000)
+    guard.sessions = LoginSessions(clock, idle_s=100, longest_s=1000)
     cookie = {"Cookie": f"coldloop_session_default={guard.sessions.begin(User('anna', PageRole.OPERATE, ''))}"}
     clock.time = 90.0
     for path in ("/api/events", "/api/audit", "/run/1/api/trend"):
@@ -249,7 +249,7 @@ def test_a_page_that_wants_a_login_can_be_opened_to_log_in(guard: Guard, run: st
 def test_as_many_browsers_as_are_served_may_draw_trends_from_one_address() -> None:
     clock = Clock()
     browsers = HmiSection().browsers
-    limit = RateLimit(clock, REQUESTS_A_BROWSER * browsers, REQUEST_BURST)
+    limit = ClientLimit(clock, REQUESTS_A_BROWSER * browsers, REQUEST_BURST)
     for second in range(60):
         clock.time = float(second)
         assert all(limit.allows("proxy") for _ in range(2 * browsers))
@@ -257,7 +257,7 @@ def test_as_many_browsers_as_are_served_may_draw_trends_from_one_address() -> No
 
 def test_requests_of_one_address_are_limited_and_others_not() -> None:
     clock = Clock()
-    limit = RateLimit(clock, per_second=1.0, burst=3.0)
+    limit = ClientLimit(clock, per_second=1.0, burst=3.0)
     assert [limit.allows("here") for _ in range(5)] == [True, True, True, False, False]
     assert limit.allows("elsewhere")
     clock.time = 2.0
@@ -308,7 +308,7 @@ def test_a_file_that_everybody_may_write_to_makes_nobody_an_operator(tmp_path: P
     file = tmp_path / "users"
     write_user(file, "anna", PageRole.OPERATE, "a long password")
     file.chmod(0o606)
-    with pytest.raises(ConfigurationError, match=r"everybody may write to it; `chmod o-w"):
+    with pytest.raises(ConfigurationError, match=r"everyone can write to it; `chmod o-w"):
         Users(file)
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from coldloop.registers.control_plc import Process
 from hmi.audit import KEPT, LARGEST_FILE, MOST_KINDS, OLDER_FILES, REPEATS_S, Audit
-from hmi.page_server import Exhibit, PageServer
+from hmi.page_server import PageServer, PageSite
 from hmi.process_image import Model
 from hmi.reading import MOST_NAMES, ROWS_AT_ONCE
 from hmi.settings import HmiSection
@@ -186,7 +186,7 @@ async def test_a_table_has_each_signal_once_and_all_its_rows() -> None:
     for tick in range(rows):
         model.trends.add(Process(tick, 400.0, (43.0, 75.0, 36.0), (1.5,) * 22), 1)
         model.put("control_plc", Process(tick, 400.0, (43.0, 75.0, 36.0), (1.5,) * 22))
-    page = PageServer(HmiSection(port=0), Exhibit(model))
+    page = PageServer(HmiSection(port=0), PageSite(model))
     await page.start()
     async with aiohttp.ClientSession() as browser:
         names = ",".join(["L1", "T5"] * 800)

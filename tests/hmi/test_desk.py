@@ -24,7 +24,7 @@ from coldloop.registers.plant import LoadAhead, LoadStatus
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
-from hmi.operator_desk import CONFIRM_WITHIN_S, OperatorDesk, Outcome
+from hmi.operator_desk import CONFIRM_WITHIN_S, CommandResult, OperatorDesk
 from hmi.process_image import Model
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -99,7 +99,7 @@ class Desk:
     async def asked(self, command: Command) -> str:
         return (await self.desk.prepare(command, "anna"))[1]
 
-    async def outcome(self, command: Command) -> Outcome:
+    async def outcome(self, command: Command) -> CommandResult:
         token, _ = await self.desk.prepare(command, "anna")
         return await self.desk.confirm(token, "anna")
 
@@ -130,7 +130,7 @@ async def test_a_command_that_was_written_and_not_answered_is_neither_applied_no
     outcome = await desk.outcome(SetLoad(kind="load", watts=431.0))
     assert (outcome.applied, outcome.refused_because) == ("", "")
     assert "did not answer" in outcome.uncertain_because
-    assert "look what has become of it" in outcome.uncertain_because
+    assert "check its effect" in outcome.uncertain_because
 
 
 @pytest.mark.parametrize("how", ["absent", "refusing"])
@@ -241,8 +241,8 @@ async def test_nothing_to_acknowledge_is_said(desk: Desk) -> None:
     [
         (SessionPace(1, 1, 1.0, 0), "Shelve: alarm t5 band for 15 min"),
         (SessionPace(1, 1, 20.0, 0), "for 15 min of plant time, 45 s by the clock at factor 20"),
-        (SessionPace(1, 1, 20.0, 1), "for 15 min of plant time, which stands still now"),
-        (SessionPace(1, 0, 1.0, 0), "for 15 min of plant time, which goes as far as it is granted"),
+        (SessionPace(1, 1, 20.0, 1), "for 15 min of plant time, which is paused"),
+        (SessionPace(1, 0, 1.0, 0), "for 15 min of plant time, which advances as it is granted"),
     ],
     ids=["factor 1", "factor 20", "paused", "lock-step"],
 )

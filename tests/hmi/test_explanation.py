@@ -181,7 +181,7 @@ def test_the_first_update_one_after_a_restart_and_one_whose_predecessor_is_unkno
     assert explain(optimization(0, 0, 9), None, None, RULE).branch is Branch.FIRST
     again = explain(optimization(5, 300, 9), optimization(4, 100, 3), None, RULE)
     assert again.branch is Branch.BEGUN_AGAIN
-    assert "had to begin again" in sentence(again, RULE)
+    assert "had to start over" in sentence(again, RULE)
     unknown = explain(optimization(5, 300, 9), optimization(3, 100, 3), None, RULE)
     assert unknown.branch is Branch.UNKNOWN
     assert unknown.iterations_before is None

@@ -23,7 +23,7 @@ from hmi.broadcast import WAITING, Broadcast
 from hmi.documents import alarms_document, encoded, state_document, trend_document
 from hmi.page_metrics import page_families
 from hmi.polling import Poller
-from hmi.process_image import STALE_S, Model, Told
+from hmi.process_image import STALE_S, JournalEntry, Model
 from hmi.reading import safe_cell
 from hmi.signals import signals_of, words_in
 from hmi.trends import MOST_ROWS, TrendStore, thin
@@ -122,13 +122,13 @@ def test_a_control_plc_that_was_started_again_and_looks_for_its_session_empties_
 
 
 def test_marks_are_of_the_session_that_is_shown(model: Model) -> None:
-    def told(utc: str, service: str, kind: EventKind) -> Told:
-        return Told.of(service, Event(tick=400, kind=kind))._replace(utc=utc)
+    def entry(utc: str, service: str, kind: EventKind) -> JournalEntry:
+        return JournalEntry.of(service, Event(tick=400, kind=kind))._replace(utc=utc)
 
     raised = EventKind.ALARM_RAISED
-    model.put_events([told("10:00", "control_plc", raised), told("10:05", "plant", EventKind.SESSION)])
+    model.put_events([entry("10:00", "control_plc", raised), entry("10:05", "plant", EventKind.SESSION)])
     assert trend_document(model, ["L1"], 0, 900, 20)["marks"] == []
-    model.put_events([told("10:06", "control_plc", raised)])
+    model.put_events([entry("10:06", "control_plc", raised)])
     assert len(trend_document(model, ["L1"], 0, 900, 20)["marks"]) == 1
 
 
@@ -185,11 +185,11 @@ def test_a_service_that_counts_its_events_anew_loses_none(model: Model, monkeypa
         if again:
             poller._lose(LinkError("its connection has closed"))  # noqa: SLF001 `run` waits in between
         await poller._look()  # noqa: SLF001
-        return [(told.boot, told.number) for told in model.events]
+        return [(entry.boot, entry.number) for entry in model.events]
 
     first = [(1, number) for number in range(1, 6)]
     assert asyncio.run(look()) == first
-    assert asyncio.run(look(again=True)) == first, "the same start: nothing is told twice"
+    assert asyncio.run(look(again=True)) == first, "the same start: nothing is reported twice"
     service.boot, service.newest = 2, 7
     assert asyncio.run(look(again=True)) == first + [(2, number) for number in range(1, 8)]
 
@@ -308,7 +308,7 @@ def test_what_is_sent_is_json_even_when_numbers_or_words_are_none(model: Model) 
 def test_loads_and_alarms_are_marked_on_the_trends(model: Model) -> None:
     model.put("control_plc", process(100))
     kinds = (EventKind.LIVE_LOAD, EventKind.BOOT, EventKind.ALARM_RAISED)
-    model.put_events(Told.of("plant", Event(number, 1, 50 + number, kind=kind)) for number, kind in enumerate(kinds))
+    model.put_events(JournalEntry.of("plant", Event(i, 1, 50 + i, kind=kind)) for i, kind in enumerate(kinds))
     marks = trend_document(model, ["L1"], 0, 100, 100)["marks"]
     assert [(mark["kind"], mark["time"]) for mark in marks] == [("load", 12.5), ("alarm", 13.0)]
 

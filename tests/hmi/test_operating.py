@@ -161,7 +161,7 @@ def test_time_is_paused_and_goes_on(operated: "Page", site: Site) -> None:
     operated.click("button:text-is('Pause')")
     assert "paused" in confirm(operated)
     tick = operated.get_attribute("body", "data-tick")
-    operated.click("button:text-is('Go on')")
+    operated.click("button:text-is('Resume')")
     assert "running" in confirm(operated)
     eventually(lambda: operated.get_attribute("body", "data-tick") != tick, "time goes on")
     eventually(lambda: mode(site) == MPC, "MPC drives")

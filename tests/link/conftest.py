@@ -202,8 +202,8 @@ class Control:
     async def link(self) -> PlantLinkStatus:
         return await self.client.read(PlantLinkStatus)
 
-    async def in_step(self) -> bool:
-        return (await self.link()).state == PlantLinkState.IN_STEP
+    async def synchronised(self) -> bool:
+        return (await self.link()).state == PlantLinkState.SYNCHRONISED
 
     async def alarm(self, kind: AlarmKind) -> Alarm:
         return (await self.client.read_rows(Alarm, kind, 1))[0]
@@ -261,7 +261,7 @@ class Field:
         await self.rack.begin(factor=factor)
         control = self.control(*assignments, stderr=stderr)
         await control.begin(self.rack.session, factor=factor)
-        await self.rack.until(control.in_step)
+        await self.rack.until(control.synchronised)
         await self.rack.passes(4)
         return control
 
@@ -273,7 +273,7 @@ class Field:
             measured, link = await self.rack.measurement(), await control.link()
             shown = await control.client.read(Identity)
             return (
-                link.state == PlantLinkState.IN_STEP
+                link.state == PlantLinkState.SYNCHRONISED
                 and measured.holder == link.holder
                 and shown.session == self.rack.session
                 and abs(shown.tick - measured.tick) <= 2

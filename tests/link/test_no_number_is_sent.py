@@ -53,7 +53,7 @@ class FakeRack:
     def _measurement(self) -> Measurement:
         self.reads += 1
         u, holder = (self.taken[-1][1:4], self.taken[-1].holder) if self.taken else (HEADER.u0, 0)
-        verdict = OutputVerdict.TAKEN if self.taken else OutputVerdict.NONE
+        verdict = OutputVerdict.ACCEPTED if self.taken else OutputVerdict.NONE
         truth = Measurement(self.tick, HEADER.w0, HEADER.y0, HEADER.x0, 1, u, holder, 1, verdict)
         return sealed(self.shows(truth))
 

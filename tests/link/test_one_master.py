@@ -33,7 +33,7 @@ async def test_a_second_control_plc_is_refused_and_takes_over_when_the_first_is_
         await rack.passes(100)
         holder = (await first.link()).holder
         shown = await second.link()
-        assert (shown.state, shown.cause) == (PlantLinkState.FOREIGN, LinkCause.SECOND_MASTER)
+        assert (shown.state, shown.cause) == (PlantLinkState.OTHER_MASTER, LinkCause.SECOND_MASTER)
         assert (await second.alarm(AlarmKind.PLANT_FOREIGN)).times == 1
         lease, counted = await rack.client.read(LeaseStatus), await rack.client.read(ServerStatistics)
         assert (lease.state, lease.holder) == (LeaseState.HELD, holder)
@@ -92,7 +92,7 @@ async def test_a_control_plc_that_was_stopped_while_another_took_over_does_not_i
         first.service.resume()
         await rack.passes(100)
         await site.follows(second)
-        assert (await first.link()).state == PlantLinkState.FOREIGN
+        assert (await first.link()).state == PlantLinkState.OTHER_MASTER
         assert (await first.alarm(AlarmKind.PLANT_FOREIGN)).active
         driven = [rack.applied[tick][0] for tick in range(begun, rack.tick)]
         assert driven == sorted(driven), "from the safe state towards the setpoint of the second"
@@ -101,7 +101,7 @@ async def test_a_control_plc_that_was_stopped_while_another_took_over_does_not_i
 
 async def drives(control: RegisterClient, rack: RegisterClient) -> bool:
     link, lease = await control.read(PlantLinkStatus), await rack.read(LeaseStatus)
-    return link.state == PlantLinkState.IN_STEP and lease.holder == link.holder
+    return link.state == PlantLinkState.SYNCHRONISED and lease.holder == link.holder
 
 
 async def test_a_second_optimiser_is_refused_and_takes_over_when_the_first_is_killed(
@@ -130,8 +130,8 @@ async def test_a_second_optimiser_is_refused_and_takes_over_when_the_first_is_ki
 
         await rack.until(lambda: accepted(2))
         found = await states()
-        standing_by = found.index(ControlLinkState.FOREIGN)
-        assert found[1 - standing_by] != ControlLinkState.FOREIGN
+        standing_by = found.index(ControlLinkState.OTHER_MASTER)
+        assert found[1 - standing_by] != ControlLinkState.OTHER_MASTER
         alarm, lease = await control.alarm(AlarmKind.SECOND_WRITER), await control.client.read(LeaseStatus)
         assert alarm.active
         assert lease.refused >= 1
@@ -142,7 +142,7 @@ async def test_a_second_optimiser_is_refused_and_takes_over_when_the_first_is_ki
         optimizers[1 - standing_by].kill()
         before = (await control.client.read(Status)).accepted
         await rack.until(lambda: accepted(before + 2))
-        assert (await clients[standing_by].read(ControlLinkStatus)).state != ControlLinkState.FOREIGN
+        assert (await clients[standing_by].read(ControlLinkStatus)).state != ControlLinkState.OTHER_MASTER
         assert rack.violations() == []
         for client in clients:
             client.close()

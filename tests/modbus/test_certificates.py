@@ -127,7 +127,7 @@ async def test_a_client_whose_certificate_is_revoked_is_refused_counted_and_logg
         client.close()
         assert await (await running.connect()).ask(READ_MAGIC) == MAGIC
         assert running.server.counters.tls_refused == 1
-        assert "its certificate does not hold: certificate revoked" in caplog.messages[0]
+        assert "its certificate is invalid: certificate revoked" in caplog.messages[0]
 
 
 async def test_our_client_does_not_talk_to_a_server_whose_certificate_is_revoked(serve: "Serve", pki: "Pki") -> None:
@@ -173,7 +173,7 @@ def bad_list(pki: "Pki", case: str) -> Path:
         ("missing", "No such file or directory; name a readable file"),
         ("junk", "no PEM revocation list in it; name a file that has one"),
         ("certificate", "no PEM revocation list in it; name a file that has one"),
-        ("foreign", "is not by an authority in ca; name the list of one of them"),
+        ("foreign", "not issued by an authority in ca; name the list of one of them"),
     ],
 )
 def test_a_list_that_cannot_be_used_is_told_in_one_line(pki: "Pki", case: str, message: str) -> None:

@@ -91,7 +91,8 @@ async def test_a_refusal_says_who_refused_what(serve: "Serve") -> None:
 
 async def test_nobody_listens(free_port: int) -> None:
     async with client_of(free_port) as client:
-        with pytest.raises(PeerUnreachableError, match=rf"^nobody listens as plant at 127.0.0.1:{free_port}: start it"):
+        message = rf"^nothing listens as plant at 127.0.0.1:{free_port}: start it"
+        with pytest.raises(PeerUnreachableError, match=message):
             await client.connect(0.0)
 
 
@@ -149,12 +150,12 @@ async def impostor(answer: bytes | None) -> AsyncIterator[int]:
 IMPOSTORS = {
     "silence": (b"", "did not answer in time"),
     "hangs up": (None, "closed the connection"),
-    "HTTP": (b"TP/1.1 400 Bad Request\r\n\r\n", "with something else: check host and port"),
-    "no identity block": (bytes.fromhex("0000 0003 01 83 02"), "something else .*no identity block"),
-    "other registers": (bytes.fromhex("0000 001d 01 03 1a") + bytes(26), r"something else .*not 123.456"),
-    "too few registers": (bytes.fromhex("0000 0005 01 03 02 0000"), "with something else"),
-    "another function": (bytes.fromhex("0000 0005 01 04 02 0000"), "with something else"),
-    "an unknown function": (bytes.fromhex("0000 0003 01 55 02"), "with something else"),
+    "HTTP": (b"TP/1.1 400 Bad Request\r\n\r\n", "with something invalid: check host and port"),
+    "no identity block": (bytes.fromhex("0000 0003 01 83 02"), "not that service .*no identity block"),
+    "other registers": (bytes.fromhex("0000 001d 01 03 1a") + bytes(26), r"not that service .*not 123.456"),
+    "too few registers": (bytes.fromhex("0000 0005 01 03 02 0000"), "with something invalid"),
+    "another function": (bytes.fromhex("0000 0005 01 04 02 0000"), "with something invalid"),
+    "an unknown function": (bytes.fromhex("0000 0003 01 55 02"), "with something invalid"),
 }
 
 
@@ -228,7 +229,7 @@ async def test_a_server_that_goes_away_is_noticed_at_once_and_found_again(serve:
         await first.server.close()
         with pytest.raises(PeerUnreachableError, match="closed the connection"):
             await exchange
-        with pytest.raises(PeerUnreachableError, match="nobody listens"):
+        with pytest.raises(PeerUnreachableError, match="nothing listens"):
             await client.read(LoadStep)
         async with serve(port=port):
             assert await client.read(LoadStep) == LoadStep(0, 0.0)

@@ -104,7 +104,7 @@ async def test_a_certificate_of_another_authority(serve: "Serve", pki: "Pki", ca
     context.load_cert_chain(files.certificate, files.key)
     async with serve(CONTROL_MAP, tls=pki.server, client=pki.client(None)) as running:
         await turned_away(running, context)
-        assert "its certificate does not hold" in await refused_for(running, caplog)
+        assert "its certificate is invalid" in await refused_for(running, caplog)
 
 
 async def test_a_server_certificate_does_not_make_a_client(

@@ -150,7 +150,7 @@ async def test_transaction_ids_begin_again_after_the_last() -> None:
 
 
 async def test_nobody_listens(free_port: int) -> None:
-    with pytest.raises(PeerUnreachableError, match=f"nobody listens as plant at 127.0.0.1:{free_port}"):
+    with pytest.raises(PeerUnreachableError, match=f"nothing listens as plant at 127.0.0.1:{free_port}"):
         await Transport("plant", "127.0.0.1", free_port, 5.0, None).open()
 
 

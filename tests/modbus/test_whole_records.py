@@ -266,7 +266,7 @@ async def test_a_second_writer_is_refused_with_06_counted_as_such_and_stores_not
         running.bank.judged_by(busy, Actuators)
         client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=running.server.port, timeout_s=5.0)
         for refused in range(1, 4):
-            with pytest.raises(RequestRefusedError, match="exception 6, somebody else holds the lease") as refusal:
+            with pytest.raises(RequestRefusedError, match="exception 6, another client holds the lease") as refusal:
                 await client.exchange(Actuators(7, 43.0, 75.0, 36.0, session=1), Measurement)
             assert refusal.value.exception_code == 6
             assert running.server.counters.second_writer == refused

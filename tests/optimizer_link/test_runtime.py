@@ -174,10 +174,10 @@ async def test_it_lets_another_optimiser_be_and_goes_on_when_the_lease_is_free(
     control.lease.take(ANOTHER)
     control.latch()
     async with connect(control) as link:
-        await link.reaches(S.FOREIGN)
+        await link.reaches(S.OTHER_MASTER)
         while control.lease.refused < 2:
             await link.wire.moves()
-        assert link.status.state == S.FOREIGN
+        assert link.status.state == S.OTHER_MASTER
         assert not control.plans
         control.lease.closed(ANOTHER)
         await link.answers(2)

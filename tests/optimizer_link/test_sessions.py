@@ -18,7 +18,7 @@ from coldloop.registers.declaration import Role
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OperatingLimits, OptimizerSession
 from coldloop.registers.text import from_words
 from optimizer_plc.budget import BudgetSettings, PlcBudget
-from optimizer_plc.publication import Publication
+from optimizer_plc.publication import OptimizerPublication
 
 if TYPE_CHECKING:
     from tests.optimizer_link.conftest import Connect, Link, PlayedControlPlc, Until
@@ -28,8 +28,9 @@ BLOCK = OPTIMIZER_MAP.block_of(OptimizerSession)
 UPDATING_PERIOD = BLOCK.end - 1
 
 
-def shown(power: float = 1.0, tau_1_s: float = 0.25) -> Publication:
-    return Publication(WordOrder.HIGH_FIRST, PlcBudget(BudgetSettings(power=power), tau_1_s), OperatingLimits(), 1, 1)
+def shown(power: float = 1.0, tau_1_s: float = 0.25) -> OptimizerPublication:
+    budget = PlcBudget(BudgetSettings(power=power), tau_1_s)
+    return OptimizerPublication(WordOrder.HIGH_FIRST, budget, OperatingLimits(), 1, 1)
 
 
 @asynccontextmanager

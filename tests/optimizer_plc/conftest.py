@@ -23,7 +23,7 @@ from control_plc.settings import ControlSection
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem, Situation
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import Answer, Solver, make_solver
 from plant.cold_box.physics import REFERENCE
@@ -31,7 +31,7 @@ from plant.load import find_load
 from plant.program import PlantProgram
 
 Array = NDArray[np.float64]
-Situations = Callable[[np.random.Generator], Situation]
+Situations = Callable[[np.random.Generator], QpParameters]
 Optimum = Callable[[QuadraticProblem], Array]
 PenalisedOptimum = Callable[[QuadraticProblem, float], Array]
 
@@ -66,9 +66,9 @@ def situations(model: LtiModel) -> Situations:
     scale = np.full(len(model.x0), 1.0)
     scale[0], scale[1] = 2000.0, 1.0 / model.C[0, 1]
 
-    def draw(rng: np.random.Generator) -> Situation:
+    def draw(rng: np.random.Generator) -> QpParameters:
         x = scale * rng.normal(size=len(scale)) * rng.choice([0.2, 0.5, 1.0])
-        return Situation(x, float(rng.uniform(-150, 200)), rng.uniform([-8, -60, -8], [8, 60, 8]))
+        return QpParameters(x, float(rng.uniform(-150, 200)), rng.uniform([-8, -60, -8], [8, 60, 8]))
 
     return draw
 

@@ -21,7 +21,7 @@ from coldloop.service.journal import Journal
 from optimizer_plc.control_link import REPEAT_S, ControlLink
 
 S = ControlLinkState
-BUSY = RequestRefusedError("somebody else holds the lease", 6)
+BUSY = RequestRefusedError("another client holds the lease", 6)
 NO_SUCH_REGISTER = RequestRefusedError("no such register", 2)
 GONE = PeerUnreachableError("did not answer in time")
 OTHER_MODEL = ModelFileError("another model")
@@ -63,7 +63,7 @@ def test_an_update_takes_the_link_from_searching_to_waiting_and_around() -> None
     ("error", "state"),
     [
         (GONE, S.SEARCHING), (UntrustedPeerError("expired"), S.SEARCHING), (DAMAGED, S.SEARCHING),
-        (NO_SUCH_REGISTER, S.SEARCHING), (BUSY, S.FOREIGN), (OTHER_MODEL, S.WRONG_MODEL),
+        (NO_SUCH_REGISTER, S.SEARCHING), (BUSY, S.OTHER_MASTER), (OTHER_MODEL, S.WRONG_MODEL),
     ],
 )  # fmt: skip
 def test_the_kind_of_failure_decides_the_state(error: ColdloopError, state: S) -> None:
@@ -82,9 +82,9 @@ def test_a_foreign_link_stays_foreign_while_it_tries_again_and_then_waits() -> N
         link.answered()
         link.failed(BUSY)
     link.answered()
-    assert link.state is S.FOREIGN
+    assert link.state is S.OTHER_MASTER
     link.introduced()
-    assert watched.noted == [S.FOREIGN, S.WAITING]
+    assert watched.noted == [S.OTHER_MASTER, S.WAITING]
     assert link.registers().breaks == 0  # it had never been up
 
 

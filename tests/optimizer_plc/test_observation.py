@@ -23,7 +23,7 @@ from coldloop.safety.sequence import InputSequence
 from optimizer_plc import solvers
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem, Situation
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from optimizer_plc.rules import Assessment, Observation
 from optimizer_plc.rules.interface import decides_by
 from optimizer_plc.settings import ProgramSettings
@@ -128,7 +128,7 @@ class Bench:
 
     def answer(self, x: Array, watts: float, u_before: Array, ticks: int, guess: Array, iterations: int) -> "Answer":
         """Return what the solver makes of a problem at a state, a load, an input before it and a guess."""
-        qp = self.problem.at(Situation(x, watts, u_before, ticks))
+        qp = self.problem.at(QpParameters(x, watts, u_before, ticks))
         z = np.clip(guess, qp.low, qp.high)
         costs = [cost(qp, z)]
         for _ in range(iterations):
@@ -138,7 +138,7 @@ class Bench:
 
     def reached(self, answer: "Answer", z: Array, x: Array, watts: float = 0.0) -> float:
         """Return J of a profile, in the situation of its answer, at another state and load."""
-        return cost(self.problem.at(Situation(x, watts, answer.u_before, answer.ticks)), z)
+        return cost(self.problem.at(QpParameters(x, watts, answer.u_before, answer.ticks)), z)
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def test_at_rest_every_cost_is_the_floor(bench: Bench) -> None:
     (o,) = bench.rule.told
     assert (o.iterations, o.period_s) == (FIRST, 4 * TICK_S)
     assert (o.effective_before, o.hot_start) == (1.0, 1.0)
-    qp = bench.problem.at(Situation(still, 0.0, AT_REST, 4))
+    qp = bench.problem.at(QpParameters(still, 0.0, AT_REST, 4))
     assert [o.last_but_one, o.delivered] == pytest.approx(
         [cost(qp, 2 * KnownSolver.move), cost(qp, 3 * KnownSolver.move)]
     )
@@ -204,7 +204,7 @@ def test_in_time_the_five_costs_are_those_of_the_paper(bench: Bench, states: lis
     there = bench.predicted(states[0], 5.0, [AT_REST] * 4)
     one = bench.answer(there, 5.0, AT_REST, 4, NOTHING, FIRST)
     bench.update(4, 1, states[1], 5.0)
-    before = cost(problem.at(Situation(states[0], 5.0, AT_REST)), NOTHING)
+    before = cost(problem.at(QpParameters(states[0], 5.0, AT_REST)), NOTHING)
     expected = [before, one.hot_start, one.last_but_one, one.delivered, bench.reached(one, one.z, states[1], 5.0)]
     assert told(bench.rule.told[0]) == pytest.approx(expected, rel=1e-9)
 
@@ -303,5 +303,5 @@ def test_after_others_have_driven_nothing_is_told_of_before(bench: Bench, states
     bench.program.solve()
     bench.update(13, 78, states[3])
     assert bench.rule.told[1].iterations == FIRST
-    hold = cost(bench.problem.at(Situation(states[2], 0.0, AT_REST)), bench.problem.hold(AT_REST))
+    hold = cost(bench.problem.at(QpParameters(states[2], 0.0, AT_REST)), bench.problem.hold(AT_REST))
     assert bench.rule.told[1].effective_before == pytest.approx(hold)

@@ -12,7 +12,7 @@ from optimizer_plc.qp.costs import augmented_cost, indicators
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.penalties import PRESETS, PenaltySettings, Preset
 from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, Situation
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers.ode import ode_solver
 
@@ -107,7 +107,7 @@ def test_a_row_keeps_its_share_of_a_violation(
         problem = PredictiveProblem(prediction, ControlDesign(), InputLimits(), penalties=penalties)
         x = np.zeros(prediction.n_states)
         x[1] = -4.0 / prediction.model.C[0, 1]  # the level is 3 % below its band, at the first instant
-        situation = Situation(x, 0.0, np.zeros(3))
+        situation = QpParameters(x, 0.0, np.zeros(3))
         qp = problem.at(situation)
         z = penalised_optimum(qp, factor * 100.0)
         first, last = problem.outputs(z, situation)[[0, -1], 0]

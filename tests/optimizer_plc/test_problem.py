@@ -17,7 +17,7 @@ from optimizer_plc.qp import costs
 from optimizer_plc.qp.costs import augmented_cost, indicators, matrices_of, quadratic_cost
 from optimizer_plc.qp.design import ControlDesign, trivial_design
 from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, Situation
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 
 if TYPE_CHECKING:
     from tests.optimizer_plc.conftest import Optimum, Situations
@@ -54,7 +54,7 @@ class Simulation:
     y: Array
 
 
-def simulated(model: LtiModel, z: Array, situation: Situation) -> Simulation:
+def simulated(model: LtiModel, z: Array, situation: QpParameters) -> Simulation:
     discrete = model.discretised(5.0)
     u, v = profile(z[:21].reshape(7, 3) * INPUT_SCALE), profile(z[21:].reshape(7, 4))
     x, states = situation.x, []
@@ -165,7 +165,7 @@ class Uncondensed:
         moves[:, :21], z[:, :49] = knots, np.eye(49)
         return scipy.sparse.csr_matrix(np.vstack([*rows, moves, -moves, z[:21], -z]))
 
-    def _right_hand_side(self, situation: Situation) -> Array:
+    def _right_hand_side(self, situation: QpParameters) -> Array:
         high, low = (bound - self._model.y0[CONSTRAINED] - self._G * situation.w for bound in (HIGH, LOW))
         longest = np.kron(np.diff(KNOTS, prepend=0), RATE)
         before = np.concatenate([situation.u_before, np.zeros(18)])
@@ -174,7 +174,7 @@ class Uncondensed:
         inputs = [longest + before, longest - before, np.tile(top, 7), -np.tile(bottom, 7)]
         return np.concatenate([bands, *inputs, np.zeros(28)])
 
-    def solve(self, situation: Situation) -> Array:
+    def solve(self, situation: QpParameters) -> Array:
         start = np.tile(self._F * situation.w, SAMPLES)
         start[:28] += self._A @ (situation.x / self._scale)
         fixed = np.concatenate([np.zeros(49), self._states.solve(start)])
@@ -331,7 +331,7 @@ def test_the_first_knot_stays_within_its_rate_of_the_input_before_it(
 def test_the_rate_limit_of_an_update_is_whole_or_shrinks_with_the_time_that_passed(
     prediction: PredictionModel, ticks: int, share: float
 ) -> None:
-    situation = Situation(np.zeros(28), 0.0, np.array([1.0, -5.0, 2.0]), ticks)
+    situation = QpParameters(np.zeros(28), 0.0, np.array([1.0, -5.0, 2.0]), ticks)
     for reference, used in ((RateReference.PER_UPDATE, 1.0), (RateReference.ELAPSED, share)):
         problem = PredictiveProblem(prediction, ControlDesign(), InputLimits(rate_reference=reference))
         qp = problem.at(situation)

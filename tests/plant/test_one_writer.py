@@ -33,7 +33,7 @@ def test_a_second_writer_is_refused_counted_and_noted(switch_on: "SwitchOn", num
         assert second.exchange(second.outputs(*OTHER)) == (6,)
         assert second.write(WatchdogTime(0)) == (6,)
     shown = rack.shown()
-    assert (shown.u, shown.holder, shown.verdict, shown.tick) == (U, 77, OutputVerdict.TAKEN, 1)
+    assert (shown.u, shown.holder, shown.verdict, shown.tick) == (U, 77, OutputVerdict.ACCEPTED, 1)
     status = second.read(LeaseStatus)
     assert (status.state, status.holder, status.refused) == (LeaseState.HELD, 77, 40)
     assert from_words(status.who) == "first"
@@ -67,7 +67,7 @@ def test_the_lease_ends_with_silence(
     rack.now += 0.02 * silence_s
     assert second.read(LeaseStatus).state == LeaseState.FREE
     assert second.send(*U, generation=1).verdict == OutputVerdict.CHANGED, "the first one has written since"
-    assert second.send(*U, generation=2).verdict == OutputVerdict.TAKEN
+    assert second.send(*U, generation=2).verdict == OutputVerdict.ACCEPTED
     assert first.exchange(first.outputs(*U)) == (6,)
     assert lease_events(rack)[2:] == [
         (LeaseEvent.ENDED, "first"),
@@ -82,7 +82,7 @@ def test_outputs_that_are_not_for_now_do_not_keep_the_lease(switch_on: "SwitchOn
     lost, plc = rack.client("lost", 77), rack.client("control PLC", 78)
     for changed in ({"session": 9}, {"tick": 5000}):
         lost.send(*OTHER, **changed)
-    assert plc.send(*U, generation=1).verdict == OutputVerdict.TAKEN
+    assert plc.send(*U, generation=1).verdict == OutputVerdict.ACCEPTED
 
 
 def test_the_silent_holder_goes_on_when_nobody_else_has_written(switch_on: "SwitchOn") -> None:
@@ -90,7 +90,7 @@ def test_the_silent_holder_goes_on_when_nobody_else_has_written(switch_on: "Swit
     plc = rack.client("control PLC", 77)
     plc.send(*U, generation=1)
     rack.now += 600.0
-    assert plc.send(*U, generation=1).verdict == OutputVerdict.TAKEN
+    assert plc.send(*U, generation=1).verdict == OutputVerdict.ACCEPTED
 
 
 def test_a_simple_client_hands_over_by_closing(switch_on: "SwitchOn") -> None:
@@ -111,7 +111,7 @@ def test_a_control_plc_comes_back_over_another_connection(switch_on: "SwitchOn")
     plc.closes()
     assert simple.exchange(simple.outputs(*OTHER)) == (6,), "for a moment only the same one may"
     again = rack.client("control PLC", 77)
-    assert again.send(*U, generation=1).verdict == OutputVerdict.TAKEN
+    assert again.send(*U, generation=1).verdict == OutputVerdict.ACCEPTED
     plc.closes()
     assert again.read(LeaseStatus).state == LeaseState.HELD, "the old connection says nothing any more"
     again.closes()
@@ -127,7 +127,7 @@ def test_a_gateway_that_mixes_two_control_plcs_is_a_break_each_time(switch_on: "
     gateway.send(*U, generation=1)
     gateway.number = 78
     assert gateway.send(*U, generation=1).verdict == OutputVerdict.CHANGED
-    assert gateway.send(*U, generation=2).verdict == OutputVerdict.TAKEN
+    assert gateway.send(*U, generation=2).verdict == OutputVerdict.ACCEPTED
     gateway.number = 77
     assert gateway.send(*U, generation=2).verdict == OutputVerdict.CHANGED
 
@@ -137,4 +137,4 @@ def test_the_watchdog_may_be_set_while_nobody_writes_outputs(switch_on: "SwitchO
     assert rack.client("commissioning").write(WatchdogTime(8)) is None
     (event,) = rack.events(EventKind.WATCHDOG_TIME)
     assert (event.subject, event.cause, from_words(event.who)) == (8, 40, "commissioning")
-    assert rack.client("control PLC", 77).send(*U).verdict == OutputVerdict.TAKEN, "that was no lease"
+    assert rack.client("control PLC", 77).send(*U).verdict == OutputVerdict.ACCEPTED, "that was no lease"

@@ -50,7 +50,7 @@ def test_a_measurement_shows_what_is_applied_whose_it_is_and_that_it_was_taken(s
     assert (begun.verdict, begun.age) == (OutputVerdict.NONE, 0.0)
     answer = plc.send(*U, generation=1)
     assert (answer.tick, answer.u, answer.holder, answer.generation) == (0, U, 77, 1)
-    assert answer.verdict == OutputVerdict.TAKEN
+    assert answer.verdict == OutputVerdict.ACCEPTED
     assert rack.shown() == sealed(plc.read(Measurement))
     assert (rack.shown().tick, rack.shown().u) == (1, U), "a reader sees the present tick"
 
@@ -58,8 +58,8 @@ def test_a_measurement_shows_what_is_applied_whose_it_is_and_that_it_was_taken(s
 @pytest.mark.parametrize(
     ("changed", "verdict"),
     [
-        ({"tick": 0}, OutputVerdict.UNTIMELY),
-        ({"tick": 7}, OutputVerdict.UNTIMELY),
+        ({"tick": 0}, OutputVerdict.STALE),
+        ({"tick": 7}, OutputVerdict.STALE),
         ({"session": 9}, OutputVerdict.WRONG_SESSION),
         ({"session": 0}, OutputVerdict.WRONG_SESSION),
         ({"generation": 2}, OutputVerdict.CHANGED),
@@ -76,7 +76,7 @@ def test_outputs_that_are_not_for_now_are_not_taken_and_the_answer_says_why(
     assert rack.tick == 1
     applied = plc.read(Actuators)
     assert applied[1:4] == U, "what is applied is read back, not what was refused"
-    assert plc.send(44.0, 70.0, 37.0).verdict == OutputVerdict.TAKEN
+    assert plc.send(44.0, 70.0, 37.0).verdict == OutputVerdict.ACCEPTED
 
 
 def test_damaged_outputs_are_refused_and_a_simple_client_need_not_seal(switch_on: "SwitchOn") -> None:
@@ -85,7 +85,7 @@ def test_damaged_outputs_are_refused_and_a_simple_client_need_not_seal(switch_on
     plc.send(*U)
     assert plc.exchange(plc.outputs(50.0, 80.0, 36.0)._replace(cv155=50.5)) == (3,)
     shown = rack.shown()
-    assert (shown.u, shown.verdict, shown.tick) == (U, OutputVerdict.TAKEN, 1), "nothing has happened"
+    assert (shown.u, shown.verdict, shown.tick) == (U, OutputVerdict.ACCEPTED, 1), "nothing has happened"
     plc.closes()
     rack.now += 2.0
     simple = rack.client("simple client")
@@ -106,7 +106,7 @@ def test_in_real_time_what_a_network_held_up_is_not_applied(switch_on: "SwitchOn
     plc = rack.client("control PLC", 77)
     plc.send(*U)
     rack.passes(40)
-    for tick, verdict in ((31, "UNTIMELY"), (49, "UNTIMELY"), (32, "TAKEN"), (48, "TAKEN")):
+    for tick, verdict in ((31, "STALE"), (49, "STALE"), (32, "ACCEPTED"), (48, "ACCEPTED")):
         assert plc.send(*U, tick=tick).verdict == OutputVerdict[verdict], tick
 
 
@@ -115,16 +115,16 @@ def test_a_session_ends_at_its_last_tick_and_another_one_begins(switch_on: "Swit
     rack = switch_on(session={"mode": mode})
     plc = rack.client("control PLC", 77)
     rack.registers.rack._program.tick = LAST_TICK - 1  # noqa: SLF001 - 34 years are too long
-    assert plc.send(*U).verdict == OutputVerdict.TAKEN
+    assert plc.send(*U).verdict == OutputVerdict.ACCEPTED
     if mode == "realtime":
         rack.registers.advance()
     assert (rack.tick, rack.registers.rack.has_ended) == (LAST_TICK, True)
-    assert plc.send(*U).verdict == OutputVerdict.UNTIMELY
+    assert plc.send(*U).verdict == OutputVerdict.STALE
     assert rack.tick == LAST_TICK
     assert plc.exchange(plc.outputs(*U, tick=LAST_TICK + 1)) == (3,)
     assert rack.operator.read(LoadStatus).watts > 0
     assert rack.operator.write(PlantSession(0xFFFF_FFFF, 0, 1.0, 1, 1)) is None
-    assert plc.send(*U).verdict == OutputVerdict.TAKEN
+    assert plc.send(*U).verdict == OutputVerdict.ACCEPTED
     assert rack.operator.write(PlantSession(1, 0, 1.0, 1, 1)) is None
 
 
@@ -147,7 +147,7 @@ def test_nobody_moves_an_output_by_more_than_its_rate_in_a_tick_however_often_it
     plc.send(*start)
     rack.passes(1)
     first = plc.send(*map(float.__add__, start, (0.5, -10.0, 0.1)))
-    assert first.verdict == OutputVerdict.TAKEN
+    assert first.verdict == OutputVerdict.ACCEPTED
     for _ in range(3):  # within the same tick
         again = plc.send(*map(float.__add__, first.u, (0.5, -10.0, 0.1)), generation=0)
         assert (again.verdict, again.u) == (OutputVerdict.LIMITED, pytest.approx(first.u, rel=1e-6))
@@ -195,7 +195,7 @@ def test_what_a_simple_client_has_moved_is_read_back_before_the_control_plc_move
     again = rack.client("control PLC", 78)
     first = again.send(*U, generation=1)
     assert (first.verdict, first.u[0], first.generation) == (OutputVerdict.CHANGED, 25.0, 3)
-    assert again.send(25.5, 80.0, 36.0, generation=3).verdict == OutputVerdict.TAKEN
+    assert again.send(25.5, 80.0, 36.0, generation=3).verdict == OutputVerdict.ACCEPTED
 
 
 def test_a_session_that_begins_again_at_tick_0_is_a_break(switch_on: "SwitchOn") -> None:
@@ -212,7 +212,7 @@ def test_a_session_that_begins_again_at_tick_0_is_a_break(switch_on: "SwitchOn")
     assert begun.y[T5] != 1.0
     assert rack.operator.read(SensorFault, T5).kind == SensorFaultKind.NONE
     assert plc.send(*U, generation=2).verdict == OutputVerdict.CHANGED
-    assert plc.send(*U, generation=3).verdict == OutputVerdict.TAKEN
+    assert plc.send(*U, generation=3).verdict == OutputVerdict.ACCEPTED
     assert [event.value for event in rack.events(EventKind.SESSION)] == [1.0, 1.0]
 
 
@@ -233,7 +233,7 @@ def test_an_answer_that_was_lost_can_be_read_again(switch_on: "SwitchOn") -> Non
     plc.send(*U)
     plc.exchange(plc.outputs(44.0, 80.0, 36.0, generation=1))  # nobody gets the answer
     shown = plc.read(Measurement)
-    assert (shown.u[0], shown.holder, shown.verdict) == (44.0, 77, OutputVerdict.TAKEN)
+    assert (shown.u[0], shown.holder, shown.verdict) == (44.0, 77, OutputVerdict.ACCEPTED)
 
 
 # -- time --------------------------------------------------------------------------------------------------------------
@@ -410,7 +410,7 @@ def test_a_sealed_state_that_cannot_be_is_set_aside_and_the_rack_starts_without(
     assert (rack.tick, file.with_name("plant.refused").exists()) == (0, True)
     (boot,) = rack.events(EventKind.BOOT)
     assert (boot.subject, boot.cause) == (0, 1)
-    assert rack.client("control PLC", 77).send(*U).verdict == OutputVerdict.TAKEN
+    assert rack.client("control PLC", 77).send(*U).verdict == OutputVerdict.ACCEPTED
 
 
 @pytest.mark.parametrize("content", [b"", b"coldloop-retained plant/2", b"\x00" * 100])

@@ -157,4 +157,4 @@ def test_a_load_table_that_is_written_is_one_event_a_request(switch_on: "SwitchO
 def test_operators_do_not_write_outputs(under_way: "RackOnTheBus") -> None:
     operator = under_way.operator
     assert operator.exchange(operator.outputs(*U)) == (1,)
-    assert operator.read(Measurement).verdict == OutputVerdict.TAKEN
+    assert operator.read(Measurement).verdict == OutputVerdict.ACCEPTED

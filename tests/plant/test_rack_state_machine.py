@@ -116,8 +116,8 @@ class RackMachine(RuleBasedStateMachine):
     def judge(self, writer: Writer, sent: Actuators, answer: Measurement, *, timely: bool) -> None:
         before, verdict = self.applied, answer.verdict
         assert (verdict == OutputVerdict.WRONG_SESSION) == (sent.session != answer.session)
-        assert (verdict == OutputVerdict.UNTIMELY) == (sent.session == answer.session and not timely)
-        if verdict == OutputVerdict.TAKEN:
+        assert (verdict == OutputVerdict.STALE) == (sent.session == answer.session and not timely)
+        if verdict == OutputVerdict.ACCEPTED:
             assert (answer.u, answer.holder) == (sent[1:4], writer.connection.number)
             assert sent.generation in (0, answer.generation)
             assert not sent.generation or before.u in writer.believed, "it did not know what was applied"

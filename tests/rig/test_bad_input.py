@@ -285,7 +285,7 @@ def test_a_rig_that_is_not_there_is_told(coldloop: "Coldloop", results: Path, fr
     nobody = f"127.0.0.1:{free_port}"
     outcome = coldloop("run", "--duration", "2s", "--attach", nobody, nobody, nobody, "--out", results)
     assert outcome.code == FAILURE
-    assert outcome.complaints[-1] == f"coldloop: nobody listens as plant at {nobody}: start it, or check host and port"
+    assert outcome.complaints[-1] == f"coldloop: nothing listens as plant at {nobody}: start it, or check host and port"
     assert_no_results(results)
 
 

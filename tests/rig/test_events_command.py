@@ -145,7 +145,7 @@ def test_a_client_without_the_role_reads_the_last_256_events_and_says_so(coldloo
         some = coldloop("events", where, "--since", "299")
     assert numbers(outcome.out) == list(range(45, 301))
     assert outcome.complaints == [
-        f"coldloop: no role of an operator at control_plc at {where}: only its last 256 events can be read"
+        f"coldloop: no operator role at control_plc at {where}: only its last 256 events can be read"
     ]
     assert numbers(some.out) == [299, 300]
 
@@ -237,7 +237,7 @@ def test_nobody_there_is_told_in_one_line_and_no_file_is_made(coldloop: "Coldloo
     outcome = coldloop("events", f"127.0.0.1:{port}", "--csv", tmp_path / "events.csv")
     assert outcome.code == FAILURE
     (complaint,) = outcome.complaints
-    assert "nobody listens" in complaint
+    assert "nothing listens" in complaint
     assert not list(tmp_path.iterdir())
 
 
@@ -246,7 +246,7 @@ def test_nobody_there_is_told_in_one_line_and_no_file_is_made(coldloop: "Coldloo
     [
         (["127.0.0.1:1", "--port-base", "5020"], "give one of them"),
         (["localhost"], "'localhost' is not HOST:PORT"),
-        (["127.0.0.1:1", "--kind", "alarms"], "no kind is called 'alarms'; there are mode, alarm-raised, "),
+        (["127.0.0.1:1", "--kind", "alarms"], "unknown kind 'alarms'; choose from mode, alarm-raised, "),
         (["127.0.0.1:1", "--since", "yesterday"], "'yesterday' is neither the number of an event nor a time"),
         (["127.0.0.1:1", "--since", "0"], "'0' is neither"),
         (["127.0.0.1:1", "--service", "broker"], "invalid choice: 'broker'"),

@@ -64,8 +64,8 @@ class Rig:
     async def in_mpc(self) -> bool:
         return (await self.control.read(LadderStatus)).mode == Mode.MPC
 
-    async def in_step(self) -> bool:
-        return (await self.control.read(PlantLinkStatus)).state == PlantLinkState.IN_STEP
+    async def synchronised(self) -> bool:
+        return (await self.control.read(PlantLinkStatus)).state == PlantLinkState.SYNCHRONISED
 
     async def pace(self, factor: float, *, paused: bool = False) -> None:
         for client in self.clients:
@@ -152,7 +152,7 @@ def test_a_rig_that_is_paused_stands_and_goes_on_without_alarm(tmp_path: Path) -
                 await asyncio.sleep(0.1)
             await rig.pace(FACTOR)
             await rig.moved_by(20)
-            await rig.until(rig.in_step)
+            await rig.until(rig.synchronised)
             await rig.until(rig.in_mpc)
             assert not await rig.alarms()
             assert [event.subject for event in await rig.events(rig.control, EventKind.PACE)] == [2, 1]

@@ -216,7 +216,7 @@ def test_a_link_is_cut_for_a_while_and_the_rig_finds_back(coldloop: Coldloop, up
     assert outcome.out == f"the {link} link is cut for 6 s\n", outcome
     until(coldloop, up, "alarms", alarm)
     log, deadline = state_folder(int(up)) / "up.log", time.monotonic() + PATIENCE_S
-    while f"the {link} link is whole again" not in log.read_text():
+    while f"the {link} link is restored" not in log.read_text():
         assert time.monotonic() < deadline, log.read_text()
     until(coldloop, up, "mode", "mpc")
 
@@ -345,17 +345,17 @@ def test_a_control_plc_that_comes_back_before_its_rack_can_be_reached_keeps_its_
     until(coldloop, up, "mode", "mpc")
     session = shown(coldloop, up)["session"].partition(",")[0]
     log = state_folder(int(up)) / "up.log"
-    restarts, whole = (log.read_text().count(words) for words in ("started again", "link is whole again"))
+    restarts, whole = (log.read_text().count(words) for words in ("started again", "link is restored"))
     assert coldloop("fault", "--port-base", up, "cut", "plant", "15").code == 0
     assert coldloop("fault", "--port-base", up, "kill", "control_plc").code == 0
     deadline = time.monotonic() + PATIENCE_S
-    while log.read_text().count("started again") == restarts or log.read_text().count("link is whole again") == whole:
+    while log.read_text().count("started again") == restarts or log.read_text().count("link is restored") == whole:
         assert time.monotonic() < deadline, log.read_text()
     while coldloop("status", "--port-base", up).code:  # a busy machine starts it later still
         assert time.monotonic() < deadline, log.read_text()
     until(coldloop, up, "mode", "mpc")
     assert shown(coldloop, up)["session"].partition(",")[0] == session
-    assert "had no state to go on with" not in log.read_text()
+    assert "had no state to resume" not in log.read_text()
 
 
 def test_a_paused_session_goes_on_when_its_control_plc_was_started_again(coldloop: Coldloop, up: str) -> None:

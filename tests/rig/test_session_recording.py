@@ -3,7 +3,7 @@
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Status
 from coldloop.registers.safety import AlarmState
-from hmi.process_image import Told
+from hmi.process_image import JournalEntry
 from rig.cosim.session_recording import Lateness, state_of
 from rig.results.recorded import LinkStatistics
 from rig.results.recorded_alarms import alarms_after
@@ -28,8 +28,8 @@ def test_an_alarm_is_as_it_was_when_the_recording_begins() -> None:
         noted(1, EventKind.ALARM_SHELVED, 5), noted(2, raised, 5), noted(3, returned, 5), noted(4, raised, 5),
         noted(5, acknowledged, 5), noted(6, raised, 7), noted(7, returned, 7), noted(8, EventKind.ALARM_UNSHELVED, 5),
     ]  # fmt: skip
-    told = [Told.of("control_plc", event) for event in state_of(events)]
-    rows = alarms_after(told)
+    entry = [JournalEntry.of("control_plc", event) for event in state_of(events)]
+    rows = alarms_after(entry)
     assert (rows[5].state, rows[5].active, rows[5].raised) == (AlarmState.ACKNOWLEDGED, 1, 40)
     assert (rows[7].state, rows[7].active) == (AlarmState.RETURNED, 0)
 

@@ -169,7 +169,7 @@ async def test_a_service_that_was_frozen_runs_again_when_the_command_is_ended(ot
     [
         (("freeze", "plant", "0"), "not a number of seconds"), (("freeze", "plant", "inf"), "not a number of seconds"),
         (("freeze", "plant", "1e9"), "not a number of seconds"), (("kill", "everything"), "invalid choice"),
-        (("sensor", "T99", "dead"), "no output is called 'T99'"), (("sensor", "T5", "broken"), "a sensor shows"),
+        (("sensor", "T99", "dead"), "unknown output 'T99'"), (("sensor", "T5", "broken"), "a sensor shows"),
         (("sensor", "T5", "nan"), "finite number"), (("sensor", "T5"), "required"), ((), "required"),
     ],
 )  # fmt: skip

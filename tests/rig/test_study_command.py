@@ -54,9 +54,9 @@ def test_a_study_on_a_load_of_ones_own_leaves_table_figure_and_section(
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (("nonsense",), "no such study"),
+        (("nonsense",), "unknown study"),
         (("limited", "--load", "missing.csv"), "missing.csv"),
-        (("limited", "--seeds", "0"), "'0' is not a number from 1 on"),
+        (("limited", "--seeds", "0"), "'0' is not a whole number of at least 1"),
         (("limited", "--duration", "soon"), "'soon' is not a duration"),
         (("limited", "--duration", "5s"), "5 s are too short"),
         (("limited", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"), "give one of them"),

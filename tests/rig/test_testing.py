@@ -71,17 +71,17 @@ def test_a_refusal_has_its_exception_code(rig: LiveRig) -> None:
     ("act", "part"),
     [
         (lambda rig: rig.plant.read("measurement.y.T55"), "did you mean measurement.y.T5"),
-        (lambda rig: rig.plant.read_block("oven"), "no block 'oven'; there are identity"),
+        (lambda rig: rig.plant.read_block("oven"), "unknown block 'oven'; choose from identity"),
         (lambda rig: rig.plant.read("load table.watts", row=5000), "rows 0 to 2047"),
         (lambda rig: rig.control_plc.write_block("operator", speed=1), "no register 'speed'; it has mode"),
         (lambda rig: rig.control_plc.write("operator.mode", "manual"), "block 'operator' cannot hold mode='manual'"),
         (lambda rig: rig.control_plc.write("operator.mode", 70000), "cannot hold mode=70000"),
         (lambda rig: rig.advance(0.1), "multiple of 0.25"),
-        (lambda rig: rig.log("boiler"), "no service 'boiler'"),
+        (lambda rig: rig.log("boiler"), "unknown service 'boiler'"),
         (lambda rig: rig.fault("meteor").__enter__(), "fault 'meteor'"),
         (lambda rig: rig.fault("kill").__enter__(), "process: Field required"),
         (lambda rig: rig.fault("kill", process="plant", duration_s=3).__enter__(), "duration_s belongs to a plan"),
-        (lambda rig: rig.fault("sensor", output="T55", shows="nan").__enter__(), "no output 'T55'"),
+        (lambda rig: rig.fault("sensor", output="T55", shows="nan").__enter__(), "unknown output 'T55'"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(rig: LiveRig, act: "object", part: str) -> None:
@@ -109,10 +109,10 @@ def test_the_links_of_a_rig_in_real_time_can_be_disturbed_and_its_ports_closed_b
         def until(name: str, condition: Callable[[Any], bool]) -> None:
             rig.wait_until(lambda: condition(rig.control_plc.read(name)), within_s=900)
 
-        until("plant link.state", lambda state: state == PlantLinkState.IN_STEP)
+        until("plant link.state", lambda state: state == PlantLinkState.SYNCHRONISED)
         with rig.fault("freeze", link="plant"):
             until("plant link.state", lambda state: state == PlantLinkState.SEARCHING)
-        until("plant link.state", lambda state: state == PlantLinkState.IN_STEP)
+        until("plant link.state", lambda state: state == PlantLinkState.SYNCHRONISED)
         with rig.fault("sensor", output="T5", shows="nan"):
             until("ladder.bad_sensors", lambda sensors: sensors != 0)
         assert rig.log("plant").is_file()

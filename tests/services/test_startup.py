@@ -79,7 +79,7 @@ async def is_lost(client: RegisterClient) -> bool:
 
 async def is_in_step(client: RegisterClient) -> bool:
     """Tell whether the control PLC writes to its rack."""
-    return (await client.read(PlantLinkStatus)).state == PlantLinkState.IN_STEP
+    return (await client.read(PlantLinkStatus)).state == PlantLinkState.SYNCHRONISED
 
 
 def test_an_optimiser_refuses_a_control_plc_with_another_model(start: "Start", tmp_path: Path) -> None:

@@ -141,7 +141,7 @@ def test_the_command_prints_a_row_for_each_solver(coldloop: "Coldloop", monkeypa
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (("--certify", "0"), "'0' is not a number from 1 on"),
+        (("--certify", "0"), "'0' is not a whole number of at least 1"),
         (("--certify", "2", "--confidence", "100"), "'100' is not a percentage"),
         (("--certify", "2", "--tolerance", "much"), "'much' is not a percentage"),
         (("--certify", "2", "--power", "2"), "leave out --power and --updating-period"),

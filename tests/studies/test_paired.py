@@ -15,7 +15,7 @@ from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from optimizer_plc.computing_settings import QpoasesSettings
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem, Situation
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
 from optimizer_plc.solvers import make_solver
 from plant.load import find_load
@@ -50,12 +50,12 @@ def profiles(problem: PredictiveProblem) -> PlayedProfiles:
     return PlayedProfiles(problem)
 
 
-def situation(rng: np.random.Generator) -> Situation:
+def situation(rng: np.random.Generator) -> QpParameters:
     """Return a state some kPa, % and K away, and any load and input in reach."""
     model = load_model(DEFAULT_MODEL_FILE)
     scale = np.full(len(model.x0), 1.0)
     scale[0], scale[1] = 2000.0, 1.0 / model.C[0, 1]
-    return Situation(
+    return QpParameters(
         scale * rng.normal(size=len(scale)), float(rng.uniform(-150, 200)), rng.uniform([-8, -60, -8], [8, 60, 8])
     )
 
@@ -74,7 +74,7 @@ def test_each_knot_is_moved_to_within_the_rate_of_the_one_before(
     problem: PredictiveProblem, profiles: PlayedProfiles
 ) -> None:
     """Knots at 1, 2, 4, 8, 16, 50 and 100 periods; CV155 moves by 0.5 % a period, 0.05 when scaled by 10 %."""
-    qp = problem.at(Situation(np.zeros(28), 0.0, np.zeros(3)))
+    qp = problem.at(QpParameters(np.zeros(28), 0.0, np.zeros(3)))
     knots = np.zeros((7, 3))
     knots[:, 0] = [0.05, 0.30, 0.30, 0.05, 0.05, 2.0, 2.0]
     knots[:, 1] = [0.1, 0.5, 0.5, -5.0, -1.0, 0.0, 0.0]  # the heater moves by 10 W a period, 0.2 when scaled by 50 W
@@ -107,7 +107,7 @@ def test_what_keeps_its_rates_is_played_as_it_is(problem: PredictiveProblem, pro
 # -- the lowest cost --------------------------------------------------------------------------------------------------
 
 
-def lowest_by_daqp(problem: PredictiveProblem, qp: QuadraticProblem, where: Situation) -> float:
+def lowest_by_daqp(problem: PredictiveProblem, qp: QuadraticProblem, where: QpParameters) -> float:
     """Minimise the played cost as one quadratic problem: a slack for each output, side and sample, 421 variables."""
     n, samples = problem.n_inputs, problem.design.horizon
     Y, y0 = problem.stacked_outputs_z[:n].T, problem.outputs(np.zeros(49), where).ravel()

@@ -13,7 +13,7 @@ from optimizer_plc.qp.penalties import Preset
 from rig.results.indicators import Indicators
 from rig.studies.beyond.penalties import PenaltiesStudy, misfit
 from rig.studies.beyond.penalty_sums import Paired
-from rig.studies.beyond.penalty_variants import OWN, PRESETS, VARIANTS, Variant, paired, powers_of
+from rig.studies.beyond.penalty_variants import OWN, PRESETS, VARIANTS, PenaltyVariant, paired, powers_of
 from rig.studies.paper.best_periods import end_over_best, groups, share_inside
 from rig.studies.paper.open_loop import paired_loads
 from rig.studies.paper.updating_period import is_inside
@@ -42,7 +42,7 @@ def of(total: float, lowest: float, c1: float = 0.0) -> Outcome:
     return Outcome("", nothing._replace(J_dev=total / 4, J_cst=3 * total / 4, c1=c1), "", 0, columns, {})
 
 
-def found(totals: dict[tuple[Variant | None, float], float]) -> Paired:
+def found(totals: dict[tuple[PenaltyVariant | None, float], float]) -> Paired:
     """Give a quick study whose one draw has the lowest cost 10."""
     (load,) = paired_loads(QUICK)
     outcomes: dict[RunRequest, Outcome] = {}

@@ -22,8 +22,8 @@ from rig.report.scorecard import (
     FROM_POINTS,
     TOLERANCES,
     Claim,
-    Kind,
-    Verdict,
+    ClaimKind,
+    ClaimVerdict,
     as_json,
     claims,
     counted,
@@ -52,22 +52,22 @@ CLAIM = Claim(
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        ((1.0, 3.0), Verdict.REPRODUCED),
-        ((1.0, 4.0), Verdict.PARTLY),
-        ((9.0, 9.0), Verdict.PARTLY),
-        ((0.5, 4.5), Verdict.PARTLY),
-        ((9.1, 9.0), Verdict.NOT_REPRODUCED),
-        ((math.nan,), Verdict.NOT_REPRODUCED),
-        ((), Verdict.NOT_RUN),
-        ((math.inf,), Verdict.NOT_REPRODUCED),
+        ((1.0, 3.0), ClaimVerdict.REPRODUCED),
+        ((1.0, 4.0), ClaimVerdict.PARTLY),
+        ((9.0, 9.0), ClaimVerdict.PARTLY),
+        ((0.5, 4.5), ClaimVerdict.PARTLY),
+        ((9.1, 9.0), ClaimVerdict.NOT_REPRODUCED),
+        ((math.nan,), ClaimVerdict.NOT_REPRODUCED),
+        ((), ClaimVerdict.NOT_RUN),
+        ((math.inf,), ClaimVerdict.NOT_REPRODUCED),
     ],
 )
-def test_a_verdict_needs_all_draws(values: tuple[float, ...], expected: Verdict) -> None:
+def test_a_verdict_needs_all_draws(values: tuple[float, ...], expected: ClaimVerdict) -> None:
     assert verdict(CLAIM, values) is expected
 
 
 def test_without_data_in_the_paper_there_is_no_verdict() -> None:
-    assert verdict(CLAIM.model_copy(update={"reproduced": None}), (2.0,)) is Verdict.NO_DATA
+    assert verdict(CLAIM.model_copy(update={"reproduced": None}), (2.0,)) is ClaimVerdict.NO_DATA
 
 
 # -- the file and its history -----------------------------------------------------------------------------------------
@@ -135,7 +135,7 @@ def test_each_change_in_the_history_of_the_file_was_dated_when_it_was_made() -> 
             assert bad <= UNDATED_AIMS | BEFORE_DATES, (day, bad)
 
 
-UNDATED_AIMS = {claim.value for claim in claims() if claim.kind is Kind.AIM}
+UNDATED_AIMS = {claim.value for claim in claims() if claim.kind is ClaimKind.AIM}
 """They were aims from the start, and are called so by another key since."""
 BEFORE_DATES = {
     "tau_u 0 to 30 s after a load step over that in quiet, by time, Algorithm 1",
@@ -151,10 +151,10 @@ def test_a_date_without_a_reason_or_a_reason_without_a_date_is_refused(one: dict
 
 
 def test_what_cannot_fail_or_is_a_milder_form_does_not_count() -> None:
-    apart = {claim.value for claim in claims() if claim.kind in (Kind.CHECK, Kind.VARIANT)}
+    apart = {claim.value for claim in claims() if claim.kind in (ClaimKind.CHECK, ClaimKind.VARIANT)}
     assert {claim.value for claim in claims() if claim.study == "cholesky"} <= apart
     assert {"plc-2h: same trace, 5 s", "adaptive-2h: same trace, adaptive"} <= apart
-    milder = {claim.value for claim in claims() if claim.kind is Kind.VARIANT}
+    milder = {claim.value for claim in claims() if claim.kind is ClaimKind.VARIANT}
     assert milder == {
         "crossing in J_BF within 2 %", "interior optimum from 0.5 to 5 s, share of hours",
         "interior optimum from 1 to 5 s, share of hours, as printed",
@@ -163,14 +163,14 @@ def test_what_cannot_fail_or_is_a_milder_form_does_not_count() -> None:
     judged = judge({claim.value: [1.0] for claim in claims()})
     assert {j.claim.value for j in judged} - {j.claim.value for j in counted(judged)} == apart
     by_group = counts(judged)
-    assert sum(by_group["claims of the paper"].values()) == sum(claim.kind is Kind.CLAIM for claim in claims())
+    assert sum(by_group["claims of the paper"].values()) == sum(claim.kind is ClaimKind.CLAIM for claim in claims())
     assert sum(by_group["among them calibrated"].values()) == 3
 
 
 def test_where_a_value_can_be_too_good_the_tolerance_has_two_sides() -> None:
     one_sided = {
         claim.value for claim in claims()
-        if claim.kind is Kind.CLAIM and claim.reproduced and any(map(math.isinf, claim.reproduced))
+        if claim.kind is ClaimKind.CLAIM and claim.reproduced and any(map(math.isinf, claim.reproduced))
     }  # fmt: skip
     assert one_sided == {
         "unlimited: iterations", "qpOASES from P = 10 on, largest distance from converged",
@@ -236,7 +236,8 @@ def test_the_paper_itself_is_judged_by_the_same_ranges() -> None:
     failing = {
         claim.value
         for claim in claims()
-        if claim.of_paper == FROM_POINTS and verdict(claim, (paper_values()[claim.value],)) is not Verdict.REPRODUCED
+        if claim.of_paper == FROM_POINTS
+        and verdict(claim, (paper_values()[claim.value],)) is not ClaimVerdict.REPRODUCED
     }
     assert failing == {
         "qpOASES from P = 10 on, largest distance from converged",
@@ -289,7 +290,7 @@ def test_the_scorecard_is_plain_json_and_counts_every_verdict() -> None:
     total = sum(sum(by_group[group].values()) for group in ("claims of the paper", "aims of this project"))
     assert total == len(counted(judged)) < len(judged)
     text = json.dumps(as_json(judged), allow_nan=False)
-    assert json.loads(text)[0]["verdict"] in set(Verdict)
+    assert json.loads(text)[0]["verdict"] in set(ClaimVerdict)
 
 
 def test_the_page_holds_its_pictures_and_colours_its_verdicts(tmp_path: Path) -> None:

@@ -133,7 +133,7 @@ def changed(**fields: object) -> Callable[[Path], None]:
     [
         (one_gone, StudyError, r"1 of 12 runs are missing or damaged, of shards 2/2; do these with --shard"),
         (one_half_written, StudyError, r"1 of 12 runs are missing or damaged, of shards 2/2"),
-        (lambda part: record(part).unlink(), UsageError, r"no shard of study trade-off; name folders"),
+        (lambda part: record(part).unlink(), UsageError, r"no shard of study trade-off; name the --out folders"),
         (lambda part: record(part).write_text('{"study"'), UsageError, r"not the record of a shard"),
         (changed(programs="others"), UsageError, r"done by another version of Coldloop"),
         (changed(runs="others"), UsageError, r"of another configuration \(load files differ\)"),
@@ -142,7 +142,7 @@ def changed(**fields: object) -> Callable[[Path], None]:
             UsageError,
             r"of another configuration \(seeds 2 there, 1 here\); give all shards and the merge the same options",
         ),
-        (changed(shard=3, of=3), UsageError, r"one of 3 shards, while .* is one of 2; merge shards of one cut"),
+        (changed(shard=3, of=3), UsageError, r"one of 3 shards, while .* is one of 2; merge shards of one set"),
     ],
 )
 def test_what_cannot_be_merged_is_one_line(

@@ -30,7 +30,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def _scenarios(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 on")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
     return int(text)
 
 
@@ -61,7 +61,7 @@ def execute(options: argparse.Namespace) -> int:
         from rig.plc_sizing.certification_table import certification_table
 
         if options.power is not None or options.period is not None:
-            raise UsageError("--certify: is for the PLC that the configuration gives; leave out --power and "
+            raise UsageError("--certify: uses the configured PLC; leave out --power and "
                              "--updating-period")  # fmt: skip
         settings = configuration(options).settings
         sys.stdout.write(certification_table(settings, options.certify, options.tolerance, options.confidence))

@@ -19,7 +19,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--days", type=_days, default=365, help="days until they expire (default: 365)")
     parser.add_argument("--revoke", action="append", default=[], metavar="NAME",
                         help="revoke a certificate in the folder, such as operator; may be repeated")  # fmt: skip
-    parser.add_argument("--renew-list", action="store_true", help="make the list of revoked certificates anew")
+    parser.add_argument("--renew-list", action="store_true", help="renew the list of revoked certificates")
     parser.set_defaults(execute=execute)
 
 

@@ -15,7 +15,7 @@ from rig.durations import duration
 if TYPE_CHECKING:
     from coldloop.config import Configuration
     from rig.chaos.experiment import Experiment
-    from rig.chaos.plan import Plan
+    from rig.chaos.plan import ChaosPlan
     from rig.settings import Settings
 
 
@@ -24,7 +24,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add_configuration_options(parser)
     plan = parser.add_argument("plan", nargs="?", metavar="PLAN", help="a shipped plan (see --list) or a TOML file")
     plan.completer = lambda **_: plans()  # type: ignore[attr-defined]  # argcomplete looks for it
-    parser.add_argument("--list", action="store_true", help="name the plans that are shipped")
+    parser.add_argument("--list", action="store_true", help="list the shipped plans")
     parser.add_argument("--out", type=Path, help="folder for the results (default: chaos/<plan>-<time>)")
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     parser.add_argument("--seed", type=_seed, dest="plan_seed", help="instead of the plan's")
@@ -41,7 +41,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def _seed(text: str) -> int:
     if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 0 on")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 0")
     return int(text)
 
 
@@ -52,7 +52,7 @@ def execute(options: argparse.Namespace) -> int:
         return 0
     check_load(options.plan_load)
     if options.plan is None:
-        raise UsageError("which plan? `coldloop chaos --list` names those that are shipped")
+        raise UsageError("name a plan; `coldloop chaos --list` lists the shipped ones")
     from rig.chaos.experiment import perform
     from rig.chaos.plan import find_plan
     from rig.chaos.progress import ChaosProgress
@@ -97,7 +97,7 @@ def _refuse_what_has_no_effect(effective: "Configuration[Settings]") -> None:
     )
 
 
-def _report(out: Path, plan: "Plan", experiment: "Experiment") -> None:
+def _report(out: Path, plan: "ChaosPlan", experiment: "Experiment") -> None:
     from rig.chaos.report import as_text, summary_lines, table
 
     try:
@@ -120,7 +120,7 @@ def _changes(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
 
 
-def _write(out: Path, plan: "Plan", experiment: "Experiment") -> None:
+def _write(out: Path, plan: "ChaosPlan", experiment: "Experiment") -> None:
     from rig.chaos.figure import plot_chaos
     from rig.chaos.report import write_report
 

@@ -39,7 +39,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         help="only events of these kinds, such as alarm-raised,mode")  # fmt: skip
     parser.add_argument("--since", type=_since, default=Since(1, 0.0), metavar="NUMBER|TIME",
                         help="from this event on, or from this time (UTC, such as 2026-11-22T01:30)")  # fmt: skip
-    parser.add_argument("--follow", action="store_true", help="go on with new events until interrupted")
+    parser.add_argument("--follow", action="store_true", help="print new events until interrupted")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write a CSV file instead of lines")
     parser.add_argument("--force", action="store_true", help="overwrite that file")
     parser.set_defaults(execute=execute)
@@ -58,7 +58,7 @@ def _kinds(text: str) -> tuple[int, ...]:
     try:
         return tuple(known[name.strip().lower().replace("_", "-").replace(" ", "-")] for name in text.split(","))
     except KeyError as error:
-        raise argparse.ArgumentTypeError(f"no kind is called {error}; there are {', '.join(known)}") from None
+        raise argparse.ArgumentTypeError(f"unknown kind {error}; choose from {', '.join(known)}") from None
 
 
 def _since(text: str) -> Since:
@@ -100,7 +100,7 @@ async def _show(options: argparse.Namespace) -> None:
 
 
 def _place(options: argparse.Namespace) -> "Endpoint":
-    """Return where the service is whose journal is asked for."""
+    """Return the endpoint of the service whose journal is read."""
     settings = operator_settings(options)
     if options.endpoint is not None and (options.rig or options.port_base):
         raise UsageError("HOST:PORT, --rig and --port-base: give one of them")
@@ -127,9 +127,9 @@ async def _copy(reader: "JournalReader", options: argparse.Namespace, output: "_
 
 def _warnings(reader: "JournalReader", peer: str) -> Iterator[str]:
     if reader.limited:
-        yield f"no role of an operator at {peer}: only its last 256 events can be read"
+        yield f"no operator role at {peer}: only its last 256 events can be read"
     if reader.missed:
-        yield f"{reader.missed} events are not kept any more"
+        yield f"{reader.missed} events are no longer kept"
     if reader.restarted:
         yield f"{peer} was restarted, and numbers its events from 1 again: it retains no state"
 

@@ -24,22 +24,22 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add_configuration_options(parser)
     add_rig_options(parser)
     what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
-    kill = what.add_parser("kill", help="end a service at once, as by SIGKILL; `coldloop up` starts it again")
+    kill = what.add_parser("kill", help="kill a service (SIGKILL); `coldloop up` restarts it")
     kill.add_argument("service", choices=SERVICES, metavar="|".join(SERVICES))
     kill.set_defaults(fault=_kill)
-    freeze = what.add_parser("freeze", help="let a service stand still for a while")
+    freeze = what.add_parser("freeze", help="suspend a service for a while")
     freeze.add_argument("service", choices=SERVICES, metavar="|".join(SERVICES))
-    freeze.add_argument("seconds", type=_seconds, help="how long, by the clock")
+    freeze.add_argument("seconds", type=_seconds, help="duration in real time")
     freeze.set_defaults(fault=_freeze)
-    cut = what.add_parser("cut", help="let nothing pass a link for a while; the rig was started with `up --cuttable`")
+    cut = what.add_parser("cut", help="cut a link for a while; needs a rig started with `up --cuttable`")
     cut.add_argument("link", choices=LINKS, metavar="|".join(LINKS), help="control PLC to plant, or optimiser to it")
-    cut.add_argument("seconds", type=_seconds, help="how long, by the clock")
+    cut.add_argument("seconds", type=_seconds, help="duration in real time")
     cut.set_defaults(fault=_cut)
-    sensor = what.add_parser("sensor", help="what a sensor shows: nothing, always the same, or a value")
+    sensor = what.add_parser("sensor", help="make a sensor fail: not a number, frozen, or a given value")
     sensor.add_argument("output", metavar="OUTPUT", help="such as T5")
     sensor.add_argument("shows", metavar="dead|stuck|VALUE|none", help="none ends the fault")
     sensor.set_defaults(fault=_sensor)
-    for subcommand in what.choices.values():  # options are taken before and behind what is to be done
+    for subcommand in what.choices.values():  # options are accepted before and after the subcommand
         add_configuration_options(subcommand, again=True)
         add_rig_options(subcommand, again=True)
     parser.set_defaults(execute=execute)
@@ -59,7 +59,7 @@ def execute(options: argparse.Namespace) -> int:
     """Do it, and say what was done."""
     from rig.until_interrupted import run_until_interrupted
 
-    operator_settings(options)  # a configuration that cannot be read is told, whether the fault needs it or not
+    operator_settings(options)  # report an unreadable configuration even if the fault does not need it
     return 130 if run_until_interrupted(lambda: options.fault(options)) else 0
 
 
@@ -67,15 +67,15 @@ async def _kill(options: argparse.Namespace) -> None:
     from rig.live.process_faults import kill, process_of
 
     kill(process_of(first_port_here(options), options.service))
-    sys.stdout.write(f"killed the {options.service} service; `coldloop up` starts it again\n")
+    sys.stdout.write(f"killed the {options.service} service; `coldloop up` restarts it\n")
 
 
 async def _freeze(options: argparse.Namespace) -> None:
     from rig.live.process_faults import freeze, process_of
 
     process = process_of(first_port_here(options), options.service)
-    with suppress(BrokenPipeError):  # nobody listens: it is done all the same
-        sys.stdout.write(f"the {options.service} service stands still for {options.seconds:g} s (Ctrl-C ends it)\n")
+    with suppress(BrokenPipeError):  # no reader: the fault is injected all the same
+        sys.stdout.write(f"the {options.service} service is suspended for {options.seconds:g} s (Ctrl-C resumes it)\n")
         sys.stdout.flush()
     runs = await freeze(process, options.seconds)
     sys.stdout.write(f"the {options.service} service {'runs again' if runs else 'has ended meanwhile'}\n")
@@ -95,7 +95,7 @@ async def _sensor(options: argparse.Namespace) -> None:
     from rig.live.operator_request import ask
 
     if options.output not in OUTPUT_NAMES:
-        raise UsageError(f"no output is called '{options.output}'; there are {', '.join(OUTPUT_NAMES)}")
+        raise UsageError(f"unknown output '{options.output}'; choose from {', '.join(OUTPUT_NAMES)}")
     command = read_command({"kind": "sensor_fault", "output": options.output, **_shown(options.shows)})
     services, work = WORK[type(command)]
     rig = rig_endpoints(options, operator_settings(options))

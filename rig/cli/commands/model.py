@@ -16,7 +16,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Solve, linearise, print; write the model file when there is --out; refuse a configured model that is none."""
+    """Solve, linearise, print; write the model file when there is --out; reject an invalid configured model."""
     from coldloop.errors import UsageError
     from coldloop.process.lti_model import load
     from rig.cli.model_listing import describe_model

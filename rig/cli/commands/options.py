@@ -94,7 +94,7 @@ def add_rig_options(parser: argparse.ArgumentParser, *, again: bool = False) -> 
     parser.add_argument("--port-base", type=port_base, default=default, metavar="PORT",
                         help="first of its three ports in a row here, where several rigs are up")  # fmt: skip
     parser.add_argument("--tls", type=Path, default=default, metavar="FOLDER",
-                        help="folder with the operator's certificate; a rig that is up here tells its own")  # fmt: skip
+                        help="folder with the operator's certificate; known for a rig started here")  # fmt: skip
 
 
 def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Settings") -> "RigEndpoints":
@@ -138,7 +138,7 @@ def first_port_here(options: argparse.Namespace) -> int | None:
         return None if options.port_base is None else int(options.port_base)
     plant: HostPort = options.rig[0]
     if plant.host not in LOOPBACK:
-        raise UsageError(f"--rig {plant.host}:{plant.port}: processes are ended and stopped on their own machine only")
+        raise UsageError(f"--rig {plant.host}:{plant.port}: kill and suspend services on their own machine only")
     return plant.port
 
 
@@ -191,7 +191,7 @@ def operator_settings(options: argparse.Namespace) -> "OperatorSettings":
     )
     for key, source in effective.sources.items():
         if source.startswith("--set") and not (key.startswith(("limits", "rig")) or key.endswith(".word_order")):
-            raise UsageError(f"{source}: has no effect on this command, which asks a rig that has its own; drop it")
+            raise UsageError(f"{source}: has no effect on this command: the rig has its own; drop it")
     return effective.settings
 
 
@@ -211,7 +211,7 @@ def refuse_ineffective(effective: "Configuration[Settings]", keys: Mapping[str, 
             raise UsageError(f"{source}: has no effect on this command: {remedy}")
 
 
-OWN_PORTS = "services that it starts get ports of their own; `coldloop up --port-base` has fixed ones"
+OWN_PORTS = "its services get free ports; `coldloop up --port-base` has fixed ones"
 PLACES = (
     "plant.server.port", "plant.server.host", "control_plc.server.port", "control_plc.server.host",
     "optimizer_plc.server.port", "optimizer_plc.server.host", "control_plc.plant.port", "control_plc.plant.host",

@@ -1,4 +1,4 @@
-"""`coldloop record`: a session that is under way, recorded from now on by somebody who only looks.
+"""`coldloop record`: records a session under way from now on, without changing it.
 
 It leaves the folder that a run leaves; `coldloop page FOLDER` replays it.
 """

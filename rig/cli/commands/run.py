@@ -26,7 +26,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
     parser.add_argument("--mode", choices=MODES, help="default: lockstep")
-    parser.add_argument("--factor", type=float, help="in real time: seconds of plant time in a second (default: 1)")
+    parser.add_argument("--factor", type=float, help="real time only: seconds of plant time per second (default: 1)")
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--in-process", action="store_true", help="one process and direct calls instead of Modbus/TCP")
     way.add_argument("--attach", nargs=3, type=endpoint, metavar="HOST:PORT",

@@ -41,7 +41,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     setpoint.set_defaults(
         document=lambda options: {"kind": "setpoint", "input": INPUTS[options.input], "value": options.value}
     )
-    factor = what.add_parser("factor", help="seconds of plant time in a second; also changes over to real time")
+    factor = what.add_parser("factor", help="seconds of plant time per second; also switches to real time")
     factor.add_argument("factor", type=float)
     factor.set_defaults(document=lambda options: {"kind": "factor", "factor": options.factor})
     pause = what.add_parser("pause", help="pause plant time")
@@ -51,7 +51,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     acknowledge = what.add_parser("acknowledge", help="an alarm, or all")
     acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as t5-band (default: all)")
     acknowledge.set_defaults(document=_acknowledgement)
-    for subcommand in what.choices.values():  # options are taken before and behind what is to be done
+    for subcommand in what.choices.values():  # options are accepted before and after the subcommand
         add_configuration_options(subcommand, again=True)
         add_rig_options(subcommand, again=True)
     parser.set_defaults(execute=execute)
@@ -68,7 +68,7 @@ def _seconds(text: str) -> float:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Do it, and say what came back."""
+    """Send the command, and print the result."""
     from rig.until_interrupted import run_until_interrupted
 
     return 130 if run_until_interrupted(lambda: _do(options)) else 0
@@ -111,7 +111,7 @@ def _stream(options: argparse.Namespace) -> tuple[tuple[str, ...], "Work"]:
 
 
 def _is_stream(options: argparse.Namespace) -> bool:
-    """Tell whether a load file is to be written, of any length: it takes as long as it takes."""
+    """Return whether a load file is written: that has no time limit."""
     if options.document is not _load:
         return False
     try:
@@ -134,12 +134,12 @@ def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
 
     kinds = {kind.name.lower().replace("_", "-"): int(kind) for kind in AlarmKind}
     if options.alarm is not None and options.alarm not in kinds:
-        raise UsageError(f"no alarm is called '{options.alarm}'; there are {', '.join(kinds)}")
+        raise UsageError(f"unknown alarm '{options.alarm}'; choose from {', '.join(kinds)}")
     alarm = ALL_ALARMS if options.alarm is None else kinds[options.alarm]
     return {"kind": "alarm", "alarm": alarm, "action": int(AlarmAction.ACKNOWLEDGE)}
 
 
 def _say(text: str) -> None:
-    with suppress(BrokenPipeError):  # nobody listens: it is done all the same
+    with suppress(BrokenPipeError):  # no reader: the command has been carried out all the same
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()

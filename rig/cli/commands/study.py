@@ -23,14 +23,14 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     name = parser.add_argument("name", nargs="?", metavar="NAME", help="see --list")
     name.completer = lambda **_: STUDIES  # type: ignore[attr-defined]  # argcomplete looks for it
-    parser.add_argument("--list", action="store_true", help="name the studies")
+    parser.add_argument("--list", action="store_true", help="list the studies")
     parser.add_argument("--duration", type=duration, help="plant time of each run (default: that of its load)")
     parser.add_argument("--load", nargs="+", metavar="LOAD", default=[],
                         help="named loads or CSV files time_s,load_w")  # fmt: skip
     parts = parser.add_mutually_exclusive_group()
-    parts.add_argument("--shard", metavar="I/N", help="do every N-th run only, from the I-th on, and no evaluation")
+    parts.add_argument("--shard", metavar="I/N", help="do every N-th run only, from the I-th on, without evaluation")
     parts.add_argument("--merge", type=Path, nargs="+", metavar="FOLDER",
-                       help="gather the runs of all shards from the --out folders they were done with, and evaluate"
+                       help="collect the runs of all shards from their --out folders, and evaluate"
                        )  # fmt: skip
     add_scale_options(parser)
     parser.set_defaults(execute=execute)
@@ -44,13 +44,13 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
                        )  # fmt: skip
     scale.add_argument("--quick", action="store_true", help="one seed, ten minutes, fewer points")
     parser.add_argument("--workers", type=_positive, metavar="N", help="processes to use (default: one a core)")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler that is up, such as tcp://host:8786")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="a running Dask scheduler, such as tcp://host:8786")
     parser.add_argument("--out", type=Path, default=Path("studies"), help="folder for all results (default: studies)")
 
 
 def _positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 on")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
     return int(text)
 
 
@@ -63,7 +63,7 @@ def workers(options: argparse.Namespace) -> "Workers":
     from rig.studies.execution import Workers
 
     if options.scheduler and options.workers:
-        raise UsageError("--workers is for a local cluster and --scheduler for one that is up: give one of them")
+        raise UsageError("--workers starts a local cluster, --scheduler uses a running one: give one of them")
     return Workers(options.workers or os.cpu_count() or 1, options.scheduler)
 
 
@@ -78,7 +78,7 @@ def study_options(options: argparse.Namespace) -> "StudyOptions":
 def execute(options: argparse.Namespace) -> int:
     """Do a study, or list them."""
     if options.name is not None and options.name not in STUDIES:
-        raise UsageError(f"study {options.name}: there is no such study; `coldloop study --list` names them")
+        raise UsageError(f"study {options.name}: unknown study; `coldloop study --list` lists them")
     for name in options.load:
         check_load(name)
     from rig.studies import APART

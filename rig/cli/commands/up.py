@@ -11,7 +11,7 @@ from rig.cli.commands.options import PLACES, check_load, port_base, refuse_ineff
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument("--factor", type=float, help="seconds of plant time in a second (default: 1)")
+    parser.add_argument("--factor", type=float, help="seconds of plant time per second (default: 1)")
     load = parser.add_argument(
         "--load", help=f"{', '.join(LOADS)}, or a CSV file time_s,load_w; its end is held (default: 2h)"
     )
@@ -24,13 +24,13 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tls", type=Path, metavar="FOLDER",
                         help="Modbus/TCP Security with what `coldloop certificates --out FOLDER` made")  # fmt: skip
     parser.add_argument("--port-base", type=port_base, metavar="PORT",
-                        help="first of three ports in a row (default: 5020)")  # fmt: skip
+                        help="first of three consecutive ports (default: 5020)")  # fmt: skip
     parser.add_argument("--page", action="store_true", help="serve the operator's page, too")
     parser.add_argument("--page-port", type=int, metavar="PORT", help="its port (default: 8020); implies --page")
     parser.add_argument("--cuttable", action="store_true",
-                        help="have a proxy in each link, for `coldloop fault cut`")  # fmt: skip
+                        help="put a proxy into each link, for `coldloop fault cut`")  # fmt: skip
     parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")
-    parser.add_argument("--quiet", action="store_true", help="do not say where everything is")
+    parser.add_argument("--quiet", action="store_true", help="do not print addresses and commands")
     parser.add_argument("--locked", type=int, help=argparse.SUPPRESS)  # what --detach has locked for this process
     parser.set_defaults(execute=execute, mode="realtime")
 

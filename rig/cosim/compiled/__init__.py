@@ -1,1 +1,1 @@
-"""The one-process rig's ordinary ticks as compiled loops; whatever is unusual is left to the programs."""
+"""The one-process rig's ordinary ticks as compiled loops; all other ticks are left to the programs."""

@@ -17,14 +17,14 @@ LONGEST_SILENCE = 22
 
 
 def is_ordinary(program: ControlProgram) -> bool:
-    """Tell whether the next tick is an ordinary one, as far as the control PLC is concerned."""
+    """Return whether the next tick is an ordinary one, as far as the control PLC is concerned."""
     return (
         program.mode is Mode.MPC
         and program.operator.mode == OperatorMode.AUTO
         and program.optimizer_present
         and program.player.is_ordinary(program.tick)
         and not program.sensors.bad
-        and not program.guard.state.astray
+        and not program.guard.state.out_of_bounds
         and program.alarms.are_quiet
         and not program.watchdog.expired
         and (not program.watchdog.time or program.watchdog.time > LONGEST_SILENCE)
@@ -53,7 +53,7 @@ def scan_record(program: ControlProgram) -> Any:  # noqa: ANN401 a record
     )  # fmt: skip
     s["triggered"], s["lowest"] = program.watchdog.triggered, program.watchdog.lowest
     s["level_since"], s["t5_since"] = (NOT if since is None else since for since in program.alarms.pending(*BANDS))
-    s["stands"], s["seen"] = program.sensors.stands, program.sensors.before
+    s["unchanged"], s["seen"] = program.sensors.unchanged, program.sensors.before
     return scans
 
 
@@ -67,8 +67,8 @@ def guard_records(state: GuardState) -> Any:  # noqa: ANN401 records
     return guards
 
 
-def give_back_guard(program: ControlProgram, g: Any) -> None:  # noqa: ANN401 a record
-    """Let the guard go on from a record."""
+def restore_guard(program: ControlProgram, g: Any) -> None:  # noqa: ANN401 a record
+    """Restore the guard from a record."""
     state, slots = program.guard.state, len(program.guard.state.moves)
     state.applied[:], state.anchor[:] = g["applied"].tolist(), g["anchor"].tolist()
     state.moves[:], state.before[:] = g["moves"][:slots].tolist(), g["before"][:slots].tolist()
@@ -77,14 +77,14 @@ def give_back_guard(program: ControlProgram, g: Any) -> None:  # noqa: ANN401 a 
     program.guard.applied = SequenceRow(*state.applied)
 
 
-def give_back_scan(program: ControlProgram, s: Any, trace: Trace) -> None:  # noqa: ANN401 a record
-    """Let sensors, alarms, watchdog and process go on after the ticks of a record, of which there are some."""
+def restore_scan(program: ControlProgram, s: Any, trace: Trace) -> None:  # noqa: ANN401 a record
+    """Restore sensors, alarms, watchdog and process after the ticks of a record (at least one)."""
     last = int(s["tick"]) - 1
     row = last - int(s["first"])
     y = tuple(trace.y[row].tolist())
     program.tick, program.alarms.now = last + 1, last
     program.process = Process(last, float(trace.load[row]), tuple(trace.u[row].tolist()), y)
-    program.sensors.stands[:] = s["stands"].tolist()
+    program.sensors.unchanged[:] = s["unchanged"].tolist()
     program.sensors.seen(last, y)
     program.watchdog.triggered, program.watchdog.lowest = int(s["triggered"]), int(s["lowest"])
     for kind, since in zip(BANDS, (int(s["level_since"]), int(s["t5_since"])), strict=True):

@@ -13,10 +13,10 @@ import rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is pl
 from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import L1, T5
 from control_plc.output_limits import admit, admits, copy_state, in_range
-from control_plc.sensors import CONTROLLED, are_inside, watch_standing
+from control_plc.sensors import CONTROLLED, are_inside, count_unchanged
 from optimizer_plc import scheme
 from optimizer_plc.scheme import BY_THE_RULE
-from optimizer_plc.session_state import Memory
+from optimizer_plc.session_state import OptimizerState
 from rig.cosim.compiled.plants import advance_plant
 from rig.cosim.compiled.records import NOT, Alarms, Array, Optimizer, PlantState, Reports, Trace, World
 
@@ -28,7 +28,7 @@ UPDATE: Final = 2
 
 @kernel
 def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> bool:  # noqa: ANN401 a record
-    """Write load, outputs and state of the present tick into the trace; tell whether the tick is an ordinary one."""
+    """Write load, outputs and state of the present tick into the trace; return whether the tick is an ordinary one."""
     row = s.tick - s.first
     while s.load_index + 1 < w.load_ticks.shape[0] and w.load_ticks[s.load_index + 1] <= s.tick:
         s.load_index += 1
@@ -41,8 +41,8 @@ def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> b
     interrupted = s.load_step > 0.0 and abs(load - s.update_load) > s.load_step
     frozen = False
     for place in range(len(CONTROLLED)):
-        stands = y[CONTROLLED[place]] == s.seen[CONTROLLED[place]]
-        frozen = frozen or (stands and s.stands[place] + 1 >= w.frozen_ticks)
+        unchanged = y[CONTROLLED[place]] == s.seen[CONTROLLED[place]]
+        frozen = frozen or (unchanged and s.unchanged[place] + 1 >= w.frozen_ticks)
     changes = is_due(alarms.level_band, alarms.level_active, alarms.level_delay, s.level_since, s.tick, y[L1])
     changes = changes or is_due(alarms.t5_band, alarms.t5_active, alarms.t5_delay, s.t5_since, s.tick, y[T5])
     return known and not (interrupted or frozen or changes) and are_inside(y, w.low, w.high)
@@ -50,7 +50,7 @@ def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> b
 
 @kernel
 def is_due(band: tuple[float, float], active: bool, delay: int, since: int, tick: int, value: float) -> bool:  # noqa: FBT001
-    """Tell whether a band alarm follows its condition at this tick, `delay` ticks after it has changed."""
+    """Return whether a band alarm follows its condition at this tick, `delay` ticks after it has changed."""
     if (not band[0] <= value <= band[1]) == active:
         return False
     return tick - (tick if since == NOT else since) >= delay
@@ -78,7 +78,7 @@ def scan(
         for i in range(plant.y.shape[0]):
             plant.y[i] = plant.y[i] + w.biases[i] + w.deviations[i] * plant.noise[row, i]
     y = trace.y[row]
-    watch_standing(s.stands, s.seen, y, 1)
+    count_unchanged(s.unchanged, s.seen, y, 1)
     s.level_since = pending(alarms.level_band, alarms.level_active, s.level_since, tick, y[L1])
     s.t5_since = pending(alarms.t5_band, alarms.t5_active, s.t5_since, tick, y[T5])
     s.tick = tick + 1
@@ -100,7 +100,7 @@ def play(
 
 
 @kernel
-def go_on(
+def run_block(
     w: World,
     alarms: Alarms,
     o: Optimizer,
@@ -149,7 +149,7 @@ def go_on(
 def answer(
     w: World, o: Optimizer, s: Any, guard: Any, twin: Any, rows: Array, reports: Reports  # noqa: ANN401
 ) -> bool:  # fmt: skip
-    """Solve the problem of the update under way; tell whether the control PLC would accept the sequence."""
+    """Solve the problem of the update under way; return whether the control PLC would accept the sequence."""
     m = o.memory
     scheme.solve(o.constants, o.method, m)
     offered, length = rows[1], m.sent.numbers[0].length
@@ -169,7 +169,7 @@ def answer(
 
 
 @kernel
-def begin_sequence(s: Any, rows: Array, m: Memory) -> None:  # noqa: ANN401
+def begin_sequence(s: Any, rows: Array, m: OptimizerState) -> None:  # noqa: ANN401
     """Let the answer be what is played."""
     scheme.begin_sent(m)
     playing = m.playing.numbers[0]
@@ -197,7 +197,7 @@ def latch(
 
 
 @kernel
-def measured(values: Array, m: Memory) -> Array:
+def measured(values: Array, m: OptimizerState) -> Array:
     """Return values in the optimiser's floating-point type."""
     result = np.empty(values.shape[0], m.u.dtype)
     for i in range(values.shape[0]):
@@ -213,7 +213,7 @@ def trigger(w: World, s: Any, tick: int) -> None:  # noqa: ANN401
 
 
 @kernel
-def report(s: Any, m: Memory, reports: Reports) -> None:  # noqa: ANN401
+def report(s: Any, m: OptimizerState, reports: Reports) -> None:  # noqa: ANN401
     """Write what was done with the update under way."""
     now, sent = m.numbers[0], m.sent.numbers[0]
     counts, values = reports.counts[s.solved], reports.values[s.solved]

@@ -1,4 +1,4 @@
-"""When the optimiser's updates go through the compiled loop, and what it did in there."""
+"""Decides which updates run in the compiled loop, and takes over their results."""
 
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
@@ -8,14 +8,14 @@ from rig.cosim.compiled.records import Optimizer, Reports
 
 
 def is_compiled(program: OptimizerProgram) -> bool:
-    """Tell whether the program's updates have a compiled form: those of a solver of our own."""
+    """Return whether the program's updates have a compiled form: those of a solver of our own."""
     if type(program) is not OptimizerProgram:  # who has made another kind of it wants to be asked
         return False
     return isinstance(program.solver, KernelSolver)
 
 
 def is_ordinary(program: OptimizerProgram) -> bool:
-    """Tell whether the update under way is one of many: what is played began at its instant."""
+    """Return whether the update under way is one of many: what is played began at its instant."""
     now, playing = program.state.numbers[0], program.state.playing.numbers[0]
     return bool(now["planned"] and playing["length"] and playing["first_tick"] == now["tick"])
 

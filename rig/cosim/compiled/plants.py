@@ -1,6 +1,6 @@
 """The plants in the compiled loop: the tick of each, and what their programs hand over before and after.
 
-Each plant has constants and a state of types of its own, and numba makes a loop for each.
+Each plant has its own types of constants and state, and numba makes a loop for each.
 """
 
 from typing import Any
@@ -93,8 +93,8 @@ def state_of(program: PlantProgram, noise: Array, ticks: int) -> PlantState:
     return BoxState(x, y, np.empty(0), noise, slope, held)
 
 
-def give_back(program: PlantProgram, state: PlantState, tick: int, u: Array) -> None:
-    """Let the program go on at `tick`, to which the inputs `u` were held."""
+def restore(program: PlantProgram, state: PlantState, tick: int, u: Array) -> None:
+    """Resume the program at `tick`, up to which the inputs `u` were held."""
     if isinstance(state, BoxState):
         program.take_over(tick, state.x, state.slope, state.held, state.y)
     elif isinstance(program, RefrigeratorProgram):

@@ -23,7 +23,7 @@ PORTABLE: Final[tuple[Callable[..., Any], ...]] = (
     output_limits.rate_share,
     sensors.are_inside,
     sensors.moved,
-    sensors.watch_standing,
+    sensors.count_unchanged,
 )
 
 for function in PORTABLE:

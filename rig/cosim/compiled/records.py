@@ -10,7 +10,7 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS
 from control_plc.output_limits import Limits
 from optimizer_plc.rules import UpdatingRule
 from optimizer_plc.scheme import Constants
-from optimizer_plc.session_state import Memory
+from optimizer_plc.session_state import OptimizerState
 from plant.cold_box.physics import ColdBox
 from plant.helium.properties import Helium
 from plant.refrigerator.physics import Refrigerator
@@ -27,7 +27,7 @@ NOT: Final = -1
 GUARD: Final = np.dtype([
     ("applied", "f8", 3), ("anchor", "f8", 3),
     ("moves", "i8", TICKS_PER_SAMPLE), ("before", "f8", (TICKS_PER_SAMPLE, 3)),
-    ("start", "i8"), ("share", "f8"), ("moved", "i8"), ("changes", "i8"), ("astray", "?"),
+    ("start", "i8"), ("share", "f8"), ("moved", "i8"), ("changes", "i8"), ("out_of_bounds", "?"),
 ])  # fmt: skip
 """`control_plc.output_limits.GuardState`."""
 
@@ -35,7 +35,7 @@ SCAN: Final = np.dtype([
     ("first", "i8"), ("tick", "i8"), ("next_update", "i8"), ("updates", "i8"), ("update_tick", "i8"),
     ("update_load", "f8"), ("load_step", "f8"), ("u_before", "f8", 3), ("number", "i8"), ("first_tick", "i8"),
     ("length", "i8"), ("tau_u", "i8"), ("accepted", "i8"), ("triggered", "i8"), ("lowest", "i8"),
-    ("level_since", "i8"), ("t5_since", "i8"), ("stands", "i8", 2), ("seen", "f8", len(OUTPUT_NAMES)),
+    ("level_since", "i8"), ("t5_since", "i8"), ("unchanged", "i8", 2), ("seen", "f8", len(OUTPUT_NAMES)),
     ("load_index", "i8"), ("solved", "i8"),
 ])  # fmt: skip
 """The control PLC and the load.
@@ -43,8 +43,8 @@ SCAN: Final = np.dtype([
 first: tick of the trace's first row. tick: the next scan. next_update, updates: tick and number of the next update.
 update_tick, update_load, u_before: the one under way, and what was applied before it. load_step: change of the load (W)
 that interrupts it, or 0. number, first_tick, length, tau_u: the sequence being played. accepted: sequences accepted.
-triggered, lowest: the optimiser's watchdog. level_since, t5_since: since when a band alarm is about to change. stands,
-seen: of the sensor check. load_index: step of the load that holds. solved: reports made."""
+triggered, lowest: the optimiser's watchdog. level_since, t5_since: since when a band alarm is about to change.
+unchanged, seen: of the sensor check. load_index: step of the load that holds. solved: reports made."""
 
 
 class BoxConstants(NamedTuple):
@@ -112,7 +112,7 @@ class World(NamedTuple):
     load_watts: Array
     limits: Limits
     low: Array
-    """Lowest value that a sensor can tell, shape (22,)."""
+    """Lowest value in the range of a sensor, shape (22,)."""
     high: Array
     frozen_ticks: int
     largest_load: float
@@ -129,7 +129,7 @@ class Optimizer(NamedTuple):
     method: Any
     """Of a solver of our own."""
     rule: UpdatingRule
-    memory: Memory
+    memory: OptimizerState
     """Its state, which is overwritten."""
 
 

@@ -18,14 +18,14 @@ SHORTEST: Final = 6
 
 
 class Stretch(NamedTuple):
-    """What was done without the programs."""
+    """Results of the ticks run in the compiled loop."""
 
     block: SampleBlock
     updates: list[Optimization]
 
 
 class CompiledStretches:
-    """Runs the programs of one session ahead as long as nothing unusual happens.
+    """Runs the programs of one session ahead while nothing unusual happens.
 
     Args:
         plant: Of either kind.
@@ -61,7 +61,7 @@ class CompiledStretches:
         with self._plant.noise(ticks) as noise:
             plant = plants.state_of(self._plant, noise, ticks)
             stretch = self._updates_too(plant, until) if whole else self._ticks_alone(plant, until)
-        if stretch is None:  # the programs go on alone to the next updating instant
+        if stretch is None:  # the programs run alone to the next updating instant
             self._pause_until = self._control.player.next_update_tick
         return stretch
 
@@ -84,7 +84,7 @@ class CompiledStretches:
             raise RuntimeError("an ordinary update plays a sequence")
         scans, guards = control.scan_record(program), control.guard_records(program.guard.state)
         rows = control.sequence_rows(playing)
-        loops.go_on(
+        loops.run_block(
             self._world, control.alarms_of(program), optimizer.parts_of(optimizer_plc), scans, guards, rows, plant,
             self._trace, self._reports, until,
         )  # fmt: skip
@@ -99,10 +99,10 @@ class CompiledStretches:
         return Stretch(block, optimizer.optimizations(self._reports, solved))
 
     def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:
-        """Let plant and control PLC go on from what the loop has left; return the ticks it has done."""
-        plants.give_back(self._plant, plant, int(s["tick"]), guard["applied"])
-        control.give_back_guard(self._control, guard)
-        control.give_back_scan(self._control, s, self._trace)
+        """Hand the state of the loop back to plant and control PLC; return the ticks it has run."""
+        plants.restore(self._plant, plant, int(s["tick"]), guard["applied"])
+        control.restore_guard(self._control, guard)
+        control.restore_scan(self._control, s, self._trace)
         ticks = int(s["tick"]) - int(s["first"])
         load, u, y, x, station = (part[:ticks].copy() for part in self._trace)
         return SampleBlock(int(s["first"]), load, u, y, x, station if station.size else NO_STATION)

@@ -14,26 +14,26 @@ from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
 EVENTS: Final = "plant.refrigerator.events="
 
 
-class Event(NamedTuple):
+class DisturbanceCase(NamedTuple):
     """What happens, under which load."""
 
     load: str
     assignments: tuple[str, ...]
 
 
-HAPPENINGS: Final = {
-    "nothing": Event("a", ()),
-    "a compressor trips for 2 min": Event(
+CASES: Final = {
+    "nothing": DisturbanceCase("a", ()),
+    "a compressor trips for 2 min": DisturbanceCase(
         "a", (f"{EVENTS}[{{at_s=600,target='nc1',value=0}},{{at_s=720,target='nc1',value=1}}]",)
     ),
-    "no nitrogen for 45 min": Event(
+    "no nitrogen for 45 min": DisturbanceCase(
         "a", (f"{EVENTS}[{{at_s=300,target='nitrogen',value=0}},{{at_s=3000,target='nitrogen',value=1}}]",)
     ),
-    "a leak for 20 min": Event(
+    "a leak for 20 min": DisturbanceCase(
         "a", (f"{EVENTS}[{{at_s=600,target='leak',value=1}},{{at_s=1800,target='leak',value=0}}]",)
     ),
-    "10 K warmer outside": Event("a", (f"{EVENTS}[{{at_s=600,target='ambient',value=310}}]",)),
-    "a train of pulses": Event("pulses", ()),
+    "10 K warmer outside": DisturbanceCase("a", (f"{EVENTS}[{{at_s=600,target='ambient',value=310}}]",)),
+    "a train of pulses": DisturbanceCase("pulses", ()),
 }
 DRIVERS: Final = {"MPC": (), "classical loops": ("control_plc.driver=classical",)}
 STATION: Final = {"LQ": (), "PI": ("plant.station.control=pi",)}
@@ -51,17 +51,17 @@ class DisturbancesStudy:
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
         """Return every event with every pair of controllers."""
-        return [run for event in HAPPENINGS.values() for load in _loads(event, options) for run in _runs(event, load)]
+        return [run for event in CASES.values() for load in _loads(event, options) for run in _runs(event, load)]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-        """Tell bands, pressures, modes and alarms of each run."""
+        """Tabulate bands, pressures, modes and alarms of each run."""
         result = StudyResult(COLUMNS, [], {})
         lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
-        for name, event in HAPPENINGS.items():
+        for name, event in CASES.items():
             for load in _loads(event, options):
                 runs = [outcomes[request] for request in _runs(event, load)]
                 for (driver, station), run in zip(_pairs(), runs, strict=True):
-                    row = (f"{name} ({load.name})", driver, station, *_told(run))
+                    row = (f"{name} ({load.name})", driver, station, *_measures(run))
                     result.rows.append(row)
                     lines.append("| " + " | ".join(f"{c:.4g}" if isinstance(c, float) else str(c) for c in row) + " |")
                 if load.draw == 1:
@@ -75,11 +75,11 @@ def _pairs() -> list[tuple[str, str]]:
     return [(driver, station) for driver in DRIVERS for station in STATION]
 
 
-def _loads(event: Event, options: StudyOptions) -> list[Load]:
+def _loads(event: DisturbanceCase, options: StudyOptions) -> list[Load]:
     return loads(options, event.load)[options.loads[0] if options.loads else event.load]
 
 
-def _runs(event: Event, load: Load) -> list[RunRequest]:
+def _runs(event: DisturbanceCase, load: Load) -> list[RunRequest]:
     return [
         load.request(
             0.0, REFRIGERATOR, *event.assignments, *DRIVERS[driver], *STATION[station], trace_ticks=TRACE_TICKS
@@ -88,7 +88,7 @@ def _runs(event: Event, load: Load) -> list[RunRequest]:
     ]
 
 
-def _told(run: Outcome) -> tuple[str | float, ...]:
+def _measures(run: Outcome) -> tuple[str | float, ...]:
     i = run.indicators
     spans = [
         f"{run.series(name).min():.{digits}f}..{run.series(name).max():.{digits}f}"

@@ -18,7 +18,7 @@ FIXED_S: Final = (1.0, 1.5, 2.5, 3.5, 5.0)
 INTERRUPTED_S: Final = (1.0, 1.5, 2.5)
 
 
-class Way(NamedTuple):
+class PeriodRule(NamedTuple):
     """A way to choose the updating period."""
 
     period_s: float
@@ -29,26 +29,27 @@ class Way(NamedTuple):
 LITERAL: Final = "Algorithm 1"
 OWN: Final = ("contraction rule", "contraction rule, interrupt")
 CONSTANT: Final = {
-    **{f"fixed {period:g} s": Way(period) for period in FIXED_S},
-    **{f"fixed {period:g} s, interrupt": Way(period, (INTERRUPT,)) for period in INTERRUPTED_S},
+    **{f"fixed {period:g} s": PeriodRule(period) for period in FIXED_S},
+    **{f"fixed {period:g} s, interrupt": PeriodRule(period, (INTERRUPT,)) for period in INTERRUPTED_S},
 }
 RULES: Final = {
-    LITERAL: Way(ADAPTIVE),
-    "Algorithm 1, interrupt": Way(ADAPTIVE, (INTERRUPT,)),
-    OWN[0]: Way(ADAPTIVE, (f"{RULE}contraction",)),
-    OWN[1]: Way(ADAPTIVE, (f"{RULE}contraction", INTERRUPT)),
+    LITERAL: PeriodRule(ADAPTIVE),
+    "Algorithm 1, interrupt": PeriodRule(ADAPTIVE, (INTERRUPT,)),
+    OWN[0]: PeriodRule(ADAPTIVE, (f"{RULE}contraction",)),
+    OWN[1]: PeriodRule(ADAPTIVE, (f"{RULE}contraction", INTERRUPT)),
 }
 INSTANTS_S: Final = (0.25, 1.0, 2.5, 5.0)
 FAST: Final = {
-    f"infinitely fast PLC, every {period:g} s": Way(period, (), Procedure.INFINITELY_FAST) for period in INSTANTS_S
+    f"infinitely fast PLC, every {period:g} s": PeriodRule(period, (), Procedure.INFINITELY_FAST)
+    for period in INSTANTS_S
 }
 SEARCHED: Final = {
     Objective.CLOSED_LOOP: "beam search for J_BF",
     Objective.OPEN_LOOP: "beam search for the open loop",
 }
 ORACLES: Final = {
-    SEARCHED[Objective.CLOSED_LOOP]: Way(ADAPTIVE, (INTERRUPT,), Procedure.BEST_CLOSED_LOOP),
-    SEARCHED[Objective.OPEN_LOOP]: Way(ADAPTIVE, (INTERRUPT,), Procedure.BEST_OPEN_LOOP),
+    SEARCHED[Objective.CLOSED_LOOP]: PeriodRule(ADAPTIVE, (INTERRUPT,), Procedure.BEST_CLOSED_LOOP),
+    SEARCHED[Objective.OPEN_LOOP]: PeriodRule(ADAPTIVE, (INTERRUPT,), Procedure.BEST_OPEN_LOOP),
     **FAST,
 }
 WAYS: Final = {**ORACLES, **CONSTANT, **RULES}
@@ -113,7 +114,7 @@ def _groups(hours: Sequence[Load]) -> dict[str, list[Load]]:
     return {title: group for title, group in (("hours", first), ("fresh hours", fresh)) if group}
 
 
-def _request(load: Load, way: Way) -> RunRequest:
+def _request(load: Load, way: PeriodRule) -> RunRequest:
     return load.request(way.period_s, *way.assignments, procedure=way.procedure)
 
 

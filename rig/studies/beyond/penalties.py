@@ -13,7 +13,7 @@ from rig.studies.beyond.penalty_variants import (
     PRESETS,
     SETTLED,
     START_POWERS,
-    Variant,
+    PenaltyVariant,
     closed,
     closed_loads,
     hours,
@@ -77,9 +77,9 @@ class PenaltiesStudy:
         return result
 
 
-def period_costs(options: StudyOptions, outcomes: Outcomes) -> dict[Variant, PeriodCosts]:
+def period_costs(options: StudyOptions, outcomes: Outcomes) -> dict[PenaltyVariant, PeriodCosts]:
     """Return the costs of fixed periods, by variant."""
-    costs: dict[Variant, PeriodCosts] = {}
+    costs: dict[PenaltyVariant, PeriodCosts] = {}
     for load in hours(options):
         for variant in timed_variants(load, options):
             runs = [outcomes[of_period(load, variant, period)].indicators for period in periods(options)]
@@ -92,10 +92,10 @@ def period_costs(options: StudyOptions, outcomes: Outcomes) -> dict[Variant, Per
 def _rows(
     options: StudyOptions,
     found: Paired,
-    loops: Mapping[Variant, Series],
-    timed: Mapping[Variant, PeriodCosts],
+    loops: Mapping[PenaltyVariant, Series],
+    timed: Mapping[PenaltyVariant, PeriodCosts],
 ) -> list[tuple[Cell, ...]]:
-    def names(variant: Variant | None) -> tuple[str, str]:
+    def names(variant: PenaltyVariant | None) -> tuple[str, str]:
         return (str(variant.preset), variant.change) if variant else ("", QPOASES)
 
     nothing = (np.nan,) * 5
@@ -119,7 +119,7 @@ def _rows(
 
 
 def _crossing_text(found: Paired) -> str:
-    def said(variant: Variant) -> str:
+    def said(variant: PenaltyVariant) -> str:
         power = found.crossing(variant)
         where = f"from P = {power.brief()} on" if np.isfinite(power.value) else "at no power"
         return f"{variant.preset}: {where}"
@@ -144,7 +144,7 @@ def _of_paper(what: str) -> float:
     return value / float(qpoases[what][-1]) if what.startswith("J") else value
 
 
-def _table(preset: Preset, options: StudyOptions, found: Paired, loops: Mapping[Variant, Series]) -> str:
+def _table(preset: Preset, options: StudyOptions, found: Paired, loops: Mapping[PenaltyVariant, Series]) -> str:
     """Return what one change at a time does to a preset, and the paper's points."""
     rows: list[tuple[Cell, ...]] = [(
         "the paper's points", f"{_of_paper('J_total'):.3f}", "", f"{_of_paper('J_dev'):.3f}",
@@ -171,7 +171,7 @@ def _table(preset: Preset, options: StudyOptions, found: Paired, loops: Mapping[
     return f"{caption}\n\n{markdown_table(header, rows)}"
 
 
-def _settled(found: Paired, variant: Variant) -> tuple[str, str, str]:
+def _settled(found: Paired, variant: PenaltyVariant) -> tuple[str, str, str]:
     """Return total, J_dev and J_cst of a solver that has converged, if it was run to there."""
     if (variant, SETTLED) not in found.sums:
         return "", "", ""
@@ -198,7 +198,7 @@ def _start_table(options: StudyOptions, found: Paired) -> list[str]:
     for variant in starts:
         every = list(range(len(found.loads)))
 
-        def curve(which: Sequence[int], variant: Variant = variant) -> Series:
+        def curve(which: Sequence[int], variant: PenaltyVariant = variant) -> Series:
             base = found.over_lowest(PRESETS[variant.preset], SETTLED, which)
             return np.array([found.over_lowest(variant, power, which) / base for power in some])
 

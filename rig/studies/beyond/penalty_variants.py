@@ -13,7 +13,7 @@ from rig.studies.solver_runs import throttled
 from rig.studies.study import PROGRAM, Load, StudyOptions, loads
 
 
-class Variant(NamedTuple):
+class PenaltyVariant(NamedTuple):
     """A preset, or a preset with one thing changed."""
 
     preset: Preset
@@ -70,14 +70,14 @@ def _preset(preset: Preset) -> tuple[str, ...]:
     return () if preset is Preset.TUNED else (f"{PROGRAM}preset={preset}",)
 
 
-PRESETS: Final = {preset: Variant(preset, "", _preset(preset)) for preset in Preset}
+PRESETS: Final = {preset: PenaltyVariant(preset, "", _preset(preset)) for preset in Preset}
 VARIANTS: Final = tuple(
     variant
     for preset in Preset
     for variant in (
         PRESETS[preset],
         *(
-            Variant(preset, change, (*_preset(preset), PROGRAM + assignment))
+            PenaltyVariant(preset, change, (*_preset(preset), PROGRAM + assignment))
             for change, assignment in CHANGES.items()
             if change not in OWN[preset]
         ),
@@ -100,12 +100,12 @@ FRESH_DRAWS: Final = 3
 """Draws of each hour a to f; those from the second on are fresh."""
 
 
-def variants(options: StudyOptions) -> tuple[Variant, ...]:
+def variants(options: StudyOptions) -> tuple[PenaltyVariant, ...]:
     """Return those of a study; a quick one has the presets only."""
     return tuple(PRESETS.values()) if options.quick else VARIANTS
 
 
-def powers_of(variant: Variant | None, options: StudyOptions) -> tuple[float, ...]:
+def powers_of(variant: PenaltyVariant | None, options: StudyOptions) -> tuple[float, ...]:
     """Return the powers of a variant, or of qpOASES."""
     if options.quick:
         return QUICK_POWERS
@@ -116,11 +116,11 @@ def powers_of(variant: Variant | None, options: StudyOptions) -> tuple[float, ..
     return WEIGHT_POWERS if variant.is_weight else DEVICE_POWERS
 
 
-def _with(request: RunRequest, variant: Variant) -> RunRequest:
+def _with(request: RunRequest, variant: PenaltyVariant) -> RunRequest:
     return replace(request, assignments=(*request.assignments, *variant.assignments))
 
 
-def paired(load: Load, variant: Variant | None, power: float) -> RunRequest:
+def paired(load: Load, variant: PenaltyVariant | None, power: float) -> RunRequest:
     """Return the request for a variant, or for qpOASES, on the problems of a load."""
     if variant is None:
         return paired_request(load, "qpoases", power)
@@ -134,7 +134,7 @@ def closed_loads(options: StudyOptions) -> list[Load]:
     return [replace(load, ticks=min(load.ticks, longest)) for draws in drawn for load in draws]
 
 
-def closed(load: Load, variant: Variant) -> RunRequest:
+def closed(load: Load, variant: PenaltyVariant) -> RunRequest:
     """Return the request for the closed loop of a variant at 5 s and P = 1."""
     return _with(throttled(load, "ode", 1.0), variant)
 
@@ -150,12 +150,12 @@ def periods(options: StudyOptions) -> tuple[float, ...]:
     return FEW if options.quick else NINE
 
 
-def timed_variants(load: Load, options: StudyOptions) -> list[Variant]:
+def timed_variants(load: Load, options: StudyOptions) -> list[PenaltyVariant]:
     """Return the variants whose periods are compared under a load: other starts under first draws only."""
     return [one for one in variants(options) if one.is_timed and (not one.change or load.draw == 1)]
 
 
-def of_period(load: Load, variant: Variant, period_s: float) -> RunRequest:
+def of_period(load: Load, variant: PenaltyVariant, period_s: float) -> RunRequest:
     """Return the request for a fixed updating period."""
     return load.request(period_s, *variant.assignments)
 

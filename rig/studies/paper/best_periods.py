@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from optimizer_plc.qp.penalties import Preset
 from rig.figures.plot import ACCENT, INK, THIRD
 from rig.studies import published
-from rig.studies.beyond.penalty_variants import Variant
+from rig.studies.beyond.penalty_variants import PenaltyVariant
 from rig.studies.drawing import legend_outside, panels, paper
 from rig.studies.intervals import Interval, geometric_mean, resampled
 from rig.studies.paper.updating_period import TUNING_DRAWS, is_inside
@@ -53,7 +53,7 @@ def period_values(preset: str, costs: PeriodCosts) -> dict[str, list[float]]:
     }
 
 
-def period_remarks(timed: Mapping[Variant, PeriodCosts], periods: Sequence[float]) -> list[str]:
+def period_remarks(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequence[float]) -> list[str]:
     """Return a table for each cost."""
     theirs = np.array([hour["cost_fixed_pct"] for hour in published.updating_period().values()])
     remarks = []
@@ -81,7 +81,7 @@ def _row(table: Series, periods: Sequence[float]) -> tuple[Cell, ...]:
     return share_inside(table).brief(2), best, *ends
 
 
-def period_figure(timed: Mapping[Variant, PeriodCosts], periods: Sequence[float]) -> Figure:
+def period_figure(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequence[float]) -> Figure:
     """Draw the first draw of each hour over its best period, both presets and the paper's points."""
     colours = {Preset.TUNED: INK, Preset.AS_PRINTED: ACCENT}
     presets = {setting: costs for setting, costs in timed.items() if not setting.change}

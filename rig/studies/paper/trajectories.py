@@ -109,7 +109,7 @@ def load_steps(load: Load) -> Series:
 
 
 def follows_step(run: Outcome, load: Load) -> "NDArray[np.bool_]":
-    """Tell for each update whether it is the first one after a load step."""
+    """Return for each update whether it is the first one after a load step."""
     seen = _steps_before(run.column("tick"), load)
     return np.diff(seen, prepend=0) > 0
 

@@ -40,13 +40,13 @@ OWN_INTERRUPT: Final = Policy("contraction rule, interrupt", ADAPTIVE, (f"{RULE}
 CONTROL: Final = Policy("fixed 2.5 s, interrupt", 2.5, (INTERRUPT,))
 POLICIES: Final = (LITERAL, OWN, OWN_INTERRUPT, CONTROL, Policy("fixed 1.5 s, interrupt", 1.5, (INTERRUPT,)))
 RESPONDING: Final = (LITERAL, OWN, OWN_INTERRUPT)
-"""Whose response to load steps is told."""
+"""Policies whose response to load steps is reported."""
 TUNING_DRAWS: Final = (11, 12)
 """Draws that the constants of the contraction rule were chosen on."""
 
 
 @dataclass(frozen=True)
-class Variant:
+class PolicyVariant:
     """Another setting in which rules and fixed periods are compared."""
 
     label: str
@@ -56,16 +56,16 @@ class Variant:
 
 
 SLOW: Final = (1.0, 2.5)
-AS_PRINTED: Final = Variant("as printed", (f"{PROGRAM}preset=as-printed",), NINE)
+AS_PRINTED: Final = PolicyVariant("as printed", (f"{PROGRAM}preset=as-printed",), NINE)
 VARIANTS: Final = (
-    Variant(
+    PolicyVariant(
         "rate limit scaled by tau_u / 5 s",
         ("limits.rate_reference=elapsed",),
         policies=(LITERAL, OWN_INTERRUPT, CONTROL),
     ),
-    Variant("measurement noise", NOISE, policies=(LITERAL, OWN_INTERRUPT, CONTROL)),
-    Variant("fast gradient", (f"{PROGRAM}solver=fast-gradient", f"{PROGRAM}fast_gradient.tau_1_s=0.25"), SLOW),
-    Variant("ODE starting slowly", (f"{PROGRAM}ode.cost_scale=1e-8", f"{PROGRAM}ode.growth=2.0"), SLOW),
+    PolicyVariant("measurement noise", NOISE, policies=(LITERAL, OWN_INTERRUPT, CONTROL)),
+    PolicyVariant("fast gradient", (f"{PROGRAM}solver=fast-gradient", f"{PROGRAM}fast_gradient.tau_1_s=0.25"), SLOW),
+    PolicyVariant("ODE starting slowly", (f"{PROGRAM}ode.cost_scale=1e-8", f"{PROGRAM}ode.growth=2.0"), SLOW),
     AS_PRINTED,
 )
 
@@ -139,7 +139,7 @@ def _periods(load: Load, options: StudyOptions) -> tuple[float, ...]:
     return (*SHORTER, *NINE) if load.draw == 1 else NINE
 
 
-def _variants(options: StudyOptions) -> tuple[Variant, ...]:
+def _variants(options: StudyOptions) -> tuple[PolicyVariant, ...]:
     return () if options.quick else VARIANTS
 
 
@@ -148,7 +148,7 @@ def _main(load: Load, options: StudyOptions) -> list[RunRequest]:
     return fixed + [load.request(policy.period_s, *policy.assignments) for policy in POLICIES]
 
 
-def _variant_runs(load: Load, variant: Variant) -> list[RunRequest]:
+def _variant_runs(load: Load, variant: PolicyVariant) -> list[RunRequest]:
     fixed = [load.request(period, *variant.assignments) for period in variant.periods]
     return fixed + [load.request(p.period_s, *variant.assignments, *p.assignments) for p in variant.policies]
 
@@ -217,7 +217,7 @@ def _judge(result: StudyResult, which: str, hours: Mapping[str, _Hour]) -> None:
 
 
 def is_inside(costs: Sequence[float] | Series) -> bool:
-    """Tell whether the least is neither the first nor the last."""
+    """Return whether the least is neither the first nor the last."""
     return 0 < int(np.argmin(costs)) < len(costs) - 1
 
 

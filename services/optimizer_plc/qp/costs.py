@@ -1,7 +1,7 @@
 """What a profile costs: the augmented cost J that solvers decrease, its gradient, and the indicators of section V.
 
 Gamma z - gamma and the gradient are computed here for all solvers, except by the interior-point method, which has its
-variables in an order of its own.
+variables in its own order.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from optimizer_plc.qp.linear_algebra import Columns, add_product, add_transposed_product, by_columns
-from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem, Situation
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 
 Array = NDArray[np.float64]
 
@@ -120,7 +120,7 @@ def gradient_with_excess(
                 result[j] += factor * rows.transposed[r, j]
 
 
-class Indicators(NamedTuple):
+class ProfileCosts(NamedTuple):
     """Predicted costs and violation of a profile."""
 
     j_dev: float
@@ -132,7 +132,7 @@ class Indicators(NamedTuple):
 
 
 class OutputMaps(NamedTuple):
-    """How the constrained outputs over the horizon of N samples follow from a profile and a situation."""
+    """How the constrained outputs over the horizon of N samples follow from a profile and the parameters."""
 
     resting: Array
     """L1 and T5 in turn at the operating point, shape (2 N,)."""
@@ -156,23 +156,25 @@ def output_maps(problem: PredictiveProblem) -> OutputMaps:
     )  # fmt: skip
 
 
-def indicators(problem: PredictiveProblem, qp: QuadraticProblem, z: Array, situation: Situation) -> Indicators:
-    """Return the indicators of profile z in a situation (paper, section V); `qp` is the problem's instance there."""
+def indicators(problem: PredictiveProblem, qp: QuadraticProblem, z: Array, parameters: QpParameters) -> ProfileCosts:
+    """Return the indicators of profile z at the parameters (paper, section V); `qp` is the problem's instance there."""
     maps, real = output_maps(problem), z.dtype.type
-    return Indicators(*map(float, predicted_indicators(maps, qp, z, situation.x, real(situation.w), problem.n_inputs)))
+    return ProfileCosts(
+        *map(float, predicted_indicators(maps, qp, z, parameters.x, real(parameters.w), problem.n_inputs))
+    )
 
 
 @kernel
 def predicted_indicators(
     maps: OutputMaps, qp: QuadraticProblem, z: Array, x: Array, w: float, n_inputs: int
-) -> Indicators:
+) -> ProfileCosts:
     """Return the indicators of profile z (n,) at the state x (n_x,) under the load w (W), both as deviations."""
     outputs = maps.resting.copy()
     add_transposed_product(maps.of_z, z, outputs)
     add_transposed_product(maps.of_x, x, outputs)
     j_cst = violation_cost(outputs, maps.of_w, w, maps.bands)
     j_dev = deviation_cost(qp, z, n_inputs) + qp.constant
-    return Indicators(j_dev, j_cst, largest_violation(qp, z, maps.row_gains))
+    return ProfileCosts(j_dev, j_cst, largest_violation(qp, z, maps.row_gains))
 
 
 @kernel

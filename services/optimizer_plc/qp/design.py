@@ -20,7 +20,7 @@ Pair = tuple[float, float]
 
 def _rising_instants(instants: tuple[int, ...]) -> tuple[int, ...]:
     if not instants or instants[0] < 1 or any(b <= a for a, b in pairwise(instants)):
-        raise ValueError("instants are rising sample numbers from 1 on")
+        raise ValueError("instants must be rising sample numbers of at least 1")
     return instants
 
 
@@ -58,9 +58,9 @@ class ControlDesign(BaseModel):
         if self.constraint_instants[-1] > self.horizon:
             raise ValueError("constraint_instants end behind the last of decision_instants, which is the horizon")
         if any(low >= high for low, high in zip(self.output_low, self.output_high, strict=True)):
-            raise ValueError("each of output_low is below its output_high")
+            raise ValueError("each output_low must be below its output_high")
         if min(*self.input_scale, *self.input_weight) <= 0:
-            raise ValueError("input_scale and input_weight are positive")
+            raise ValueError("input_scale and input_weight must be positive")
         return self
 
 

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 class Maps(NamedTuple):
-    """How an instance follows from a situation; the state and the load are stacked as s = (x, w)."""
+    """How an instance follows from the parameters; the state and the load are stacked as s = (x, w)."""
 
     phi: Array
     """Shape (n_s, n)."""

@@ -40,7 +40,7 @@ class QuadraticProblem(NamedTuple):
     constant: float
 
 
-class Situation(NamedTuple):
+class QpParameters(NamedTuple):
     """What an instance depends on, as deviations from the operating point."""
 
     x: Array
@@ -127,10 +127,10 @@ class PredictiveProblem:
 
     # -- instances ---------------------------------------------------------------------------------------------------
 
-    def at(self, situation: Situation) -> QuadraticProblem:
-        """Return the instance of the problem for a situation."""
-        share = self._real(self.limits.rate_share(situation.elapsed_ticks))
-        phi, gamma, low, high, constant = instance(self.maps, situation.x, situation.w, situation.u_before, share)
+    def at(self, parameters: QpParameters) -> QuadraticProblem:
+        """Return the instance of the problem for these parameters."""
+        share = self._real(self.limits.rate_share(parameters.elapsed_ticks))
+        phi, gamma, low, high, constant = instance(self.maps, parameters.x, parameters.w, parameters.u_before, share)
         return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, self._real(constant))
 
     def memory(self) -> int:
@@ -145,11 +145,11 @@ class PredictiveProblem:
             return shifted(self.shifts[ticks], z)
         return shifted(self._rounded(shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE)), z)
 
-    def within_first_rate(self, z: Array, situation: Situation) -> Array:
+    def within_first_rate(self, z: Array, parameters: QpParameters) -> Array:
         """Return the profile z with its first knot within the rate of the input before it, as it can be sent."""
-        share = self._real(self.limits.rate_share(situation.elapsed_ticks))
+        share = self._real(self.limits.rate_share(parameters.elapsed_ticks))
         result = z.copy()
-        keep_first_rate(self.maps, self.scaled_rate, situation.u_before, share, result)
+        keep_first_rate(self.maps, self.scaled_rate, parameters.u_before, share, result)
         return result
 
     def inputs(self, z: Array, samples: int) -> Array:
@@ -159,12 +159,12 @@ class PredictiveProblem:
         """
         return inputs_of(self.knots_to_samples[:samples], z, self.input_scale, self._u0, self.rate)
 
-    def outputs(self, z: Array, situation: Situation) -> Array:
+    def outputs(self, z: Array, parameters: QpParameters) -> Array:
         """Return L1 and T5 predicted for a profile at the end of each sampling period, shape (horizon, 2)."""
         outputs = self.resting_outputs.copy()
         add_transposed_product(self.stacked_outputs_z, z, outputs)
-        add_transposed_product(self.stacked_outputs_x, situation.x, outputs)
-        outputs += self.stacked_outputs_w * situation.w
+        add_transposed_product(self.stacked_outputs_x, parameters.x, outputs)
+        outputs += self.stacked_outputs_w * parameters.w
         return outputs.reshape(-1, self._n_constrained)
 
     def hold(self, u: Array) -> Array:

@@ -6,7 +6,7 @@ the interior-point solver gets problem k if
 
     max(J+_k, J+_{k-1}) > switch Jhat_{k-1}
 
-that is, after a load step (or any other surprise), and as long as the problem before was still being improved. All of
+that is, after a load step (or any other disturbance), and while the problem before was still being improved. All of
 it is known when the problem begins.
 
 The PLC's time is counted in slots, each as long as the longer of both iterations. In the time of its slots the chosen
@@ -87,7 +87,7 @@ def picoseconds(seconds: float) -> int:
 
 @kernel
 def is_far(switch: float, guessed: float, before: Costs) -> bool:
-    """Tell whether a problem is far from its optimum, from J+_k, J+_{k-1} and Jhat_{k-1}."""
+    """Return whether a problem is far from its optimum, from J+_k, J+_{k-1} and Jhat_{k-1}."""
     return max(guessed, before.guessed) > switch * before.delivered
 
 

@@ -181,9 +181,8 @@ def descend(
 ) -> tuple[int, int, float, float]:
     """Move z by `count` steps, or fewer once it is stationary.
 
-    `look_ahead_rows` (m,) are those that `step` has left for the next step, `stalled` is the number of stalled steps
-    in a row up to here. Returns how many were done, the new number of stalled ones, the cost at z and the next step
-    size.
+    `look_ahead_rows` (m,) are those that `step` has left for the next step, `stalled` is the number of stalled steps in
+    a row up to here. Returns how many were done, the new number of stalled ones, the cost at z and the next step size.
     """
     stationarity = z.dtype.type(STATIONARITY)
     v, active = np.empty_like(z), np.empty_like(qp.gamma)

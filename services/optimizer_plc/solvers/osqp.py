@@ -2,7 +2,7 @@
 
 The matrices are scaled and factorised once, with a fixed rho; from problem to problem only vectors change.
 
-- An iteration is one of ADMM: a solve with the factors, and a projection of the rows. Calls go on where the last one
+- An iteration is one of ADMM: a solve with the factors, and a projection of the rows. Calls continue where the last one
   stopped; OSQP keeps its multipliers, and begins each problem at the guess.
 - A truncated answer is near the problem's rows and box without keeping them; it is projected into the box.
   J is not monotonic (Definition 1 of the paper): see `docs/solvers.md`.

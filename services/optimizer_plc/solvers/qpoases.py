@@ -4,12 +4,12 @@ qpOASES moves along the line from the previous problem to the present one and st
 It is the qpOASES inside CasADi; its CPU-time limit is not used, since it would make runs irreproducible.
 
 - An iteration is one step of that homotopy. The limit nWSR of a CasADi object is fixed when it is made, so ours is 1
-  and an iteration is a call: going on with the same data goes on along the same line, and a steps and then b are a + b
-  steps to the bit. One object with nWSR = q gives the same points to rounding until, at some
-  harsh load jumps, it takes another path (ramping begins anew at each call); neither is better on average.
+  and an iteration is a call: another call with the same data continues along the same line, and a steps and then b are
+  a + b steps to the bit. One object with nWSR = q gives the same points to rounding until, at some
+  harsh load jumps, it takes another path (ramping restarts at each call); neither is better on average.
 - A truncated answer is the optimum of an intermediate problem. It may violate the box and the rows of the present one;
   it is projected into the box. J is not monotonic (Definition 1 of the paper): see `docs/solvers.md`.
-- The guess is what `solution` is until the first iteration. The method itself goes on from where it stopped before.
+- The guess is what `solution` is until the first iteration. The method itself continues from where it stopped before.
 - A chain begins at an optimum, as `qpOASES_sequence` is begun by 'i' before it is hot-started: the first problem of a
   session is solved to the end, whatever the count.
 """
@@ -115,7 +115,7 @@ class _Chain:
             self._inputs[name][:] = value
 
     def step(self) -> str:
-        """Go one step; return the status that CasADi tells."""
+        """Go one step; return CasADi's status."""
         with redirect_stdout(io.StringIO()):  # failures are printed whatever the print level
             self._evaluate()
         return str(self._buffer.stats()["unified_return_status"])

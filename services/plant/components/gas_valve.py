@@ -23,7 +23,7 @@ class ReliefValve(NamedTuple):
     span: float
     """Rise above it at which the valve is fully open, Pa."""
     valve: Valve
-    """What it passes then."""
+    """Flow at that opening."""
 
 
 @kernel

@@ -21,7 +21,7 @@ class SensorFaults:
 
         Args:
             faults: One for each output.
-            y: What the sensors show now; a sensor that freezes goes on showing it.
+            y: What the sensors show now; a frozen sensor keeps showing it.
         """
         for output, (before, fault) in enumerate(zip(self._faults, faults, strict=True)):
             if fault != before:

@@ -50,7 +50,7 @@ class LoadSchedule:
                 raise ValueError(f"{step.watts:g} W is outside 0 to {MAX_LOAD_W:g} W")
         kept = max(0, bisect_left(self._times, steps[0].tick) - 1 - self._place(now))
         if kept + len(steps) > MOST_UPCOMING:
-            raise ValueError(f"{kept} steps are known already, and {MOST_UPCOMING} are kept: write these later")
+            raise ValueError(f"{kept} of at most {MOST_UPCOMING} steps are scheduled already: write these later")
 
     def put(self, steps: Sequence[LoadStep], now: int) -> None:
         """Take steps that `check` has found good; what was known from the first of them on is dropped."""

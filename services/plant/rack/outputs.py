@@ -24,7 +24,7 @@ class AppliedOutputs:
     its writer move them only a part of the way. Who sends the generation that it has read back therefore knows what is
     applied; all others are answered `CHANGED`.
 
-    Whoever writes, and however often: in one tick of the rack no output moves further than its rate.
+    For all writers together: in one tick of the rack no output moves further than its rate.
 
     Args:
         u: CV155 %, NCR22_A W, CV156 %.
@@ -67,7 +67,7 @@ class AppliedOutputs:
         if not session or asked.session != session:
             self.verdict = OutputVerdict.WRONG_SESSION
         elif ended or abs(asked.tick - tick) > (STALE_TICKS if realtime else 0):
-            self.verdict = OutputVerdict.UNTIMELY
+            self.verdict = OutputVerdict.STALE
         else:
             self.verdict = self._judge_writer(asked, caller)
         return self.verdict
@@ -83,7 +83,7 @@ class AppliedOutputs:
         if not taken:
             self._begin_generation()
         self._writer = caller
-        return OutputVerdict.TAKEN if taken else OutputVerdict.LIMITED
+        return OutputVerdict.ACCEPTED if taken else OutputVerdict.LIMITED
 
     def _within_reach(self, wanted: Inputs) -> Inputs:
         """Return outputs as far as they may move in the present tick."""
@@ -93,7 +93,7 @@ class AppliedOutputs:
         return cv155, ncr22, cv156
 
     def _is_writer(self, holder: int, caller: Caller) -> bool:
-        """Tell whether the writer of this generation writes: its number says so, or the connection of one without."""
+        """Return whether the writer of this generation writes: its number says so, or the connection of one without."""
         if holder != self.holder:
             return False
         return holder != SIMPLE_CLIENT or (self._writer is not None and self._writer.connection == caller.connection)

@@ -30,18 +30,18 @@ from coldloop.registers.plant import (
 )
 from coldloop.safety.watchdog import Watchdog
 from coldloop.service.journal import Journal
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 from plant.program import HeatLoad, PlantProgram
 from plant.rack.faults import SensorFaults
 from plant.rack.load_schedule import LoadSchedule
 from plant.rack.outputs import AppliedOutputs, Inputs, next_generation
-from plant.rack.retained_state import RetainedState
+from plant.rack.retained_state import RetainedPlantState
 from plant.settings import SafeAction, WatchdogSettings
 
 MakePlant = Callable[[HeatLoad, int], PlantProgram]
 """Returns the plant at tick 0, for a load and a seed of the sensors' noise."""
 
-APPLIED: Final = (OutputVerdict.TAKEN, OutputVerdict.LIMITED)
+APPLIED: Final = (OutputVerdict.ACCEPTED, OutputVerdict.LIMITED)
 """Verdicts on outputs that move the plant."""
 UNWATCHED_SILENCE_S: Final = 10.0
 """Real time after which a silent client loses its lease when the watchdog is off."""
@@ -52,13 +52,13 @@ class Session(NamedTuple):
 
     number: int
     """0 is none: the plant waits for an operator."""
-    pace: Pace
+    pace: TimeBase
     load: LoadProfile
     seed: int
 
 
 class Rack:
-    """The simulation, what it applies, and what watches over who writes that.
+    """The simulation, its applied outputs, and the supervision of their writer.
 
     Args:
         watchdog: Its configuration.
@@ -134,12 +134,12 @@ class Rack:
         self.journal.note(0, EventKind.SESSION, int(pace.realtime), value=pace.factor, who=who)
         self.journal.note(0, EventKind.LOAD, value=session.load.value(0), who=who)
 
-    def resume(self, state: RetainedState) -> None:
-        """Go on where a session was when the rack was ended; a new generation of outputs begins.
+    def resume(self, state: RetainedPlantState) -> None:
+        """Resume a session after a restart of the rack; a new generation of outputs begins.
 
         Raises:
             ArithmeticError, AttributeError, LookupError, TypeError, ValueError: It is not the state of such a plant, or
-                one from which no plant goes on; nothing has changed.
+                one that the plant cannot resume; nothing has changed.
         """
         load = LoadProfile(state.times, state.watts)
         schedule = LoadSchedule(load)
@@ -155,11 +155,11 @@ class Rack:
         )
         self.moving = state.pace.realtime and program.tick > 0 and not self.has_ended
 
-    def retained(self) -> RetainedState:
+    def retained(self) -> RetainedPlantState:
         """Return what `resume` needs."""
         session, outputs, journal = self.session, self.outputs, self.journal
         load = self.load.from_tick(self.tick)
-        return RetainedState.model_construct(
+        return RetainedPlantState.model_construct(
             boot=journal.boot, events=journal.count, generation=outputs.generation, holder=outputs.holder,
             session=session.number, pace=session.pace, watchdog=self.watchdog.time,
             times=load.times, watts=load.watts, seed=session.seed, program=self._program.retained(),
@@ -194,7 +194,7 @@ class Rack:
         return sample
 
     def _note_station(self, before: StationSample, now: StationSample) -> None:
-        """Tell changes of the station's mode and alarms."""
+        """Note changes of the station's mode and alarms."""
         if now.mode != before.mode:
             self.journal.note(self.tick, EventKind.STATION_MODE, now.mode)
         for number, alarm in enumerate(StationAlarm):
@@ -234,12 +234,12 @@ class Rack:
     # -- what operators change -----------------------------------------------------------------------------------------
 
     def set_watchdog(self, time: int, who: str) -> None:
-        """Change the time-out of the watchdog (ticks, 0 is off), and start it anew."""
+        """Change the time-out of the watchdog (ticks, 0 is off), and restart it."""
         self.journal.note(self.tick, EventKind.WATCHDOG_TIME, time, self.watchdog.time, who=who)
         self.watchdog.set(time, self.tick)
 
     def load_steps(self, asked: LiveLoad | LoadAhead) -> list[LoadStep]:
-        """Judge a load that was written while a session goes on; return its steps.
+        """Judge a load written during a session; return its steps.
 
         Raises:
             ValueError: It is not for this session, or not a load that can be taken now.
@@ -262,7 +262,7 @@ class Rack:
             self.journal.note(self.tick, EventKind.LIVE_LOAD, int(ahead), value=steps[0].watts, who=who)
         self._load_by = who if ahead else ""
 
-    def set_pace(self, pace: Pace, who: str) -> None:
+    def set_pace(self, pace: TimeBase, who: str) -> None:
         """Change the time base from the present tick on."""
         self.session = self.session._replace(pace=pace)
         self.moving = pace.realtime and (self.moving or self.tick > 0)
@@ -302,12 +302,12 @@ class Rack:
         }
 
 
-def _try_a_tick(program: PlantProgram, state: RetainedState) -> None:
+def _try_a_tick(program: PlantProgram, state: RetainedPlantState) -> None:
     """Move a plant, which is not used any further, on from a state that may be nonsense."""
     program.resume(**state.program)
     program.advance()
     if not all(map(math.isfinite, (*program.measure(), *program.state))):
-        raise ValueError("from there the plant goes nowhere")
+        raise ValueError("the plant cannot advance from there")
 
 
 def station_snapshot(station: StationSample) -> Mapping[str, object]:

@@ -35,13 +35,13 @@ from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 from coldloop.registers.text import from_words
 from coldloop.safety.writer_lease import LeaseEvent, WriterLease
 from coldloop.service.journal import Journal, JournalPublication
-from coldloop.session.pace import Pace
 from coldloop.session.settings import TimeMode
+from coldloop.session.time_base import TimeBase
 from plant.load import find_load
 from plant.rack.faults import HEALTHY
 from plant.rack.outputs import next_generation
 from plant.rack.rack import APPLIED, MakePlant, Rack, Session
-from plant.rack.retained_state import Memory
+from plant.rack.retained_state import PlantStateStore
 from plant.settings import SHOWN, PlantSettings
 
 log = logging.getLogger("coldloop.plant")
@@ -54,7 +54,7 @@ class RackRegisters:
         settings: The configuration.
         header: Of the model file.
         make_plant: Makes the simulation of a session.
-        first_generation: Of the outputs, where no retained state tells one; drawn by default, so that nobody takes this
+        first_generation: Of the outputs, without a retained state; random by default, so that no client takes this
             rack for the one before its restart.
         age: Returns the time since the present tick began, in ticks; 0 while no clock runs.
         now: A clock, s, by which the lease of the outputs ends.
@@ -76,12 +76,12 @@ class RackRegisters:
         self._age = age
         self.bank = RegisterBank(PLANT_MAP, settings.plant.word_order)
         publish_configuration(self.bank, selected(settings, SHOWN))
-        self._memory = Memory(settings.plant.retain.file, header.short_digest)
+        self._store = PlantStateStore(settings.plant.retain.file, header.short_digest)
         self.rack, resumed = self._switched_on(
             settings, header, make_plant, utc, first_generation or secrets.randbelow(2**31) + 1
         )
         self._journal = JournalPublication(self.rack.journal, self.bank)
-        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed), int(self._memory.refused))
+        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed), int(self._store.refused))
         self.lease = WriterLease("the outputs", lambda: self.rack.silence_s, self._note_lease, now)
         self._kept_generation = 0
         self._written_row = 0
@@ -107,10 +107,10 @@ class RackRegisters:
     ) -> tuple[Rack, bool]:
         """Return the rack at the beginning of the configured session, or, and True, where it was when it ended."""
         section, configured = settings.plant, settings.session
-        pace = Pace(configured.mode is TimeMode.REALTIME, configured.factor)
+        pace = TimeBase(configured.mode is TimeMode.REALTIME, configured.factor)
         load = find_load(section.load, header.w0)
         session = Session(1 if configured.autostart else 0, pace, load, section.seed)
-        state = self._memory.recall()
+        state = self._store.recall()
         journal = (
             Journal(now=utc)
             if state is None
@@ -127,7 +127,7 @@ class RackRegisters:
         try:
             rack.resume(state)
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            self._memory.refuse(repr(error))
+            self._store.refuse(repr(error))
             return rack, False
         return rack, True
 
@@ -219,12 +219,12 @@ class RackRegisters:
         verdict = self.rack.offer(asked, caller)
         if verdict in {*APPLIED, OutputVerdict.CHANGED}:
             self.lease.take(caller, asked.holder)
-        if verdict is not OutputVerdict.TAKEN or not asked.crc:
+        if verdict is not OutputVerdict.ACCEPTED or not asked.crc:
             self._show_applied()
 
     def _start_session(self, who: str) -> None:
         asked = self.bank.get(PlantSession)
-        pace = Pace(bool(asked.realtime), asked.factor)
+        pace = TimeBase(bool(asked.realtime), asked.factor)
         self.rack.start(Session(asked.session, pace, self._load_of(asked), asked.seed), who)
         for output in range(len(OUTPUT_NAMES)):
             self.bank.put(HEALTHY, output)
@@ -341,7 +341,7 @@ class RackRegisters:
             self._keep()
 
     def _show_events(self) -> bool:
-        """Show and log new events; tell whether there were any."""
+        """Show and log new events; return whether there were any."""
         if not self._journal.is_behind:
             return False
         for event in self._journal.show():
@@ -350,8 +350,8 @@ class RackRegisters:
 
     def _keep(self) -> None:
         self._kept_generation = self.rack.outputs.generation
-        if self._memory.active:
-            self._memory.keep(self.rack.retained())
+        if self._store.active:
+            self._store.keep(self.rack.retained())
 
 
 def log_event(event: Event) -> None:

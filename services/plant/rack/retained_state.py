@@ -1,4 +1,4 @@
-"""What the rack keeps over a restart: the simulation, what it applies, and the count of its journal."""
+"""State that the rack keeps over a restart: simulation, applied outputs and count of its journal."""
 
 import logging
 from pathlib import Path
@@ -11,7 +11,7 @@ from coldloop.process.signals import LAST_TICK
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
 from coldloop.safety.retained import RetainedFile, RetainedStateError
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 
 log = logging.getLogger("coldloop.plant")
 
@@ -21,7 +21,7 @@ OWNER = "plant/3"
 Count = Annotated[int, Field(ge=0, lt=2**32)]
 
 
-class RetainedState(BaseModel):
+class RetainedPlantState(BaseModel):
     """The state of a rack between two ticks."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -31,8 +31,8 @@ class RetainedState(BaseModel):
     generation: Annotated[int, Field(ge=1, lt=2**32)]
     holder: Count
     session: Count
-    """0: there has been none, and what follows is the rack as it is configured."""
-    pace: Pace
+    """0: none yet; the other fields are as configured."""
+    pace: TimeBase
     watchdog: Annotated[int, Field(ge=0, lt=2**16)]
     """Its time-out, in ticks."""
     times: tuple[Annotated[int, Field(ge=0, le=LAST_TICK)], ...]
@@ -51,22 +51,22 @@ class RetainedState(BaseModel):
         return self
 
 
-class Memory:
+class PlantStateStore:
     """Keeps the state in a file, if one is configured; what cannot be trusted or written is logged."""
 
     def __init__(self, file: Path | None, model_digest: int) -> None:
         self._file = RetainedFile(file, OWNER, model_digest) if file else None
         self.active = file is not None
         self.refused = False
-        """There was a state before, and it is not used."""
+        """A previous state exists and is not used."""
 
-    def recall(self) -> RetainedState | None:
-        """Return the state of before, if there is one."""
+    def recall(self) -> RetainedPlantState | None:
+        """Return the previous state, if any."""
         if self._file is None:
             return None
         try:
             content = self._file.load()
-            return None if content is None else RetainedState.model_validate(content)
+            return None if content is None else RetainedPlantState.model_validate(content)
         except RetainedStateError as error:
             self.refuse(str(error))
         except ValidationError as error:
@@ -74,12 +74,12 @@ class Memory:
         return None
 
     def refuse(self, reason: str) -> None:
-        """Do without the state of before: the file is set aside, and the log says why."""
+        """Discard the previous state: set its file aside and log the reason."""
         self.refused = True
         if self._file is not None:
             log.warning("retained state refused", extra={"reason": reason, "file": self._file.set_aside()})
 
-    def keep(self, state: RetainedState) -> None:
+    def keep(self, state: RetainedPlantState) -> None:
         """Keep the state of now: it is the memory of a simulation, so every tick counts and no disk is waited for."""
         if self._file is None:
             return

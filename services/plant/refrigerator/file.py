@@ -19,7 +19,7 @@ from plant.refrigerator.station_settings import LqWeights
 
 KIND: Final = "refrigerator"
 SHIPPED = Path(__file__).with_name("refrigerator.json")
-REMEDY = "make it anew with `python -m plant.refrigerator.model FILE`"
+REMEDY = "make a new one with `python -m plant.refrigerator.model FILE`"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,9 +86,9 @@ def read_refrigerator_file(path: Path) -> RefrigeratorFile:
     names = document.get("state_names"), document.get("command_names")
     sizes = len(file.x0), len(file.u0), len(file.v0), len(first), len(second)
     if names != (list(STATE_NAMES), list(COMMAND_NAMES)) or sizes != (len(STATE_NAMES), 3, len(COMMAND_NAMES), 6, 6):
-        raise ModelFileError(f"{path}: of a refrigerator with other states; {REMEDY}")
+        raise ModelFileError(f"{path}: made for a refrigerator with other states; {REMEDY}")
     if file.parameters_digest != refrigerator_digest(REFERENCE_REFRIGERATOR, load_helium()):
-        raise ModelFileError(f"{path}: of a refrigerator with other parameters; {REMEDY}")
+        raise ModelFileError(f"{path}: made for a refrigerator with other parameters; {REMEDY}")
     return file
 
 

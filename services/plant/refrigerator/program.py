@@ -1,4 +1,4 @@
-"""The whole refrigerator as a program: the plant, its station's controller, and what happens to both."""
+"""The whole refrigerator as a program: the plant, its station's controller, and their disturbances."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -35,7 +35,7 @@ class RefrigeratorProgram(PlantProgram):
         u0: Inputs held until the first `apply`, 3 numbers.
         load: The heat load over time.
         station: Settings of the station's controller.
-        events: What happens to the refrigerator.
+        events: Disturbances of the refrigerator.
         noise: Noise on the cold box's measurements; None measures exactly.
 
     Raises:
@@ -120,7 +120,7 @@ class RefrigeratorProgram(PlantProgram):
         )
 
     def take_over_whole(self, tick: int, u: RealArray, memory: RefrigeratorMemory, y: RealArray) -> None:
-        """Go on at another tick with what `memory` and `measure` would tell there; `u` was held up to it."""
+        """Resume at another tick with what `memory` and `measure` would return there; `u` was held up to it."""
         self.tick, self._u, self._memory = tick, u.copy(), memory
         self._x, self._measured = memory.x[:BOX_STATES], tuple(y.tolist())
 
@@ -133,7 +133,7 @@ class RefrigeratorProgram(PlantProgram):
         noise_state: Mapping[str, Any],
         warm: Mapping[str, Any] | None = None,
     ) -> None:
-        """Go on from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
+        """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
         if warm is None:
             raise ValueError("the retained state is that of a cold box, not of a refrigerator")
         names = {"x": "x", "signals": "signals", "commands": "commands", "integrals": "control"}

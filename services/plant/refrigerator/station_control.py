@@ -24,7 +24,7 @@ from plant.refrigerator.station_settings import PiTuning, StationControlKind, St
 
 
 class StationReference(NamedTuple):
-    """What the refrigerator's file tells the controller."""
+    """Gains from the refrigerator's file."""
 
     gains: tuple[tuple[float, ...], tuple[float, ...]]
     """K of the LQ controller, (2, 6)."""

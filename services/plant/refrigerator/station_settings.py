@@ -47,7 +47,7 @@ class PiTuning(BaseModel):
     integral_s: PositiveFloat
 
 
-class AlarmLimits(BaseModel):
+class StationAlarmSettings(BaseModel):
     """Where the station's alarms begin."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -61,7 +61,7 @@ class AlarmLimits(BaseModel):
     helium_lost_kg: PositiveFloat = 0.5
 
     @model_validator(mode="after")
-    def _low_is_below_high(self) -> "AlarmLimits":
+    def _low_is_below_high(self) -> "StationAlarmSettings":
         if not (self.hp_low_bar < self.hp_high_bar and self.lp_low_bar < self.lp_high_bar):
             raise ValueError("a low limit is not below its high one: write hp_low_bar < hp_high_bar, and so for lp")
         return self
@@ -88,4 +88,4 @@ class StationSettings(BaseModel):
     pi_nitrogen: PiTuning = PiTuning(gain=2.0, integral_s=600.0)
     charge_ends_bar: Annotated[float, Field(gt=0, le=0.5)] = 0.08
     """So far above its set point does the low pressure close the charge valve, whatever the high pressure asks for."""
-    alarms: AlarmLimits = AlarmLimits()
+    alarms: StationAlarmSettings = StationAlarmSettings()

@@ -154,7 +154,7 @@ def _keep(path: Path, found: NDArray[np.float64]) -> None:
 
 
 def _cache_directory() -> Path:
-    """Return a folder for the cache that nobody else can write to: what is in it is loaded as code.
+    """Return a folder for the cache that only this user can write to: its files are loaded as code.
 
     Raises:
         ConfigurationError: Others can write to the one that the environment names.
@@ -193,7 +193,7 @@ def _usual_roots() -> list[Path]:
 
 
 def _lets_others_write() -> bool:
-    """Tell whether new files of this process can be written by everybody."""
+    """Return whether everyone can write to new files of this process."""
     mask = os.umask(0o077)
     os.umask(mask)
     return not mask & stat.S_IWOTH
@@ -204,7 +204,7 @@ def _user() -> int:
 
 
 def _is_closed(folder: Path, *, sticky: bool = False) -> bool:
-    """Tell whether only this user and an administrator can write to a folder; the user's own group is left alone.
+    """Return whether only this user and an administrator can write to a folder; the user's own group is left alone.
 
     Args:
         folder: Which one.

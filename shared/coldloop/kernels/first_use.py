@@ -1,7 +1,7 @@
-"""Tells the user that numerical kernels are being compiled, which takes long and happens once.
+"""Announces that numerical kernels are being compiled, which takes long and happens once.
 
-Whoever needs kernels says whose they are, in `kernels_of`; the cache of kernels reports each one that it does not have
-to `needs_compiling`. Without one that is missing nothing is said.
+A user of kernels names their owner with `kernels_of`; the cache of kernels reports each one that it does not have
+to `needs_compiling`. Nothing is announced if all are cached.
 """
 
 import contextlib
@@ -43,7 +43,7 @@ _announce: Announce = write_line
 
 
 def announce_with(announce: Announce) -> None:
-    """Let `announce` tell the user from now on."""
+    """Use `announce` from now on."""
     global _announce  # noqa: PLW0603 one user a process
     _announce = announce
 

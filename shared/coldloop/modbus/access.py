@@ -1,4 +1,4 @@
-"""Who asks, and what that client may do: by its address, or with TLS by the role in its certificate.
+"""Identity and rights of a client: by its address, or with TLS by the role in its certificate.
 
 A certificate says its role in the X.509v3 extension of the Modbus/TCP Security Protocol Specification (v21, section
 8.2, "Role extension"): a UTF8String. One without a role, or with a role that we do not know, may only read.
@@ -20,7 +20,7 @@ MAX_LENGTH: Final = 127
 
 
 def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:
-    """Return who calls from an address, or None when nobody may from there."""
+    """Return the caller at an address, or None if the address is not allowed."""
     address = _plain_address(host)
     places = {Role.CONTROL: access.control, Role.OPTIMIZER: access.optimizer, Role.OPERATOR: access.operator}
     roles = frozenset(role for role, networks in places.items() if _within(address, networks))
@@ -30,7 +30,7 @@ def caller_at(host: str, name: str, access: AccessSettings) -> Caller | None:
 
 
 def caller_with(certificate: bytes, name: str) -> Caller:
-    """Return who calls with a certificate (DER) that has been verified."""
+    """Return the caller with a verified certificate (DER)."""
     subject, role = _subject_and_role(certificate)
     known = {each.value: each for each in Role}
     described = " ".join(f"{key}={json.dumps(text)}" for key, text in (("certificate", subject), ("role", role)))
@@ -38,7 +38,7 @@ def caller_with(certificate: bytes, name: str) -> Caller:
 
 
 def _plain_address(host: str) -> IPv4Address | IPv6Address:
-    """Return an address; an IPv4 client of a socket for both versions counts as what it is."""
+    """Return an address; an IPv4 client of a dual-stack socket is returned as IPv4."""
     address = ip_address(host)
     return getattr(address, "ipv4_mapped", None) or address
 

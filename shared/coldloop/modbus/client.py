@@ -45,7 +45,7 @@ _EXCEPTIONS: Final = {
     2: "no such register, or read-only",
     3: "illegal value",
     4: "failure in the server",
-    6: "somebody else holds the lease of this role",
+    6: "another client holds the lease of this role",
     11: "no such unit id",
 }
 
@@ -123,10 +123,10 @@ class RegisterClient:
         """Connect, and make sure that the peer speaks this register map in this word order.
 
         Args:
-            patience_s: How long to go on trying while nobody answers.
+            patience_s: How long to keep trying without an answer.
 
         Raises:
-            PeerUnreachableError: Nobody answers, or not as the register map says.
+            PeerUnreachableError: No answer, or not as the register map says.
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + patience_s
@@ -142,7 +142,7 @@ class RegisterClient:
                 await asyncio.sleep(min(CONNECT_PAUSE_S, patience_s))
             except RequestRefusedError as error:
                 raise PeerUnreachableError(
-                    f"something else than {self.peer} answers there (no identity block): check host and port"
+                    f"{self.peer} is not that service (no identity block): check host and port"
                 ) from error
             else:
                 check_peer(raw, self._map, self._order, self.peer)
@@ -299,7 +299,7 @@ class RegisterClient:
 
     def _nonsense(self, block: Block) -> PeerUnreachableError:
         return PeerUnreachableError(
-            f"{self.peer} answered a request for block '{block.name}' with something else: check host and port"
+            f"{self.peer} answered a request for block '{block.name}' with something invalid: check host and port"
         )
 
 
@@ -313,4 +313,4 @@ def _encoded(block: Block, codec: RecordCodec, record: tuple[Any, ...]) -> bytes
     try:
         return sealed_bytes(codec, record) if block.sealed else codec.encode(record)
     except (struct.error, OverflowError) as error:
-        raise UnfitValueError(f"block '{block.name}' cannot hold what was to be written: {error}") from None
+        raise UnfitValueError(f"block '{block.name}' cannot hold the values to be written: {error}") from None

@@ -37,7 +37,7 @@ _numbers = count(1)
 class Connection(asyncio.Protocol):
     """Serves one client.
 
-    `opened` tells the server that the connection exists, and returns whether it may stay; `lost` tells that it is gone.
+    `opened` reports the connection to the server and returns whether it may stay; `lost` reports its end.
     """
 
     _handle: Callable[[bytes], bytes | Written]
@@ -137,7 +137,7 @@ class Connection(asyncio.Protocol):
         self._output_blocked = True
 
     def resume_writing(self) -> None:
-        """Go on serving (event loop callback)."""
+        """Resume serving (event loop callback)."""
         self._output_blocked = False
         self.last_request = monotonic()
         self._serve()
@@ -204,7 +204,7 @@ class Connection(asyncio.Protocol):
         return more and bool(self._buffer)
 
     def _too_fast(self, limit: RateLimit) -> bool:
-        """Tell whether the next request comes too early; then it is served, and the client read from, later."""
+        """Return whether the next request comes too early; then it is served, and the client read from, later."""
         wait_s = limit.take()
         if wait_s:
             self._refusals.note("rate_limited", self.peer, f"more than {limit.rate:g} requests/s: read from later")
@@ -237,7 +237,7 @@ class Connection(asyncio.Protocol):
         return framed(frame, outcome)
 
     def _answer_written(self, frame: Frame, written: Written, blocks: Iterator[Block]) -> bytes:
-        """Tell the program about the blocks; return the answer, or nothing when the program makes it wait."""
+        """Report the written blocks to the program; return the answer, or nothing if the program delays it."""
         try:
             for block in blocks:
                 waiting = self._on_write(block, self.caller)
@@ -272,5 +272,5 @@ class Connection(asyncio.Protocol):
         if remaining > 0:
             self._idle_timer = self._loop.call_later(remaining, self._check_idle)
             return
-        self._refusals.note("idle_timeout", self.peer, f"no whole request for {self._settings.idle_timeout_s:g} s")
+        self._refusals.note("idle_timeout", self.peer, f"no complete request for {self._settings.idle_timeout_s:g} s")
         self._transport.abort()

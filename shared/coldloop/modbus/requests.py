@@ -2,7 +2,7 @@
 
 Requests are decoded with `struct`. pymodbus converts register by register: an FC23 with 104 words read and 8 written
 costs 58 us to decode and encode where this costs 4 us, and its decoders accept what the standard refuses. pymodbus
-encodes the device identification, which nobody asks for a thousand times a second, and frames what our client sends.
+encodes the device identification, which is rarely requested, and frames what our client sends.
 """
 
 import struct

@@ -165,7 +165,7 @@ class ModbusServer:
     def _admit(self, newcomer: Connection) -> bool:
         """Take a connection in, where need be in the place of an idle one; return whether it may stay."""
         if len(self._connections) >= self._settings.connection_limit and not self._make_room(newcomer):
-            self._refusals.note("connection_refused", newcomer.peer, "as many connections as may be, and none is idle")
+            self._refusals.note("connection_refused", newcomer.peer, "too many connections, and none is idle")
             newcomer.close()
             return False
         self._accepted += 1

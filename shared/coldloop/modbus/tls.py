@@ -139,7 +139,7 @@ def _revocation_lists(
         raise ConfigurationError(f"{what} {file}: no PEM revocation list in it; name a file that has one")
     for each in lists:
         if not any(_is_by(each, authority) for authority in authorities):
-            raise ConfigurationError(f"{what} {file}: is not by an authority in ca; name the list of one of them")
+            raise ConfigurationError(f"{what} {file}: not issued by an authority in ca; name the list of one of them")
     return lists
 
 

@@ -1,6 +1,6 @@
 """Listens for TLS clients, and hands a connection on once it is secure.
 
-The event loop's own TLS server does not tell of handshakes that fail, and has no limit on those under way. Here each
+The event loop's own TLS server does not report failed handshakes, and has no limit on those under way. Here each
 is a task: it is counted when it fails, with the reason, and the oldest one gives way when there are too many.
 """
 
@@ -122,7 +122,7 @@ class TlsListener:
 
 def _reason(error: OSError) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate does not hold: {error.verify_message}"
+        return f"its certificate is invalid: {error.verify_message}"
     if isinstance(error, ssl.SSLError):
         return (error.reason or "TLS failed").replace("_", " ").lower()
     return f"the handshake ended early: {error}".rstrip(": ")

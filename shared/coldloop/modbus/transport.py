@@ -19,7 +19,7 @@ UNIT: Final = 1
 REQUESTS_AT_ONCE: Final = 16
 """Requests that may be under way."""
 NONSENSE: Final = b"\0"
-"""What stands for an answer that is not Modbus: it answers no function."""
+"""Placeholder of an answer that is not Modbus: it answers no function."""
 _FRAMER: Final = FramerSocket(DecodePDU(is_server=False))
 _PROTOCOL: Final = slice(2, 4)
 """Where a frame says which protocol it is of: 0 is Modbus."""
@@ -27,7 +27,7 @@ _LARGEST_FRAME: Final = 260
 
 
 class NoAnswerError(Exception):
-    """A request was not answered; `closed` tells whether the peer closed the connection."""
+    """A request was not answered; `closed`: the peer closed the connection."""
 
     def __init__(self, *, closed: bool) -> None:
         super().__init__("closed by the peer" if closed else "no answer in time")
@@ -69,7 +69,7 @@ class Transport:
         """Connect.
 
         Raises:
-            PeerUnreachableError: Nobody listens, nobody answers in time, or not with TLS.
+            PeerUnreachableError: No server listens, or none answers in time with TLS.
             UntrustedPeerError: The certificate of the peer does not hold.
         """
         loop = asyncio.get_running_loop()
@@ -81,17 +81,17 @@ class Transport:
                 f"{self.peer} cannot be trusted: {error.verify_message}: check the host name, and tls.ca here"
             ) from None
         except UnicodeError:
-            raise PeerUnreachableError(f"{self.peer}: the host name is none") from None
+            raise PeerUnreachableError(f"{self.peer}: the host name is invalid") from None
         except TimeoutError:
             raise PeerUnreachableError(
-                f"{self.peer} did not answer in time when it was called: check host, port and the network between"
+                f"{self.peer} did not accept the connection in time: check host, port and the network between"
             ) from None
         except OSError as error:
             if self._tls is not None and isinstance(
                 error, ssl.SSLError | ConnectionResetError | ConnectionAbortedError
             ):
                 raise PeerUnreachableError(f"{self.peer} does not speak TLS 1.3: check server.tls there") from None
-            raise PeerUnreachableError(f"nobody listens as {self.peer}: start it, or check host and port") from None
+            raise PeerUnreachableError(f"nothing listens as {self.peer}: start it, or check host and port") from None
 
     async def transact(self, requests: Sequence[bytes], timeout_s: float) -> list[bytes]:
         """Send up to `REQUESTS_AT_ONCE` PDUs, and return the answers' PDUs; whatever goes wrong closes the connection.
@@ -182,5 +182,5 @@ class _Wire(asyncio.Protocol):
             self._done.set_result(self._answers)
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - why it was lost changes nothing
-        """Tell who waits for an answer (event loop callback)."""
+        """Fail the waiting requests (event loop callback)."""
         self._fail(closed=True)

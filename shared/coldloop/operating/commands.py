@@ -37,7 +37,7 @@ class _Command(BaseModel):
 
 
 class SetMode(_Command):
-    """Who drives. Manual is taken over without a bump: the setpoints are what is applied at that moment."""
+    """Operating mode. The change to manual is bumpless: setpoints begin at the applied inputs."""
 
     kind: Literal["mode"]
     mode: Literal["auto", "classical", "manual"]
@@ -46,7 +46,7 @@ class SetMode(_Command):
     def text(self) -> str:
         """The command in words."""
         return {
-            "auto": "Hand over to automatic: MPC, and the fail-safe ladder when it is not there",
+            "auto": "Hand over to automatic: MPC, and the fail-safe ladder when MPC is unavailable",
             "classical": "Switch to the classical loops",
             "manual": "Take over in manual: the inputs stay where they are until a setpoint is written",
         }[self.mode]
@@ -99,7 +99,7 @@ class PlayLoad(_Command):
 
     @property
     def profile(self) -> LoadProfile:
-        """The load that the file tells."""
+        """The load in the file."""
         return load_profile_of(self.content, "load file")
 
     @property
@@ -121,7 +121,7 @@ class SetFactor(_Command):
     @property
     def text(self) -> str:
         """The command in words."""
-        return f"Let plant time go {self.factor:g} times as fast as real time"
+        return f"Run plant time {self.factor:g} times as fast as real time"
 
 
 class SetPaused(_Command):
@@ -133,7 +133,7 @@ class SetPaused(_Command):
     @property
     def text(self) -> str:
         """The command in words."""
-        return "Let plant time stand still" if self.paused else "Let plant time go on"
+        return "Pause plant time" if self.paused else "Resume plant time"
 
 
 class TreatAlarm(_Command):
@@ -152,7 +152,7 @@ class TreatAlarm(_Command):
     @classmethod
     def _known(cls, alarm: int) -> int:
         if alarm != ALL_ALARMS and alarm not in AlarmKind.__members__.values():
-            raise ValueError(f"there is no alarm {alarm}")
+            raise ValueError(f"unknown alarm {alarm}")
         return alarm
 
     @property
@@ -175,7 +175,7 @@ class FaultSensor(_Command):
     @classmethod
     def _known(cls, output: str) -> str:
         if output not in OUTPUT_NAMES:
-            raise ValueError(f"there is no output {output}")
+            raise ValueError(f"unknown output {output}")
         return output
 
     @property

@@ -43,7 +43,7 @@ MOST_NAMES: Final = 6
 """Alarms that are named; more are counted."""
 WAITING: Final = frozenset({AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED})
 HINTS: Final = {
-    1: "the certificate or the address of this client has not the role of an operator",
+    1: "the certificate or the address of this client does not have the operator role",
     3: "the value is not possible now",
     BUSY: "another client is its writer",
 }
@@ -100,7 +100,7 @@ def reason_of(error: Exception) -> str:
 
 
 async def set_mode(clients: Clients, command: SetMode) -> str:
-    """Write who drives; wait until the control PLC follows."""
+    """Write the operating mode; wait until the control PLC follows."""
     client = clients["control_plc"]
     mode = OperatorMode[command.mode.upper()]
     operator = await client.read(Operator)
@@ -139,7 +139,7 @@ async def check_manual(client: RegisterClient) -> Operator:
     """
     operator = await client.read(Operator)
     if operator.mode != OperatorMode.MANUAL:
-        raise UsageError("setpoints count in manual mode: take over in manual first")
+        raise UsageError("setpoints apply in manual mode only: take over in manual first")
     return operator
 
 
@@ -183,9 +183,7 @@ def _load_text(command: SetLoad, status: LoadStatus) -> str:
     if not status.upcoming:
         return f"load {status.watts:g} W now"
     if command.tick and status.last_tick != command.tick:
-        raise LinkError(
-            f"the load from {command.tick * TICK_S:g} s on is another one: somebody else has written it meanwhile"
-        )
+        raise LinkError(f"the load from {command.tick * TICK_S:g} s on is different: another client has overwritten it")
     text = f"load {command.watts:g} W from {status.last_tick * TICK_S:g} s on"
     if status.next_tick == status.last_tick:
         return text
@@ -215,11 +213,11 @@ async def stream_load(clients: Clients, load: LoadProfile, tick: int, say: Calla
     stream, begin = await _stream(plant, load, tick)
     taken = await stream.fill()
     if not stream.done:
-        say(f"the plant has taken {taken} steps of {stream.steps}: this goes on until it has all of them")
+        say(f"the plant has taken {taken} steps of {stream.steps}: the rest is written as it takes them")
     while not stream.done:
         await asyncio.sleep(LOOK_S)
         if await stream.was_replaced():
-            raise LinkError("somebody else has written the load meanwhile: the rest of the file is not written")
+            raise LinkError("another client has overwritten the load: the rest of the file is not written")
         await stream.fill()
     return await _streamed(plant, stream, begin)
 
@@ -303,7 +301,7 @@ def _treated(
     """Return what has become of alarms.
 
     Raises:
-        NotTakenError: Nothing of what was asked for.
+        NotTakenError: Nothing of the command took effect.
     """
     left = [kind for kind in kinds if not _is_done(action, rows[kind].state)]
     if len(left) == len(kinds):
@@ -352,7 +350,7 @@ async def set_factor(clients: Clients, command: SetFactor) -> str:
 
 
 async def set_paused(clients: Clients, command: SetPaused) -> str:
-    """Let plant time stand still, or go on."""
+    """Pause or resume plant time."""
     return await _set_pace(clients, lambda pace: pace._replace(paused=int(command.paused)))
 
 
@@ -362,7 +360,7 @@ async def _set_pace(clients: Clients, change: Callable[[SessionPace], SessionPac
     present = await plant.read(SessionPace)
     pace = change(present)
     if not pace.realtime:
-        raise UsageError("the session is in lock-step: it goes as far as it is granted")
+        raise UsageError("the session is in lock-step: time advances as it is granted")
     await write_pace(clients, pace)
     back, tick = await plant.read(SessionPace), (await plant.read(Identity)).tick
     return f"{'paused' if back.paused else 'running'} at {tick * TICK_S:g} s, factor {back.factor:g}"

@@ -10,9 +10,9 @@ from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 LEVEL_BAND: Final = (59.0, 61.0)
-"""Where L1 is to be, % (paper, section IV)."""
+"""Band of L1, % (paper, section IV)."""
 T5_BAND: Final = (9.0, 16.0)
-"""Where T5 is to be, K (paper, section IV)."""
+"""Band of T5, K (paper, section IV)."""
 
 
 class RateReference(StrEnum):
@@ -52,7 +52,7 @@ class InputLimits(BaseModel):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if any(low >= high for low, high in zip(self.low, self.high, strict=True)):
-            raise ValueError("each low is below its high")
+            raise ValueError("each low must be below its high")
         if min(self.rate) <= 0:
-            raise ValueError("each rate is positive")
+            raise ValueError("each rate must be positive")
         return self

@@ -36,7 +36,7 @@ class LoadProfile:
         if self.times[-1] > LAST_TICK:
             raise ValueError(f"tick {self.times[-1]} is after the last one of a session, {LAST_TICK}")
         if not all(0.0 <= load < math.inf for load in self.watts):
-            raise ValueError("loads are finite and not negative")
+            raise ValueError("loads must be finite and not negative")
 
     def value(self, tick: int) -> float:
         """Return the load (W) that is held from `tick` (0 or later) to the next."""
@@ -59,7 +59,7 @@ def read_load_file(path: Path) -> LoadProfile:
 
 
 def load_profile_of(text: str, where: str) -> LoadProfile:
-    """Return the load that a CSV text tells; `where` names it in messages.
+    """Return the load in a CSV text; `where` names it in messages.
 
     Raises:
         LoadFileError: One line that names place, line and remedy.
@@ -83,7 +83,7 @@ def load_profile_of(text: str, where: str) -> LoadProfile:
 
 
 def _step(row: dict[str, str | None], before: list[int], where: str) -> tuple[int, float]:
-    """Return the step (tick, W) that a line tells, if it may follow those before."""
+    """Return the step (tick, W) in a line, if it may follow those before."""
     time, load = (_number(row[column], f"{where}, {column}") for column in COLUMNS)
     if not 0 <= time < LAST_TICK * TICK_S:
         raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * TICK_S:g} s")

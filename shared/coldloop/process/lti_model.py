@@ -151,7 +151,7 @@ def discretise(A: RealArray, B: RealArray, F: RealArray, period_s: float) -> Dis
     from scipy.linalg import expm  # noqa: PLC0415 - only who discretises needs scipy
 
     if not (np.isfinite(period_s) and period_s > 0.0):
-        raise ValueError(f"a sampling period is positive, not {period_s} s")
+        raise ValueError(f"a sampling period must be positive, not {period_s} s")
     n, m = B.shape
     augmented = np.zeros((n + m + 1, n + m + 1))
     augmented[:n] = np.hstack([A, B, F[:, np.newaxis]]) * period_s

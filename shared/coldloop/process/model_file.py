@@ -14,7 +14,7 @@ from typing import Any
 from coldloop.errors import ModelFileError
 
 FORMAT = 1
-REMEDY = "make it anew with `python -m plant.cold_box.model FILE`"
+REMEDY = "make a new one with `python -m plant.cold_box.model FILE`"
 COLD_BOX = "cold-box"
 """The plant of a model file that names none."""
 

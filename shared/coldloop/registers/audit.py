@@ -13,7 +13,7 @@ NOBODY: Final = (0,) * WHO_WORDS
 
 
 class EventKind(IntEnum):
-    """What an event tells of: `subject`, `cause` and `value` depend on it."""
+    """Kind of an event: `subject`, `cause` and `value` depend on it."""
 
     NONE = 0
     MODE = 1
@@ -28,7 +28,7 @@ class EventKind(IntEnum):
     ALARM_OUT_OF_SERVICE = 7
     ALARM_IN_SERVICE = 8
     BOOT = 9
-    """The service started: subject 1 when it goes on with a retained state, cause 1 when one was set aside."""
+    """The service started: subject 1 when it resumes a retained state, cause 1 when one was set aside."""
     SESSION = 10
     """A session was started: subject 0 lock-step, 1 real time; value the factor."""
     OPERATOR_MODE = 11
@@ -70,7 +70,7 @@ class Event(NamedTuple):
     """One line of the journal. The row of event n is n modulo the number of rows; the first is number 1."""
 
     number: Annotated[int, u32("Number of the event, rising over restarts; 0 is none yet")] = 0
-    boot: Annotated[int, u16("Number of the start of the service in which it happened")] = 0
+    boot: Annotated[int, u16("Number of the start of the service")] = 0
     tick: Annotated[int, u32("Tick of plant time")] = 0
     utc: Annotated[int, u32("UTC, seconds since 1970", unit="s")] = 0
     milliseconds: Annotated[int, u16("Milliseconds of that time", unit="ms", high=999)] = 0
@@ -87,24 +87,24 @@ class Event(NamedTuple):
     subject: Annotated[int, u16("The mode, the alarm, ...: depends on the kind")] = 0
     cause: Annotated[int, u16("Why: depends on the kind")] = 0
     value: Annotated[float, f32("A value: depends on the kind")] = 0.0
-    who: Annotated[tuple[int, ...], text("Whose request it was: address, role, certificate", WHO_WORDS)] = NOBODY
+    who: Annotated[tuple[int, ...], text("Client of the request: address, role, certificate", WHO_WORDS)] = NOBODY
 
 
 class JournalQuery(NamedTuple):
     """Selects events when written; the answer is in the block behind it."""
 
-    first: Annotated[int, u32("Number of the first event looked at")]
+    first: Annotated[int, u32("Number of the first event to search")]
     kind: Annotated[int, u16("Only events of this kind; 0 is any")]
     subject: Annotated[int, u16("Only events with this subject; 65535 is any")]
 
 
 class JournalPage(NamedTuple):
-    """State of the journal, and where to go on after the last query."""
+    """State of the journal, and where the next query continues."""
 
     oldest: Annotated[int, u32("Number of the oldest event kept")] = 0
     newest: Annotated[int, u32("Number of the newest event")] = 0
     found: Annotated[int, u16("Events in the answer")] = 0
-    next_first: Annotated[int, u32("First number for the next query; 0 when there is nothing more")] = 0
+    next_first: Annotated[int, u32("First number for the next query; 0 at the end")] = 0
 
 
 class JournalAnswer(Event):

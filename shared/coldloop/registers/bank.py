@@ -58,7 +58,7 @@ class ForbiddenWriteError(RefusedAccessError):
 
 
 class BusyError(RefusedAccessError):
-    """Exception 06: somebody else holds the lease of this role."""
+    """Exception 06: another client holds the lease of this role."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(6, reason)
@@ -186,7 +186,7 @@ class RegisterBank:
             IllegalAddressError: A register does not exist or is read-only.
             ForbiddenWriteError: A register is not for the roles of the caller to write.
             IllegalValueError: A value is out of range, half of a 32-bit value, or does not fit the rest of its record.
-            BusyError: Somebody else holds the lease of the role.
+            BusyError: Another client holds the lease of the role.
         """
         span = self._span(address, len(data) // 2, caller)
         image = data

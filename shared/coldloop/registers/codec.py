@@ -76,9 +76,9 @@ class RecordCodec:
         return self._made_of(self._values.unpack(data, offset))
 
     def decode_checked(self, data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[Any, ...]:
-        """Return the record in `data` at `offset` (bytes), which somebody else has made.
+        """Return the record in `data` at `offset` (bytes), made by another program.
 
-        Registers that nobody has written yet are all 0, whatever their ranges.
+        Registers that have not been written yet are all 0, whatever their ranges.
 
         Raises:
             DomainError: A value is not one that its register can have.

@@ -4,7 +4,7 @@ from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.registers.declaration import Block, f32, u16, u32
-from coldloop.session.pace import Pace
+from coldloop.session.time_base import TimeBase
 
 MAGIC: Final = 123.456
 
@@ -19,12 +19,12 @@ class ServiceState(IntEnum):
 class Identity(NamedTuple):
     """Who answers, which map it speaks, and whether it is alive."""
 
-    magic: Annotated[float, f32("Always 123.456: reads right only with the right word order")] = MAGIC
+    magic: Annotated[float, f32("Always 123.456: reads correctly only with the right word order")] = MAGIC
     map_digest: Annotated[int, u32("Digest of this register map")] = 0
     map_version: Annotated[int, u16("Version of this register map")] = 0
     state: Annotated[int, u16("0 ready, 1 running", values=ServiceState)] = ServiceState.READY
     model_digest: Annotated[int, u32("First 32 bits of the digest of the prediction model in use")] = 0
-    session: Annotated[int, u32("Session being run")] = 0
+    session: Annotated[int, u32("Present session")] = 0
     tick: Annotated[int, u32("Present tick of plant time, counted from the start of the session", unit="0.25 s")] = 0
     heartbeat: Annotated[int, u16("Rises with every tick or update, and wraps")] = 0
 
@@ -35,13 +35,13 @@ class SessionPace(NamedTuple):
     It is the same record in all three maps; write it to the plant first, then to the control PLC and the optimiser PLC.
     """
 
-    session: Annotated[int, u32("Session that it is for; 0 is the one under way")] = 0
+    session: Annotated[int, u32("Session of the command; 0 is the present one")] = 0
     realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)] = 0
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)] = 1.0
-    paused: Annotated[int, u16("1 pause, 0 go on; in real time only", high=1)] = 0
+    paused: Annotated[int, u16("1 pause, 0 resume; in real time only", high=1)] = 0
 
-    def of(self, session: int) -> Pace:
-        """Return the time base that is asked for.
+    def of(self, session: int) -> TimeBase:
+        """Return the requested time base.
 
         Raises:
             ValueError: It is not for this session, or there is none.
@@ -52,15 +52,15 @@ class SessionPace(NamedTuple):
             raise ValueError(f"session {session} is under way, not {self.session}")
         if self.paused and not self.realtime:
             raise ValueError("lock-step is not paused: grant no more ticks")
-        return Pace(bool(self.realtime), self.factor, bool(self.paused))
+        return TimeBase(bool(self.realtime), self.factor, bool(self.paused))
 
     @classmethod
-    def shown(cls, session: int, pace: Pace) -> "SessionPace":
+    def shown(cls, session: int, pace: TimeBase) -> "SessionPace":
         """Return the record of a time base."""
         return cls(session, int(pace.realtime), pace.factor, int(pace.paused))
 
 
-def pace_subject(pace: Pace) -> int:
+def pace_subject(pace: TimeBase) -> int:
     """Return the subject of the event PACE: 0 lock-step, 1 real time, 2 paused."""
     return 2 if pace.paused else int(pace.realtime)
 
@@ -68,9 +68,9 @@ def pace_subject(pace: Pace) -> int:
 class ServerStatistics(NamedTuple):
     """What the server has done since it started; all counts wrap."""
 
-    connections: Annotated[int, u16("Connections open now")] = 0
+    connections: Annotated[int, u16("Open connections")] = 0
     accepted: Annotated[int, u32("Connections accepted")] = 0
-    requests: Annotated[int, u32("Requests, the refused ones too")] = 0
+    requests: Annotated[int, u32("Requests, including refused ones")] = 0
     illegal_function: Annotated[int, u32("Requests refused: function not served")] = 0
     illegal_address: Annotated[int, u32("Requests refused: no such register, or read-only")] = 0
     illegal_value: Annotated[int, u32("Requests refused: quantity, length or value")] = 0
@@ -79,12 +79,12 @@ class ServerStatistics(NamedTuple):
     malformed_frame: Annotated[int, u32("Connections closed: not Modbus/TCP")] = 0
     idle_timeout: Annotated[int, u32("Connections closed: no request for too long")] = 0
     connection_evicted: Annotated[int, u32("Connections closed: idle, and replaced by a new one")] = 0
-    connection_refused: Annotated[int, u32("Connections refused: too many, and all busy")] = 0
-    access_refused: Annotated[int, u32("Writes and connections refused: not for this client")] = 0
-    tls_refused: Annotated[int, u32("Connections refused: no TLS 1.3, or no certificate that holds")] = 0
-    rate_limited: Annotated[int, u32("Times that a connection was made to wait for its rate")] = 0
-    second_writer: Annotated[int, u32("Writes refused: somebody else holds the lease of the role")] = 0
+    connection_refused: Annotated[int, u32("Connections refused: too many, and none idle")] = 0
+    access_refused: Annotated[int, u32("Writes and connections refused: no permission")] = 0
+    tls_refused: Annotated[int, u32("Connections refused: no TLS 1.3, or no valid certificate")] = 0
+    rate_limited: Annotated[int, u32("Times that a connection was delayed by its rate limit")] = 0
+    second_writer: Annotated[int, u32("Writes refused: another client holds the lease of the role")] = 0
 
 
-IDENTITY_BLOCK: Final = Block("identity", 0, Identity, "Who answers, and whether it is alive")
-STATISTICS_BLOCK: Final = Block("statistics", 60, ServerStatistics, "What the server has done, and what it refused")
+IDENTITY_BLOCK: Final = Block("identity", 0, Identity, "Identity and heartbeat of the service")
+STATISTICS_BLOCK: Final = Block("statistics", 60, ServerStatistics, "Requests served and refused")

@@ -23,7 +23,7 @@ DIGEST_WORDS: Final = 32
 class ConfigurationDigest(NamedTuple):
     """How long the text of the configuration is, and its digest."""
 
-    length: Annotated[int, u16("Characters of the text; more than the lines hold means that it is cut off")]
+    length: Annotated[int, u16("Characters of the text; it is cut off if this is more than the lines hold")]
     sha256: Annotated[tuple[int, ...], text("SHA-256 of the text, in hexadecimal", DIGEST_WORDS)]
 
 

@@ -40,7 +40,7 @@ class Mode(IntEnum):
 
 
 class Cause(IntEnum):
-    """Why the mode is what it is."""
+    """Cause of the mode."""
 
     NONE = 0
     SESSION_STARTED = 1
@@ -57,13 +57,13 @@ class OperatorMode(IntEnum):
     """What an operator wants."""
 
     AUTO = 0
-    """MPC, and the ladder when it is not there."""
+    """MPC, and the ladder when MPC is unavailable."""
     CLASSICAL = 1
     MANUAL = 2
 
 
 class Verdict(IntEnum):
-    """What the control PLC thinks of a sequence."""
+    """Judgement of a sequence by the control PLC."""
 
     NONE = 0
     ACCEPTED = 1
@@ -79,7 +79,7 @@ class Verdict(IntEnum):
     NOT_INVITED = 11
     """No sequence is played now: an operator drives, or a sensor that MPC needs is bad."""
     PLANT_LOST = 12
-    """The rack has not been in step for a while."""
+    """The rack has not been synchronised for a while."""
 
 
 class PlantLinkState(IntEnum):
@@ -90,13 +90,13 @@ class PlantLinkState(IntEnum):
     SEARCHING = 1
     """The rack does not answer."""
     JOINING = 2
-    """It answers; what it applies is being read back, nothing is written."""
-    IN_STEP = 3
-    """Outputs are written in every scan, and taken."""
-    NOT_TAKEN = 4
-    """It answers, and does not take the outputs."""
-    FOREIGN = 5
-    """It is in another session, or somebody else drives it."""
+    """It answers; its outputs are being read back, nothing is written."""
+    SYNCHRONISED = 3
+    """Outputs are written in every scan, and accepted."""
+    REJECTED = 4
+    """It answers, and rejects the outputs."""
+    OTHER_MASTER = 5
+    """It is in another session, or has another master."""
     FROZEN = 6
     """It answers, and its clock does not move."""
 
@@ -109,26 +109,26 @@ class LinkCause(IntEnum):
     DAMAGED = 2
     """An answer whose seal is broken or absent."""
     IMPLAUSIBLE = 3
-    """It says what cannot be: a value out of its range, or no number."""
+    """A value out of its range, or not a number."""
     WRONG_SESSION = 4
-    UNTIMELY = 5
+    STALE = 5
     CHANGED = 6
-    """What it applies was changed by somebody else, or by its watchdog."""
+    """Its outputs were changed by another master, or by its watchdog."""
     SECOND_MASTER = 7
     """Another control PLC holds the lease of the rack."""
     REFUSED = 8
     """It refused a request with an exception."""
-    OVERSLEPT = 9
-    """This program stood still for a tick or more."""
-    LEAPT = 10
-    """The tick of the rack leapt, or went back."""
+    MISSED_SCANS = 9
+    """This program missed one or more ticks."""
+    TIME_JUMP = 10
+    """The tick of the rack jumped, or went back."""
     STOPPED = 11
     """The tick of the rack does not move."""
     STARTED = 12
-    PACE = 13
+    TIME_BASE = 13
     """The time base of the session was changed."""
     LIMITED = 14
-    """The rack moved its outputs by no more than it lets anybody move them in one of its ticks."""
+    """The rack limited the change of its outputs to the rate of one tick."""
 
 
 class Process(NamedTuple):
@@ -159,7 +159,7 @@ class Status(NamedTuple):
 
 
 class LadderStatus(NamedTuple):
-    """Step of the fail-safe ladder, and what it knows of those it depends on."""
+    """Step of the fail-safe ladder, and the state of its inputs."""
 
     mode: Annotated[int, u16("0 hold, 1 MPC, 2 classical loops, 3 rest of a sequence, 4 manual", values=Mode)]
     cause: Annotated[
@@ -171,7 +171,7 @@ class LadderStatus(NamedTuple):
         ),
     ]
     since: Annotated[int, u32("Tick at which this mode began")]
-    optimizer: Annotated[int, u16("1 while the optimiser shows signs of life", high=1)]
+    optimizer: Annotated[int, u16("1 while the optimiser is alive", high=1)]
     bad_sensors: Annotated[int, u32("Outputs whose measurement is substituted: bit i is output i")]
     events: Annotated[int, u32("Number of the last event")]
 
@@ -200,7 +200,7 @@ class Update(NamedTuple):
     ]
     x: Annotated[
         tuple[float, ...],
-        f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS, low=-MAX_STATE, high=MAX_STATE),
+        f32_array("Simulated state, not measured", STATE_NAMES, STATE_UNITS, low=-MAX_STATE, high=MAX_STATE),
     ]
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none")] = 0
 
@@ -243,9 +243,9 @@ class Acknowledgement(NamedTuple):
 class Heartbeat(NamedTuple):
     """Sign of life of the optimiser, besides its other requests."""
 
-    beat: Annotated[int, u16("Any number; writing it is what counts")]
+    beat: Annotated[int, u16("Any number; the write itself triggers the watchdog")]
     model_digest: Annotated[int, u32("First 32 bits of the digest of the optimiser's prediction model")]
-    holder: Annotated[int, u32("Number that the optimiser has given itself; 0 is a simple client")] = 0
+    holder: Annotated[int, u32("Number chosen by the optimiser; 0 is a simple client")] = 0
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
@@ -296,7 +296,7 @@ class PlantLinkStatus(NamedTuple):
     state: Annotated[
         int,
         u16(
-            "0 idle, 1 searching, 2 joining, 3 in step, 4 outputs not taken, 5 foreign, 6 frozen",
+            "0 idle, 1 searching, 2 joining, 3 synchronised, 4 rejected, 5 other master, 6 frozen",
             high=6,
             values=PlantLinkState,
         ),
@@ -304,26 +304,26 @@ class PlantLinkStatus(NamedTuple):
     cause: Annotated[
         int,
         u16(
-            "0 none, 1 no answer, 2 damaged, 3 implausible, 4 wrong session, 5 untimely, 6 changed, 7 second master, "
-            "8 refused, 9 overslept, 10 leapt, 11 stopped, 12 started, 13 pace, 14 limited",
+            "0 none, 1 no answer, 2 damaged, 3 implausible, 4 wrong session, 5 stale, 6 changed, 7 second master, "
+            "8 refused, 9 missed scans, 10 time jump, 11 stopped, 12 started, 13 time base, 14 limited",
             values=LinkCause,
         ),
     ] = LinkCause.NONE
     since: Annotated[int, u32("Tick at which this state began")] = 0
-    breaks: Annotated[int, u32("Times that the link has left the state in step")] = 0
-    holder: Annotated[int, u32("Number that this control PLC has given itself")] = 0
+    breaks: Annotated[int, u32("Times that the link has lost synchronisation")] = 0
+    holder: Annotated[int, u32("Number chosen by this control PLC")] = 0
     generation: Annotated[int, u32("Generation of the rack's outputs that was read back")] = 0
     plant_session: Annotated[int, u32("Session of the rack when it last answered")] = 0
     plant_tick: Annotated[int, u32("Tick of the rack when it last answered")] = 0
-    offset: Annotated[float, f32("Phase of the rack's clock against ours, less what it should be", unit="ms")] = 0.0
-    skew: Annotated[float, f32("How much faster the rack's clock is than ours", unit="ppm")] = 0.0
+    offset: Annotated[float, f32("Phase error of the rack's clock against ours", unit="ms")] = 0.0
+    skew: Annotated[float, f32("Skew of the rack's clock; positive: faster than ours", unit="ppm")] = 0.0
     skew_error: Annotated[float, f32("Standard error of that", unit="ppm", finite=False)] = 0.0
 
 
 class ControlSession(NamedTuple):
     """Starts a session when written."""
 
-    session: Annotated[int, u32("Number of the session; the control PLC starts anew from tick 0", low=1)]
+    session: Annotated[int, u32("Number of the session; the control PLC restarts from tick 0", low=1)]
     realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
 
@@ -346,22 +346,20 @@ CONTROL_MAP: Final = RegisterMap(
         Block("update", 200, Update, "Latched at the last updating instant", sealed=True),
         Block("plant link", 330, PlantLinkStatus, "Link to the rack, and the clocks of both"),
         Block("optimiser lease", 360, LeaseStatus, "Who may write as the optimiser"),
-        Block(
-            "await update", 400, AwaitUpdate, "Lets a read of the latch wait for an update", Role.OPTIMIZER, sealed=True
-        ),
+        Block("await update", 400, AwaitUpdate, "Makes a read of the latch wait", Role.OPTIMIZER, sealed=True),
         Block("plan", 410, Plan, "Decided updating period", Role.OPTIMIZER, sealed=True),
         Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence", sealed=True),
-        Block("heartbeat", 430, Heartbeat, "Sign of life of the optimiser", Role.OPTIMIZER, sealed=True),
+        Block("heartbeat", 430, Heartbeat, "Heartbeat of the optimiser", Role.OPTIMIZER, sealed=True),
         Block("watchdog", 440, WatchdogStatus, "Watches the optimiser"),
         Block("watchdog time", 446, WatchdogTime, "Sets that watchdog", Role.OPERATOR),
         Block("session", 450, ControlSession, "Start of a session", Role.OPERATOR),
-        Block("grant", 460, Grant, "How far to go in lock-step", Role.OPERATOR),
-        Block("latched update", 462, LatchedUpdate, "The newest update, in short", sealed=True),
-        Block("operator", 470, Operator, "Who drives, and manual setpoints", Role.OPERATOR),
-        Block("alarm command", 480, AlarmCommand, "What is to be done with an alarm", Role.OPERATOR),
+        Block("grant", 460, Grant, "Ticks granted in lock-step", Role.OPERATOR),
+        Block("latched update", 462, LatchedUpdate, "The newest update", sealed=True),
+        Block("operator", 470, Operator, "Operating mode and manual setpoints", Role.OPERATOR),
+        Block("alarm command", 480, AlarmCommand, "Command for an alarm", Role.OPERATOR),
         Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
         Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
-        Block("pace", 1950, SessionPace, "Time base of the session under way", Role.OPERATOR),
+        Block("pace", 1950, SessionPace, "Time base of the present session", Role.OPERATOR),
         Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(AlarmKind)),
         Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
         Block("journal page", 45010, JournalPage, "State of the journal"),

@@ -56,7 +56,7 @@ class Field:
     is_text: bool = False
     """The elements are the words of a text (`registers.text`)."""
     finite: bool = True
-    """No NaN and no infinity; where they may be, whoever uses the value judges it."""
+    """No NaN and no infinity; where they are allowed, the user of the value checks it."""
 
     @property
     def words(self) -> int:

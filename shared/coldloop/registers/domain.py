@@ -1,6 +1,6 @@
 """What the values of registers may be, by their declarations: the one check of all that comes from another side.
 
-A server checks what is written with it, a client what it reads, and a program the records of a file.
+Servers check writes with it, clients what they read, and programs the records of a file.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Register map of the optimiser PLC: what it did with each update, and the settings of a session."""
+"""Register map of the optimiser PLC: the results of each update, and the settings of a session."""
 
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
@@ -28,7 +28,7 @@ class OptimizerSession(NamedTuple):
     """Settings of a session, taken when its first update arrives."""
 
     session: Annotated[int, u32("Number of the session", low=1)]
-    realtime: Annotated[int, u16("0 lock-step, 1 real time: answers then arrive when the PLC would have them", high=1)]
+    realtime: Annotated[int, u16("0 lock-step, 1 real time: answers are delayed as by the PLC", high=1)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
     updating_period: Annotated[int, u16("Fixed updating period, 2 or more; 0 is adaptive", unit="0.25 s", high=20)]
 
@@ -39,12 +39,12 @@ class ControlLinkState(IntEnum):
     SEARCHING = 0
     """The control PLC does not answer."""
     INTRODUCING = 1
-    """It answers: who it is and which model it runs is being found out."""
+    """It answers: its identity and model are being checked."""
     WAITING = 2
     """For the next update."""
     COMPUTING = 3
     DELIVERING = 4
-    FOREIGN = 5
+    OTHER_MASTER = 5
     """Another optimiser holds the lease."""
     WRONG_MODEL = 6
     """The control PLC runs another model."""
@@ -56,16 +56,16 @@ class ControlLinkStatus(NamedTuple):
     state: Annotated[
         int,
         u16(
-            "0 searching, 1 introducing, 2 waiting, 3 computing, 4 delivering, 5 foreign, 6 wrong model",
+            "0 searching, 1 introducing, 2 waiting, 3 computing, 4 delivering, 5 other master, 6 wrong model",
             high=6,
             values=ControlLinkState,
         ),
     ] = ControlLinkState.SEARCHING
-    holder: Annotated[int, u32("Number that this optimiser has given itself")] = 0
+    holder: Annotated[int, u32("Number chosen by this optimiser")] = 0
     breaks: Annotated[int, u32("Times that the link was lost")] = 0
-    damaged: Annotated[int, u32("Answers whose seal was broken")] = 0
+    damaged: Annotated[int, u32("Answers with a broken seal")] = 0
     rejected: Annotated[int, u32("Sequences that the control PLC has rejected")] = 0
-    interrupted: Annotated[int, u32("Computations given up for a newer update")] = 0
+    interrupted: Annotated[int, u32("Computations abandoned for a newer update")] = 0
 
 
 class Optimization(NamedTuple):
@@ -115,9 +115,9 @@ class UpdatingRuleStatus(NamedTuple):
     q_min: Annotated[int, u16("Fewest iterations that the rule chooses")] = 0
     q_max: Annotated[int, u16("Most iterations that the rule chooses")] = 0
     delta: Annotated[int, u16("Step of Algorithm 1 in iterations; 0 for other rules")] = 0
-    slots: Annotated[float, f32("Time that a period keeps free for the preparation", unit="s")] = 0.0
-    preparation: Annotated[float, f32("Time that the preparation takes", unit="s")] = 0.0
-    iteration: Annotated[float, f32("Time that an iteration takes", unit="s")] = 0.0
+    slots: Annotated[float, f32("Time reserved in a period for the preparation", unit="s")] = 0.0
+    preparation: Annotated[float, f32("Duration of the preparation", unit="s")] = 0.0
+    iteration: Annotated[float, f32("Duration of an iteration", unit="s")] = 0.0
 
 
 class OperatingLimits(NamedTuple):
@@ -166,10 +166,10 @@ OPTIMIZER_MAP: Final = RegisterMap(
         Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
         Block("control link", 40, ControlLinkStatus, "Link to the control PLC"),
         STATISTICS_BLOCK,
-        Block("pace", 100, SessionPace, "Time base of the session under way", Role.OPERATOR),
+        Block("pace", 100, SessionPace, "Time base of the present session", Role.OPERATOR),
         Block("updating rule", 120, UpdatingRuleStatus, "What decides the updating period"),
         Block("operating limits", 140, OperatingLimits, "Bands of the outputs, bounds and rates of the inputs"),
-        Block("prediction", 200, Prediction, "What the last sequence is expected to lead to", sealed=True),
+        Block("prediction", 200, Prediction, "Predicted result of the last sequence", sealed=True),
         Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
         Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
         Block("journal page", 45010, JournalPage, "State of the journal"),

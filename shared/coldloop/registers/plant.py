@@ -40,63 +40,59 @@ LONGEST_AHEAD_TICKS: Final = 0xFFFF
 
 
 class OutputVerdict(IntEnum):
-    """What the rack did with the outputs that it was sent last."""
+    """Judgement of the last outputs by the rack."""
 
     NONE = 0
-    """None have been sent, or they were not for this rack to judge: they were refused with an exception."""
-    TAKEN = 1
+    """None have been sent, or they were refused with an exception."""
+    ACCEPTED = 1
     WRONG_SESSION = 2
-    UNTIMELY = 3
+    STALE = 3
     """For another tick than the present one; in real time, too old."""
     CHANGED = 4
-    """What is applied has changed since it was read back: read it back, and begin from there."""
+    """The outputs have changed since they were read back: read them back again."""
     LIMITED = 5
-    """Applied as far as the rack lets outputs move in one of its ticks: read back how far, and begin from there."""
+    """Applied as far as the rate of one tick allows: read them back again."""
 
 
 class Actuators(NamedTuple):
     """Outputs for one tick, of the one control PLC that holds the lease of the rack.
 
-    The rack judges them whole; its next measurement tells whether it has taken them.
+    The rack judges them whole; its next measurement shows whether they were accepted.
     """
 
-    tick: Annotated[
-        int, u32("Tick of these outputs; in lock-step writing the present one moves the plant on", high=LAST_TICK)
-    ]
+    tick: Annotated[int, u32("Tick of these outputs; in lock-step the present one advances the plant", high=LAST_TICK)]
     cv155: Annotated[float, f32("Opening of the Joule-Thomson valve", unit="%", low=0, high=100)]
     ncr22: Annotated[float, f32("Actuator part of the bath heater's power", unit="W", low=0, high=1000)]
     cv156: Annotated[float, f32("Opening of the turbine valve", unit="%", low=0, high=100)]
-    session: Annotated[int, u32("Session that these outputs belong to")]
-    holder: Annotated[int, u32("Number that the writer has given itself; 0 is a simple client")] = 0
+    session: Annotated[int, u32("Session of these outputs")]
+    holder: Annotated[int, u32("Number chosen by the writer; 0 is a simple client")] = 0
     generation: Annotated[int, u32("Generation that was read back; 0 does not compare")] = 0
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
 class Measurement(NamedTuple):
-    """What the rack reads at one tick, what it applies, and who decided that.
+    """Measured values and applied outputs of the rack at one tick.
 
-    Load, outputs and states may be any number, or none: sensors fail, and the control PLC goes on without them.
+    Load, outputs and states may be any number, or NaN: sensors fail, and the control PLC works without them.
     """
 
     tick: Annotated[int, u32("Tick at which these values were read", high=LAST_TICK)]
-    load: Annotated[float, f32("Heat load NCR22_HL (the same heater, so it is known)", unit="W", finite=False)]
+    load: Annotated[float, f32("Heat load NCR22_HL (known, as the heater sets it)", unit="W", finite=False)]
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS, finite=False)]
-    x: Annotated[
-        tuple[float, ...], f32_array("Simulated state: no sensor has it", STATE_NAMES, STATE_UNITS, finite=False)
-    ]
+    x: Annotated[tuple[float, ...], f32_array("Simulated state, not measured", STATE_NAMES, STATE_UNITS, finite=False)]
     session: Annotated[int, u32("Session")]
     u: Annotated[
         tuple[float, ...], f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS, low=0, high=MAX_INPUT)
     ] = (0.0, 0.0, 0.0)
-    holder: Annotated[int, u32("Whose outputs they are; 0 is a simple client's, the safe state or the beginning")] = 0
+    holder: Annotated[int, u32("Holder of these outputs; 0 is a simple client, safe or initial state")] = 0
     generation: Annotated[
         int,
-        u32("Rises when outputs change in another way than by their writer: safe state, session, new writer", low=1),
+        u32("Rises when outputs change other than by their writer: safe state, session, new writer", low=1),
     ] = 1
     verdict: Annotated[
         int,
         u16(
-            "Outputs sent last: 0 none, 1 taken, 2 wrong session, 3 untimely, 4 changed since they were read back, "
+            "Outputs sent last: 0 none, 1 accepted, 2 wrong session, 3 stale, 4 changed since they were read back, "
             "5 limited to the rate in a tick",
             values=OutputVerdict,
         ),
@@ -130,7 +126,7 @@ class SensorFault(NamedTuple):
 class PlantSession(NamedTuple):
     """Starts a simulation session when written."""
 
-    session: Annotated[int, u32("Number of the session; the simulation starts anew from tick 0", low=1)]
+    session: Annotated[int, u32("Number of the session; the simulation restarts from tick 0", low=1)]
     realtime: Annotated[int, u16("0 lock-step, 1 real time", high=1)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
     seed: Annotated[int, u32("Seed of the sensor noise")]
@@ -151,16 +147,14 @@ class LoadStatus(NamedTuple):
     next_tick: Annotated[int, u32("Tick of the next step that is known; 0 is none", unit="0.25 s")] = 0
     next_watts: Annotated[float, f32("Heat load from then on", unit="W")] = 0.0
     last_tick: Annotated[int, u32("Tick of the last step that is known; it is held from there on", unit="0.25 s")] = 0
-    upcoming: Annotated[int, u16("Steps to come that are known")] = 0
-    free: Annotated[int, u16("Further steps that can be taken now")] = 0
+    upcoming: Annotated[int, u16("Known future steps")] = 0
+    free: Annotated[int, u16("Further steps that can be accepted now")] = 0
 
 
 class LiveLoad(NamedTuple):
     """Changes the heat load of the session under way; what was known of later ticks is dropped."""
 
-    tick: Annotated[
-        int, u32("First tick of it, which is to come; 0 is the next one", unit="0.25 s", high=LAST_TICK)
-    ] = 0
+    tick: Annotated[int, u32("First tick, in the future; 0 is the next tick", unit="0.25 s", high=LAST_TICK)] = 0
     watts: Annotated[float, f32("Heat load", unit="W", low=0, high=MAX_LOAD_W)] = 0.0
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
@@ -168,8 +162,8 @@ class LiveLoad(NamedTuple):
 class LoadAhead(NamedTuple):
     """Steps of the heat load that are to come, for loads of any length; what was known from the first on is dropped."""
 
-    session: Annotated[int, u32("Session that they are for")] = 0
-    tick: Annotated[int, u32("Tick of the first step, which is to come", unit="0.25 s", high=LAST_TICK)] = 0
+    session: Annotated[int, u32("Session of these steps")] = 0
+    tick: Annotated[int, u32("Tick of the first step, in the future", unit="0.25 s", high=LAST_TICK)] = 0
     length: Annotated[int, u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
     watts: Annotated[
         tuple[float, ...], f32_array("Heat load of step", tuple(map(str, range(AHEAD_STEPS))), ("W",) * AHEAD_STEPS)
@@ -277,7 +271,7 @@ class StationStatus(NamedTuple):
     signals: Annotated[
         tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
     ] = (0.0,) * len(STATION_SIGNAL_NAMES)
-    commands: Annotated[tuple[float, ...], f32_array("Opening asked of valve", STATION_VALVE_NAMES, ("%",) * 4)] = (
+    commands: Annotated[tuple[float, ...], f32_array("Requested opening of valve", STATION_VALVE_NAMES, ("%",) * 4)] = (
         0.0,
     ) * len(STATION_VALVE_NAMES)
 
@@ -287,7 +281,7 @@ class Surroundings(NamedTuple):
 
     nc1: Annotated[int, u16("1: compressor NC1 runs, 0: it has tripped", high=1)] = 1
     nc2: Annotated[int, u16("1: compressor NC2 runs, 0: it has tripped", high=1)] = 1
-    nitrogen: Annotated[int, u16("1: there is nitrogen in the tank, 0: there is none", high=1)] = 1
+    nitrogen: Annotated[int, u16("1: nitrogen in the tank, 0: none", high=1)] = 1
     leak: Annotated[float, f32("Leak of the high-pressure line, as at 16 bar", unit="g/s", low=0, high=50)] = 0.0
     ambient: Annotated[float, f32("Temperature of the surroundings", unit="K", low=270, high=320)] = 300.0
 
@@ -300,15 +294,22 @@ PLANT_MAP: Final = RegisterMap(
         STATISTICS_BLOCK,
         Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL, sealed=True),
         Block("measurement", 200, Measurement, "Inputs of the control PLC", sealed=True),
-        Block("watchdog", 330, WatchdogStatus, "Watches the control PLC; outputs are made safe when it expires"),
+        Block("watchdog", 330, WatchdogStatus, "Watches the control PLC; applies the safe state when it expires"),
         Block("watchdog time", 340, WatchdogTime, "Sets that watchdog", Role.CONTROL),
         Block("lease", 350, LeaseStatus, "Who may write outputs"),
         Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
-        Block("pace", 410, SessionPace, "Time base of the session under way", Role.OPERATOR),
-        Block("load status", 420, LoadStatus, "The heat load, and what is known of it"),
+        Block("pace", 410, SessionPace, "Time base of the present session", Role.OPERATOR),
+        Block("load status", 420, LoadStatus, "The heat load and its known steps"),
         Block("live load", 440, LiveLoad, "Heat load from a tick on", Role.OPERATOR, sealed=True),
-        Block("sensor faults", 500, SensorFault, "Faults put into the outputs", Role.OPERATOR, len(OUTPUT_NAMES)),
-        Block("load ahead", 600, LoadAhead, "Steps of the heat load to come", Role.OPERATOR, sealed=True),
+        Block(
+            "sensor faults",
+            500,
+            SensorFault,
+            "Faults injected into the measured outputs",
+            Role.OPERATOR,
+            len(OUTPUT_NAMES),
+        ),
+        Block("load ahead", 600, LoadAhead, "Future steps of the heat load", Role.OPERATOR, sealed=True),
         Block("station", 700, StationStatus, "Compression station and nitrogen pre-cooler of a whole refrigerator"),
         Block(
             "surroundings",

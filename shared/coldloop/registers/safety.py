@@ -28,11 +28,11 @@ class WatchdogStatus(NamedTuple):
 class WatchdogTime(NamedTuple):
     """Sets a watchdog when written."""
 
-    time: Annotated[int, u16("Time-out; 0 switches the watchdog off, a new value starts it anew", unit="0.25 s")]
+    time: Annotated[int, u16("Time-out; 0 switches the watchdog off, a new value restarts it", unit="0.25 s")]
 
 
 class LeaseState(IntEnum):
-    """Whether somebody is the one writer of a role."""
+    """State of the lease of a role."""
 
     FREE = 0
     HELD = 1
@@ -46,7 +46,7 @@ class LeaseStatus(NamedTuple):
     state: Annotated[int, u16("0 free, 1 held, 2 lingering: its connection has closed", values=LeaseState)] = (
         LeaseState.FREE
     )
-    holder: Annotated[int, u32("Number that the holder has given itself; 0 is a simple client")] = 0
+    holder: Annotated[int, u32("Number chosen by the holder; 0 is a simple client")] = 0
     refused: Annotated[int, u32("Writes of others that were refused with exception 06")] = 0
     who: Annotated[tuple[int, ...], text("Address, role and certificate of the holder", WHO_WORDS)] = NOBODY
 
@@ -67,7 +67,7 @@ class AlarmKind(IntEnum):
     SCAN_OVERRUN = 10
     ACCESS_REFUSED = 11
     PLANT_FOREIGN = 12
-    """The rack is driven by somebody else, or is in another session."""
+    """The rack has another master, or is in another session."""
     PLANT_FROZEN = 13
     """The rack answers, and its clock does not move."""
     OUTPUTS_NOT_TAKEN = 14

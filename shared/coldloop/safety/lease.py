@@ -3,8 +3,8 @@
 A lease is granted to a connection with its first write, and refused to all others while it is held. It ends with
 silence, or by hand-over: when the connection of a simple client closes, at once; when that of a holder with a number
 closes, after a moment in which it may come back over another connection, from the same address and with the same
-certificate: the number is no password, anybody can read it. A holder that comes back leaves its former connection for
-good: whoever writes over that one has the same number and is somebody else.
+certificate: the number is no password, anyone can read it. A holder that reconnects leaves its former connection for
+good: another client that writes over it has the same number.
 """
 
 import time
@@ -51,7 +51,7 @@ class Lease:
 
     @property
     def state(self) -> LeaseState:
-        """Whether somebody holds it now."""
+        """Whether it is held now."""
         if self._caller is None:
             return LeaseState.FREE
         silence_s, now = self._silence_s(), self._now()
@@ -65,7 +65,7 @@ class Lease:
         """Check that a caller may write; `holder` is the number that it says it has, None where it does not say.
 
         Raises:
-            BusyError: Somebody else holds the lease.
+            BusyError: Another client holds the lease.
         """
         held = self._caller
         if held is None or held.connection == caller.connection or self.state is LeaseState.FREE:
@@ -77,7 +77,7 @@ class Lease:
         raise BusyError(f"{held.name} holds the lease of {self._what}")
 
     def take(self, caller: Caller, holder: int | None = None) -> bool:
-        """Note a write that `check` has let pass; tell whether the lease has a new holder with it."""
+        """Note a write that `check` has let pass; return whether the lease has a new holder with it."""
         held, state = self._caller, self.state
         same = held is not None and held.connection == caller.connection
         number = self._holder if holder is None and same else holder or SIMPLE_CLIENT
@@ -92,7 +92,7 @@ class Lease:
         return new
 
     def closed(self, caller: Caller) -> bool:
-        """Note that a connection has closed; tell whether it held the lease."""
+        """Note that a connection has closed; return whether it held the lease."""
         self._left.discard(caller.connection)
         gone = self._caller is None or self._caller.connection != caller.connection
         if gone or self._closed_at is not None:

@@ -37,7 +37,7 @@ class RetainSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     file: Path | None = None
-    """None keeps nothing: after a restart the service begins anew."""
+    """None keeps nothing: a restarted service has no state."""
 
 
 def encoded(state: Mapping[str, Any], owner: str, digest: int) -> bytes:
@@ -58,9 +58,9 @@ def decoded(data: bytes, owner: str, digest: int) -> dict[str, Any]:
     try:
         state = json.loads(content)
     except (ValueError, RecursionError):
-        raise RetainedStateError("what it holds is no state; it is not used") from None
+        raise RetainedStateError("it holds no valid state; it is not used") from None
     if not isinstance(state, dict):
-        raise RetainedStateError("what it holds is no state; it is not used")
+        raise RetainedStateError("it holds no valid state; it is not used")
     return state
 
 
@@ -138,7 +138,7 @@ class RetainedFile:
 
 
 def _is_device(path: Path) -> bool:
-    """Tell whether a path is a device, such as /dev/null, which an administrator could replace for everybody."""
+    """Return whether a path is a device, such as /dev/null, which an administrator could replace for everybody."""
     try:
         mode = path.lstat().st_mode
     except OSError:
@@ -151,14 +151,14 @@ def _read(path: Path) -> bytes:
     with open(path, "rb", opener=lambda name, _flags: os.open(name, ORDINARY)) as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
-            raise RetainedStateError("no ordinary file; it is not used")
+            raise RetainedStateError("not a regular file; it is not used")
         if status.st_size > MOST_BYTES:
-            raise RetainedStateError(f"{status.st_size} bytes are no state; it is not used")
+            raise RetainedStateError(f"{status.st_size} bytes are too many for a state; it is not used")
         return file.read(MOST_BYTES)
 
 
 def _new(path: Path) -> FileIO:
-    """Create a draft; one that was left there, whatever it is, is removed and not followed."""
+    """Create a draft; a leftover one is removed and not followed."""
     try:
         return path.open("xb", buffering=0)
     except FileExistsError:

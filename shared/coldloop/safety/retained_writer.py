@@ -1,4 +1,4 @@
-"""Writes retained states in a thread of its own: the scan never waits for a disk."""
+"""Writes retained states in a thread: the scan never waits for a disk."""
 
 import logging
 import threading
@@ -50,7 +50,7 @@ class RetainedStateWriter:
         """Let a state be written in the place of those before it; returns at once.
 
         The state is encoded as JSON later, by the thread: neither it nor anything in it may change any more. Make it of
-        numbers, strings, tuples and named tuples, and of lists and mappings that are made anew for each call.
+        numbers, strings, tuples and named tuples, and of lists and mappings that are new in each call.
         """
         with self._changed:
             self._newest = state
@@ -93,7 +93,7 @@ class RetainedStateWriter:
     def _write(self, state: Mapping[str, Any], number: int) -> None:
         try:
             self._file.save(state)
-        except Exception as error:  # noqa: BLE001 - whatever it is, the scan goes on and an alarm tells
+        except Exception as error:  # noqa: BLE001 - whatever it is, scans continue and an alarm is raised
             self._note(str(error) or repr(error))
         else:
             self._note(None)

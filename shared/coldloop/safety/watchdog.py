@@ -1,4 +1,4 @@
-"""A watchdog that counts ticks of plant time: who is watched triggers it, and it expires when nobody does."""
+"""A watchdog that counts ticks of plant time: the watched client triggers it, otherwise it expires."""
 
 from coldloop.registers import safety
 
@@ -12,24 +12,24 @@ class Watchdog:
         self.set(time, 0)
 
     def set(self, time: int, tick: int) -> None:
-        """Change the time-out and start anew at `tick`."""
+        """Change the time-out and restart at `tick`."""
         self.time = time
         self.lowest = time
         self.expired = False
         self.triggered = tick
 
     def trigger(self, tick: int) -> None:
-        """Note a sign of life at `tick`."""
+        """Trigger it at `tick`."""
         self.lowest = min(self.lowest, self._remaining(tick))
         self.triggered = tick
         self.expired = False
 
     def set_back(self, tick: int) -> None:
-        """Go on at a tick before the present one."""
+        """Set the time back to a tick before the present one."""
         self.triggered = min(self.triggered, tick)
 
     def check(self, tick: int) -> bool:
-        """Tell whether it expires at `tick`; once for each time that it does."""
+        """Return whether it expires at `tick`; once for each time that it does."""
         if not self.time or self.expired or self._remaining(tick) > 0:
             return False
         self.expired = True

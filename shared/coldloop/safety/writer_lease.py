@@ -10,7 +10,7 @@ from coldloop.registers.safety import LeaseState, LeaseStatus
 from coldloop.safety.lease import Lease
 
 REPEATED_AFTER_S: Final = 10.0
-"""A second writer that goes on trying is an event again after this time."""
+"""A second writer that keeps trying is an event again after this time."""
 
 
 class LeaseEvent(IntEnum):

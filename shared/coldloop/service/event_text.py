@@ -1,4 +1,4 @@
-"""Events of a journal in words: for logs, for commands, for whoever shows them.
+"""Events of a journal in words, for logs, commands and pages.
 
 What `subject`, `cause` and `value` of an event mean depends on its kind (`registers.audit.EventKind`); the tables here
 say it in words. A number without a word stays a number: a newer peer may have more of them.
@@ -27,7 +27,7 @@ def word(member: IntEnum) -> str:
 
 
 def word_of(kind: type[IntEnum], number: int) -> str:
-    """Return the word for a number that a peer tells; a newer one may have numbers without a word here."""
+    """Return the word for a peer's number; a newer peer may have numbers without a word here."""
     return _members(kind)(number)
 
 
@@ -86,7 +86,7 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
     EventKind.ALARM_OUT_OF_SERVICE: _SUPPRESSION,
     EventKind.ALARM_IN_SERVICE: _SUPPRESSION,
     EventKind.BOOT: _Wording(
-        _listed(("fresh", "with a retained state")), _listed(("", "the state of before is set aside"))
+        _listed(("fresh", "with a retained state")), _listed(("", "the previous state was set aside"))
     ),
     EventKind.SESSION: _Wording(_listed(("lock-step", "real time")), unit="x real time"),
     EventKind.OPERATOR_MODE: _Wording(_members(OperatorMode)),
@@ -108,7 +108,7 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
     EventKind.PACE: _Wording(_listed(("lock-step", "real time", "paused")), unit="x real time"),
 }
 _ALARM_CAUSES: Final[Mapping[int, Words]] = {
-    AlarmKind.STATE_NOT_RETAINED: _listed(("", "that of before is set aside")),
+    AlarmKind.STATE_NOT_RETAINED: _listed(("", "the previous one was set aside")),
     AlarmKind.MODE: _causes(Cause),
     AlarmKind.SENSOR_BAD: _listed(OUTPUT_NAMES),
     AlarmKind.SEQUENCE_REJECTED: _causes(Verdict),
@@ -173,9 +173,9 @@ def log_event(log: logging.Logger, event: Event) -> None:
     else:
         subject = "alarm" if _WORDINGS.get(event.kind) in (_ALARM, _SHELVING, _SUPPRESSION) else "subject"
     fields = {subject: text.subject, "cause": text.cause, "value": text.value, "who": text.who}
-    told = {name: field for name, field in fields.items() if field}
+    given = {name: field for name, field in fields.items() if field}
     level = logging.WARNING if event.kind in WARNINGS else logging.INFO
-    log.log(level, text.kind, extra={**told, "tick": event.tick, "number": event.number})
+    log.log(level, text.kind, extra={**given, "tick": event.tick, "number": event.number})
 
 
 def utc_text(event: Event) -> str:

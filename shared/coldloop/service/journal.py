@@ -59,12 +59,7 @@ class Journal:
         return self._events[0].number if self._events else 0
 
     def continue_from(self, boot: int, count: int) -> None:
-        """Number on from before a restart.
-
-        Args:
-            boot: Number of this start.
-            count: Number of the last event before it; those of this start so far are numbered anew behind it.
-        """
+        """Continue the numbering of an earlier start after its event `count`; present events are renumbered."""
         moved = count - self.before
         self._events = deque(
             [event._replace(number=event.number + moved, boot=boot & 0xFFFF) for event in self._events], maxlen=KEPT
@@ -74,16 +69,7 @@ class Journal:
     def note(
         self, tick: int, kind: EventKind, subject: int = 0, cause: int = 0, *, value: float = 0.0, who: str = ""
     ) -> None:
-        """Add an event.
-
-        Args:
-            tick: Tick of plant time.
-            kind: What happened.
-            subject: Of what; depends on the kind.
-            cause: Why; depends on the kind.
-            value: A value; depends on the kind.
-            who: Whose request it was: address, role, certificate.
-        """
+        """Add an event; its arguments are the fields of `Event`."""
         self.noted += 1
         milliseconds = max(0, int(self._now() * 1000))
         self._events.append(
@@ -103,7 +89,7 @@ class Journal:
         return list(newest_first)[::-1]
 
     def select(self, query: JournalQuery) -> tuple[JournalPage, list[JournalAnswer]]:
-        """Return the first events that a query selects, and where to go on.
+        """Return the first events that a query selects, and where the next query continues.
 
         At most `LOOKED_AT` events are looked at: a page may have fewer events than fit, even none, and `next_first`
         still says that there is more.

@@ -1,4 +1,4 @@
-"""Lines that are written by a thread: whoever reads them slowly, or not at all, never holds the program up."""
+"""Lines that are written by a thread: a slow or absent reader never holds up the program."""
 
 import io
 import os
@@ -11,7 +11,7 @@ from typing import Final, TextIO
 CAPACITY: Final = 1000
 """Lines that wait to be written; a line has a few hundred bytes."""
 FLUSH_S: Final = 1.0
-"""How long the end of a program waits for whoever reads its lines."""
+"""How long the end of a program waits for the reader of its lines."""
 
 Write = Callable[[str], object]
 
@@ -67,7 +67,7 @@ class LineWriter:
         while (line := self._next()) is not None:
             try:
                 self._write(line)
-            except (OSError, ValueError):  # the reader has gone, or the stream is closed: nobody reads it
+            except (OSError, ValueError):  # the reader has gone, or the stream is closed
                 with self._changed:
                     self.dropped += 1
             with self._changed:

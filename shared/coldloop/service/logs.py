@@ -1,6 +1,6 @@
-"""Structured logs: one JSON object a line on standard error, by a thread that never holds up who logs.
+"""Structured logs: one JSON object a line on standard error, by a thread that never holds up its callers.
 
-When nobody reads them, lines are dropped and counted; the next line that is written says how many in `dropped`.
+Lines that are not read are dropped and counted; the next line that is written says how many in `dropped`.
 """
 
 import json
@@ -57,7 +57,7 @@ class FloodFilter(logging.Filter):
         self._seen: dict[tuple[str, ...], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Tell whether a record is to be written."""
+        """Return whether to write a record."""
         about = tuple(str(getattr(record, name, "")) for name in ("alarm", "mode"))
         event, now = (record.name, str(record.msg), *about), self._now()
         if len(self._seen) > MOST_EVENTS:
@@ -124,7 +124,7 @@ def set_up_logs(service: str, level: str, stream: TextIO = sys.stderr) -> None:
 
 
 def dropped() -> int:
-    """Return how many lines of this process were dropped, because nobody read those before them."""
+    """Return how many lines of this process were dropped, because those before them were not read."""
     return sum(handler.writer.dropped for handler in _handlers)
 
 

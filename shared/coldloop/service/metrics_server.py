@@ -42,7 +42,7 @@ class MetricsServer:
         """Serve until cancelled; return at once where it is off.
 
         Raises:
-            PortInUseError: Somebody else listens there.
+            PortInUseError: Another program listens there.
         """
         host, port = self._settings.host, self._settings.port
         if not port:
@@ -72,7 +72,7 @@ class MetricsServer:
                 writer.close()
                 await writer.wait_closed()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            log.debug("a request for metrics that was none")
+            log.debug("malformed request for metrics")
         finally:
             self._open.pop(writer, None)
             writer.transport.abort()

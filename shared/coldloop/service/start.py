@@ -1,4 +1,4 @@
-"""How a service starts as a program of its own: options, configuration, logs, event loop, signals, exit code."""
+"""How a service starts as a program: options, configuration, logs, event loop, signals, exit code."""
 
 import argparse
 import asyncio
@@ -48,10 +48,10 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
         configuration = load_configuration(
             settings, file=options.config, assignments=options.assignments, others=SECTIONS
         )
-        code = run_event_loop(lambda: _until_told(serve(configuration.settings), with_parent=options.with_parent))
+        code = run_event_loop(lambda: _until_stopped(serve(configuration.settings), with_parent=options.with_parent))
     except ColdloopError as error:
         code, last_line = error.exit_code, f"{name}: {error}"
-    except Exception:  # the interpreter would write it past the queue, and wait for whoever reads it
+    except Exception:  # the interpreter would write it past the queue, and block on its reader
         log.exception("failed")
     end_logs(last_line)
     gc.freeze()  # otherwise the interpreter looks for cycles in all modules before it ends
@@ -59,7 +59,7 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
 
 
 def in_one_line(name: str, start: Callable[[], int]) -> int:
-    """Return what `start` returns, which imports a service and runs it; what is wrong with that is told in one line."""
+    """Return what `start` returns, which imports a service and runs it; an error there is reported in one line."""
     try:
         return start()
     except ColdloopError as error:
@@ -83,7 +83,7 @@ def run_event_loop(start: Callable[[], Any]) -> int:
         return int(runner.run(start()))
 
 
-async def _until_told(service: Awaitable[None], *, with_parent: bool) -> int:
+async def _until_stopped(service: Awaitable[None], *, with_parent: bool) -> int:
     """Run the service; SIGTERM, SIGINT or the parent's end end it in good order."""
     loop = asyncio.get_running_loop()
     task = asyncio.ensure_future(service)

@@ -113,7 +113,7 @@ class _Publisher:
     def _limited(self, bufsize: int) -> bytes:
         """Return at most `bufsize` bytes from the socket; the library takes the error for a lost connection."""
         if bufsize > LONGEST_ANSWER or self._unasked <= 0:
-            raise ConnectionError("the broker sends what nobody has asked for")
+            raise ConnectionError("the broker sent an unexpected packet")
         data: bytes = self._receive(bufsize)
         self._unasked -= len(data)
         return data

@@ -18,7 +18,7 @@ class TelemetrySettings(BaseModel):
     """Name at the broker; empty is a broker that asks for none."""
     password_file: Path | None = None
     """File that holds the password for it, on one line. It is read at each connection; without TLS it is sent as it
-    is, so this is for a network of its own."""
+    is, so this is for a private network."""
     prefix: Annotated[str, Field(pattern=r"^[^#+]+$")] = "coldloop"
     period_s: PositiveFloat = 1.0
     """Real time between snapshots."""
@@ -33,7 +33,7 @@ class TelemetrySettings(BaseModel):
         return self
 
     def password(self) -> str | None:
-        """Return the password; None is none.
+        """Return the password, if one is set.
 
         Raises:
             OSError: The file cannot be read.

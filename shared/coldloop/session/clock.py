@@ -1,7 +1,7 @@
 """Plant time against real time.
 
-Plant time is an integer, the tick. In lock-step nobody looks at a clock. In real time with factor F a tick lasts
-0.25 s / F, everyone paces on the monotonic clock, and time is never stretched: what is late is late, and is recorded.
+Plant time is an integer, the tick. Lock-step uses no clock. In real time with factor F a tick lasts
+0.25 s / F, all services follow the monotonic clock, and time is never stretched: what is late is late, and is recorded.
 """
 
 import time

@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class TimeMode(StrEnum):
-    """What makes time go on."""
+    """What advances plant time."""
 
     LOCKSTEP = "lockstep"
     """The control PLC, as fast as the optimiser answers."""

@@ -16,15 +16,15 @@ function badge(alarm) {
 const seenOf = (alarms) => Object.fromEntries(alarms.filter((one) => WAITING.includes(one.state)).map((one) => [one.name, one.times]));
 
 function line() {
-  const holder = byId("alarm-line"), told = state.alarms.filter((one) => ["unacknowledged", "acknowledged", "returned"].includes(one.state));
-  const waiting = told.filter((one) => WAITING.includes(one.state)).length;
+  const holder = byId("alarm-line"), active = state.alarms.filter((one) => ["unacknowledged", "acknowledged", "returned"].includes(one.state));
+  const waiting = active.filter((one) => WAITING.includes(one.state)).length;
   const hidden = state.alarms.filter((one) => ["shelved", "out of service"].includes(one.state)).length;
-  const parts = told.slice(0, 4).map((one) => element("a", { class: `alarm ${WAITING.includes(one.state) ? "unacknowledged" : ""}`, href: "#alarms" }, badge(one), element("span", { text: `${one.name}${one.cause ? ` (${one.cause})` : ""}, ${STATES[one.state]}` })));
+  const parts = active.slice(0, 4).map((one) => element("a", { class: `alarm ${WAITING.includes(one.state) ? "unacknowledged" : ""}`, href: "#alarms" }, badge(one), element("span", { text: `${one.name}${one.cause ? ` (${one.cause})` : ""}, ${STATES[one.state]}` })));
   for (const name of state.plant.alarms || []) parts.push(element("a", { class: "alarm of-station", href: "#alarms" }, badge({ state: "acknowledged", priority: 3 }), element("span", { text: `station: ${name}` })));
   if (!parts.length) parts.push(element("span", { class: "minor", text: "No alarms" }));
   const station = (state.plant.alarms || []).length;
-  const counts = `${told.length} alarm${told.length === 1 ? "" : "s"}, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}${station ? `, ${station} of the station` : ""}`;
-  holder.replaceChildren(element("span", { class: "told" }, ...parts), element("span", { class: "count", text: counts }));
+  const counts = `${active.length} alarm${active.length === 1 ? "" : "s"}, ${waiting} unacknowledged${hidden ? `, ${hidden} suppressed` : ""}${station ? `, ${station} of the station` : ""}`;
+  holder.replaceChildren(element("span", { class: "alarms" }, ...parts), element("span", { class: "count", text: counts }));
   if (waiting) holder.append(element("button", { type: "button", class: "quiet operate-only", text: "Acknowledge all", hidden: !state.me.operates, onclick: () => command({ kind: "alarm", alarm: 65535, action: 1, seen: seenOf(state.alarms) }, true) }));
 }
 
@@ -50,17 +50,17 @@ function row(one) {
     element("td", {}, state.me.operates ? actions(one) : ""));
 }
 
-// Shelving counts plant time: what that is by the clock is said wherever it is not the same.
+// Shelving counts plant time: the real time is shown where it differs.
 function shelvingNote() {
   const factor = state.values["plant.pace.factor"], real = state.values["plant.pace.realtime"], paused = state.values["plant.pace.paused"];
-  const text = !state.values["plant.pace.session"] || (real && !paused && factor === 1) ? "" : !real ? "Shelving counts plant time, which goes as far as it is granted."
-    : paused ? "Shelving counts plant time, which stands still." : `Shelving counts plant time: at factor ${factor}, 15 min are over in ${(900 / factor).toPrecision(3)} s by the clock.`;
+  const text = !state.values["plant.pace.session"] || (real && !paused && factor === 1) ? "" : !real ? "Shelving counts plant time, which advances as it is granted."
+    : paused ? "Shelving counts plant time, which is paused." : `Shelving counts plant time: at factor ${factor}, 15 min are over in ${(900 / factor).toPrecision(3)} s by the clock.`;
   const note = byId("shelving-note");
   note.hidden = !text;
   if (note.textContent !== text) note.textContent = text;
 }
 
-// Only rows that have changed are made anew: a button is not replaced under somebody's hand.
+// Only changed rows are replaced: a button must not vanish while it is clicked.
 const rows = new Map();
 function table() {
   const body = byId("alarm-table").querySelector("tbody");
@@ -94,10 +94,10 @@ async function history() {
 
 let shownStation = "";
 function stationNote() {
-  const note = byId("station-note"), told = state.plant.alarms || [];
+  const note = byId("station-note"), active = state.plant.alarms || [];
   note.hidden = state.plant.kind !== "refrigerator";
-  note.textContent = `Compression station and nitrogen: ${told.length ? told.join(", ") : "no alarms"}. They end by themselves; the history has them.`;
-  note.classList.toggle("refused", told.length > 0);
+  note.textContent = `Compression station and nitrogen: ${active.length ? active.join(", ") : "no alarms"}. They clear by themselves; see the history.`;
+  note.classList.toggle("refused", active.length > 0);
 }
 
 export function initAlarms() {

@@ -47,7 +47,7 @@ export function makeChart(holder, lines, options) {
   return { chart, extra, lines, title: options.title, show(data, more = {}) { Object.assign(extra, more); chart.setData(withoutReplaced(data, lines, extra)); Object.assign(holder.dataset, { substituted: extra.replaced.length, gaps: extra.gaps.length, ahead: extra.planned && extra.predictions.length > 0 }); } };
 }
 
-// Where a sensor is bad another value stands in for it: what is not measured is no line like others.
+// Where a sensor is bad it is substituted: what is not measured is drawn differently.
 function withoutReplaced([times, ...columns], lines, extra) {
   extra.replaced = []; extra.replacedEnds = [];
   return [times, ...columns.map((values, place) => {

@@ -1,4 +1,4 @@
-// Commands in two steps: what would be done, then confirm; and what came of it. Login.
+// Commands in two steps, preview and confirmation, with their results. Login.
 import { ask, element, isStale, onChange, send, signal, state, timeText } from "./store.js";
 import { bindAll } from "./values.js";
 
@@ -65,14 +65,14 @@ async function oneCommand(body, atOnce) {
   } catch (error) { await failed(prepared.text, error, "uncertain"); }
 }
 
-// Without a status nobody has answered: a command that was only prepared is not done, of a confirmed one nobody knows.
+// Without a status there was no answer: a prepared command is not done, the result of a confirmed one is unknown.
 async function failed(asked, error, unanswered) {
   if (error.status) note(asked, "refused", error.message);
-  else note(asked, unanswered, "the page's own server did not answer; look what has become of it before asking again");
+  else note(asked, unanswered, "the page's own server did not answer; check its effect before repeating it");
   if (error.status === 401) await refreshUser().catch(() => {});
 }
 
-// Enter does not confirm by itself: whoever holds a key down, or clicks twice, has not read what is asked.
+// Enter does not confirm by itself: a held key or a double click must not confirm an unread question.
 function confirmed(text) {
   const dialog = byId("confirm");
   byId("confirm-text").textContent = `${text}?`;
@@ -88,7 +88,7 @@ function confirmed(text) {
   });
 }
 
-// A field shows what there is until somebody writes into it: what is sent by mistake then changes nothing. Returns what
+// A field shows the present value until it is edited: sending it by mistake then changes nothing. Returns what
 // makes it follow again.
 function follow(field, name, others = []) {
   let touched = false;
@@ -125,7 +125,7 @@ function faceplates() {
   bindAll(holder);
 }
 
-// The mode that the operator asks for is the button that is pressed.
+// The pressed button shows the operator's mode.
 function showMode() {
   const about = signal("control_plc.operator.mode"), asked = about && about.words[state.values["control_plc.operator.mode"]];
   for (const one of document.querySelectorAll("[data-mode]")) one.setAttribute("aria-pressed", String(Boolean(asked) && asked.startsWith(one.dataset.mode) && !isStale("control_plc.")));

@@ -60,7 +60,7 @@ function overview() {
     const values = state.values, upcoming = values["plant.load status.upcoming"];
     const note = byId("tau-u-note"), inUse = !state.stale.includes("update");
     note.hidden = inUse;
-    if (!inUse) note.textContent = "Of the last update: MPC does not drive now.";
+    if (!inUse) note.textContent = "Of the last update: MPC is not active now.";
     const rows = [["expected next", state.replay ? "–" : upcoming ? `${values["plant.load status.next_watts"]?.toFixed(1)} W in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
       ["estimated mismatch", state.update ? `${state.update.update.load_mismatch.toFixed(1)} W` : "–", "optimizer_plc.", "update"]];
     const text = JSON.stringify(rows);
@@ -73,7 +73,7 @@ function overview() {
   setInterval(refreshStrips, 1000);
 }
 
-// One drawing for each kind of plant. Where another plant is found later, the page begins anew.
+// One drawing for each kind of plant. If another plant is found later, the page reloads.
 const MIMICS = { refrigerator: "static/mimic-refrigerator.svg" };
 async function mimic(kind) {
   const text = await (await fetch(MIMICS[kind] || "static/mimic.svg")).text();

@@ -1,4 +1,4 @@
-// What the server has sent, the clock that tells how old it is, and who wants to know of changes.
+// What the server has sent, the clock for its age, and the listeners to its changes.
 
 export const state = { catalog: null, me: null, values: {}, services: {}, stale: [], alarms: [], update: null, plant: { kind: "" }, tick: 0, heard: 0, refused: "" };
 const listeners = [];
@@ -43,13 +43,13 @@ export function isStale(name) {
 
 export function signal(name) { return state.catalog.signals[name] || null; }
 
-// Why there is no stream: an answer that says so is the server's, such as that nobody is logged in any more.
+// Why there is no stream: an answer that says so is the server's, such as an expired login.
 async function why() {
   state.refused = "";
   try { await ask("api/state"); } catch (error) { if (error.status) state.refused = `The page's own server refuses: ${error.message}`; }
 }
 
-// A connection on which nothing comes any more, as after a server's loss of power, tells no error: it is given up.
+// A connection that has gone silent, as after a server's loss of power, reports no error: it is closed.
 export function connect() {
   let source = null, begun = 0;
   const open = () => {

@@ -117,7 +117,7 @@ function bindBar(bar) {
   watched.push([text, name], [drawing, name]);
 }
 
-// What stands in words on the drawing, and machines that have tripped.
+// Words on the drawing, and machines that have tripped.
 function drawStation() {
   for (const one of document.querySelectorAll("[data-station]")) { const text = `${one.dataset.station}${state.plant.mode || ""}`; if (one.textContent !== text) one.textContent = text; }
   for (const one of document.querySelectorAll("[data-alarm-of]")) one.classList.toggle("tripped", (state.plant.alarms || []).includes(one.dataset.alarmOf));

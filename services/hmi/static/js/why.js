@@ -1,4 +1,4 @@
-// Why the updating period of one update is as long as it is.
+// Explanation of the updating period of one update.
 import { ask, element, indexed, onChange, shape, timeText } from "./store.js";
 import { makeChart } from "./charts.js";
 
@@ -31,7 +31,7 @@ function alternatives(found) {
   const rows = found.alternatives.map((one) => element("tr", { class: one.iterations === found.iterations ? "chosen" : "" },
     element("td", { class: "number", text: `${one.iterations}${one.iterations === found.iterations ? " (chosen)" : ""}` }), element("td", { class: "number", text: `${one.period_s} s` }),
     element("td", { class: "number", text: digits(one.contraction, 6) }), element("td", { class: "number", text: one.response_s === null ? "does not fall" : `${digits(one.response_s)} s` })));
-  byId("why-alternatives").replaceChildren(...(rows.length ? rows : [element("tr", {}, element("td", { colspan: "4", class: "minor", text: ["up", "down", "level"].includes(found.branch) ? "K is 1 to the precision of the registers: nothing can be told of other q." : "Algorithm 1 did not decide here." }))]));
+  byId("why-alternatives").replaceChildren(...(rows.length ? rows : [element("tr", {}, element("td", { colspan: "4", class: "minor", text: ["up", "down", "level"].includes(found.branch) ? "K is 1 to the precision of the registers: no estimate for other q." : "Algorithm 1 did not decide here." }))]));
 }
 
 function budget(found) {

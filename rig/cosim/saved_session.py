@@ -1,4 +1,4 @@
-"""A rig that ran in real time before somebody attached to it runs on in real time afterwards."""
+"""Restores a rig that ran in real time before a client attached to it."""
 
 import logging
 from typing import NamedTuple
@@ -17,17 +17,17 @@ from rig.cosim.session_client import SessionClient
 log = logging.getLogger("coldloop.rig")
 
 
-class Found(NamedTuple):
-    """What a rig did when we came."""
+class SavedSession(NamedTuple):
+    """State of a rig when the client attached."""
 
     pace: SessionPace
     operator: Operator
     load: LoadProfile
-    """From the tick on at which we came."""
+    """From that tick on."""
 
 
-async def look_around(rig: SessionClient) -> Found | None:
-    """Return what a rig does, if it does something in real time.
+async def save_session(rig: SessionClient) -> SavedSession | None:
+    """Return the session of a rig if it runs in real time.
 
     Raises:
         LinkError: A service does not answer.
@@ -35,11 +35,11 @@ async def look_around(rig: SessionClient) -> Found | None:
     identity, pace = await rig.plant.read(Identity), await rig.plant.read(SessionPace)
     if not identity.session or not pace.realtime:
         return None
-    return Found(pace, await rig.control.read(Operator), await _load_from(rig, identity.tick))
+    return SavedSession(pace, await rig.control.read(Operator), await _load_from(rig, identity.tick))
 
 
 async def _load_from(rig: SessionClient, now: int) -> LoadProfile:
-    """Return the load from now on: of the session's table, unless somebody has written another one since."""
+    """Return the load from now on: of the session's table, unless another client has written one since."""
     status, asked = await rig.plant.read(LoadStatus), await rig.plant.read(PlantSession)
     steps: list[LoadStep] = []
     if status.upcoming:
@@ -50,29 +50,29 @@ async def _load_from(rig: SessionClient, now: int) -> LoadProfile:
     try:
         return LoadProfile((0, *(step.tick - now for step in coming)), (status.watts, *(step.watts for step in coming)))
     except ValueError as error:
-        raise LinkError(f"{rig.plant.peer}: its load is none: {error}") from None
+        raise LinkError(f"{rig.plant.peer}: its load is invalid: {error}") from None
 
 
-async def give_back(rig: SessionClient, found: Found | None, session: int) -> None:
-    """Let the session of our run go on as the rig was found: real time, factor, load, who drives.
+async def restore_session(rig: SessionClient, saved: SavedSession | None, session: int) -> None:
+    """Restore real time, factor, load and operating mode of the rig in the session of our run.
 
-    Nothing is done where the rig was in lock-step, or where somebody else has begun another session. What cannot be
-    given back is logged: the run is recorded all the same.
+    Nothing is done where the rig was in lock-step, or where another client has begun another session. A failure
+    is logged: the run is recorded all the same.
     """
-    if found is None:
+    if saved is None:
         return
     try:
         identity = await rig.plant.read(Identity)
         if identity.session != session:
             return
-        await write_pace(rig.clients, found.pace._replace(session=0))
-        if found.operator.mode != OperatorMode.AUTO:
-            await rig.control.write(found.operator)
+        await write_pace(rig.clients, saved.pace._replace(session=0))
+        if saved.operator.mode != OperatorMode.AUTO:
+            await rig.control.write(saved.operator)
         tick = (await rig.plant.read(Identity)).tick
-        await rig.plant.write(sealed(LiveLoad(0, found.load.watts[0])))
-        coming = LoadProfile(found.load.times, found.load.watts)
-        await LoadStream(rig.plant, session, coming, begin=tick + lead_ticks(found.pace)).feed(tick)
+        await rig.plant.write(sealed(LiveLoad(0, saved.load.watts[0])))
+        coming = LoadProfile(saved.load.times, saved.load.watts)
+        await LoadStream(rig.plant, session, coming, begin=tick + lead_ticks(saved.pace)).feed(tick)
     except LinkError as error:
-        log.warning("the rig does not run on as it was found: %s", error)
+        log.warning("the rig was not restored: %s", error)
     else:
-        log.info("given back at %g s", tick * TICK_S)
+        log.info("restored at %g s", tick * TICK_S)
