@@ -41,8 +41,8 @@ class AlarmRule(NamedTuple):
 DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     # The process is uncontrolled, or under another master: act at once.
     AlarmKind.PLANT_LOST: AlarmRule(CRITICAL),  # only the rack's watchdog protects the plant
-    AlarmKind.PLANT_FOREIGN: AlarmRule(CRITICAL),  # another master decides the outputs
-    AlarmKind.OUTPUTS_NOT_TAKEN: AlarmRule(CRITICAL),  # what is computed is not applied
+    AlarmKind.PLANT_OTHER_MASTER: AlarmRule(CRITICAL),  # another master decides the outputs
+    AlarmKind.OUTPUTS_REJECTED: AlarmRule(CRITICAL),  # what is computed is not applied
     AlarmKind.SCANS_STOPPED: AlarmRule(CRITICAL),  # nothing is computed
     # The process leaves its limits, or is about to unnoticed: act within minutes.
     AlarmKind.LEVEL_BAND: AlarmRule(HIGH),  # the bath may run dry or flood; on-delay: `band_delay_s`

@@ -34,8 +34,8 @@ FROZEN_S: Final = 0.5
 ALARMS: Final = {
     PlantLinkState.SEARCHING: AlarmKind.PLANT_LOST,
     PlantLinkState.JOINING: AlarmKind.PLANT_LOST,
-    PlantLinkState.REJECTED: AlarmKind.OUTPUTS_NOT_TAKEN,
-    PlantLinkState.OTHER_MASTER: AlarmKind.PLANT_FOREIGN,
+    PlantLinkState.REJECTED: AlarmKind.OUTPUTS_REJECTED,
+    PlantLinkState.OTHER_MASTER: AlarmKind.PLANT_OTHER_MASTER,
     PlantLinkState.FROZEN: AlarmKind.PLANT_FROZEN,
 }
 SECOND_MASTER: Final = 2

@@ -193,7 +193,7 @@ def test_alarms_tell_what_is_wrong_and_return_when_a_scan_is_taken() -> None:
     link.unanswered(LinkCause.NO_ANSWER)
     assert alarms.rows[AlarmKind.PLANT_LOST].active
     link.unanswered(LinkCause.SECOND_MASTER)
-    assert alarms.rows[AlarmKind.PLANT_FOREIGN].active
+    assert alarms.rows[AlarmKind.PLANT_OTHER_MASTER].active
     assert not alarms.rows[AlarmKind.PLANT_LOST].active, "it answers"
     assert read_twice(link, reading())
     link.joined()

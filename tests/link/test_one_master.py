@@ -27,14 +27,14 @@ async def test_a_second_control_plc_is_refused_and_takes_over_when_the_first_is_
         await second.drive(40.0, 50.0, 35.5)
 
         async def refused() -> bool:
-            return bool((await second.alarm(AlarmKind.PLANT_FOREIGN)).active)
+            return bool((await second.alarm(AlarmKind.PLANT_OTHER_MASTER)).active)
 
         await rack.until(refused)
         await rack.passes(100)
         holder = (await first.link()).holder
         shown = await second.link()
         assert (shown.state, shown.cause) == (PlantLinkState.OTHER_MASTER, LinkCause.SECOND_MASTER)
-        assert (await second.alarm(AlarmKind.PLANT_FOREIGN)).times == 1
+        assert (await second.alarm(AlarmKind.PLANT_OTHER_MASTER)).times == 1
         lease, counted = await rack.client.read(LeaseStatus), await rack.client.read(ServerStatistics)
         assert (lease.state, lease.holder) == (LeaseState.HELD, holder)
         assert lease.refused >= 1
@@ -66,7 +66,7 @@ async def test_of_two_control_plcs_with_the_same_retained_number_one_drives_and_
         assert (await second.link()).holder == (await first.link()).holder
 
         async def told() -> bool:
-            alarms = [await one.alarm(AlarmKind.PLANT_FOREIGN) for one in (first, second)]
+            alarms = [await one.alarm(AlarmKind.PLANT_OTHER_MASTER) for one in (first, second)]
             return any(alarm.active for alarm in alarms)
 
         await rack.until(told)
@@ -93,7 +93,7 @@ async def test_a_control_plc_that_was_stopped_while_another_took_over_does_not_i
         await rack.passes(100)
         await site.follows(second)
         assert (await first.link()).state == PlantLinkState.OTHER_MASTER
-        assert (await first.alarm(AlarmKind.PLANT_FOREIGN)).active
+        assert (await first.alarm(AlarmKind.PLANT_OTHER_MASTER)).active
         driven = [rack.applied[tick][0] for tick in range(begun, rack.tick)]
         assert driven == sorted(driven), "from the safe state towards the setpoint of the second"
         assert rack.violations() == []

@@ -35,7 +35,7 @@ PATIENCE_S = 90.0
 PAUSE_S = 3.2
 """Real time; plant time would go on by more than the time-outs of optimiser (15 s) and rack (10 s)."""
 OF_THE_RACK = {
-    AlarmKind.PLANT_LOST, AlarmKind.PLANT_FOREIGN, AlarmKind.PLANT_FROZEN, AlarmKind.OUTPUTS_NOT_TAKEN,
+    AlarmKind.PLANT_LOST, AlarmKind.PLANT_OTHER_MASTER, AlarmKind.PLANT_FROZEN, AlarmKind.OUTPUTS_REJECTED,
 }  # fmt: skip
 
 

@@ -66,11 +66,11 @@ class AlarmKind(IntEnum):
     MODEL_MISMATCH = 9
     SCAN_OVERRUN = 10
     ACCESS_REFUSED = 11
-    PLANT_FOREIGN = 12
+    PLANT_OTHER_MASTER = 12
     """The rack has another master, or is in another session."""
     PLANT_FROZEN = 13
     """The rack answers, and its clock does not move."""
-    OUTPUTS_NOT_TAKEN = 14
+    OUTPUTS_REJECTED = 14
     CLOCK_SKEW = 15
     """The rack's clock and ours differ by too much."""
     SECOND_WRITER = 16

@@ -113,9 +113,9 @@ _ALARM_CAUSES: Final[Mapping[int, Words]] = {
     AlarmKind.SENSOR_BAD: _listed(OUTPUT_NAMES),
     AlarmKind.SEQUENCE_REJECTED: _causes(Verdict),
     AlarmKind.PLANT_LOST: _causes(LinkCause),
-    AlarmKind.PLANT_FOREIGN: _causes(LinkCause),
+    AlarmKind.PLANT_OTHER_MASTER: _causes(LinkCause),
     AlarmKind.PLANT_FROZEN: _causes(LinkCause),
-    AlarmKind.OUTPUTS_NOT_TAKEN: _causes(LinkCause),
+    AlarmKind.OUTPUTS_REJECTED: _causes(LinkCause),
     AlarmKind.CERTIFICATE: _listed(("", "expires soon", "has expired", "unreadable")),
 }
 
