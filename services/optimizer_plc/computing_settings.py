@@ -1,13 +1,19 @@
 """Settings of what the optimiser computes with: arithmetic, estimator, solvers. It imports nothing that takes time."""
 
 from enum import StrEnum
-from typing import Annotated, Self
+from typing import Annotated, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
+
+from coldloop.process.signals import L1, OUTPUT_NAMES
 
 PENALTY_WEIGHT = 3000.0
 """alpha that all solvers are judged by with the default weights. In a program's settings it follows from `penalties`
 and `design.violation_weight` wherever it is not set."""
+
+
+ALL_OUTPUTS: Final = "outputs"
+"""What `estimator.disturbances` calls all outputs that may have one."""
 
 
 class Arithmetic(StrEnum):
@@ -56,11 +62,40 @@ class EstimatorSettings(BaseModel):
     noise_reference: NoiseReference = NoiseReference.MEASUREMENT
     """Of one measurement, whatever the updating period; or of a mean over a sampling period, so that measurements which
     follow each other sooner count for less: a model error is then not taken for more load the shorter the period is."""
+    disturbances: tuple[str, ...] = ()
+    """Outputs, by name, whose readings may differ from the model's by a constant that is estimated: no offset on a
+    plant that is not the model. `outputs` are all but L1, whose constant no estimator could tell from liquid helium."""
+    disturbance_walk: PositiveFloat = 3.0
+    """Random walk of such a constant, per square root of a sampling period, over the sensor's standard deviation."""
     longest_riccati: Annotated[int, Field(ge=1)] = 2000
     """Longest run of the Riccati recursion for a stationary gain, in periods."""
 
+    @field_validator("disturbances", mode="before")
+    @classmethod
+    def _one_or_several(cls, names: object) -> object:
+        return (names,) if isinstance(names, str) else names
+
+    @field_validator("disturbances")
+    @classmethod
+    def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if names == (ALL_OUTPUTS,):
+            return names
+        unknown = [name for name in names if name not in OUTPUT_NAMES]
+        if unknown or len(set(names)) < len(names):
+            raise ValueError(f"disturbances are '{ALL_OUTPUTS}' or a list, each once, of {', '.join(OUTPUT_NAMES)}")
+        return names
+
+    @property
+    def disturbed(self) -> tuple[int, ...]:
+        """Indices of the outputs with a disturbance."""
+        if self.disturbances == (ALL_OUTPUTS,):
+            return tuple(index for index in range(len(OUTPUT_NAMES)) if index != L1)
+        return tuple(sorted(OUTPUT_NAMES.index(name) for name in self.disturbances))
+
     @model_validator(mode="after")
-    def _load_is_estimated(self) -> Self:
+    def _what_is_estimated(self) -> Self:
+        if self.kind is EstimatorKind.STATE_FEEDBACK and self.disturbances:
+            raise ValueError("state-feedback estimates no disturbances; choose kind = kalman")
         if self.kind is EstimatorKind.STATE_FEEDBACK and not self.load_known:
             raise ValueError("state-feedback estimates no load; choose kind = kalman for load_known = false")
         return self

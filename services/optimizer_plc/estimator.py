@@ -1,19 +1,23 @@
 """What the optimiser believes of the plant's state at an updating instant."""
 
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
-from coldloop.process.signals import SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
+from coldloop.process.signals import OUTPUT_NAMES, SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.linear_algebra import add_transposed_product, multiply, respond
 from optimizer_plc.qp.prediction import PredictionModel, Transition
 
 Array = NDArray[np.float64]
+
+
+UNDETECTABLE: Final = 1e-9
+"""Relative size of a direction that no measurement sees."""
 
 
 class Estimator(NamedTuple):
@@ -62,6 +66,7 @@ def estimator_of(prediction: PredictionModel, settings: EstimatorSettings, real:
         ConfigurationError: The simulated state is used, and is not that of the model.
     """
     kalman = settings.kind is EstimatorKind.KALMAN
+    check_detectability(prediction)
     if not kalman and prediction.n_states > len(STATE_NAMES):
         raise ConfigurationError(
             "optimizer_plc.program.estimator.kind=state-feedback: the model has more states than the plant reports; "
@@ -119,6 +124,30 @@ def predict(c: Estimator, belief: Belief, u: Array, ticks: int) -> None:
         ticks -= step
 
 
+def check_detectability(prediction: PredictionModel) -> None:
+    """Check that the measurements tell the disturbances from the states and from the load (Hautus' test at 1).
+
+    Raises:
+        ConfigurationError: They do not.
+    """
+    if not prediction.disturbances:
+        return
+    n, step = prediction.n_states, prediction.sample
+    modes = np.vstack([
+        np.hstack([step.A - np.eye(n), step.F]), np.hstack([prediction.C, prediction.G])
+    ])  # fmt: skip
+    modes /= np.linalg.norm(modes, axis=0)
+    _, sizes, directions = np.linalg.svd(modes)
+    if sizes[-1] > UNDETECTABLE:
+        return
+    shares = np.abs(directions[-1][n - len(prediction.disturbances) : n])
+    worst = OUTPUT_NAMES[prediction.disturbances[int(np.argmax(shares))]]
+    raise ConfigurationError(
+        f"optimizer_plc.program.estimator.disturbances: a constant error of {worst} cannot be told from the plant's"
+        " state by any sensor: leave it out"
+    )
+
+
 def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> dict[int, Array]:
     """Return the gain of every updating period, in ticks, transposed: (n_y, n + 1); the load mismatch comes last."""
     nx = prediction.n_states
@@ -127,9 +156,13 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
         "Pa": settings.pressure_noise_pa, "m3": settings.volume_noise_m3, "K": settings.temperature_noise_k,
         "kg": settings.mass_noise_kg, "kg/s": settings.flow_noise_kg_s, "bar s": settings.integral_noise_bar_s,
     }  # fmt: skip
-    drift = np.array([*(by_unit[unit] for unit in prediction.model.state_units), settings.load_walk_w])
     sensors = np.full(C.shape[0], settings.temperature_sensor)
     sensors[0], sensors[1], sensors[12:] = settings.level_sensor, settings.speed_sensor, settings.pressure_sensor
+    drift = np.array([
+        *(by_unit[unit] for unit in prediction.model.state_units),
+        *(settings.disturbance_walk * sensors[output] for output in prediction.disturbances),
+        settings.load_walk_w,
+    ])  # fmt: skip
 
     def computed() -> Array:
         P = np.diag(100.0 * drift**2)

@@ -54,7 +54,7 @@ class OptimizerProgram:
             self.settings = settings
             self.model_digest = model.short_digest
             self._real = real_of(settings.arithmetic)
-            prediction = PredictionModel(model)
+            prediction = PredictionModel(model).with_disturbances(settings.estimator.disturbed)
             self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
             self.solver = make_solver(settings)
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)

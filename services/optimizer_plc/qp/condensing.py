@@ -37,7 +37,8 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
     A, B, F = prediction.sample
     to_z = np.zeros((nx, n))
     to_s = np.hstack([np.eye(nx), np.zeros((nx, 1))])
-    Q = state_weights(prediction.model, design)
+    Q = np.zeros(nx)  # disturbances weigh nothing
+    Q[: len(prediction.model.x0)] = state_weights(prediction.model, design)
     R = np.asarray(design.input_weight)
     C, D, G = (matrix[list(prediction.constrained)] for matrix in (prediction.C, prediction.D, prediction.G))
     Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))

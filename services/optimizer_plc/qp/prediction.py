@@ -4,6 +4,7 @@ One matrix triple for a tick comes with the model file; those of longer periods 
 exponential is needed on line.
 """
 
+from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
 from typing import NamedTuple
@@ -52,6 +53,7 @@ class PredictionModel:
         self.x0, self.u0, self.y0 = model.x0, model.u0, model.y0
         self.w0 = DOUBLE(model.w0)
         self.real = DOUBLE
+        self.disturbances: tuple[int, ...] = ()
         self.transitions = {1: tick}
         for ticks in range(2, TICKS_PER_SAMPLE + 1):
             self.transitions[ticks] = self.transitions[ticks - 1].then(tick)
@@ -68,10 +70,30 @@ class PredictionModel:
         }
         return twin
 
+    def with_disturbances(self, outputs: Sequence[int]) -> "PredictionModel":
+        """Return this model with a constant disturbance of each of these outputs as a further state.
+
+        An estimator of these leaves no offset (Pannocchia and Rawlings 2003); costs and rows follow from the states.
+        """
+        if not outputs:
+            return self
+        n, extra = self.n_states, len(outputs)
+        twin = copy(self)
+        twin.disturbances = tuple(outputs)
+        twin.x0 = np.concatenate([self.x0, np.zeros(extra)])
+        twin.C = np.hstack([self.C, np.eye(len(self.y0))[:, list(outputs)]])
+        twin.transitions = {}
+        for ticks, step in self.transitions.items():
+            A = np.eye(n + extra)
+            A[:n, :n] = step.A
+            B, F = (np.vstack([M, np.zeros((extra, M.shape[1]))]) for M in (step.B, step.F))
+            twin.transitions[ticks] = Transition(A, B, F)
+        return twin
+
     @property
     def n_states(self) -> int:
         """Number of states."""
-        return int(self.model.A.shape[0])
+        return len(self.x0)
 
     @cached_property
     def sample(self) -> Transition:

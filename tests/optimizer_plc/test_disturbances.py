@@ -1,0 +1,139 @@
+"""Constant errors of the sensors' readings, estimated beside the states: what they are, and what the control gains."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from coldloop.errors import ConfigurationError
+from coldloop.process.limits import InputLimits
+from coldloop.process.lti_model import LtiModel
+from coldloop.process.signals import L1, OUTPUT_NAMES, T5
+from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
+from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict, stationary_gains
+from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.qp.linear_algebra import respond
+from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from rig import simulate
+
+Array = NDArray[np.float64]
+
+ALL = EstimatorSettings(disturbances=("outputs",))
+SENSORS = np.concatenate([[0.01, 1.0], np.full(10, 0.02), np.full(10, 1e-3)])
+"""Standard deviations by default."""
+
+
+@pytest.fixture(scope="module")
+def disturbed(prediction: PredictionModel) -> PredictionModel:
+    return prediction.with_disturbances(ALL.disturbed)
+
+
+def test_all_outputs_but_the_level_may_have_one(disturbed: PredictionModel) -> None:
+    assert ALL.disturbed == tuple(range(1, 22))
+    assert L1 == 0
+    assert disturbed.n_states == 28 + 21
+    assert EstimatorSettings(disturbances=("T5", "V1")).disturbed == (1, T5)
+    assert EstimatorSettings.model_validate({"disturbances": "outputs"}) == ALL
+
+
+def test_names_that_are_no_outputs_are_refused() -> None:
+    for wrong in (("T55",), ("T5", "T5"), ("outputs", "T5")):
+        with pytest.raises(ValueError, match="disturbances are"):
+            EstimatorSettings(disturbances=wrong)
+    with pytest.raises(ValueError, match="state-feedback estimates no disturbances"):
+        EstimatorSettings(kind=EstimatorKind.STATE_FEEDBACK, disturbances=("T5",))
+
+
+@pytest.mark.parametrize("names", [("L1",), ("L1", "T5"), tuple(OUTPUT_NAMES)])
+def test_an_error_of_the_level_cannot_be_told_from_helium(prediction: PredictionModel, names: tuple[str, ...]) -> None:
+    chosen = EstimatorSettings(disturbances=names)
+    with pytest.raises(ConfigurationError, match=r"a constant error of L1 cannot be told .* leave it out"):
+        estimator_of(prediction.with_disturbances(chosen.disturbed), chosen)
+
+
+@given(names=st.sets(st.sampled_from(OUTPUT_NAMES), min_size=1))
+def test_what_is_accepted_is_what_the_rank_allows(prediction: PredictionModel, names: set[str]) -> None:
+    """By Hautus' test in exact form: with the plant's only integrator, the level, at one."""
+    chosen = EstimatorSettings(disturbances=tuple(names))
+    model = prediction.with_disturbances(chosen.disturbed)
+    n, step = model.n_states, model.sample
+    modes = np.block([[step.A - np.eye(n), step.F], [model.C, model.G]])
+    rank = np.linalg.matrix_rank(modes / np.linalg.norm(modes, axis=0), tol=1e-9)
+    assert (rank == n + 1) == ("L1" not in names)
+
+
+@pytest.mark.parametrize("ticks", [2, 8, 20])
+def test_the_gain_is_that_of_the_riccati_equation(disturbed: PredictionModel, ticks: int) -> None:
+    drift = np.full(50, 0.05)
+    drift[0], drift[1], drift[28:49], drift[49] = 50.0, 1e-5, 3.0 * SENSORS[1:], 3.0
+    A = np.eye(50)
+    A[:49, :49], A[:49, 49] = disturbed.transitions[ticks].A, disturbed.transitions[ticks].F[:, 0]
+    C = np.hstack([disturbed.C, disturbed.G])
+    A, C = A * drift / drift[:, None], C * drift  # states in units of their walk
+    R = np.diag(SENSORS**2)
+    P = scipy.linalg.solve_discrete_are(A.T, C.T, np.eye(50) * ticks / 20, R)
+    expected = drift[:, None] * (P @ C.T @ np.linalg.inv(C @ P @ C.T + R))
+    found = stationary_gains(disturbed, ALL)[ticks].T
+    size = np.abs(expected).max(axis=1, keepdims=True)
+    assert np.abs((found - expected) / size).max() < 1e-4
+
+
+within_ten_sigmas = arrays(np.float64, 21, elements=st.floats(-10.0, 10.0))
+
+
+@settings(max_examples=20)
+@given(errors=within_ten_sigmas, unseen=st.floats(-60.0, 60.0), ticks=st.sampled_from([4, 10, 20]))
+def test_constant_errors_are_found_and_leave_no_offset(
+    model: LtiModel, disturbed: PredictionModel, errors: Array, unseen: float, ticks: int
+) -> None:
+    """On a plant as its model but for these errors, and a load that no sensor sees."""
+    p, plant = np.concatenate([[0.0], errors * SENSORS[1:]]), model.discretised(ticks * 0.25)
+    estimator, belief = estimator_of(disturbed, ALL), no_belief(disturbed.n_states)
+    x, u = np.zeros(28), np.array([0.5, -3.0, 0.2])
+    for _ in range(6000 // ticks):
+        y = model.C @ x + model.D @ u + model.G * unseen + p
+        seen = respond(*disturbed.outputs, belief.predicted, u, belief.numbers[0]["w"])
+        correct(estimator, belief, u + model.u0, model.w0, y + model.y0, np.zeros(49))
+        begin_prediction(belief)
+        predict(estimator, belief, u, ticks)
+        x = plant.A @ x + plant.B @ u + plant.F * unseen
+    assert np.abs((y - seen) / SENSORS).max() < 0.05
+    assert belief.numbers[0]["mismatch"] == pytest.approx(unseen, abs=0.5)
+    assert np.abs((belief.x[28:] - p[1:]) / SENSORS[1:]).max() < 0.5
+
+
+def test_the_problem_keeps_the_reading_of_t5_within_its_band(
+    disturbed: PredictionModel, prediction: PredictionModel
+) -> None:
+    """An error of T5 moves its rows by as much, and changes neither the cost nor the rows of L1."""
+    plain, extended = (PredictiveProblem(one, ControlDesign(), InputLimits()) for one in (prediction, disturbed))
+    x = np.zeros(49)
+    x[28 + ALL.disturbed.index(T5)] = 0.4
+    x[28 + ALL.disturbed.index(T5) + 1] = 7.0
+    before, after = (
+        problem.at(QpParameters(state, 0.0, np.zeros(3))) for problem, state in ((plain, x[:28]), (extended, x))
+    )
+    assert np.array_equal(after.Phi, before.Phi)
+    assert np.array_equal(after.phi, before.phi)
+    shift = after.gamma - before.gamma
+    rows = shift[:56].reshape(-1, 2, 2)  # instants, outputs, sides
+    assert np.all(rows[:, 0] == 0.0)
+    assert np.allclose(rows[:, 1, 0], -rows[:, 1, 1])
+    assert np.allclose(np.abs(rows[:, 1]), 0.4 * extended.row_gains[2])
+    assert np.all(shift[56:] == 0.0)
+
+
+def test_the_level_stays_within_its_band_on_a_plant_whose_valves_pass_less() -> None:
+    off = {"mismatch": {"jt_valve": 0.9, "turbine_valve": 0.9}}
+    outside = [
+        simulate(
+            load="a", duration_s=900, plant=off, optimizer_plc={"program": {"estimator": {"disturbances": chosen}}}
+        ).summary["L1_outside_band_pct"]
+        for chosen in ([], ["outputs"])
+    ]
+    assert outside[0] > 50.0
+    assert outside[1] == 0.0
