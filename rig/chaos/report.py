@@ -13,6 +13,7 @@ from rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
 from rig.chaos.plan import Plan
 from rig.chaos.trace import ChaosTrace
 from rig.results.folders import whole_file, write_json
+from rig.text_tables import aligned, markdown_table
 
 HEADINGS: Final = (
     "fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit", "L1 out s (was)", "T5 out s (was)",
@@ -23,23 +24,9 @@ MANY_MODES: Final = 8
 """More modes than this are not all named in a table."""
 
 
-def table(rows: Sequence[Row]) -> list[list[str]]:
-    """Return the cells of all rows, the headings first."""
-    return [list(HEADINGS), *(_cells(row) for row in rows)]
-
-
-def as_text(cells: Sequence[Sequence[str]]) -> str:
-    """Return a table for a terminal."""
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-    return "".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() + "\n" for row in cells
-    )
-
-
-def as_markdown(cells: Sequence[Sequence[str]]) -> str:
-    """Return a table for a page."""
-    rule = ["---"] * len(cells[0])
-    return "".join(f"| {' | '.join(row)} |\n" for row in [cells[0], rule, *cells[1:]])
+def table(rows: Sequence[Row]) -> str:
+    """Return all rows for a terminal."""
+    return aligned([HEADINGS, *map(_cells, rows)])
 
 
 def write_report(
@@ -114,7 +101,7 @@ def _page(plan: Plan, trace: ChaosTrace, evaluation: Evaluation, failure: str | 
         f"{plan.description}\n",
         f"Load {plan.load}, {plan.duration_s:g} s, seed {plan.seed}, {plan.mode}.\n",
         *([f"**The run failed:** {failure}\n"] if failure else []),
-        as_markdown(table(evaluation.rows)),
+        markdown_table(HEADINGS, map(_cells, evaluation.rows)) + "\n",
         *(f"- {line}" for line in summary_lines(trace, evaluation)),
         "\n![Outputs, inputs, modes, faults](chaos.png)\n",
     ]

@@ -24,6 +24,7 @@ from rig.figures.plot import (
 )
 from rig.figures.run_plot import save_figure
 from rig.results.run_folder import Curves, RunFolder
+from rig.text_tables import aligned
 
 FIGURES: Final = (
     "complete", "ticks", "updates", "J_BF", "J_open_mean", "J_dev", "J_cst", "c1", "c2", "tau_u_mean",
@@ -66,9 +67,7 @@ def comparison_table(runs: Sequence[RunFolder], labels: Sequence[str]) -> str:
     keys = sorted({key for run in runs for key in run.configuration})
     different = [key for key in keys if len({repr(run.configuration.get(key)) for run in runs}) > 1]
     rows += [[key, *(_cell(run.configuration.get(key)) for run in runs)] for key in different]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [[row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in rows]
-    return "".join("  ".join(line).rstrip() + "\n" for line in lines)
+    return aligned(rows, numbers=True)
 
 
 def _cell(value: Any) -> str:  # noqa: ANN401 a value of a JSON document

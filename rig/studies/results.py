@@ -10,7 +10,8 @@ from rig.results.folders import prepare_folder, whole_file
 from rig.studies.execution import Workers, perform_all
 from rig.studies.request import check
 from rig.studies.store import Store
-from rig.studies.study import RUNS, Cell, Study, StudyOptions, StudyResult
+from rig.studies.study import RUNS, Study, StudyOptions, StudyResult
+from rig.text_tables import markdown_table
 
 
 def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path) -> StudyResult:
@@ -56,22 +57,9 @@ LONGEST_TABLE = 24
 
 
 def section(result: StudyResult, folder: str = "") -> str:
-    """Return figures, remarks and, if it is short, the table as Markdown; figures are looked for in `folder`."""
+    """Return figures, remarks and, if it is shown, the table as Markdown; figures are looked for in `folder`."""
     parts = [f"![{name}]({folder}{figure_file(name)})" for name in result.figures]
     parts += result.remarks
-    if result.rows and len(result.rows) <= LONGEST_TABLE:
+    if result.rows and (result.always_shown or len(result.rows) <= LONGEST_TABLE):
         parts.append(markdown_table(result.columns, result.rows))
     return "\n\n".join(parts) + "\n"
-
-
-def markdown_table(columns: tuple[str, ...], rows: list[tuple[Cell, ...]]) -> str:
-    """Return a table."""
-    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    lines += ["| " + " | ".join(_cell(value) for value in row) + " |" for row in rows]
-    return "\n".join(lines)
-
-
-def _cell(value: Cell) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return f"{value[:12]}…" if isinstance(value, str) and len(value) == 64 else str(value)

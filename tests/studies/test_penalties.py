@@ -14,11 +14,11 @@ from rig.results.indicators import Indicators
 from rig.studies.beyond.penalties import PenaltiesStudy, misfit
 from rig.studies.beyond.penalty_sums import Paired
 from rig.studies.beyond.penalty_variants import OWN, PRESETS, VARIANTS, Variant, paired, powers_of
-from rig.studies.paper.best_periods import end_over_best, groups, share_inside
+from rig.studies.paper.best_periods import FIRST, end_over_best, share_inside
 from rig.studies.paper.open_loop import paired_loads
 from rig.studies.paper.updating_period import is_inside
 from rig.studies.request import Outcome, RunRequest, settings_of
-from rig.studies.study import Load, StudyOptions
+from rig.studies.study import Load, StudyOptions, first_and_fresh
 
 if TYPE_CHECKING:
     from tests.studies.conftest import Conducted
@@ -84,7 +84,7 @@ def test_a_best_period_at_an_end_is_not_inside() -> None:
 
 def test_hours_that_rules_were_tuned_on_are_not_fresh() -> None:
     loads = [Load(f"a@{draw}", draw, LoadProfile((0,), (1.0,)), 60) for draw in (1, 2, 11)]
-    assert {title: [one.draw for one in some] for title, some in groups({load: {} for load in loads}).items()} == {
+    assert {title: [one.draw for one in some] for title, some in first_and_fresh(loads, FIRST).items()} == {
         "hours a to f": [1],
         "fresh hours": [2],
     }

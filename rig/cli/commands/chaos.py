@@ -98,13 +98,13 @@ def _refuse_what_has_no_effect(effective: "Configuration[Settings]") -> None:
 
 
 def _report(out: Path, plan: "Plan", experiment: "Experiment") -> None:
-    from rig.chaos.report import as_text, summary_lines, table
+    from rig.chaos.report import summary_lines, table
 
     try:
         _write(out, plan, experiment)
     except OSError as error:
         raise ResultsError(f"{out}: {error.strerror}; no report was written, choose another --out") from None
-    sys.stdout.write(as_text(table(experiment.evaluation.rows)))
+    sys.stdout.write(table(experiment.evaluation.rows))
     for line in [*summary_lines(experiment.trace, experiment.evaluation), f"results in {out}"]:
         sys.stdout.write(f"{line}\n")
 

@@ -24,13 +24,12 @@ from rig.studies.beyond.penalty_variants import (
     variants,
 )
 from rig.studies.crossing import crossing
-from rig.studies.drawing import legend_outside, panels, paper
+from rig.studies.drawing import LEAST_DRAWN, above_lowest, legend_outside, panels, paper
 from rig.studies.intervals import mean_ratio, over_draws
 from rig.studies.paper.best_periods import PeriodCosts, period_figure, period_remarks, period_values
-from rig.studies.paper.open_loop import LEAST_DRAWN
 from rig.studies.request import RunRequest, Series
-from rig.studies.results import markdown_table
-from rig.studies.study import Cell, Outcomes, StudyOptions, StudyResult
+from rig.studies.study import Outcomes, StudyOptions, StudyResult
+from rig.text_tables import Cell, markdown_table
 
 COLOURS: Final = {QPOASES: "#888888", Preset.TUNED.value: "#1f5fa8", Preset.AS_PRINTED.value: "#b3261e"}
 NOMINAL: Final = 1.0
@@ -168,7 +167,7 @@ def _table(preset: Preset, options: StudyOptions, found: Paired, loops: Mapping[
         "at P = 1."
     )
     header = ("change", "total, P = 1", "total, P = 10", "J_dev", "J_cst", "c1", "c2", "J_BF")
-    return f"{caption}\n\n{markdown_table(header, rows)}"
+    return markdown_table(header, rows, caption)
 
 
 def _settled(found: Paired, variant: Variant) -> tuple[str, str, str]:
@@ -208,7 +207,7 @@ def _start_table(options: StudyOptions, found: Paired) -> list[str]:
         "**Starts**: total cost at few iterations over that of the same preset at P = 10, all draws together, and how "
         "far that is from the paper's points, over theirs at P = 25: root mean square of the logarithm of the ratio."
     )
-    return [f"{caption}\n\n{markdown_table(('start', *(f'P = {p:g}' for p in some), 'misfit'), rows)}"]
+    return [markdown_table(("start", *(f"P = {p:g}" for p in some), "misfit"), rows, caption)]
 
 
 def _misfit_of(curve: Callable[[Sequence[int]], Series], theirs: Series) -> Callable[[list[int]], float]:
@@ -223,19 +222,10 @@ def _figure(found: Paired) -> Figure:
         for variant in (None, *PRESETS.values()):
             label = variant.label if variant else QPOASES
             powers = found.powers(variant)
-            intervals = [found.interval(variant, power) for power in powers]
-            value, low, high = (
-                np.maximum(np.array(series) - 1.0, LEAST_DRAWN) for series in list(zip(*intervals, strict=True))[:3]
-            )
-            place.plot(powers, value, color=COLOURS[label], marker=".", label=label)
-            place.fill_between(powers, low, high, color=COLOURS[label], alpha=0.18, linewidth=0)
+            above_lowest(place, powers, [found.interval(variant, power) for power in powers], COLOURS[label], label)
         for solver, label in (("qpoases", QPOASES), ("ode", str(Preset.AS_PRINTED))):
             total = np.maximum(points[solver]["J_total"] / converged - 1.0, LEAST_DRAWN)
             name = "qpOASES" if solver == "qpoases" else "ODE"
             paper(place, points[solver]["normalized_power"], total, COLOURS[label], f"{name}, paper")
-        place.set_xscale("log")
-        place.set_yscale("log")
-        place.set_xlabel("normalised power $P$ (1)")
-        place.set_ylabel("total cost above the lowest, share of it (1)")
         legend_outside(figure, place, 5)
     return figure

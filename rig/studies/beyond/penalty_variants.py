@@ -129,9 +129,7 @@ def paired(load: Load, variant: Variant | None, power: float) -> RunRequest:
 
 def closed_loads(options: StudyOptions) -> list[Load]:
     """Return the draws of the closed loop at 5 s, an hour of each."""
-    longest = options.ticks or HOUR_TICKS
-    drawn = loads(options, "8h", usual=CLOSED_DRAWS).values()
-    return [replace(load, ticks=min(load.ticks, longest)) for draws in drawn for load in draws]
+    return loads(options, "8h", usual=CLOSED_DRAWS, longest_ticks=HOUR_TICKS)
 
 
 def closed(load: Load, variant: Variant) -> RunRequest:
@@ -141,8 +139,7 @@ def closed(load: Load, variant: Variant) -> RunRequest:
 
 def hours(options: StudyOptions) -> list[Load]:
     """Return the hours that periods are compared in."""
-    names = ("a", "c", "e") if options.quick else tuple("abcdef")
-    return [load for draws in loads(options, *names, usual=FRESH_DRAWS).values() for load in draws]
+    return loads(options, *options.hours, usual=FRESH_DRAWS)
 
 
 def periods(options: StudyOptions) -> tuple[float, ...]:

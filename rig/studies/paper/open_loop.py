@@ -1,7 +1,7 @@
 """The paired part of the solver comparison: every solver and every power on the same problems, as they are played."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
@@ -14,11 +14,12 @@ from plant.load import HOUR_TICKS
 from rig.figures.plot import COLOURS
 from rig.studies import published
 from rig.studies.crossing import crossing
-from rig.studies.drawing import legend_outside, panels
+from rig.studies.drawing import above_lowest, legend_outside, panels
 from rig.studies.intervals import Interval, over_draws
 from rig.studies.request import Outcome, Procedure, RunRequest, Series
 from rig.studies.solver_runs import throttled
 from rig.studies.study import Load, Outcomes, StudyOptions, loads
+from rig.text_tables import markdown_table
 
 DRAWS: Final = 10
 """Of the eight hours' families, an hour each, unless another number is asked for."""
@@ -28,8 +29,6 @@ LABELS: Final = {
     "ode": "ODE", "qpoases": "qpOASES", "interior-point": "interior point", "osqp": "OSQP",
     "fast-gradient": "fast gradient", "daqp": "DAQP, one solve",
 }  # fmt: skip
-LEAST_DRAWN: Final = 1e-5
-"""Share above the lowest cost below which it is drawn here: the axis is logarithmic."""
 BELOW: Final = 1e-9
 """Share of the lowest cost, or of 1, by which rounding may let a cost be below it."""
 
@@ -48,9 +47,7 @@ def powers_of(solver: str, options: StudyOptions) -> tuple[float, ...]:
 
 def paired_loads(options: StudyOptions) -> list[Load]:
     """Return the draws, an hour of each."""
-    longest = options.ticks or HOUR_TICKS
-    drawn = loads(options, "8h", usual=DRAWS).values()
-    return [replace(load, ticks=min(load.ticks, longest)) for draws in drawn for load in draws]
+    return loads(options, "8h", usual=DRAWS, longest_ticks=HOUR_TICKS)
 
 
 def paired_request(load: Load, solver: str, power: float) -> RunRequest:
@@ -147,20 +144,15 @@ def open_loop_table(found: OpenLoop) -> str:
         "that can be played [95 % percentile interval over the draws]. All solvers have the same problems, each with "
         "its own hot starts, and are judged by what the control PLC would play; no ratio can be below 1."
     )
-    lines = [
-        caption,
-        "",
-        "| solver | " + " | ".join(f"P = {power:g}" for power in some) + " |",
-        "|---|" + "---|" * len(some),
-    ]
+    rows = []
     for solver, powers in found.powers.items():
         cells = [
             found.interval(solver, powers.tolist().index(power)).brief(4) if power in powers else "" for power in some
         ]
-        lines.append(f"| {LABELS[solver]} | " + " | ".join(cells) + " |")
-    for other in ("ode", "interior-point"):
-        lines += ["", _crossing_text(found.crossing("qpoases", other), LABELS[other])]
-    return "\n".join(lines)
+        rows.append((LABELS[solver], *cells))
+    table = markdown_table(("solver", *(f"P = {power:g}" for power in some)), rows, caption)
+    crossings = [_crossing_text(found.crossing("qpoases", other), LABELS[other]) for other in ("ode", "interior-point")]
+    return "\n\n".join([table, *crossings])
 
 
 def _crossing_text(power: Interval, other: str) -> str:
@@ -174,14 +166,6 @@ def open_loop_figure(found: OpenLoop) -> Figure:
     with panels(1, 1, (8.0, 4.2)) as (figure, (place,)):
         for (solver, powers), colour in zip(found.powers.items(), COLOURS, strict=False):
             intervals = [found.interval(solver, number) for number in range(len(powers))]
-            value, low, high = (
-                np.maximum(np.array(series) - 1.0, LEAST_DRAWN) for series in list(zip(*intervals, strict=True))[:3]
-            )
-            place.plot(powers, value, color=colour, marker=".", label=LABELS[solver])
-            place.fill_between(powers, low, high, color=colour, alpha=0.18, linewidth=0)
-        place.set_xscale("log")
-        place.set_yscale("log")
-        place.set_xlabel("normalised power $P$ (1)")
-        place.set_ylabel("total cost above the lowest, share of it (1)")
+            above_lowest(place, powers, intervals, colour, LABELS[solver])
         legend_outside(figure, place)
     return figure

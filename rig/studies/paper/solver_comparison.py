@@ -1,7 +1,6 @@
 """Costs of throttled solvers against the computing power of the PLC (paper, figure `solv_cmp`)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -18,7 +17,8 @@ from rig.studies.harsh_problems import harsh_ratios, harsh_requests, harsh_table
 from rig.studies.paper.open_loop import OpenLoop, open_loop_figure, open_loop_table, paired_requests, paper_powers
 from rig.studies.request import RunRequest, Series
 from rig.studies.solver_runs import throttled
-from rig.studies.study import Cell, Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.text_tables import Cell
 
 Table = Mapping[str, Mapping[str, Series]]
 """Values against power, by solver and indicator."""
@@ -85,7 +85,7 @@ class SolverComparison:
 
 def _gather(result: StudyResult, values: Mapping[str, float]) -> None:
     for claim, value in values.items():
-        result.values.setdefault(claim, []).append(value)
+        result.note(claim, value)
 
 
 def _open_rows(
@@ -100,9 +100,7 @@ def _open_rows(
 
 
 def _closed_loads(options: StudyOptions) -> list[Load]:
-    longest = options.ticks or CLOSED_TICKS
-    drawn = loads(options, "8h", usual=CLOSED_DRAWS).values()
-    return [replace(load, ticks=min(load.ticks, longest)) for draws in drawn for load in draws]
+    return loads(options, "8h", usual=CLOSED_DRAWS, longest_ticks=CLOSED_TICKS)
 
 
 def _closed_table(load: Load, powers: Series, outcomes: Outcomes) -> Table:
