@@ -8,6 +8,7 @@ from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import PlantSample
 from coldloop.registers.safety import AlarmKind
+from optimizer_plc.qp.design import ControlDesign
 from rig.chaos.evaluation import Evaluation, RaisedAlarm, evaluate
 from rig.chaos.faults import Kill, Reset
 from rig.chaos.report import table
@@ -42,8 +43,8 @@ def alarm(tick: int, kind: AlarmKind) -> Event:
     return Event(number=1, tick=tick, kind=EventKind.ALARM_RAISED, subject=kind)
 
 
-def evaluated(trace: ChaosTrace) -> Evaluation:
-    return evaluate(trace, quiet().recording(), RATE)
+def evaluated(trace: ChaosTrace, design: ControlDesign | None = None) -> Evaluation:
+    return evaluate(trace, quiet().recording(), RATE, design or ControlDesign())
 
 
 @pytest.fixture
@@ -117,6 +118,13 @@ def test_ticks_that_nobody_saw_are_counted_and_disturb_nothing() -> None:
     assert evaluation.largest_steps == (0.0, 0.0, 0.0)
     assert np.isnan(trace.recording().u[100:120]).all()
     assert len(INPUT_NAMES) == trace.recording().u.shape[1]
+
+
+def test_the_bands_of_the_configuration_are_those_that_are_judged_by() -> None:
+    narrow = ControlDesign(output_low=(60.5, 9.0), output_high=(61.0, 11.5))
+    assert evaluated(quiet()).outside_s == (0.0, 0.0)
+    assert evaluated(quiet(), narrow).outside_s == (100.0, 100.0)
+    assert evaluated(quiet(), narrow).undisturbed_s == (100.0, 100.0)
 
 
 def test_a_run_without_faults_has_a_table_of_headings() -> None:

@@ -130,4 +130,4 @@ def _write(out: Path, plan: "Plan", experiment: "Experiment") -> None:
         "undisturbed_trace_sha256": undisturbed.trace_sha256,
     }
     write_report(out, plan, trace, experiment.evaluation, hashes, experiment.failure)
-    plot_chaos(out / "chaos.png", trace, undisturbed, f"{plan.name}: {plan.description}")
+    plot_chaos(out / "chaos.png", trace, undisturbed, experiment.design, f"{plan.name}: {plan.description}")
