@@ -11,10 +11,10 @@ from matplotlib.patches import Patch
 
 from coldloop.process.signals import INPUT_NAMES, L1, T5, TICK_S
 from coldloop.registers.control_plc import Mode
+from coldloop.whole_file import whole_file
 from optimizer_plc.qp.design import ControlDesign
 from rig.chaos.trace import ChaosTrace
 from rig.figures.plot import ACCENT, BAND, INK, THIRD, Series, legend_above, view
-from rig.results.folders import whole_file
 from rig.results.recording import Recording
 
 COLOURS: Final = {

@@ -9,10 +9,11 @@ from typing import Any, Final
 from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind, AlarmState
+from coldloop.whole_file import whole_text
 from rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
 from rig.chaos.plan import Plan
 from rig.chaos.trace import ChaosTrace
-from rig.results.folders import whole_file, write_json
+from rig.results.folders import write_json
 from rig.text_tables import aligned, markdown_table
 
 HEADINGS: Final = (
@@ -34,8 +35,7 @@ def write_report(
 ) -> None:
     """Write chaos.json and chaos.md."""
     write_json(folder / "chaos.json", document(plan, trace, evaluation, hashes, failure))
-    text = _page(plan, trace, evaluation, failure)
-    whole_file(folder / "chaos.md", lambda draft: draft.write_text(text, encoding="utf-8"))
+    whole_text(folder / "chaos.md", _page(plan, trace, evaluation, failure))
 
 
 def document(

@@ -6,7 +6,7 @@ import os
 import signal
 from collections.abc import Awaitable, Mapping, Sequence
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import IO, Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
 from coldloop.errors import LinkError
@@ -47,11 +47,7 @@ class LocalServices:
     ) -> None:
         self._ports = ReservedPorts(len(SERVICES) if ports is None else 0)
         self.endpoints = endpoints_on(ports or self._ports.numbers, settings)
-        self._environment = {
-            **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
-            **to_environment(wired(settings, self.endpoints, detours)),
-            **(environment or {}),
-        }
+        self._environment = {**to_environment(wired(settings, self.endpoints, detours)), **(environment or {})}
         self._logs = log_folder
         self._processes: dict[str, asyncio.subprocess.Process] = {}
         self._watchers: set[asyncio.Task[None]] = set()
@@ -75,11 +71,9 @@ class LocalServices:
             await asyncio.gather(self._showing, return_exceptions=True)
         processes, self._processes = self._processes, {}
         for process in processes.values():
-            for number in (signal.SIGTERM, signal.SIGCONT):  # one that is stopped could not end
-                with contextlib.suppress(ProcessLookupError):
-                    process.send_signal(number)
+            terminate(process)
         for process in processes.values():
-            await _ended(process)
+            await wait_for_end(process)
         await asyncio.gather(*self._watchers)
         self._ports.release()
 
@@ -91,13 +85,8 @@ class LocalServices:
             environment: Further variables for this time.
             may_end: Its end by itself does not end the run.
         """
-        # A session of their own: a Ctrl-C is the rig's to answer, in good order.
         with self.log(service).open("ab") as log:
-            process = await asyncio.create_subprocess_exec(
-                *PYTHON, "-m", service, "--with-parent",
-                env={**self._environment, **(environment or {})}, start_new_session=True,
-                stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
-            )  # fmt: skip
+            process = await start_program(service, {**self._environment, **(environment or {})}, log)
         self._processes[service] = process
         if may_end:
             return
@@ -110,7 +99,7 @@ class LocalServices:
         process = self._processes.pop(service)
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(number)
-        await _ended(process)
+        await wait_for_end(process)
 
     def ended(self, service: str) -> bool:
         """Tell whether a service has ended by itself."""
@@ -192,7 +181,26 @@ def last_line(log: Path) -> str:
     return lines[-1] if lines else "no reason given"
 
 
-async def _ended(process: asyncio.subprocess.Process) -> None:
+async def start_program(module: str, configured: Mapping[str, str], log: IO[bytes]) -> asyncio.subprocess.Process:
+    """Start one of our programs, configured by these variables alone; it ends with this process.
+
+    It has a session of its own: a Ctrl-C is the rig's to answer, in good order.
+    """
+    others = {name: value for name, value in os.environ.items() if not name.startswith(PREFIX)}
+    return await asyncio.create_subprocess_exec(
+        *PYTHON, "-m", module, "--with-parent", env={**others, **configured}, start_new_session=True,
+        stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
+    )  # fmt: skip
+
+
+def terminate(process: asyncio.subprocess.Process) -> None:
+    """Ask a process to end; one that is stopped could not."""
+    for number in (signal.SIGTERM, signal.SIGCONT):
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(number)
+
+
+async def wait_for_end(process: asyncio.subprocess.Process) -> None:
     """Wait for the end of a process; one that does not end is made to."""
     try:
         async with asyncio.timeout(STOP_GRACE_S):

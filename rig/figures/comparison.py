@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from coldloop.errors import ResultsError
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS
 from rig.figures.plot import (
     COLOURS,
@@ -23,6 +22,7 @@ from rig.figures.plot import (
     time_unit,
 )
 from rig.figures.run_plot import save_figure
+from rig.results.folders import writing
 from rig.results.run_folder import Curves, RunFolder
 from rig.text_tables import aligned
 
@@ -47,10 +47,8 @@ def compare(paths: Sequence[Path], out: Path) -> str:
     """
     runs = [RunFolder(path) for path in paths]
     labels = _labels(paths)
-    try:
+    with writing(out):
         save_figure(draw_comparison(runs, labels), out)
-    except OSError as error:
-        raise ResultsError(f"{out}: {error.strerror}; choose another --out") from None
     return comparison_table(runs, labels) + f"figure in {out}\n"
 
 

@@ -4,9 +4,9 @@ import csv
 import io
 from pathlib import Path
 
-from coldloop.errors import ResultsError
+from coldloop.whole_file import whole_text
 from rig.figures.run_plot import save_figure
-from rig.results.folders import prepare_folder, whole_file
+from rig.results.folders import prepare_folder, writing
 from rig.studies.execution import Workers, perform_all
 from rig.studies.request import check
 from rig.studies.store import Store
@@ -27,10 +27,8 @@ def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path)
         check(request)
     outcomes = perform_all(requests, Store(folder / RUNS), workers, study.name)
     result = study.evaluate(options, outcomes)
-    try:
+    with writing(folder / study.name):
         _write(study, result, folder / study.name)
-    except OSError as error:
-        raise ResultsError(f"{folder / study.name}: {error.strerror}; choose another --out") from None
     return result
 
 
@@ -39,12 +37,11 @@ def _write(study: Study, result: StudyResult, folder: Path) -> None:
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(result.columns)
     writer.writerows(result.rows)
-    whole_file(folder / "results.csv", lambda draft: draft.write_text(table.getvalue(), encoding="utf-8"))
+    whole_text(folder / "results.csv", table.getvalue())
     for name, figure in result.figures.items():
         save_figure(figure, folder / figure_file(name))
         save_figure(figure, (folder / figure_file(name)).with_suffix(".pdf"))
-    text = f"# {study.title}\n\n{section(result)}"
-    whole_file(folder / "section.md", lambda draft: draft.write_text(text, encoding="utf-8"))
+    whole_text(folder / "section.md", f"# {study.title}\n\n{section(result)}")
 
 
 def figure_file(name: str) -> str:

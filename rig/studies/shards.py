@@ -13,8 +13,8 @@ from typing import Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coldloop.errors import ResultsError, StudyError, UsageError
-from rig.results.folders import prepare_folder, write_json
+from coldloop.errors import StudyError, UsageError
+from rig.results.folders import prepare_folder, write_json, writing
 from rig.studies.execution import Workers, perform_all
 from rig.studies.request import RunRequest, check, programs_digest
 from rig.studies.store import Store
@@ -99,10 +99,8 @@ def conduct_shard(study: Study, options: StudyOptions, workers: Workers, folder:
         prepare_folder(folder / name)
     record = ShardRecord.of_study(study, options, shard)
     path = folder / study.name / f"shard-{shard.number}-of-{shard.of}.json"
-    try:
+    with writing(path):
         write_json(path, record.model_dump())
-    except OSError as error:
-        raise ResultsError(f"{path}: {error.strerror}; choose another --out") from None
     mine = shard.part(requests)
     perform_all(mine, Store(folder / RUNS), workers, f"{study.name} {shard}")
     return len(mine)

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coldloop.errors import LinkError, ResultsError, UsageError
+from coldloop.errors import LinkError, UsageError
 from coldloop.process.signals import TICK_S
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import FIGURE_FORMATS, MODES, plans
@@ -99,11 +99,10 @@ def _refuse_what_has_no_effect(effective: "Configuration[Settings]") -> None:
 
 def _report(out: Path, plan: "Plan", experiment: "Experiment") -> None:
     from rig.chaos.report import summary_lines, table
+    from rig.results.folders import writing
 
-    try:
+    with writing(out, "no report was written, choose another --out"):
         _write(out, plan, experiment)
-    except OSError as error:
-        raise ResultsError(f"{out}: {error.strerror}; no report was written, choose another --out") from None
     sys.stdout.write(table(experiment.evaluation.rows))
     for line in [*summary_lines(experiment.trace, experiment.evaluation), f"results in {out}"]:
         sys.stdout.write(f"{line}\n")

@@ -19,8 +19,8 @@ def execute(options: argparse.Namespace) -> int:
     """Solve, linearise, print; write the model file when there is --out; refuse a configured model that is none."""
     from coldloop.errors import UsageError
     from coldloop.process.lti_model import load
+    from coldloop.whole_file import require_regular_file
     from rig.cli.model_listing import describe_model
-    from rig.results.folders import require_regular_file
 
     if options.out is not None:
         require_regular_file(options.out)

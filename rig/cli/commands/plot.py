@@ -17,12 +17,10 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Draw."""
-    from coldloop.errors import ResultsError
     from rig.figures.run_plot import plot_run
+    from rig.results.folders import writing
 
-    try:
+    with writing(options.run, "the figure was not written"):
         paths = plot_run(options.run, options.figures)
-    except OSError as error:
-        raise ResultsError(f"{options.run}: {error.strerror}; the figure was not written") from None
     sys.stdout.writelines(f"{path}\n" for path in paths)
     return 0
