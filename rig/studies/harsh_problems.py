@@ -6,7 +6,8 @@ from typing import Final
 import numpy as np
 
 from rig.studies.paired_run import HARSH, INTERIOR_POINT_ITERATIONS
-from rig.studies.paper.open_loop import LABELS, watch
+from rig.studies.paired_sums import watch
+from rig.studies.paper.open_loop import LABELS
 from rig.studies.request import Outcome, Procedure, RunRequest, Series
 from rig.studies.solver_runs import throttled
 from rig.studies.study import Load, Outcomes, StudyOptions, loads

@@ -8,16 +8,18 @@ from matplotlib.figure import Figure
 
 from optimizer_plc.qp.penalties import Preset
 from rig.studies import published
-from rig.studies.beyond.penalty_sums import QPOASES, Paired
 from rig.studies.beyond.penalty_variants import (
     PRESETS,
+    QPOASES,
     SETTLED,
     START_POWERS,
+    Paired,
     Variant,
     closed,
     closed_loads,
     hours,
     of_period,
+    paired_sums,
     periods,
     requests,
     timed_variants,
@@ -50,7 +52,7 @@ class PenaltiesStudy:
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare the variants with the lowest cost, with converged qpOASES and with the paper's points."""
-        found = Paired(options, outcomes)
+        found = paired_sums(options, outcomes)
         loops = {
             variant: np.array([outcomes[closed(load, variant)].indicators.J_BF for load in closed_loads(options)])
             for variant in variants(options)
@@ -62,7 +64,7 @@ class PenaltiesStudy:
         })  # fmt: skip
         for preset, variant in PRESETS.items():
             result.values |= {
-                f"{preset}: crossing in total cost": found.crossings(variant),
+                f"{preset}: crossing in total cost": found.crossings(None, variant),
                 f"{preset}: c1 at P = 1": [one.c1 for one in found.sums[variant, NOMINAL]],
                 f"{preset}: c2 at P = 1": [one.c2 for one in found.sums[variant, NOMINAL]],
                 **period_values(str(preset), timed[variant]),
@@ -119,7 +121,7 @@ def _rows(
 
 def _crossing_text(found: Paired) -> str:
     def said(variant: Variant) -> str:
-        power = found.crossing(variant)
+        power = found.crossing(None, variant)
         where = f"from P = {power.brief()} on" if np.isfinite(power.value) else "at no power"
         return f"{variant.preset}: {where}"
 
@@ -175,7 +177,7 @@ def _settled(found: Paired, variant: Variant) -> tuple[str, str, str]:
     if (variant, SETTLED) not in found.sums:
         return "", "", ""
     total = found.interval(variant, SETTLED).brief(4)
-    dev, cst = (found.over_converged(part, variant, SETTLED).brief() for part in ("J_dev", "J_cst"))
+    dev, cst = (found.over_converged(part, variant, SETTLED, None).brief() for part in ("J_dev", "J_cst"))
     return total, dev, cst
 
 
@@ -221,7 +223,7 @@ def _figure(found: Paired) -> Figure:
     with panels(1, 1, (8.0, 4.4)) as (figure, (place,)):
         for variant in (None, *PRESETS.values()):
             label = variant.label if variant else QPOASES
-            powers = found.powers(variant)
+            powers = found.powers[variant]
             above_lowest(place, powers, [found.interval(variant, power) for power in powers], COLOURS[label], label)
         for solver, label in (("qpoases", QPOASES), ("ode", str(Preset.AS_PRINTED))):
             total = np.maximum(points[solver]["J_total"] / converged - 1.0, LEAST_DRAWN)

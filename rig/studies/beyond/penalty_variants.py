@@ -6,11 +6,12 @@ from typing import Final, NamedTuple
 
 from optimizer_plc.qp.penalties import Preset
 from plant.load import HOUR_TICKS
+from rig.studies.paired_sums import PairedSums
 from rig.studies.paper.open_loop import paired_loads, paired_request
 from rig.studies.paper.updating_period import FEW, NINE
 from rig.studies.request import Procedure, RunRequest
 from rig.studies.solver_runs import throttled
-from rig.studies.study import PROGRAM, Load, StudyOptions, loads
+from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, loads
 
 
 class Variant(NamedTuple):
@@ -42,6 +43,9 @@ class Variant(NamedTuple):
         return not self.change or self.change in TIMED
 
 
+Paired = PairedSums[Variant | None]
+
+QPOASES: Final = "qpOASES"
 COST_SCALE: Final = "cost_scale"
 TIMED: Final = (f"{COST_SCALE} 0.0001", f"{COST_SCALE} 1e-08")
 """Starts whose best periods are looked for: that of the other preset."""
@@ -125,6 +129,18 @@ def paired(load: Load, variant: Variant | None, power: float) -> RunRequest:
     if variant is None:
         return paired_request(load, "qpoases", power)
     return _with(throttled(load, "ode", power, procedure=Procedure.PAIRED_PROBLEMS), variant)
+
+
+def paired_sums(options: StudyOptions, outcomes: Outcomes) -> Paired:
+    """Gather what presets, variants and qpOASES, which is no variant, gave on the same problems.
+
+    Raises:
+        StudyError: A profile costs less than the optimum.
+    """
+    powers = {variant: sorted(powers_of(variant, options)) for variant in (None, *variants(options))}
+    return PairedSums(
+        paired_loads(options), powers, paired, lambda variant: variant.label if variant else QPOASES, outcomes
+    )
 
 
 def closed_loads(options: StudyOptions) -> list[Load]:

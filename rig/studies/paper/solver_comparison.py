@@ -14,7 +14,7 @@ from rig.studies import published
 from rig.studies.crossing import crossing
 from rig.studies.drawing import legend_outside, panels, paper, spans_decade, spread
 from rig.studies.harsh_problems import harsh_ratios, harsh_requests, harsh_table, harsh_values
-from rig.studies.paper.open_loop import OpenLoop, open_loop_figure, open_loop_table, paired_requests, paper_powers
+from rig.studies.paper.open_loop import open_loop, open_loop_figure, open_loop_table, paired_requests, paper_powers
 from rig.studies.request import RunRequest, Series
 from rig.studies.solver_runs import throttled
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
@@ -54,13 +54,14 @@ class SolverComparison:
 
     def _evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         powers = np.array(paper_powers(options))
-        paired = OpenLoop.of(options, outcomes)
+        paired = open_loop(options, outcomes)
+        tables: list[Table] = [paired.table(draw) for draw in range(len(paired.loads))]
         closed = [_closed_table(load, powers, outcomes) for load in _closed_loads(options)]
         result = StudyResult(COLUMNS, [], {
-            "indicators": _figure(powers, paired.tables, closed),
+            "indicators": _figure(powers, tables, closed),
             "paired open loop": open_loop_figure(paired),
         })  # fmt: skip
-        for load, table in zip(paired.loads, paired.tables, strict=True):
+        for load, table in zip(paired.loads, tables, strict=True):
             result.rows += _open_rows(load, table, paired.powers)
             _gather(result, open_loop_measures(powers, table))
         for load, table in zip(_closed_loads(options), closed, strict=True):
@@ -89,13 +90,13 @@ def _gather(result: StudyResult, values: Mapping[str, float]) -> None:
 
 
 def _open_rows(
-    load: Load, table: Mapping[str, Mapping[str, Series]], powers: Mapping[str, Series]
+    load: Load, table: Mapping[str, Mapping[str, Series]], powers: Mapping[str, Sequence[float]]
 ) -> list[tuple[Cell, ...]]:
     return [
         ("paired", load.name, solver, power, *(columns[name][i] for name in INDICATORS[:-1]), np.nan,
          columns["J_total"][i] / columns["lowest"][i])
         for solver, columns in table.items()
-        for i, power in enumerate(powers[solver].tolist())
+        for i, power in enumerate(powers[solver])
     ]  # fmt: skip
 
 
