@@ -32,7 +32,6 @@ class LocalServices:
         settings: Their configuration.
         log_folder: Their logs go to `<folder>/<service>.log`.
         detours: Where something is between clients and servers.
-        environment: Further variables for all of them.
         ports: Where they listen; by default on ports that nobody else uses.
     """
 
@@ -42,12 +41,11 @@ class LocalServices:
         log_folder: Path,
         *,
         detours: Detours | None = None,
-        environment: Mapping[str, str] | None = None,
         ports: Sequence[int] | None = None,
     ) -> None:
         self._ports = ReservedPorts(len(SERVICES) if ports is None else 0)
         self.endpoints = endpoints_on(ports or self._ports.numbers, settings)
-        self._environment = {**to_environment(wired(settings, self.endpoints, detours)), **(environment or {})}
+        self._environment = to_environment(wired(settings, self.endpoints, detours))
         self._logs = log_folder
         self._processes: dict[str, asyncio.subprocess.Process] = {}
         self._watchers: set[asyncio.Task[None]] = set()

@@ -39,7 +39,6 @@ PROGRAM_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc")
 RIG_MODULES = (
     "rig.cosim.compiled.control",
     "rig.cosim.compiled.loops",
-    "rig.cosim.compiled.optimizer",
     "rig.cosim.compiled.plants",
     "rig.cosim.compiled.portable",
     "rig.cosim.compiled.records",

@@ -6,9 +6,8 @@ from pathlib import Path
 
 from coldloop.whole_file import whole_text
 from rig.figures.run_plot import save_figure
-from rig.results.folders import prepare_folder, writing
-from rig.studies.execution import Workers, perform_all
-from rig.studies.request import check
+from rig.results.folders import writing
+from rig.studies.execution import Workers, checked_requests, perform_all
 from rig.studies.store import Store
 from rig.studies.study import RUNS, Study, StudyOptions, StudyResult
 from rig.text_tables import markdown_table
@@ -20,11 +19,7 @@ def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path)
     Raises:
         ColdloopError: A run failed, or a file cannot be written.
     """
-    for name in (study.name, RUNS):
-        prepare_folder(folder / name)
-    requests = study.requests(options)
-    for request in requests:
-        check(request)
+    requests = checked_requests(study, options, folder)
     outcomes = perform_all(requests, Store(folder / RUNS), workers, study.name)
     result = study.evaluate(options, outcomes)
     with writing(folder / study.name):

@@ -15,8 +15,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coldloop.errors import StudyError, UsageError
 from rig.results.folders import prepare_folder, write_json, writing
-from rig.studies.execution import Workers, perform_all
-from rig.studies.request import RunRequest, check, programs_digest
+from rig.studies.execution import Workers, checked_requests, perform_all
+from rig.studies.request import RunRequest, programs_digest
 from rig.studies.store import Store
 from rig.studies.study import RUNS, Study, StudyOptions
 
@@ -92,11 +92,7 @@ def conduct_shard(study: Study, options: StudyOptions, workers: Workers, folder:
     Raises:
         ColdloopError: A run failed, or a file cannot be written.
     """
-    requests = study.requests(options)
-    for request in requests:
-        check(request)
-    for name in (study.name, RUNS):
-        prepare_folder(folder / name)
+    requests = checked_requests(study, options, folder)
     record = ShardRecord.of_study(study, options, shard)
     path = folder / study.name / f"shard-{shard.number}-of-{shard.of}.json"
     with writing(path):
