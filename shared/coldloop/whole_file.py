@@ -35,10 +35,9 @@ def whole_text(path: Path, text: str, *, synced: bool = False) -> None:
     """Write a text; `synced`: the disk has it when it gets its name, also if power fails."""
 
     def write(draft: Path) -> None:
-        with draft.open("w", encoding="utf-8") as file:
-            file.write(text)
-            if synced:
-                file.flush()
+        draft.write_text(text, encoding="utf-8")
+        if synced:
+            with draft.open("r+b") as file:
                 os.fsync(file.fileno())
 
     whole_file(path, write)
