@@ -36,7 +36,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--factor", type=float, dest="plan_factor", help="instead of the plan's")
     parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
                         help="of the run's picture: png, pdf, svg (default: png)")  # fmt: skip
-    parser.set_defaults(execute=execute)
 
 
 def _seed(text: str) -> int:

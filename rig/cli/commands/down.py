@@ -11,7 +11,6 @@ PATIENCE_S = 15.0
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_rig_options(parser)
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

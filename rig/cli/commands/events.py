@@ -40,7 +40,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--follow", action="store_true", help="go on with new events until interrupted")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write a CSV file instead of lines")
     parser.add_argument("--force", action="store_true", help="overwrite that file")
-    parser.set_defaults(execute=execute)
 
 
 class Since(NamedTuple):

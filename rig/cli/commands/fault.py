@@ -44,7 +44,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     sensor.add_argument("shows", metavar="dead|stuck|VALUE|none", help="none ends the fault")
     sensor.set_defaults(fault=_sensor)
     add_to_subcommands(what)
-    parser.set_defaults(execute=execute)
 
 
 def _seconds(text: str) -> float:

@@ -12,7 +12,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the model file, for model.file")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

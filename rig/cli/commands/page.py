@@ -20,7 +20,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN",
                         help="folder of a recorded run; two: side by side; none: a rig that is up")  # fmt: skip
     parser.add_argument("--page-port", type=int, metavar="PORT", help="where it is served (default: 8020)")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

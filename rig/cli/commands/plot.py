@@ -12,7 +12,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png", "pdf", "svg"],
                         metavar="FORMAT", help="png, pdf, svg (default: all)")  # fmt: skip
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -19,7 +19,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=duration, default=duration("1h"),
                         help="plant time, such as 2h or 90s (default: 1h; Ctrl-C ends it before)")  # fmt: skip
     add_result_options(parser, "session")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -10,7 +10,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--out", type=Path, metavar="FILE", help="page (default: report.html in the folder of the run)")
     parser.add_argument("--force", action="store_true", help="replace a page that exists")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -34,7 +34,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s (default: that of the load)")
     add_loop_options(parser, "another draw such as a@2, or a CSV file time_s,load_w")
     add_result_options(parser, "<load>")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

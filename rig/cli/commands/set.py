@@ -49,7 +49,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as t5-band (default: all)")
     acknowledge.set_defaults(document=_acknowledgement)
     add_to_subcommands(what)
-    parser.set_defaults(execute=execute)
 
 
 def _seconds(text: str) -> float:

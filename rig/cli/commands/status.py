@@ -15,7 +15,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_rig_options(parser)
     parser.add_argument("--follow", action="store_true", help="a line a second until Ctrl-C")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

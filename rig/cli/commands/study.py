@@ -33,7 +33,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
                        help="gather the runs of all shards from the --out folders they were done with, and evaluate"
                        )  # fmt: skip
     add_scale_options(parser)
-    parser.set_defaults(execute=execute)
 
 
 def add_scale_options(parser: argparse.ArgumentParser) -> None:

@@ -23,7 +23,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")
     parser.add_argument("--quiet", action="store_true", help="do not say where everything is")
     parser.add_argument("--locked", type=int, help=argparse.SUPPRESS)  # what --detach has locked for this process
-    parser.set_defaults(execute=execute, mode="realtime")
+    parser.set_defaults(mode="realtime")
 
 
 def execute(options: argparse.Namespace) -> int:
