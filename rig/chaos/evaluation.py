@@ -6,23 +6,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.limits import LEVEL_BAND, T5_BAND
 from coldloop.process.signals import L1, T5, TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind
+from optimizer_plc.qp.design import ControlDesign
 from rig.chaos.trace import ChaosTrace
 from rig.results.recording import Recording
 
 Triple = tuple[float, float, float]
 Pair = tuple[float, float]
-
-
-class Bands(NamedTuple):
-    """Where the constrained outputs are to stay, (L1 %, T5 K)."""
-
-    low: Pair = (LEVEL_BAND[0], T5_BAND[0])
-    high: Pair = (LEVEL_BAND[1], T5_BAND[1])
 
 
 class RaisedAlarm(NamedTuple):
@@ -70,18 +63,17 @@ class Evaluation(NamedTuple):
     missing_ticks: int
 
 
-def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: Triple, bands: Bands | None = None) -> Evaluation:
+def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: Triple, design: ControlDesign) -> Evaluation:
     """Compute the rows of all faults, and the same for the whole run.
 
     Args:
         trace: The run.
         undisturbed: The same run without faults.
         rate: Largest change of each input, as the limits have it.
-        bands: Those of the paper by default.
+        design: Has the bands.
     """
-    bands = bands or Bands()
     recording = trace.recording()
-    outside, outside_undisturbed = _outside(recording, bands), _outside(undisturbed, bands)
+    outside, outside_undisturbed = _outside(recording, design), _outside(undisturbed, design)
     steps = _steps(recording, rate)
     rows = [_row(trace, number, steps, (outside, outside_undisturbed)) for number in range(len(trace.marks))]
     return Evaluation(
@@ -147,10 +139,10 @@ def _largest(steps: NDArray[np.float64]) -> Triple:
     return first, second, third
 
 
-def _outside(recording: Recording, bands: Bands) -> NDArray[np.bool_]:
+def _outside(recording: Recording, design: ControlDesign) -> NDArray[np.bool_]:
     """Return for each tick whether L1 and T5 are outside, (N, 2); False for unknown ticks."""
     y = recording.y[:, [L1, T5]]
-    outside: NDArray[np.bool_] = (y < np.array(bands.low)) | (y > np.array(bands.high))
+    outside: NDArray[np.bool_] = (y < np.array(design.output_low)) | (y > np.array(design.output_high))
     return outside
 
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from coldloop.config import Configuration
 from coldloop.errors import LinkError
 from coldloop.process.lti_model import load as load_model
+from optimizer_plc.qp.design import ControlDesign
 from rig.chaos.evaluation import Evaluation, evaluate
 from rig.chaos.plan import ChaosPlan
 from rig.chaos.runner import conduct
@@ -28,6 +29,8 @@ class Experiment(NamedTuple):
     trace: ChaosTrace
     undisturbed: Recording
     evaluation: Evaluation
+    design: ControlDesign
+    """Has the bands that it was judged by."""
     failure: str | None
     """Why the run ended early, if it did."""
 
@@ -72,7 +75,8 @@ def perform(
             raise
         failure = str(error)
     reference = undisturbed(settings, scenario)
-    return Experiment(trace, reference, evaluate(trace, reference, settings.limits.rate), failure)
+    design = settings.optimizer_plc.program.design
+    return Experiment(trace, reference, evaluate(trace, reference, settings.limits.rate, design), design, failure)
 
 
 def undisturbed(settings: Settings, scenario: Scenario) -> Recording:

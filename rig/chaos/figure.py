@@ -11,10 +11,10 @@ from matplotlib.patches import Patch
 
 from coldloop.process.signals import INPUT_NAMES, L1, T5, TICK_S
 from coldloop.registers.control_plc import Mode
-from rig.chaos.evaluation import Bands
+from coldloop.whole_file import whole_file
+from optimizer_plc.qp.design import ControlDesign
 from rig.chaos.trace import ChaosTrace
 from rig.figures.plot import ACCENT, BAND, INK, THIRD, Series, legend_above, view
-from rig.results.folders import whole_file
 from rig.results.recording import Recording
 
 COLOURS: Final = {
@@ -24,16 +24,16 @@ MANY: Final = 24
 """More faults than this are marked, but not named."""
 
 
-def plot_chaos(path: Path, trace: ChaosTrace, undisturbed: Recording, title: str) -> None:
+def plot_chaos(path: Path, trace: ChaosTrace, undisturbed: Recording, design: ControlDesign, title: str) -> None:
     """Draw outputs with their bands and without faults, inputs, and modes, with the faults marked (PNG)."""
     minutes = np.arange(trace.ticks) * TICK_S / 60
-    recording, bands = trace.recording(), Bands()
+    recording = trace.recording()
+    bands = list(zip(design.output_low, design.output_high, strict=True))
     with mpl.rc_context({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False}):
         figure = Figure(figsize=(10, 10), layout="constrained")
         axes: list[Axes] = list(figure.subplots(5, 1, sharex=True, height_ratios=[3, 3, 3, 3, 1]))
-        for place, output, i, label in ((axes[0], L1, 0, "L1 (%)"), (axes[1], T5, 1, "T5 (K)")):
-            band = f"band {bands.low[i]:g} to {bands.high[i]:g}"
-            place.axhspan(bands.low[i], bands.high[i], color=BAND, alpha=0.35, label=band)
+        for place, output, band, label in zip(axes[:2], (L1, T5), bands, ("L1 (%)", "T5 (K)"), strict=True):
+            place.axhspan(*band, color=BAND, alpha=0.35, label=f"band {band[0]:g} to {band[1]:g}")
             place.plot(minutes, undisturbed.y[:, output], color=THIRD, linewidth=0.8, label="undisturbed")
             place.plot(minutes, recording.y[:, output], color=INK, linewidth=1, label="with faults")
             place.set_ylabel(label)

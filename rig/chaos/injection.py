@@ -1,15 +1,17 @@
 """Brings faults about, and takes them back."""
 
 import asyncio
+import contextlib
 import signal
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, TypeVar
 
 from coldloop.config import PREFIX
-from coldloop.errors import LinkError
+from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError
+from coldloop.modbus.client import RegisterClient
 from coldloop.process.signals import OUTPUT_NAMES
-from coldloop.registers.plant import SensorFault, SensorFaultKind
+from coldloop.registers.plant import SensorFault, SensorFaultKind, Surroundings
 from rig.chaos.faults import (
     SERVICE_OF,
     AnyFault,
@@ -26,20 +28,13 @@ from rig.chaos.faults import (
 from rig.chaos.models import WRONG_MODEL
 from rig.chaos.proxy import LinkProxy
 from rig.cosim.local_services import LocalServices
+from rig.cosim.session_client import CONTACT_S
 from rig.cosim.wiring import SERVICES
+
+T = TypeVar("T")
 
 ATTEMPTS: Final = 20
 _SHOWN: Final = {"nan": SensorFaultKind.NOT_A_NUMBER, "frozen": SensorFaultKind.FROZEN, "value": SensorFaultKind.VALUE}
-
-
-class PlantWriter(Protocol):
-    """Puts faults into the plant's sensors, and changes what a refrigerator is given."""
-
-    async def set_sensor_fault(self, output: int, fault: SensorFault) -> bool:
-        """Write the fault of an output, by its index; return whether the plant has taken it."""
-
-    async def change_surroundings(self, target: str, value: float) -> float | None:
-        """Change one of the surroundings; return its old value, None if the plant has not accepted it."""
 
 
 class Injector:
@@ -49,7 +44,7 @@ class Injector:
         self,
         services: LocalServices,
         proxies: Mapping[Link, LinkProxy],
-        plant: PlantWriter,
+        plant: RegisterClient,
         folder: Path,
     ) -> None:
         self._services = services
@@ -104,16 +99,27 @@ class Injector:
         return None
 
     async def _give(self, target: str, value: float) -> float:
-        for _ in range(ATTEMPTS):
-            before = await self._plant.change_surroundings(target, value)
-            if before is not None:
-                return before
-            await asyncio.sleep(0.5)
-        raise LinkError(f"the plant did not accept {target} = {value:g}: see its log")
+        """Change one of a refrigerator's surroundings; return its old value."""
+
+        async def write() -> float:
+            given = await self._plant.read(Surroundings)
+            before = getattr(given, target)
+            await self._plant.write(given._replace(**{target: type(before)(value)}))
+            return float(before)
+
+        return await _insisted(write, f"{target} = {value:g}")
 
     async def _set_sensor(self, output: str, fault: SensorFault) -> None:
-        for _ in range(ATTEMPTS):
-            if await self._plant.set_sensor_fault(OUTPUT_NAMES.index(output), fault):
-                return
-            await asyncio.sleep(0.5)
-        raise LinkError(f"the plant did not accept a sensor fault for {output}: see its log")
+        await _insisted(
+            lambda: self._plant.write_rows([fault], OUTPUT_NAMES.index(output)), f"sensor fault for {output}"
+        )
+
+
+async def _insisted(request: Callable[[], Awaitable[T]], what: str) -> T:
+    """Return the answer to a request, which is repeated for a while."""
+    for _ in range(ATTEMPTS):
+        with contextlib.suppress(PeerUnreachableError, RequestRefusedError, TimeoutError):
+            async with asyncio.timeout(CONTACT_S):
+                return await request()
+        await asyncio.sleep(0.5)
+    raise LinkError(f"the plant did not accept {what}: see its log")

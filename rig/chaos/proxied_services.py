@@ -6,13 +6,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from coldloop.config import PREFIX
 from rig.chaos.faults import Link
 from rig.chaos.proxy import LinkProxy
 from rig.cosim.endpoints import RigEndpoints
 from rig.cosim.local_services import LocalServices
 from rig.cosim.ports import ReservedPorts
-from rig.cosim.wiring import Detours
+from rig.cosim.wiring import Detours, retaining
 from rig.settings import Settings
 
 
@@ -66,7 +65,7 @@ class ProxiedServices:
     def __init__(self, settings: Settings, folder: Path, seed: str) -> None:
         self._proxies = LinkProxies(seed)
         self.services = LocalServices(
-            settings, folder / "logs", detours=self._proxies.detours, environment=_retained(folder)
+            retaining(settings, folder, always=True), folder / "logs", detours=self._proxies.detours
         )
         self._proxies.put_before(self.services.endpoints)
         self.proxies = self._proxies.by_link
@@ -87,11 +86,3 @@ class ProxiedServices:
     async def connect_links(self) -> None:
         """Start the proxies: until then no service reaches another one."""
         await self._proxies.connect()
-
-
-def _retained(folder: Path) -> dict[str, str]:
-    """Return the variables that let the control PLC and the plant come back where they were killed."""
-    files = {service: folder / f"retained_{service}.json" for service in ("control_plc", "plant")}
-    for file in files.values():
-        file.unlink(missing_ok=True)
-    return {f"{PREFIX}{service.upper()}__RETAIN__FILE": str(file) for service, file in files.items()}

@@ -9,10 +9,12 @@ from typing import Any, Final
 from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind, AlarmState
+from coldloop.whole_file import whole_text
 from rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
 from rig.chaos.plan import ChaosPlan
 from rig.chaos.trace import ChaosTrace
-from rig.results.folders import whole_file, write_json
+from rig.results.folders import write_json
+from rig.text_tables import aligned, markdown_table
 
 HEADINGS: Final = (
     "fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit", "L1 out s (was)", "T5 out s (was)",
@@ -23,23 +25,9 @@ MANY_MODES: Final = 8
 """More modes than this are not all named in a table."""
 
 
-def table(rows: Sequence[Row]) -> list[list[str]]:
-    """Return the cells of all rows, the headings first."""
-    return [list(HEADINGS), *(_cells(row) for row in rows)]
-
-
-def as_text(cells: Sequence[Sequence[str]]) -> str:
-    """Return a table for a terminal."""
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-    return "".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() + "\n" for row in cells
-    )
-
-
-def as_markdown(cells: Sequence[Sequence[str]]) -> str:
-    """Return a table for a page."""
-    rule = ["---"] * len(cells[0])
-    return "".join(f"| {' | '.join(row)} |\n" for row in [cells[0], rule, *cells[1:]])
+def table(rows: Sequence[Row]) -> str:
+    """Return all rows for a terminal."""
+    return aligned([HEADINGS, *map(_cells, rows)])
 
 
 def write_report(
@@ -47,8 +35,7 @@ def write_report(
 ) -> None:
     """Write chaos.json and chaos.md."""
     write_json(out / "chaos.json", document(plan, trace, evaluation, hashes, failure))
-    text = _page(plan, trace, evaluation, failure)
-    whole_file(out / "chaos.md", lambda draft: draft.write_text(text, encoding="utf-8"))
+    whole_text(out / "chaos.md", _page(plan, trace, evaluation, failure))
 
 
 def document(
@@ -114,7 +101,7 @@ def _page(plan: ChaosPlan, trace: ChaosTrace, evaluation: Evaluation, failure: s
         f"{plan.description}\n",
         f"Load {plan.load}, {plan.duration_s:g} s, seed {plan.seed}, {plan.mode}.\n",
         *([f"**The run failed:** {failure}\n"] if failure else []),
-        as_markdown(table(evaluation.rows)),
+        markdown_table(HEADINGS, map(_cells, evaluation.rows)) + "\n",
         *(f"- {line}" for line in summary_lines(trace, evaluation)),
         "\n![Outputs, inputs, modes, faults](chaos.png)\n",
     ]

@@ -48,7 +48,7 @@ async def conduct(
         await services.during(client.connect(START_PATIENCE_S))
         await proxied.connect_links()
         await services.during(client.begin(scenario, recorder))
-        injector = Injector(services, proxied.proxies, client, folder)
+        injector = Injector(services, proxied.proxies, client.plant, folder)
         driver = FaultSequencer(plan, services, client, injector, trace, progress)
         try:
             async with asyncio.timeout(_patience_s(plan)):

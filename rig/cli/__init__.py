@@ -63,6 +63,7 @@ def make_parser(chosen: str | None) -> argparse.ArgumentParser:
             module = import_module(f"rig.cli.commands.{name}")
             command.description = module.__doc__
             module.declare(command)
+            command.set_defaults(execute=module.execute)
     version = commands.add_parser("version", help="the version")
     version.set_defaults(execute=_print_version)
     return parser

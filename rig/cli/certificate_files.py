@@ -11,9 +11,10 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from coldloop.errors import ResultsError, UsageError
 from coldloop.registers.declaration import Role
+from coldloop.whole_file import whole_file
 from rig.cli.certificates import Authority, Pair, revoked_now
 from rig.cosim.wiring import SERVICES
-from rig.results.folders import prepare_folder
+from rig.results.folders import prepare_folder, writing
 
 CLIENTS = {**{role.value: role.value for role in Role}, "reader": None}
 """Clients and their roles."""
@@ -72,12 +73,9 @@ def revoke(out: Path, names: Sequence[str], days: int) -> tuple[int, Path]:
     present = {each.serial_number for each in revoked}
     certificates = [_certificate(out / f"{name}.crt") for name in names]
     revoked += [revoked_now(each) for each in certificates if each.serial_number not in present]
-    fresh = out / f"{REVOCATIONS}.new"
-    try:
-        fresh.write_bytes(authority.revocation_list(revoked, days))
-        fresh.replace(out / REVOCATIONS)
-    except OSError as error:
-        raise ResultsError(f"{error.filename or out}: {error.strerror}; choose another --out") from None
+    with writing(out / REVOCATIONS):
+        fresh = authority.revocation_list(revoked, days)
+        whole_file(out / REVOCATIONS, lambda draft: draft.write_bytes(fresh))
     return len(revoked), out / REVOCATIONS
 
 

@@ -11,6 +11,7 @@ from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
 from coldloop.modbus.requests import MAX_READ_WORDS
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap
 from coldloop.service.event_text import word
+from rig.text_tables import aligned, markdown_table
 
 PORTS: Final = {"plant": PLANT_PORT, "control_plc": CONTROL_PORT, "optimizer_plc": OPTIMIZER_PORT}
 
@@ -78,9 +79,7 @@ def as_table(maps: Sequence[RegisterMap]) -> str:
     """Return aligned columns for a terminal."""
     shown = ("service", "block", "name", "address", "modicon", "type", "unit", "writer")
     rows = [shown, *[tuple(_text(entry[column]) for column in shown) for entry in _entries(maps)]]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(shown))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join(lines) + "\n"
+    return aligned(rows)
 
 
 def as_markdown(maps: Sequence[RegisterMap]) -> str:
@@ -99,19 +98,17 @@ def as_markdown(maps: Sequence[RegisterMap]) -> str:
 def _block_markdown(service: str, block: Block) -> str:
     writer = f"written by the {block.writer.value}" if block.writer else "read-only"
     many = f"; {block.rows} rows of {block.row_words} words, the first one shown" if block.rows > 1 else ""
-    lines = [
-        f"### {block.name}: {block.description} ({writer}{many})\n",
-        f"`{mbpoll_line(service, block)}`\n",
-        "| address | 4xxxx | name | type | unit | range | description |",
-        "|---|---|---|---|---|---|---|",
+    caption = f"### {block.name}: {block.description} ({writer}{many})\n\n`{mbpoll_line(service, block)}`"
+    header = ("address", "4xxxx", "name", "type", "unit", "range", "description")
+    rows = [
+        (r.address, modicon(r.address), r.name, r.kind.label, r.unit, _range(r), r.description)
+        for r in block.registers()
     ]
-    for r in block.registers():
-        bounds = f"{_text(r.low)}..{_text(r.high)}" if r.low is not None or r.high is not None else ""
-        lines.append(
-            f"| {r.address} | {modicon(r.address)} | {r.name} | {r.kind.label} | {r.unit} | {bounds} "
-            f"| {r.description} |"
-        )
-    return "\n".join(lines) + "\n"
+    return markdown_table(header, rows, caption) + "\n"
+
+
+def _range(r: Register) -> str:
+    return f"{_text(r.low)}..{_text(r.high)}" if r.low is not None or r.high is not None else ""
 
 
 def mbpoll_line(service: str, block: Block) -> str:

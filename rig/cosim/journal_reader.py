@@ -5,6 +5,7 @@ from typing import Final
 
 from coldloop.errors import LinkError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
+from coldloop.operating.rings import read_ring
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.service.journal import ANY_SUBJECT
 
@@ -96,10 +97,7 @@ class JournalReader:
         """Read what the block of the last events has from the next one on."""
         page = await self._client.read(JournalPage)
         first = max(self._next, page.newest - EVENT_ROWS + 1)
-        count, start = max(0, page.newest - first + 1), first % EVENT_ROWS
-        behind = min(count, EVENT_ROWS - start)
-        rows = await self._client.read_rows(Event, start, behind)
-        rows += await self._client.read_rows(Event, 0, count - behind)
+        rows = await read_ring(self._client, Event, EVENT_ROWS, first, page.newest)
         events = sorted(event for event in rows if event.number >= first)  # newer ones may have come meanwhile
         newest = max([page.newest, *(event.number for event in events)])
         return JournalPage(max(page.oldest, newest - EVENT_ROWS + 1), newest, len(events)), events

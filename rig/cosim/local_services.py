@@ -6,7 +6,7 @@ import os
 import signal
 from collections.abc import Awaitable, Mapping, Sequence
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import IO, Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
 from coldloop.errors import LinkError
@@ -32,7 +32,6 @@ class LocalServices:
         settings: Their configuration.
         log_folder: Their logs go to `<folder>/<service>.log`.
         detours: Where something is between clients and servers.
-        environment: Further variables for all of them.
         ports: Where they listen; by default on free ports.
     """
 
@@ -42,16 +41,11 @@ class LocalServices:
         log_folder: Path,
         *,
         detours: Detours | None = None,
-        environment: Mapping[str, str] | None = None,
         ports: Sequence[int] | None = None,
     ) -> None:
         self._ports = ReservedPorts(len(SERVICES) if ports is None else 0)
         self.endpoints = endpoints_on(ports or self._ports.numbers, settings)
-        self._environment = {
-            **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
-            **to_environment(wired(settings, self.endpoints, detours)),
-            **(environment or {}),
-        }
+        self._environment = to_environment(wired(settings, self.endpoints, detours))
         self._logs = log_folder
         self._processes: dict[str, asyncio.subprocess.Process] = {}
         self._watchers: set[asyncio.Task[None]] = set()
@@ -75,23 +69,22 @@ class LocalServices:
             await asyncio.gather(self._showing, return_exceptions=True)
         processes, self._processes = self._processes, {}
         for process in processes.values():
-            for number in (signal.SIGTERM, signal.SIGCONT):  # one that is stopped could not end
-                with contextlib.suppress(ProcessLookupError):
-                    process.send_signal(number)
+            terminate(process)
         for process in processes.values():
-            await _ended(process)
+            await wait_for_end(process)
         await asyncio.gather(*self._watchers)
         self._ports.release()
 
     async def start(self, service: str, environment: Mapping[str, str] | None = None, *, may_end: bool = False) -> None:
-        """Start a service where it was before; `may_end`: its end by itself does not end the run."""
-        # In their own process session: Ctrl-C is handled by the rig.
+        """Start one of them, where it was before.
+
+        Args:
+            service: Which one.
+            environment: Further variables for this time.
+            may_end: Its end by itself does not end the run.
+        """
         with self.log(service).open("ab") as log:
-            process = await asyncio.create_subprocess_exec(
-                *PYTHON, "-m", service, "--with-parent",
-                env={**self._environment, **(environment or {})}, start_new_session=True,
-                stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
-            )  # fmt: skip
+            process = await start_program(service, {**self._environment, **(environment or {})}, log)
         self._processes[service] = process
         if may_end:
             return
@@ -104,7 +97,7 @@ class LocalServices:
         process = self._processes.pop(service)
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(number)
-        await _ended(process)
+        await wait_for_end(process)
 
     def ended(self, service: str) -> bool:
         """Return whether a service has ended by itself."""
@@ -186,7 +179,26 @@ def last_line(log: Path) -> str:
     return lines[-1] if lines else "no reason given"
 
 
-async def _ended(process: asyncio.subprocess.Process) -> None:
+async def start_program(module: str, configured: Mapping[str, str], log: IO[bytes]) -> asyncio.subprocess.Process:
+    """Start one of our programs, configured by these variables alone; it ends with this process.
+
+    It has a session of its own: a Ctrl-C is the rig's to answer, in good order.
+    """
+    others = {name: value for name, value in os.environ.items() if not name.startswith(PREFIX)}
+    return await asyncio.create_subprocess_exec(
+        *PYTHON, "-m", module, "--with-parent", env={**others, **configured}, start_new_session=True,
+        stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
+    )  # fmt: skip
+
+
+def terminate(process: asyncio.subprocess.Process) -> None:
+    """Ask a process to end; one that is stopped could not."""
+    for number in (signal.SIGTERM, signal.SIGCONT):
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(number)
+
+
+async def wait_for_end(process: asyncio.subprocess.Process) -> None:
     """Wait for the end of a process; one that does not end is made to."""
     try:
         async with asyncio.timeout(STOP_GRACE_S):

@@ -16,7 +16,7 @@ from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, LadderStatus, Mode, Status
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
-from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, STATION_ROWS, PlantSession, SensorFault, Surroundings
+from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, STATION_ROWS, PlantSession
 from plant.own_model import own_header
 from rig.cosim.endpoints import RigEndpoints
 from rig.cosim.scenario import Scenario
@@ -267,24 +267,6 @@ class SessionClient:
             return None
         self._noted_events = ladder.events
         return ladder
-
-    async def set_sensor_fault(self, output: int, fault: SensorFault) -> bool:
-        """Write the fault of an output's sensor, by the output's index; return whether the plant has taken it."""
-        return await self.contact(self._write_fault(output, fault)) is not None
-
-    async def change_surroundings(self, target: str, value: float) -> float | None:
-        """Change one of a refrigerator's surroundings; return its old value, None if the plant has not accepted it."""
-        return await self.contact(self._write_surroundings(target, value))
-
-    async def _write_surroundings(self, target: str, value: float) -> float:
-        given = await self.plant.read(Surroundings)
-        before = getattr(given, target)
-        await self.plant.write(given._replace(**{target: type(before)(value)}))
-        return float(before)
-
-    async def _write_fault(self, output: int, fault: SensorFault) -> bool:
-        await self.plant.write_rows([fault], output)
-        return True
 
     async def contact(self, request: Awaitable[T]) -> T | None:
         """Return the answer to a request; with `tolerant`, None when the service does not answer in time."""

@@ -7,6 +7,7 @@ from typing import Final
 from coldloop.errors import LinkError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.transport import REQUESTS_AT_ONCE
+from coldloop.operating.rings import read_ring
 from coldloop.registers.common import Identity
 from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
 from coldloop.registers.optimizer_plc import Optimization
@@ -74,12 +75,12 @@ class SampleReader:
         return max(1, min(BATCH, self._end - self.read_until))
 
     async def _read_rows(self, last: int) -> None:
-        """Read the ticks before `last`, as many together as requests may be under way, not across ends of histories."""
+        """Read the ticks before `last`, as many together as requests may be under way."""
         while self.read_until < last:
             first = self.read_until
-            count = min(last - first, REQUESTS_AT_ONCE, STATION_ROWS - first % STATION_ROWS)
-            samples = await self._client.read_rows(PlantSample, first % HISTORY_ROWS, count)
-            await self._read_stations(first, count)
+            until = min(last, first + REQUESTS_AT_ONCE)
+            samples = await read_ring(self._client, PlantSample, HISTORY_ROWS, first, until - 1)
+            await self._read_stations(first, until)
             for tick, sample in enumerate(samples, first):
                 if sample.tick == tick:
                     self._recorder.sample(sample)
@@ -90,14 +91,15 @@ class SampleReader:
                     )
                 self.read_until = tick + 1
 
-    async def _read_stations(self, first: int, count: int) -> None:
+    async def _read_stations(self, first: int, until: int) -> None:
         """Read what goes with ticks, if the plant is a whole refrigerator: the first row that is read decides."""
         if self.has_station is None:
-            (station,) = await self._client.read_rows(StationSample, first % STATION_ROWS, 1)
+            (station,) = await read_ring(self._client, StationSample, STATION_ROWS, first, first)
             self.has_station = any(station.signals)
         if not self.has_station:
             return
-        for tick, station in enumerate(await self._client.read_rows(StationSample, first % STATION_ROWS, count), first):
+        stations = await read_ring(self._client, StationSample, STATION_ROWS, first, until - 1)
+        for tick, station in enumerate(stations, first):
             if any(station.signals) and station.tick == tick:
                 self._recorder.station(station)
 
@@ -138,14 +140,11 @@ class UpdateReader:
             if not self._tolerant:
                 raise LinkError(f"{self._client.peer} has overwritten update {self._next} before it was recorded")
             self._next = max(0, newest - UPDATE_ROWS)
-        while self._next < newest:
-            place = self._next % UPDATE_ROWS
-            count = min(newest - self._next, UPDATE_ROWS - place)
-            for update in await self._client.read_rows(Optimization, place, count):
-                if not self._tolerant or self._follows(update):
-                    self._recorder.update(update)
-                    self._last = update
-                self._next += 1
+        for update in await read_ring(self._client, Optimization, UPDATE_ROWS, self._next, newest - 1):
+            if not self._tolerant or self._follows(update):
+                self._recorder.update(update)
+                self._last = update
+            self._next += 1
 
     def _follows(self, update: Optimization) -> bool:
         """Return whether a row is the update that is looked for, and not one that was recorded before."""

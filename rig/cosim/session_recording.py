@@ -9,12 +9,13 @@ from itertools import chain
 from typing import Final, NamedTuple
 
 from coldloop.errors import LinkError, UsageError
+from coldloop.operating.rings import last_update
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Status
-from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
+from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus, PlantSample, StationSample
 from rig.cosim.journal_reader import JournalReader
 from rig.cosim.scenario import Scenario
@@ -139,11 +140,8 @@ async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recor
 
 async def _next_update(rig: SessionClient) -> int:
     """Return the number of the update that the optimiser does next."""
-    done = (await rig.optimizer.read(Identity)).heartbeat
-    if not done:
-        return 0
-    (last,) = await rig.optimizer.read_rows(Optimization, (done - 1) % HISTORY_ROWS, 1)
-    return last.update + 1
+    last = await last_update(rig.optimizer, await rig.optimizer.read(Identity))
+    return 0 if last is None else last.update + 1
 
 
 def state_of(events: Iterable[Event]) -> list[Event]:

@@ -1,13 +1,17 @@
 """Where three services on localhost listen, and where their clients are pointed at."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.modbus.endpoints import Endpoint
+from coldloop.safety.retained import RetainSettings
 from rig.cosim.endpoints import RigEndpoints
 from rig.settings import Settings
 
 SERVICES: Final = ("plant", "control_plc", "optimizer_plc")
+RETAINING: Final = ("plant", "control_plc")
+"""Services that go on after a restart where they were, with a file for their state."""
 START_PATIENCE_S: Final = 600.0
 """Services that need other kernels than before compile them first, on a slow machine for minutes."""
 
@@ -33,6 +37,21 @@ def _endpoint(settings: Settings, service: str, port: int) -> Endpoint:
         word_order=section.word_order,
         tls=settings.rig.tls if section.server.tls else None,
     )
+
+
+def retaining(settings: Settings, folder: Path, *, always: bool) -> Settings:
+    """Return settings with which services retain their state in a folder; what an earlier rig left there is removed.
+
+    Unless `always`, those that have a file of their own keep it.
+    """
+    sections = {}
+    for service in RETAINING:
+        section = getattr(settings, service)
+        if always or section.retain.file is None:
+            file = folder / f"retained_{service}.json"
+            file.unlink(missing_ok=True)
+            sections[service] = section.model_copy(update={"retain": RetainSettings(file=file)})
+    return settings.model_copy(update=sections)
 
 
 def wired(settings: Settings, endpoints: RigEndpoints, detours: Detours | None = None) -> Settings:

@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from coldloop.errors import ResultsError
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS
 from rig.figures.plot import (
     COLOURS,
@@ -23,7 +22,9 @@ from rig.figures.plot import (
     time_unit,
 )
 from rig.figures.run_plot import save_figure
+from rig.results.folders import writing
 from rig.results.run_folder import Curves, RunFolder
+from rig.text_tables import aligned
 
 FIGURES: Final = (
     "complete", "ticks", "updates", "J_BF", "J_open_mean", "J_dev", "J_cst", "c1", "c2", "tau_u_mean",
@@ -46,10 +47,8 @@ def compare(paths: Sequence[Path], out: Path) -> str:
     """
     runs = [RunFolder(path) for path in paths]
     labels = _labels(paths)
-    try:
+    with writing(out):
         save_figure(draw_comparison(runs, labels), out)
-    except OSError as error:
-        raise ResultsError(f"{out}: {error.strerror}; choose another --out") from None
     return comparison_table(runs, labels) + f"figure in {out}\n"
 
 
@@ -66,9 +65,7 @@ def comparison_table(runs: Sequence[RunFolder], labels: Sequence[str]) -> str:
     keys = sorted({key for run in runs for key in run.configuration})
     different = [key for key in keys if len({repr(run.configuration.get(key)) for run in runs}) > 1]
     rows += [[key, *(_cell(run.configuration.get(key)) for run in runs)] for key in different]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [[row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in rows]
-    return "".join("  ".join(line).rstrip() + "\n" for line in lines)
+    return aligned(rows, numbers=True)
 
 
 def _cell(value: Any) -> str:  # noqa: ANN401 a value of a JSON document

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from coldloop.process.signals import INPUT_NAMES
+from coldloop.whole_file import whole_file
 from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run
 from rig.results.columns import STATION_FILE
-from rig.results.folders import whole_file
 from rig.results.run_folder import Curves, RunFolder
 from rig.results.way import Way
 

@@ -1,27 +1,22 @@
 """The operator's page as a process of a rig that is up."""
 
 import asyncio
-import os
 import secrets
-import signal
 import socket
-from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final, NamedTuple, Self
 
-from coldloop.config import PREFIX, to_environment
+from coldloop.config import to_environment
 from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.settings import TlsSettings
 from hmi.settings import HmiSection, HmiSettings
 from hmi.users import PageRole, write_user
 from rig.cosim.endpoints import RigEndpoints
 from rig.cosim.kept_up import end_of
-from rig.cosim.local_services import last_line
-from rig.interpreter import PYTHON
+from rig.cosim.local_services import last_line, start_program, terminate, wait_for_end
 from rig.live.private_folder import new_own
 
-GRACE_S: Final = 5.0
 LOOK_S: Final = 0.05
 OPERATOR: Final = "operator"
 
@@ -133,30 +128,15 @@ class PageProcess:
 
     async def restart(self) -> None:
         """Start it, or start it again."""
-        environment: Mapping[str, str] = {
-            **{name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
-            **to_environment(HmiSettings(hmi=self._section)),
-        }
         self._log.parent.mkdir(parents=True, exist_ok=True)
         with new_own(self._log) as log:
-            self._process = await asyncio.create_subprocess_exec(
-                *PYTHON, "-m", "hmi", "--with-parent", env=environment, start_new_session=True,
-                stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
-            )  # fmt: skip
+            self._process = await start_program("hmi", to_environment(HmiSettings(hmi=self._section)), log)
 
     async def __aexit__(self, *_: object) -> None:
         """End it."""
-        process = self._process
-        if process is None or process.returncode is not None:
-            return
-        process.send_signal(signal.SIGTERM)
-        process.send_signal(signal.SIGCONT)
-        try:
-            async with asyncio.timeout(GRACE_S):
-                await process.wait()
-        except TimeoutError:
-            process.kill()
-            await process.wait()
+        if self._process is not None:
+            terminate(self._process)
+            await wait_for_end(self._process)
 
     async def is_served(self) -> None:
         """Wait until the page answers.

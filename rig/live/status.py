@@ -3,10 +3,11 @@
 from typing import Final, NamedTuple
 
 from coldloop.operating.execution import ALL_SERVICES, Clients
+from coldloop.operating.rings import last_update
 from coldloop.process.signals import L1, T5, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, Process
-from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
+from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
 from coldloop.service.event_text import alarm_cause, word, word_of
@@ -35,10 +36,7 @@ async def read_status(clients: Clients) -> RigStatus:
         LinkError: A service does not answer.
     """
     plant, control, optimizer = (clients[service] for service in ALL_SERVICES)
-    done = await optimizer.read(Identity)
-    update = None
-    if done.heartbeat:
-        (update,) = await optimizer.read_rows(Optimization, (done.heartbeat - 1) % HISTORY_ROWS, 1)
+    update = await last_update(optimizer, await optimizer.read(Identity))
     rows = await control.read_rows(Alarm, 0, len(AlarmKind))
     alarms = tuple(_alarm(kind, row) for kind, row in zip(AlarmKind, rows, strict=True) if row.state not in QUIET)
     return RigStatus(

@@ -10,11 +10,10 @@ from typing import Final
 from coldloop.errors import LinkError, PeerUnreachableError
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
-from coldloop.safety.retained import RetainSettings
 from rig.cosim.kept_up import keep_up, say
 from rig.cosim.local_services import KeptService, LocalServices
 from rig.cosim.session_client import SessionClient
-from rig.cosim.wiring import SERVICES, START_PATIENCE_S
+from rig.cosim.wiring import RETAINING, SERVICES, START_PATIENCE_S, retaining
 from rig.live.link_cuts import CuttableLinks
 from rig.live.page_process import PageProcess
 from rig.live.private_folder import make_own_folder, make_private
@@ -26,8 +25,6 @@ LOOK_S: Final = 0.5
 """Between two looks at the load that the plant knows of, and at a service that was started again."""
 LOOKING: Final = (PlantLinkState.SEARCHING, PlantLinkState.JOINING)
 """A control PLC without a session is looking for the one that it has retained."""
-RETAINING: Final = ("plant", "control_plc")
-"""Services that resume after a restart, from a state file."""
 
 
 class UpRig:
@@ -40,7 +37,7 @@ class UpRig:
         self, settings: Settings, ports: Sequence[int], tls: Path | None, *, page: bool = False, cuttable: bool = False
     ) -> None:
         self.folder = make_own_folder(str(ports[0]))
-        self._settings = _retaining(settings, self.folder)
+        self._settings = retaining(settings, self.folder, always=False)
         self._scenario = make_scenario(settings)
         self._page = page
         self._ports = tuple(ports)
@@ -157,18 +154,6 @@ async def _keep_page(page: PageProcess) -> None:
         await keep_up(page)
     except LinkError as error:
         say(str(error))
-
-
-def _retaining(settings: Settings, folder: Path) -> Settings:
-    """Return settings with which services retain their state, if they can; that of an earlier rig is removed."""
-    sections = {}
-    for service in RETAINING:
-        section = getattr(settings, service)
-        if section.retain.file is None:
-            file = folder / f"retained_{service}.json"
-            file.unlink(missing_ok=True)
-            sections[service] = section.model_copy(update={"retain": RetainSettings(file=file)})
-    return settings.model_copy(update=sections)
 
 
 def addresses(settings: Settings, ports: Sequence[int], folder: Path) -> str:

@@ -28,11 +28,10 @@ from rig.plc_sizing.reference_plc import (
     slow_down,
 )
 from rig.settings import Settings
+from rig.text_tables import aligned
 
 POWERS = (0.2, 0.4, 0.6, 1.0, 2.0, 5.0, 10.0, 25.0)
 PERIODS_S = (1.0, 2.0, 3.0, 4.0, 5.0)
-
-Table = Sequence[Sequence[str]]
 
 
 def budget_tables(settings: Settings, power: float | None, period_s: float | None) -> str:
@@ -47,35 +46,25 @@ def budget_tables(settings: Settings, power: float | None, period_s: float | Non
     curve = fitted(cholesky_times())
     estimator = estimator_memory(prediction, program.estimator)
     parts = [
-        _speed_lines(curve, problem.size),
-        _operation_lines(problem, prediction, curve),
-        _iteration_lines(program, powers, periods),
-        _memory_lines([footprint(one, estimator) for one in (problem, trivial)], [problem.size, trivial.size]),
+        _speed(curve, problem.size),
+        _operations(problem, prediction, curve),
+        _iterations(program, powers, periods),
+        _memory([footprint(one, estimator) for one in (problem, trivial)], [problem.size, trivial.size]),
     ]
-    return "\n\n".join("\n".join(lines) for lines in parts) + "\n"
+    return "\n".join(parts)
 
 
-def aligned(rows: Table) -> list[str]:
-    """Return a table as lines, the first column to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
-
-
-def _speed_lines(curve: SpeedCurve, size: int) -> list[str]:
+def _speed(curve: SpeedCurve, size: int) -> str:
     errors = np.abs(residuals(curve, cholesky_times()))
-    return [
-        (
-            f"Cholesky factorisation on the PLC: {curve.c1 * 1e6:.3g} n + {curve.c2 * 1e6:.3g} n^2 "
-            f"+ {curve.c3 * 1e6:.3g} n^3 us, within {100 * errors.max():.2f} % of 25 times"
-        ),
-        (
-            f"speed in loops of length {size}: {curve.flops_per_s(size) / 1e6:.3f} Mflop/s; "
-            f"slow-down against the laptop: {slow_down(cholesky_times(), size):.0f}"
-        ),
-    ]
+    return (
+        f"Cholesky factorisation on the PLC: {curve.c1 * 1e6:.3g} n + {curve.c2 * 1e6:.3g} n^2 "
+        f"+ {curve.c3 * 1e6:.3g} n^3 us, within {100 * errors.max():.2f} % of 25 times\n"
+        f"speed in loops of length {size}: {curve.flops_per_s(size) / 1e6:.3f} Mflop/s; "
+        f"slow-down against the laptop: {slow_down(cholesky_times(), size):.0f}\n"
+    )
 
 
-def _operation_lines(problem: PredictiveProblem, prediction: PredictionModel, curve: SpeedCurve) -> list[str]:
+def _operations(problem: PredictiveProblem, prediction: PredictionModel, curve: SpeedCurve) -> str:
     n, m, mean = problem.size, len(problem.Gamma), ACTIVE_ROWS.mean
     sizes = operations.PreparationSizes(
         n, m, m - 4 * len(problem.design.constraint_instants), problem.n_knots, prediction.n_states,
@@ -100,8 +89,8 @@ def _operation_lines(problem: PredictiveProblem, prediction: PredictionModel, cu
         (name, f"{count.flops:,.0f}", f"{count.bytes / 1e3:.1f}", f"{count.flops / speed:.3f}")
         for name, count in counts.items()
     ]
-    rows.append(("qpOASES, as in the paper", "", "", f"{_paper_qpoases_s(n):.3f}"))
-    return aligned(rows)
+    rows.append(("qpOASES, as in the paper", "", "", f"{QPOASES_ON_LAPTOP_S * slow_down(cholesky_times(), n):.3f}"))
+    return aligned(rows, numbers=True)
 
 
 def interior_point(problem: PredictiveProblem) -> Operations:
@@ -114,11 +103,7 @@ def interior_point(problem: PredictiveProblem) -> Operations:
     return step.plus(operations.augmented_cost(n, m, ACTIVE_ROWS.mean))
 
 
-def _paper_qpoases_s(size: int) -> float:
-    return QPOASES_ON_LAPTOP_S * slow_down(cholesky_times(), size)
-
-
-def _iteration_lines(program: ProgramSettings, powers: Sequence[float], periods: Sequence[float]) -> list[str]:
+def _iterations(program: ProgramSettings, powers: Sequence[float], periods: Sequence[float]) -> str:
     """Return the iterations with the tau_1 that runs use."""
     tau_1_s = {
         "ODE": program.ode.tau_1_s,
@@ -134,14 +119,14 @@ def _iteration_lines(program: ProgramSettings, powers: Sequence[float], periods:
             plc = PlcBudget(program.budget.model_copy(update={"power": power}), seconds)
             done = (str(plc.iterations(round(period / TICK_S))) for period in periods)
             rows.append((solver, f"{seconds:.3f}", f"{power:g}", *done))
-    return aligned(rows)
+    return aligned(rows, numbers=True)
 
 
-def _memory_lines(footprints: Sequence[Footprint], sizes: Sequence[int]) -> list[str]:
+def _memory(footprints: Sequence[Footprint], sizes: Sequence[int]) -> str:
     names = {"hessian": "Phi", "problem": "Gamma and maps", "shift": "shift of the profile", "solver": "ODE solver",
              "estimator": "estimator", "sequence": "sequence buffers"}  # fmt: skip
     rows = [("bytes in single precision", *(f"n = {size}" for size in sizes))]
     rows += [(text, *(f"{getattr(one, name):,}" for one in footprints)) for name, text in names.items()]
     rows.append(("total", *(f"{one.total:,}" for one in footprints)))
     rows.append(("share of 2 MB", *(f"{100 * one.total / MEMORY_BYTES:.1f} %" for one in footprints)))
-    return aligned(rows)
+    return aligned(rows, numbers=True)

@@ -12,6 +12,7 @@ from markdown_it import MarkdownIt
 
 from rig.report.scorecard import Claim, ClaimVerdict, Judged, counted, counts
 from rig.studies.intervals import interval_of_mean
+from rig.text_tables import markdown_table
 
 STYLE: Final = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c2733; max-width: 76rem; margin: 2rem auto; padding: 0 1.5rem; }
@@ -34,16 +35,13 @@ def verdict_counts(judged: Sequence[Judged]) -> str:
 
 def scorecard_table(judged: Sequence[Judged], commands: Mapping[str, str]) -> str:
     """Return a row for each claim; `commands` says how each study is repeated."""
-    lines = [
-        "| figure | claim | paper's value | ours | tolerance and why | verdict | command |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {j.claim.figure} | {j.claim.says}<br>*{j.claim.value}*{_marks(j.claim)} | {_of_paper(j)} "
-        f"| {_ours(j.values)} | {_tolerance(j.claim)} | {j.verdict} | `{commands[j.claim.study]}` |"
+    header = ("figure", "claim", "paper's value", "ours", "tolerance and why", "verdict", "command")
+    rows = [
+        (j.claim.figure, f"{j.claim.says}<br>*{j.claim.value}*{_marks(j.claim)}", _of_paper(j), _ours(j.values),
+         _tolerance(j.claim), j.verdict, f"`{commands[j.claim.study]}`")
         for j in judged
-    ]
-    return "\n".join(lines)
+    ]  # fmt: skip
+    return markdown_table(header, rows)
 
 
 PLACEHOLDER: Final = re.compile(r"\{([^{}]+)\}")

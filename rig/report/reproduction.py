@@ -8,10 +8,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from coldloop import __version__
-from coldloop.errors import ResultsError
+from coldloop.whole_file import whole_text
 from rig.report.document import as_page, deviations, scorecard_table, verdict_counts
 from rig.report.scorecard import COUNTED, TOLERANCES, Judged, as_json, counted, counts, judge
-from rig.results.folders import whole_file, write_json
+from rig.results.folders import write_json, writing
 from rig.studies import STUDIES
 from rig.studies.execution import Workers
 from rig.studies.results import conduct, section
@@ -44,25 +44,19 @@ def reproduce(options: StudyOptions, workers: Workers, out: Path) -> str:
     judged = judge(_values(results))
     minutes = (time.monotonic() - began) / 60
     text = report(options, results, judged, f"{minutes:.0f} min with {workers.count} workers")
-    try:
+    with writing(out):
         write_json(
             out / "scorecard.json",
             {"coldloop": __version__, "seeds": options.seeds, "quick": options.quick, "counts": counts(judged),
              "claims": as_json(judged)},
         )  # fmt: skip
-        _write(out / "report.md", text)
-        _write(out / "report.html", as_page(TITLE, text, out))
-    except OSError as error:
-        raise ResultsError(f"{out}: {error.strerror}; choose another --out") from None
+        whole_text(out / "report.md", text)
+        whole_text(out / "report.html", as_page(TITLE, text, out))
     return f"{verdict_counts(judged)}; {minutes:.1f} min\nreport in {out / 'report.html'}\n"
 
 
 def _values(results: Mapping[str, StudyResult]) -> dict[str, list[float]]:
     return {name: values for result in results.values() for name, values in result.values.items()}
-
-
-def _write(path: Path, text: str) -> None:
-    whole_file(path, lambda draft: draft.write_text(text, encoding="utf-8"))
 
 
 def circumstances(options: StudyOptions, effort: str) -> str:

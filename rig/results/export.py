@@ -10,9 +10,10 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 
-from coldloop.errors import ResultsError, UsageError
+from coldloop.errors import UsageError
+from coldloop.whole_file import whole_file
 from rig.results.columns import ALL_FILES, FILES
-from rig.results.folders import prepare_folder, whole_file
+from rig.results.folders import prepare_folder, writing
 from rig.results.run_folder import RunFolder
 
 Tables = dict[str, pq.ParquetFile]
@@ -35,9 +36,8 @@ def export(run: Path, kind: str, out: Path, *, force: bool) -> list[Path]:
     prepare_folder(out)
     for path, write in paths.items():
         try:
-            whole_file(path, write)
-        except OSError as error:
-            raise ResultsError(f"{path}: {error.strerror or error}; choose another --out") from None
+            with writing(path):
+                whole_file(path, write)
         except (pa.ArrowException, KeyError) as error:
             raise UsageError(f"{folder.path}: a damaged file: {str(error).splitlines()[0]}") from None
     return list(paths)

@@ -1,19 +1,18 @@
-"""Folders and files of results. A file appears whole or not at all, and only a regular file is replaced."""
+"""Folders and files of results."""
 
 import contextlib
 import json
 import os
-import socket
 import tempfile
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from coldloop.errors import UsageError
+from coldloop.errors import ResultsError, UsageError
+from coldloop.whole_file import whole_text
 
 try:
     import fcntl
@@ -99,32 +98,22 @@ def prepare_folder(folder: Path) -> None:
         raise UsageError(f"{folder}: {error.strerror}; choose a folder that can be written to with --out") from None
 
 
-def require_regular_file(path: Path) -> None:
-    """Refuse to replace a device, a folder or a pipe by a file.
+@contextlib.contextmanager
+def writing(place: Path, remedy: str = "choose another --out") -> Iterator[None]:
+    """Have files written in this context, and be told in a line of one that cannot be.
 
     Raises:
-        UsageError: The path exists and is something else than a regular file.
+        ResultsError: A file cannot be written.
     """
-    if path.exists() and not path.is_file():
-        raise UsageError(f"{path}: exists and is not a regular file; choose another --out")
-
-
-def whole_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` make the file under another name, then give it its own; others may do so at the same time."""
-    require_regular_file(path)
-    writer = f"{socket.gethostname()}.{os.getpid()}.{threading.get_native_id()}"
-    draft = path.with_name(f".{path.name}.{writer}.draft")
     try:
-        write(draft)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        raise ResultsError(f"{place}: {error.strerror or error}; {remedy}") from None
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a JSON document."""
-    text = json.dumps(content, indent=2, ensure_ascii=False) + "\n"
-    whole_file(path, lambda draft: draft.write_text(text, encoding="utf-8"))
+    whole_text(path, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
 
 
 def installed_version(name: str) -> str:

@@ -131,11 +131,6 @@ class RunEvaluation(Sink):
         )
 
 
-def instantaneous_cost(recording: Recording, model: LtiModel, design: ControlDesign) -> NDArray[np.float64]:
-    """Return the stage cost of each tick, shape (N,): deviations and violations of what was really reached."""
-    return StageCost(model, design).of(recording.block)
-
-
 def evaluate(recording: Recording, model: LtiModel, design: ControlDesign) -> Indicators:
     """Return the indicators of a recording, as `RunEvaluation` would have summed them."""
     evaluation = RunEvaluation(model, design)

@@ -1,6 +1,6 @@
 """How the figures of studies are drawn."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Final
 
@@ -12,8 +12,11 @@ from numpy.typing import ArrayLike
 
 from coldloop.process.limits import InputLimits
 from coldloop.process.signals import TICK_S
+from coldloop.registers.plant import StationMode
 from rig.figures.plot import COLOURS, INK, LONGEST_TAU_U_S, STYLE, draw_tau_u, legend_above, limit
+from rig.studies.intervals import Interval
 from rig.studies.request import Outcome
+from rig.studies.study import StudyResult
 
 
 @contextmanager
@@ -108,3 +111,97 @@ def _updates(place: Mapping[str, Axes], label: str, outcome: Outcome, colour: st
         held = outcome.column("tau_u")[np.searchsorted(start_s, time_s, side="right") - 1]
         draw_tau_u(place["tau_u"], time_s / 3600, held * TICK_S, time_s, colour, label)
         place["tau_u"].set_ylim(0, LONGEST_TAU_U_S + 0.3)
+
+
+def over_time(title: str, runs: Sequence[tuple[str, Outcome]], shown: Mapping[str, str], height: float) -> Figure:
+    """Draw series of a refrigerator's runs, `shown` with their labels, over each other; a cold box has not all."""
+    with panels(len(shown), 1, (9.0, height), sharex=True) as (figure, axes):
+        for (label, run), colour in zip(runs, COLOURS, strict=False):
+            for name, place in zip(shown, axes, strict=True):
+                if name in run.trace:
+                    place.plot(run.series("time_s") / 60, run.series(name), color=colour, linewidth=0.9, label=label)
+        for (name, label), place in zip(shown.items(), axes, strict=True):
+            place.set_ylabel(label)
+            if name == "mode":
+                place.set_yticks(list(StationMode), [mode.name.lower().replace("_", " ") for mode in StationMode])
+        axes[0].set_title(title, loc="left", fontsize=8)
+        axes[-1].set_xlabel("plant time (min)")
+        legend_outside(figure, axes[0])
+        figure.align_ylabels(axes)
+    return figure
+
+
+def cost_bars(result: StudyResult, cases: Iterable[str], width: float, *, logarithmic: bool = False) -> Figure:
+    """Draw J_BF of rows (load, case, J_BF, ...): a bar for each case, side by side for each load."""
+    names = list(dict.fromkeys(str(row[0]) for row in result.rows))
+    cases = list(cases)
+    with panels(1, 1, (9.0, 3.6)) as (figure, (place,)):
+        for number, (case, colour) in enumerate(zip(cases, COLOURS, strict=False)):
+            heights = [float(row[2]) for row in result.rows if row[1] == case]
+            offset = (width + 0.02) * (number - 0.5 * (len(cases) - 1))
+            place.bar(np.arange(len(names)) + offset, heights, width, color=colour, label=case)
+        if logarithmic:
+            place.set_yscale("log")
+        place.set_xticks(range(len(names)), names, rotation=0 if len(names) < 9 else 60)
+        place.set_xlabel("load")
+        place.set_ylabel("$J^{BF}$ (1)")
+        legend_outside(figure, place)
+    return figure
+
+
+def ratio_rows(
+    ratios: Mapping[str, Mapping[str, Interval]], label: str, size: tuple[float, float], gap: float, columns: int
+) -> Figure:
+    """Draw ratios with their intervals: a row for each name, in it a point for each series (the outer keys)."""
+    names = list(next(iter(ratios.values())))
+    with panels(1, 1, size) as (figure, (place,)):
+        for number, ((series, by_name), colour) in enumerate(zip(ratios.items(), COLOURS, strict=False)):
+            rows = np.arange(len(names)) + gap * (number - 0.5 * (len(ratios) - 1))
+            found = [by_name[name] for name in names]
+            place.plot([one.value for one in found], rows, "o", markersize=25 * gap, color=colour, label=series)
+            place.hlines(rows, [one.low for one in found], [one.high for one in found], color=colour, linewidth=0.9)
+        place.axvline(1.0, color="#888888", linewidth=0.8)
+        place.set_yticks(range(len(names)), names)
+        place.invert_yaxis()
+        place.set_xscale("log")
+        place.set_xlabel(label)
+        legend_outside(figure, place, columns)
+    return figure
+
+
+LEAST_DRAWN: Final = 1e-5
+"""Share above the lowest cost below which it is drawn here: the axis is logarithmic."""
+
+
+def above_lowest(axes: Axes, powers: ArrayLike, totals: Sequence[Interval], colour: str, label: str) -> None:
+    """Draw by which share total costs over the lowest, with intervals, are above it, against power."""
+    value, low, high = (
+        np.maximum(np.array(series) - 1.0, LEAST_DRAWN) for series in list(zip(*totals, strict=True))[:3]
+    )
+    axes.plot(powers, value, color=colour, marker=".", label=label)
+    axes.fill_between(np.asarray(powers), low, high, color=colour, alpha=0.18, linewidth=0)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("normalised power $P$ (1)")
+    axes.set_ylabel("total cost above the lowest, share of it (1)")
+
+
+def hour_panels(
+    names: Sequence[str], draw: Callable[[str, Axes], None], label: str, ticks: Sequence[int], columns: int = 4
+) -> Figure:
+    """Return a panel for each hour, drawn by `draw`: something against the updating period, with these ticks."""
+    rows = -(-len(names) // 2)
+    with panels(rows, 2, (9.5, 3.1 * rows)) as (figure, axes):
+        for name, place in zip(names, axes, strict=False):
+            draw(name, place)
+            place.set_title(f"({name})", loc="left")
+            place.set_ylabel(label)
+            place.set_yscale("log")
+            place.set_yticks(ticks, map(str, ticks))
+            place.minorticks_off()
+        legend_outside(figure, axes[0], columns)
+        for place in axes[-2:]:
+            place.set_xlabel("updating period (s)")
+        for place in axes[len(names) :]:
+            place.set_visible(False)
+    return figure

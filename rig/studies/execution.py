@@ -21,9 +21,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from coldloop.errors import ColdloopError, ResultsError, StudyError, UsageError
 from rig.interruption import INTERRUPTION
 from rig.progress import make_console
+from rig.results.folders import prepare_folder
 from rig.studies.identical import families, same_run
-from rig.studies.request import RunRequest, perform, programs_digest
+from rig.studies.request import RunRequest, check, perform, programs_digest
 from rig.studies.store import Store, StoredOutcomes
+from rig.studies.study import RUNS, Study, StudyOptions
 
 CONNECT_PATIENCE_S: Final = 10
 FINISHED: Final = "finished"
@@ -69,6 +71,20 @@ class Workers:
                 reason = _first_line(error)
                 raise UsageError(f"--scheduler {self.scheduler}: {reason}; name one that is up") from None
             yield client
+
+
+def checked_requests(study: Study, options: StudyOptions, folder: Path) -> Sequence[RunRequest]:
+    """Return the runs of a study, all of which can be done, and make its folders.
+
+    Raises:
+        UsageError: A run is too short, a solver is not there, or the folders cannot be written to.
+    """
+    requests = study.requests(options)
+    for request in requests:
+        check(request)
+    for name in (study.name, RUNS):
+        prepare_folder(folder / name)
+    return requests
 
 
 def perform_all(requests: Sequence[RunRequest], store: Store, workers: Workers, title: str) -> StoredOutcomes:

@@ -6,10 +6,12 @@ from typing import Final
 import numpy as np
 
 from rig.studies.paired_run import HARSH, INTERIOR_POINT_ITERATIONS
-from rig.studies.paper.open_loop import LABELS, watch
+from rig.studies.paired_sums import watch
+from rig.studies.paper.open_loop import LABELS
 from rig.studies.request import Outcome, Procedure, RunRequest, Series
 from rig.studies.solver_runs import throttled
 from rig.studies.study import Load, Outcomes, StudyOptions, loads
+from rig.text_tables import markdown_table
 
 DRAWS: Final = 3
 """Of six hours: they have more than 300 harsh problems."""
@@ -17,7 +19,7 @@ DRAWS: Final = 3
 
 def harsh_loads(options: StudyOptions) -> list[Load]:
     """Return the draws."""
-    return [load for draws in loads(options, *"abcdef", usual=DRAWS).values() for load in draws]
+    return loads(options, *"abcdef", usual=DRAWS)
 
 
 def _solvers() -> list[str]:
@@ -82,19 +84,14 @@ def harsh_table(options: StudyOptions, outcomes: Outcomes) -> str:
         f"converged loop, costs more than {HARSH:g} times the lowest; cost over the lowest, median (worst), after the "
         "PLC time of so many iterations of the interior-point solver; in brackets each solver's own iterations."
     )
-    lines = [
-        caption,
-        "",
-        "| solver | " + " | ".join(f"time of {k}" for k in INTERIOR_POINT_ITERATIONS) + " |",
-        "|---|" + "---|" * len(INTERIOR_POINT_ITERATIONS),
-    ]
+    rows = []
     for solver, by_count in ratios.items():
         counts = _counts(outcomes, first, solver)
         cells = [
             f"{np.median(found):.4g} ({found.max():.3g}) [{counts[k]:.0f}]" for k, found in by_count.items()
         ]  # fmt: skip
-        lines.append(f"| {LABELS[solver]} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        rows.append((LABELS[solver], *cells))
+    return markdown_table(("solver", *(f"time of {k}" for k in INTERIOR_POINT_ITERATIONS)), rows, caption)
 
 
 def _counts(outcomes: Outcomes, drawn: list[Load], solver: str) -> dict[int, float]:

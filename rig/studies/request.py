@@ -26,7 +26,7 @@ from rig.cosim.local_services import run_on_localhost
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
 from rig.results.folders import installed_version
-from rig.results.indicators import Indicators, evaluate, instantaneous_cost
+from rig.results.indicators import Indicators, StageCost, evaluate
 from rig.results.recording import Recorder, Recording
 from rig.settings import Settings
 from rig.studies.hindsight import Objective, run_best_in_hindsight
@@ -39,7 +39,6 @@ PROGRAM_PACKAGES = ("coldloop", "plant", "control_plc", "optimizer_plc")
 RIG_MODULES = (
     "rig.cosim.compiled.control",
     "rig.cosim.compiled.loops",
-    "rig.cosim.compiled.optimizer",
     "rig.cosim.compiled.plants",
     "rig.cosim.compiled.portable",
     "rig.cosim.compiled.records",
@@ -265,7 +264,7 @@ def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outc
         trace_sha256=trace_sha256,
         deadline_misses=recording.link.deadline_misses,
         updates={name: [float(getattr(row, name)) for row in recording.updates] for name in UPDATE_COLUMNS},
-        trace=_trace(recording, instantaneous_cost(recording, model, design), trace_ticks) if trace_ticks else {},
+        trace=_trace(recording, StageCost(model, design).of(recording.block), trace_ticks) if trace_ticks else {},
     )
 
 

@@ -4,13 +4,13 @@ import csv
 import io
 from pathlib import Path
 
-from coldloop.errors import ResultsError
+from coldloop.whole_file import whole_text
 from rig.figures.run_plot import save_figure
-from rig.results.folders import prepare_folder, whole_file
-from rig.studies.execution import Workers, perform_all
-from rig.studies.request import check
+from rig.results.folders import writing
+from rig.studies.execution import Workers, checked_requests, perform_all
 from rig.studies.store import Store
-from rig.studies.study import RUNS, Cell, Study, StudyOptions, StudyResult
+from rig.studies.study import RUNS, Study, StudyOptions, StudyResult
+from rig.text_tables import markdown_table
 
 
 def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path) -> StudyResult:
@@ -19,17 +19,11 @@ def conduct(study: Study, options: StudyOptions, workers: Workers, folder: Path)
     Raises:
         ColdloopError: A run failed, or a file cannot be written.
     """
-    for name in (study.name, RUNS):
-        prepare_folder(folder / name)
-    requests = study.requests(options)
-    for request in requests:
-        check(request)
+    requests = checked_requests(study, options, folder)
     outcomes = perform_all(requests, Store(folder / RUNS), workers, study.name)
     result = study.evaluate(options, outcomes)
-    try:
+    with writing(folder / study.name):
         _write(study, result, folder / study.name)
-    except OSError as error:
-        raise ResultsError(f"{folder / study.name}: {error.strerror}; choose another --out") from None
     return result
 
 
@@ -38,12 +32,11 @@ def _write(study: Study, result: StudyResult, folder: Path) -> None:
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(result.columns)
     writer.writerows(result.rows)
-    whole_file(folder / "results.csv", lambda draft: draft.write_text(table.getvalue(), encoding="utf-8"))
+    whole_text(folder / "results.csv", table.getvalue())
     for name, figure in result.figures.items():
         save_figure(figure, folder / figure_file(name))
         save_figure(figure, (folder / figure_file(name)).with_suffix(".pdf"))
-    text = f"# {study.title}\n\n{section(result)}"
-    whole_file(folder / "section.md", lambda draft: draft.write_text(text, encoding="utf-8"))
+    whole_text(folder / "section.md", f"# {study.title}\n\n{section(result)}")
 
 
 def figure_file(name: str) -> str:
@@ -56,22 +49,9 @@ LONGEST_TABLE = 24
 
 
 def section(result: StudyResult, folder: str = "") -> str:
-    """Return figures, remarks and, if it is short, the table as Markdown; figures are looked for in `folder`."""
+    """Return figures, remarks and, if it is shown, the table as Markdown; figures are looked for in `folder`."""
     parts = [f"![{name}]({folder}{figure_file(name)})" for name in result.figures]
     parts += result.remarks
-    if result.rows and len(result.rows) <= LONGEST_TABLE:
+    if result.rows and (result.always_shown or len(result.rows) <= LONGEST_TABLE):
         parts.append(markdown_table(result.columns, result.rows))
     return "\n\n".join(parts) + "\n"
-
-
-def markdown_table(columns: tuple[str, ...], rows: list[tuple[Cell, ...]]) -> str:
-    """Return a table."""
-    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    lines += ["| " + " | ".join(_cell(value) for value in row) + " |" for row in rows]
-    return "\n".join(lines)
-
-
-def _cell(value: Cell) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return f"{value[:12]}…" if isinstance(value, str) and len(value) == 64 else str(value)

@@ -13,10 +13,10 @@ from typing import Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coldloop.errors import ResultsError, StudyError, UsageError
-from rig.results.folders import prepare_folder, write_json
-from rig.studies.execution import Workers, perform_all
-from rig.studies.request import RunRequest, check, programs_digest
+from coldloop.errors import StudyError, UsageError
+from rig.results.folders import prepare_folder, write_json, writing
+from rig.studies.execution import Workers, checked_requests, perform_all
+from rig.studies.request import RunRequest, programs_digest
 from rig.studies.store import Store
 from rig.studies.study import RUNS, Study, StudyOptions
 
@@ -92,17 +92,11 @@ def conduct_shard(study: Study, options: StudyOptions, workers: Workers, folder:
     Raises:
         ColdloopError: A run failed, or a file cannot be written.
     """
-    requests = study.requests(options)
-    for request in requests:
-        check(request)
-    for name in (study.name, RUNS):
-        prepare_folder(folder / name)
+    requests = checked_requests(study, options, folder)
     record = ShardRecord.of_study(study, options, shard)
     path = folder / study.name / f"shard-{shard.number}-of-{shard.of}.json"
-    try:
+    with writing(path):
         write_json(path, record.model_dump())
-    except OSError as error:
-        raise ResultsError(f"{path}: {error.strerror}; choose another --out") from None
     mine = shard.part(requests)
     perform_all(mine, Store(folder / RUNS), workers, f"{study.name} {shard}")
     return len(mine)

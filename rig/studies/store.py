@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import ResultsError
-from rig.results.folders import whole_file
+from coldloop.whole_file import whole_text
+from rig.results.folders import writing
 from rig.studies.request import Outcome, RunRequest
 
 REMEMBERED: Final = 64
@@ -48,12 +49,8 @@ class Store:
             ResultsError: It cannot be written.
         """
         path = self.path(request)
-        try:
-            whole_file(path, lambda draft: draft.write_text(outcome, encoding="utf-8"))
-        except OSError as error:
-            raise ResultsError(
-                f"{path}: {error.strerror}; what was done before is kept: make room, or choose another --out"
-            ) from None
+        with writing(path, "what was done before is kept: make room, or choose another --out"):
+            whole_text(path, outcome)
 
 
 class StoredOutcomes(Mapping[RunRequest, Outcome]):

@@ -1,7 +1,7 @@
 """A study: its runs, and the evaluation of their outcomes."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from matplotlib.figure import Figure
@@ -12,10 +12,9 @@ from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from plant.load import find_load, named_families
 from rig.cosim.scenario import natural_ticks
 from rig.studies.request import Outcome, Procedure, RunRequest
+from rig.text_tables import Cell
 
 Outcomes = Mapping[RunRequest, Outcome]
-Cell = str | float | int
-
 USUAL_DRAWS = 3
 """Of each load, unless the study or the command sets another number."""
 RUNS = "runs"
@@ -53,6 +52,11 @@ class StudyOptions:
     def drawn(self, usual: int) -> range:
         """Return the numbers of the draws of a study, or of a part of it, that has so many of its own."""
         return range(1, (1 if self.quick else self.seeds or usual) + 1)
+
+    @property
+    def hours(self) -> str:
+        """The families of hours of a study that compares periods."""
+        return "ace" if self.quick else "abcdef"
 
 
 @dataclass(frozen=True)
@@ -92,12 +96,32 @@ def draw_of(name: str, draw: int, options: StudyOptions) -> Load:
     return Load(drawn if named or draw == 1 else f"{name}#{draw}", draw, profile, ticks, noise)
 
 
-def loads(options: StudyOptions, *names: str, usual: int = USUAL_DRAWS) -> dict[str, list[Load]]:
-    """Return the draws of the loads asked for, or else of these, by name; a name such as a@2 is one draw."""
-    return {
-        name: [draw_of(name, draw, options) for draw in (range(1, 2) if "@" in name else options.drawn(usual))]
-        for name in options.loads or names
+def loads(options: StudyOptions, *names: str, usual: int = USUAL_DRAWS, longest_ticks: int | None = None) -> list[Load]:
+    """Return the draws of the loads asked for, or else of these; a name such as a@2 is one draw.
+
+    Without a length asked for, no load is longer than `longest_ticks`.
+    """
+    drawn = [
+        draw_of(name, draw, options)
+        for name in dict.fromkeys(options.loads or names)
+        for draw in (range(1, 2) if "@" in name else options.drawn(usual))
+    ]
+    longest = options.ticks or longest_ticks
+    return [replace(load, ticks=min(load.ticks, longest)) for load in drawn] if longest else drawn
+
+
+TUNING_DRAWS = (11, 12)
+"""Draws that the constants of the contraction rule were chosen on."""
+
+
+def first_and_fresh(hours: Iterable[Load], first: str = "hours") -> dict[str, list[Load]]:
+    """Return the first draw of each load, and those of other draws that nothing was tuned on; by title."""
+    hours = list(hours)
+    groups = {
+        first: [load for load in hours if load.draw == 1],
+        "fresh hours": [load for load in hours if load.draw not in (1, *TUNING_DRAWS)],
     }
+    return {title: some for title, some in groups.items() if some}
 
 
 @dataclass
@@ -112,6 +136,12 @@ class StudyResult:
     """What the claims are judged by: one value for each draw, by claim."""
     remarks: list[str] = field(default_factory=list)
     """Paragraphs for the report."""
+    always_shown: bool = False
+    """Whether the report has all rows, however many there are."""
+
+    def note(self, claim: str, value: float) -> None:
+        """Add the value of one more draw."""
+        self.values.setdefault(claim, []).append(float(value))
 
 
 class Study(Protocol):

@@ -11,13 +11,12 @@ from typing import Any, Final, Literal, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError, UsageError
+from coldloop.errors import LinkError, PeerUnreachableError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Grant
 from coldloop.registers.maps import MAPS
-from coldloop.registers.plant import SensorFault, Surroundings
 from rig.chaos.faults import AnyFault, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
@@ -68,7 +67,7 @@ class LiveRig:
             NamedRegisters(register_map, endpoint, self._clients[service], self._call)
             for service, register_map, endpoint in zip(SERVICES, MAPS.values(), self.endpoints, strict=True)
         )
-        self._injector = Injector(self._proxied.services, self._proxied.proxies, self, folder)
+        self._injector = Injector(self._proxied.services, self._proxied.proxies, self._clients["plant"], folder)
 
     # -- time ----------------------------------------------------------------------------------------------------------
 
@@ -169,24 +168,6 @@ class LiveRig:
         service = await self._injector.end(fault)
         if service is not None:
             await self._clients[service].connect(START_PATIENCE_S)
-
-    async def set_sensor_fault(self, output: int, fault: SensorFault) -> bool:
-        """Write the fault of an output; for the injector."""
-        try:
-            await self._clients["plant"].write_rows([fault], output)
-        except (PeerUnreachableError, RequestRefusedError):
-            return False
-        return True
-
-    async def change_surroundings(self, target: str, value: float) -> float | None:
-        """Change one of a refrigerator's surroundings, and return its old value; for the injector."""
-        try:
-            given = await self._clients["plant"].read(Surroundings)
-            before = getattr(given, target)
-            await self._clients["plant"].write(given._replace(**{target: type(before)(value)}))
-        except (PeerUnreachableError, RequestRefusedError):
-            return None
-        return float(before)
 
     def log(self, service: str) -> Path:
         """Return the log of `plant`, `control_plc` or `optimizer_plc`: one JSON object a line."""

@@ -8,6 +8,7 @@ from typing import Any, Final
 from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
+from coldloop.operating.rings import last_update, read_ring
 from coldloop.registers.audit import EVENT_ROWS, Event, JournalPage
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.configuration import ConfigurationDigest, ConfigurationLine, configuration_of, lines_of
@@ -140,16 +141,16 @@ class Poller:
 
     async def _read_updates(self) -> None:
         identity = self._model.record("optimizer_plc", Identity)
-        if identity is None or not identity.heartbeat:
+        newest = None if identity is None else await last_update(self._client, identity)
+        if newest is None:
             self._next_update = 0
             return
-        (newest,) = await self._client.read_rows(Optimization, (identity.heartbeat - 1) % HISTORY_ROWS, 1)
         if newest.update + 1 < self._next_update:
             self._next_update = 0
         first = max(self._next_update, newest.update + 1 - UPDATES_AT_ONCE)
         if first > newest.update:
             return
-        rows = await self._rows(Optimization, first, newest.update, HISTORY_ROWS)
+        rows = await read_ring(self._client, Optimization, HISTORY_ROWS, first, newest.update)
         self._model.put_updates(sorted(row for row in rows if first <= row.update <= newest.update and row.tau_u))
         self._next_update = newest.update + 1
         self._model.put("optimizer_plc", await self._client.read(Prediction))
@@ -157,7 +158,7 @@ class Poller:
     async def _check_journal(self) -> None:
         """Begin with the first event again if the last one is unknown: the service has restarted its count."""
         last = self._last_event
-        if last is not None and await self._client.read_rows(Event, last.number % EVENT_ROWS, 1) != [last]:
+        if last and await read_ring(self._client, Event, EVENT_ROWS, last.number, last.number) != [last]:
             self._next_event, self._last_event = 0, None
 
     async def _read_events(self) -> None:
@@ -167,15 +168,8 @@ class Poller:
         if page.newest < self._next_event:  # it has restarted its count
             self._next_event = 0
         first = max(self._next_event, page.newest - EVENTS_AT_ONCE + 1, 1)
-        rows = await self._rows(Event, first, page.newest, EVENT_ROWS)
+        rows = await read_ring(self._client, Event, EVENT_ROWS, first, page.newest)
         news = sorted(row for row in rows if first <= row.number <= page.newest)
         self._last_event = news[-1] if news else self._last_event
         self._model.put_events(JournalEntry.of(self._service, row) for row in news)
         self._next_event = page.newest + 1
-
-    async def _rows(self, record: type[Any], first: int, last: int, ring: int) -> list[Any]:
-        """Return rows `first` to `last` of a ring of rows."""
-        start, count = first % ring, max(0, last - first + 1)
-        behind = min(count, ring - start)
-        rows = await self._client.read_rows(record, start, behind)
-        return rows + await self._client.read_rows(record, 0, count - behind)

@@ -6,7 +6,7 @@ import struct
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AbstractAsyncContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -36,6 +36,9 @@ from coldloop.safety.lease import Lease
 from coldloop.safety.sequence import InputSequence, checksum
 from optimizer_plc.runtime import OptimizerPlc
 from optimizer_plc.settings import OptimizerSettings
+from rig.chaos.faults import Direction
+from rig.chaos.proxy import reset
+from tests.harness.treated_link import TreatedLink
 
 WITHIN_S = 60.0
 LONGEST_WAIT_S = 0.1
@@ -136,21 +139,22 @@ class PlayedControlPlc:
 # -- the wire ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Wire:
-    """Forwards requests and answers; damages or loses those that concern a block as often as it is told."""
+class Wire(TreatedLink):
+    """Passes requests and answers on; damages or loses those that concern a block as often as it is told."""
 
-    port_there: int = 0
-    is_cut: bool = False
-    """Connections are closed at once."""
-    damaged_requests: dict[str, int] = field(default_factory=dict)
-    damaged_answers: dict[str, int] = field(default_factory=dict)
-    lost_requests: dict[str, int] = field(default_factory=dict)
-    lost_answers: dict[str, int] = field(default_factory=dict)
-    accepted: int = 0
-    """Connections so far."""
-    _seen: asyncio.Event = field(default_factory=asyncio.Event)
-    _ends: "dict[asyncio.Task[None], asyncio.StreamWriter]" = field(default_factory=dict)
+    def __init__(self, target: int) -> None:
+        super().__init__(target, self._treated)
+        self.is_cut = False
+        """Connections are closed at once."""
+        self.damaged_requests: dict[str, int] = {}
+        self.damaged_answers: dict[str, int] = {}
+        self.lost_requests: dict[str, int] = {}
+        self.lost_answers: dict[str, int] = {}
+        self.accepted = 0
+        """Connections so far."""
+        self._asked: dict[bytes, set[str]] = {}
+        """Blocks that requests under way concern, by their transaction."""
+        self._seen = asyncio.Event()
 
     async def moves(self) -> None:
         """Wait for the next connection or the next answer that is sent back."""
@@ -158,54 +162,36 @@ class Wire:
 
     def cut(self) -> None:
         """Close all connections."""
-        for end in self._ends.values():
-            end.close()
-
-    async def close(self) -> None:
-        """Close all connections, and wait until they are."""
-        self.cut()
-        if self._ends:
-            await asyncio.wait(self._ends)
+        for end in tuple(self._open):
+            reset(end)
 
     def _move(self) -> None:
         self._seen.set()
         self._seen = asyncio.Event()
 
-    def open(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Take a new connection."""
-        task = asyncio.ensure_future(self._forward(reader, writer))
-        self._ends[task] = writer
-        task.add_done_callback(self._ends.pop)
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.accepted += 1
         self._move()
+        if self.is_cut:
+            writer.close()
+        else:
+            await super()._serve(reader, writer)
 
-    async def _forward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        there: asyncio.StreamWriter | None = None
-        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
-            while not self.is_cut:
-                head, pdu = await _frame(reader)
-                names = _names(pdu)
-                if _due(self.lost_requests, names):
-                    break
-                if there is None:
-                    answers, there = await asyncio.open_connection("127.0.0.1", self.port_there)
-                data_from = 10 if pdu[0] == 23 else 6
-                there.write(head + (_flipped(pdu, data_from + 3) if _due(self.damaged_requests, names) else pdu))
-                head, answer = await _frame(answers)
-                if _due(self.lost_answers, names):
-                    break
-                writer.write(head + (_flipped(answer, 5) if _due(self.damaged_answers, names) else answer))
-                self._move()
-        for end in (writer, there):
-            if end is not None:
-                end.close()
-                with contextlib.suppress(ConnectionError):
-                    await end.wait_closed()
-
-
-async def _frame(reader: asyncio.StreamReader) -> tuple[bytes, bytes]:
-    head = await reader.readexactly(7)
-    return head, await reader.readexactly(struct.unpack(">H", head[4:6])[0] - 1)
+    def _treated(self, way: Direction, frame: bytes) -> bytes | None:
+        head, pdu = frame[:7], frame[7:]
+        if self.is_cut:
+            return None
+        if way is Direction.REQUESTS:
+            names = self._asked[head[:2]] = _names(pdu)
+            lost, damaged, place = self.lost_requests, self.damaged_requests, 13 if pdu[0] == 23 else 9
+        else:
+            names = self._asked.pop(head[:2])
+            lost, damaged, place = self.lost_answers, self.damaged_answers, 5
+        if _due(lost, names):
+            return None
+        if way is Direction.ANSWERS:
+            self._move()
+        return head + (_flipped(pdu, place) if _due(damaged, names) else pdu)
 
 
 def _names(pdu: bytes) -> set[str]:
@@ -280,17 +266,14 @@ async def listening(
 
 
 @contextlib.asynccontextmanager
-async def connected(control: PlayedControlPlc, wire: Wire | None = None, **program: object) -> AsyncIterator[Link]:
+async def connected(control: PlayedControlPlc, **program: object) -> AsyncIterator[Link]:
     """Run an optimiser PLC that finds a control PLC at the other end of a wire."""
-    wire = wire or Wire()
-    async with listening(control.bank, control.on_write) as server:
-        wire.port_there = server.port
-        proxy = await asyncio.start_server(wire.open, "127.0.0.1", 0)
-        here = {"host": "127.0.0.1", "port": proxy.sockets[0].getsockname()[1], "timeout_s": 2.0}
+    async with listening(control.bank, control.on_write) as server, Wire(server.port) as wire:
+        here = {"host": "127.0.0.1", "port": wire.port, "timeout_s": 2.0}
         section = {"control_plc": here, "program": program}
         optimizer = OptimizerPlc(OptimizerSettings.model_validate({"optimizer_plc": section}))
         shown = optimizer.publication
-        async with listening(shown.bank, shown.on_write) as own, proxy:
+        async with listening(shown.bank, shown.on_write) as own:
             running = asyncio.create_task(optimizer.run())
             try:
                 yield Link(optimizer, running, control, wire, own.port)
@@ -298,7 +281,6 @@ async def connected(control: PlayedControlPlc, wire: Wire | None = None, **progr
                 running.cancel()
                 await asyncio.wait({running})
                 optimizer.close()
-                await wire.close()
 
 
 @pytest.fixture(scope="session")

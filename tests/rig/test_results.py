@@ -26,11 +26,12 @@ from coldloop.process.signals import (
 )
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
+from coldloop.whole_file import whole_file
 from rig import cli
 from rig.cli.commands.options import PLACES
 from rig.cosim.scenario import Scenario
 from rig.results.columns import FILES
-from rig.results.folders import claim_folder_of_now, whole_file, write_json
+from rig.results.folders import claim_folder_of_now, write_json
 from rig.results.indicators import evaluate
 from rig.results.recording import LinkStatistics, Recorder, Recording
 from rig.settings import Settings

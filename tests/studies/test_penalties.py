@@ -12,13 +12,21 @@ from coldloop.process.load_profile import LoadProfile
 from optimizer_plc.qp.penalties import Preset
 from rig.results.indicators import Indicators
 from rig.studies.beyond.penalties import PenaltiesStudy, misfit
-from rig.studies.beyond.penalty_sums import Paired
-from rig.studies.beyond.penalty_variants import OWN, PRESETS, VARIANTS, PenaltyVariant, paired, powers_of
-from rig.studies.paper.best_periods import end_over_best, groups, share_inside
+from rig.studies.beyond.penalty_variants import (
+    OWN,
+    PRESETS,
+    VARIANTS,
+    Paired,
+    PenaltyVariant,
+    paired,
+    paired_sums,
+    powers_of,
+)
+from rig.studies.paper.best_periods import FIRST, end_over_best, share_inside
 from rig.studies.paper.open_loop import paired_loads
 from rig.studies.paper.updating_period import is_inside
 from rig.studies.request import Outcome, RunRequest, settings_of
-from rig.studies.study import Load, StudyOptions
+from rig.studies.study import Load, StudyOptions, first_and_fresh
 
 if TYPE_CHECKING:
     from tests.studies.conftest import Conducted
@@ -49,19 +57,19 @@ def found(totals: dict[tuple[PenaltyVariant | None, float], float]) -> Paired:
     for variant in (None, TUNED, AS_PRINTED):
         for power in powers_of(variant, QUICK):
             outcomes[paired(load, variant, power)] = of(totals.get((variant, power), 10.0), 10.0)
-    return Paired(QUICK, outcomes)
+    return paired_sums(QUICK, outcomes)
 
 
 def test_totals_are_compared_with_the_lowest_and_parts_with_converged_qpoases() -> None:
     one = found({(TUNED, 1.0): 15.0, (None, 25.0): 12.0})
     assert one.over_lowest(TUNED, 1.0, [0]) == 1.5
-    assert one.over_converged("J_dev", TUNED, 1.0).value == pytest.approx(15.0 / 12.0)
+    assert one.over_converged("J_dev", TUNED, 1.0, None).value == pytest.approx(15.0 / 12.0)
 
 
 def test_curves_cross_where_qpoases_comes_down_to_a_preset() -> None:
     """Both logarithms are straight between 1 and 10: ln 4 above at 1, ln 4 below at 10, so they cross at sqrt 10."""
     one = found({(None, 0.2): 400.0, (None, 1.0): 80.0, (TUNED, 0.2): 20.0, (TUNED, 1.0): 20.0, (TUNED, 10.0): 40.0})
-    assert one.crossing(TUNED).value == pytest.approx(math.sqrt(10.0))
+    assert one.crossing(None, TUNED).value == pytest.approx(math.sqrt(10.0))
 
 
 def test_a_profile_below_the_optimum_ends_the_study() -> None:
@@ -84,7 +92,7 @@ def test_a_best_period_at_an_end_is_not_inside() -> None:
 
 def test_hours_that_rules_were_tuned_on_are_not_fresh() -> None:
     loads = [Load(f"a@{draw}", draw, LoadProfile((0,), (1.0,)), 60) for draw in (1, 2, 11)]
-    assert {title: [one.draw for one in some] for title, some in groups({load: {} for load in loads}).items()} == {
+    assert {title: [one.draw for one in some] for title, some in first_and_fresh(loads, FIRST).items()} == {
         "hours a to f": [1],
         "fresh hours": [2],
     }

@@ -53,16 +53,16 @@ def test_named_loads_are_drawn_anew_for_each_seed_and_files_get_noise(tmp_path: 
     file = f"{tmp_path}/own.csv"
     with open(file, "w", encoding="utf-8") as out:  # noqa: PTH123 a name as users give it
         out.write("time_s,load_w\n0,385\n60,420\n")
-    first, second = loads(StudyOptions(seeds=2), "c")["c"]
+    first, second = loads(StudyOptions(seeds=2), "c")
     assert (first.name, second.name) == ("c", "c@2")
     assert first.profile != second.profile
-    own = loads(StudyOptions(seeds=2, loads=(file,)))[file]
+    own = loads(StudyOptions(seeds=2, loads=(file,)))
     assert own[0].profile == own[1].profile
     assert own[0].noise == NOISE
-    assert loads(StudyOptions(seeds=1, loads=(file,)))[file][0].noise == ()
+    assert loads(StudyOptions(seeds=1, loads=(file,)))[0].noise == ()
 
 
 def test_a_quick_study_has_one_draw_of_ten_minutes() -> None:
     options = StudyOptions(seeds=5, quick=True)
-    assert [load.ticks for load in loads(options, "8h")["8h"]] == [2400]
+    assert [load.ticks for load in loads(options, "8h")] == [2400]
     assert draw_of("8h", 1, StudyOptions(ticks=10, quick=True)).ticks == 10

@@ -25,7 +25,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         help="with --certify: enough is within this of the optimum (default: 5)")  # fmt: skip
     parser.add_argument("--confidence", type=_percent, default=99.9, metavar="PERCENT",
                         help="with --certify: of the bounds (default: 99.9)")  # fmt: skip
-    parser.set_defaults(execute=execute)
 
 
 def _scenarios(text: str) -> int:

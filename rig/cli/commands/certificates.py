@@ -20,7 +20,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--revoke", action="append", default=[], metavar="NAME",
                         help="revoke a certificate in the folder, such as operator; may be repeated")  # fmt: skip
     parser.add_argument("--renew-list", action="store_true", help="renew the list of revoked certificates")
-    parser.set_defaults(execute=execute)
 
 
 def _host(text: str) -> str:

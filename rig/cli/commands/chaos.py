@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coldloop.errors import LinkError, ResultsError, UsageError
+from coldloop.errors import LinkError, UsageError
 from coldloop.process.signals import TICK_S
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import FIGURE_FORMATS, MODES, plans
@@ -36,7 +36,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--factor", type=float, dest="plan_factor", help="instead of the plan's")
     parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
                         help="of the run's picture: png, pdf, svg (default: png)")  # fmt: skip
-    parser.set_defaults(execute=execute)
 
 
 def _seed(text: str) -> int:
@@ -98,13 +97,12 @@ def _refuse_what_has_no_effect(effective: "Configuration[Settings]") -> None:
 
 
 def _report(out: Path, plan: "ChaosPlan", experiment: "Experiment") -> None:
-    from rig.chaos.report import as_text, summary_lines, table
+    from rig.chaos.report import summary_lines, table
+    from rig.results.folders import writing
 
-    try:
+    with writing(out, "no report was written, choose another --out"):
         _write(out, plan, experiment)
-    except OSError as error:
-        raise ResultsError(f"{out}: {error.strerror}; no report was written, choose another --out") from None
-    sys.stdout.write(as_text(table(experiment.evaluation.rows)))
+    sys.stdout.write(table(experiment.evaluation.rows))
     for line in [*summary_lines(experiment.trace, experiment.evaluation), f"results in {out}"]:
         sys.stdout.write(f"{line}\n")
 
@@ -130,4 +128,4 @@ def _write(out: Path, plan: "ChaosPlan", experiment: "Experiment") -> None:
         "undisturbed_trace_sha256": undisturbed.trace_sha256,
     }
     write_report(out, plan, trace, experiment.evaluation, hashes, experiment.failure)
-    plot_chaos(out / "chaos.png", trace, undisturbed, f"{plan.name}: {plan.description}")
+    plot_chaos(out / "chaos.png", trace, undisturbed, experiment.design, f"{plan.name}: {plan.description}")

@@ -11,7 +11,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("compare.png"), metavar="FILE",
                         help="figure: .png, .pdf or .svg (default: compare.png)")  # fmt: skip
     parser.add_argument("--force", action="store_true", help="replace a figure that exists")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -7,7 +7,6 @@ import sys
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("shell", choices=("bash", "zsh", "fish", "tcsh"))
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -3,7 +3,6 @@
 import argparse
 import sys
 
-from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.options import add_rig_options, first_port_here
 
 PATIENCE_S = 15.0
@@ -11,9 +10,7 @@ PATIENCE_S = 15.0
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_configuration_options(parser)
     add_rig_options(parser)
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

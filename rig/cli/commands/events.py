@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
 from coldloop.errors import ResultsError, UsageError
 from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import Event, EventKind
-from coldloop.service.command_line import add_configuration_options
 from coldloop.service.event_text import describe, utc_text
 from rig.cli.commands.choices import SERVICES
 from rig.cli.commands.options import add_rig_options, endpoint, operator_settings, rig_endpoints
@@ -30,7 +29,6 @@ LOOK_AGAIN_S: Final = 1.0
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_configuration_options(parser)
     add_rig_options(parser)
     parser.add_argument("endpoint", nargs="?", type=endpoint, metavar="HOST:PORT",
                         help="where the service is, of a rig that is not up here")  # fmt: skip
@@ -42,7 +40,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--follow", action="store_true", help="print new events until interrupted")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write a CSV file instead of lines")
     parser.add_argument("--force", action="store_true", help="overwrite that file")
-    parser.set_defaults(execute=execute)
 
 
 class Since(NamedTuple):

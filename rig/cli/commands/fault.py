@@ -5,13 +5,18 @@ A service that is killed is started again by `coldloop up`. More can happen to l
 
 import argparse
 import sys
-from contextlib import suppress
 from typing import Final
 
 from coldloop.errors import UsageError
 from coldloop.process.signals import OUTPUT_NAMES
-from coldloop.service.command_line import add_configuration_options
-from rig.cli.commands.options import add_rig_options, first_port_here, operator_settings, rig_endpoints
+from rig.cli.commands.options import (
+    add_rig_options,
+    add_to_subcommands,
+    first_port_here,
+    operator_settings,
+    rig_endpoints,
+    tell,
+)
 
 SERVICES: Final = ("plant", "control_plc", "optimizer_plc")
 LINKS: Final = ("plant", "optimizer")
@@ -21,7 +26,6 @@ SENSOR_FAULTS: Final = {"none": 0, "dead": 1, "stuck": 2}
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_configuration_options(parser)
     add_rig_options(parser)
     what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
     kill = what.add_parser("kill", help="kill a service (SIGKILL); `coldloop up` restarts it")
@@ -39,10 +43,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     sensor.add_argument("output", metavar="OUTPUT", help="such as T5")
     sensor.add_argument("shows", metavar="dead|stuck|VALUE|none", help="none ends the fault")
     sensor.set_defaults(fault=_sensor)
-    for subcommand in what.choices.values():  # options are accepted before and after the subcommand
-        add_configuration_options(subcommand, again=True)
-        add_rig_options(subcommand, again=True)
-    parser.set_defaults(execute=execute)
+    add_to_subcommands(what)
 
 
 def _seconds(text: str) -> float:
@@ -74,9 +75,7 @@ async def _freeze(options: argparse.Namespace) -> None:
     from rig.live.process_faults import freeze, process_of
 
     process = process_of(first_port_here(options), options.service)
-    with suppress(BrokenPipeError):  # no reader: the fault is injected all the same
-        sys.stdout.write(f"the {options.service} service is suspended for {options.seconds:g} s (Ctrl-C resumes it)\n")
-        sys.stdout.flush()
+    tell(f"the {options.service} service is suspended for {options.seconds:g} s (Ctrl-C resumes it)")
     runs = await freeze(process, options.seconds)
     sys.stdout.write(f"the {options.service} service {'runs again' if runs else 'has ended meanwhile'}\n")
 

@@ -12,15 +12,14 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the model file, for model.file")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Solve, linearise, print; write the model file when there is --out; reject an invalid configured model."""
     from coldloop.errors import UsageError
     from coldloop.process.lti_model import load
+    from coldloop.whole_file import require_regular_file
     from rig.cli.model_listing import describe_model
-    from rig.results.folders import require_regular_file
 
     if options.out is not None:
         require_regular_file(options.out)

@@ -1,13 +1,16 @@
 """Options that several subcommands share, and how their values are read."""
 
 import argparse
+import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coldloop.errors import UsageError
 from coldloop.process.signals import TICK_S
-from rig.cli.commands.choices import LOADS
+from coldloop.service.command_line import add_configuration_options
+from rig.cli.commands.choices import FIGURE_FORMATS, LOADS, PRESETS, SOLVERS
 
 if TYPE_CHECKING:
     from coldloop.config import Configuration
@@ -87,7 +90,8 @@ def port_base(text: str) -> int:
 
 
 def add_rig_options(parser: argparse.ArgumentParser, *, again: bool = False) -> None:
-    """Declare where a rig that is up is found; `again` for a subcommand, as `add_configuration_options` has it."""
+    """Declare the configuration, and where a rig that is up is found; `again` for a subcommand, as there."""
+    add_configuration_options(parser, again=again)
     default = argparse.SUPPRESS if again else None
     parser.add_argument("--rig", nargs=3, type=endpoint, default=default, metavar="HOST:PORT",
                         help="plant, control PLC, optimiser PLC (default: the one rig that is up here)")  # fmt: skip
@@ -95,6 +99,38 @@ def add_rig_options(parser: argparse.ArgumentParser, *, again: bool = False) -> 
                         help="first of its three ports in a row here, where several rigs are up")  # fmt: skip
     parser.add_argument("--tls", type=Path, default=default, metavar="FOLDER",
                         help="folder with the operator's certificate; known for a rig started here")  # fmt: skip
+
+
+def add_to_subcommands(what: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the same for subcommands: options are taken before and behind what is to be done."""
+    for subcommand in what.choices.values():
+        add_rig_options(subcommand, again=True)
+
+
+def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
+    """Declare what the loop does; `loads` says which loads there are besides those with a name."""
+    load = parser.add_argument("--load", help=f"{', '.join(LOADS)}, {loads} (default: 2h)")
+    load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
+    parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
+    parser.add_argument("--preset", choices=PRESETS, help="penalties and start of the solver (default: tuned)")
+    parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
+                        help="default: adaptive")  # fmt: skip
+    parser.add_argument("--seed", type=int, help="seed of the sensors' noise (default: 1)")
+
+
+def add_result_options(parser: argparse.ArgumentParser, folder: str) -> None:
+    """Declare where results go, by default into `folder`."""
+    parser.add_argument("--out", type=Path, help=f"folder for the results (default: runs/{folder}-<time>)")
+    parser.add_argument("--force", action="store_true", help="replace the run in a folder that is not empty")
+    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
+                        help="png, pdf, svg (default: png)")  # fmt: skip
+
+
+def tell(text: str) -> None:
+    """Write a line of what goes on, also where nobody listens any more: it is done all the same."""
+    with suppress(BrokenPipeError):
+        sys.stdout.write(f"{text}\n")
+        sys.stdout.flush()
 
 
 def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Settings") -> "RigEndpoints":

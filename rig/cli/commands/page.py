@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coldloop.errors import UsageError
-from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.options import add_rig_options, configuration, rig_endpoints
 
 if TYPE_CHECKING:
@@ -17,12 +16,10 @@ MOST_RUNS = 2
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_configuration_options(parser)
     add_rig_options(parser)
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN",
                         help="folder of a recorded run; two: side by side; none: a rig that is up")  # fmt: skip
     parser.add_argument("--page-port", type=int, metavar="PORT", help="port of the page (default: 8020)")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -12,17 +12,14 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png", "pdf", "svg"],
                         metavar="FORMAT", help="png, pdf, svg (default: all)")  # fmt: skip
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Draw."""
-    from coldloop.errors import ResultsError
     from rig.figures.run_plot import plot_run
+    from rig.results.folders import writing
 
-    try:
+    with writing(options.run, "the figure was not written"):
         paths = plot_run(options.run, options.figures)
-    except OSError as error:
-        raise ResultsError(f"{options.run}: {error.strerror}; the figure was not written") from None
     sys.stdout.writelines(f"{path}\n" for path in paths)
     return 0

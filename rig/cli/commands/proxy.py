@@ -16,7 +16,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         help="where clients connect; at 127.0.0.1 unless an address is named")  # fmt: skip
     parser.add_argument("--to", type=endpoint, required=True, metavar="HOST:PORT", help="the server behind it")
     parser.add_argument("--seed", type=int, help="decides which frames are hit, instead of the plan's")
-    parser.set_defaults(execute=execute)
 
 
 def _listener(text: str) -> HostPort:

@@ -4,12 +4,9 @@ It leaves the folder that a run leaves; `coldloop page FOLDER` replays it.
 """
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coldloop.service.command_line import add_configuration_options
-from rig.cli.commands.choices import FIGURE_FORMATS
-from rig.cli.commands.options import add_rig_options, configuration, rig_endpoints
+from rig.cli.commands.options import add_result_options, add_rig_options, configuration, rig_endpoints
 from rig.durations import duration
 
 if TYPE_CHECKING:
@@ -18,15 +15,10 @@ if TYPE_CHECKING:
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_configuration_options(parser)
     add_rig_options(parser)
     parser.add_argument("--duration", type=duration, default=duration("1h"),
                         help="plant time, such as 2h or 90s (default: 1h; Ctrl-C ends it before)")  # fmt: skip
-    parser.add_argument("--out", type=Path, help="folder for the results (default: runs/session-<time>)")
-    parser.add_argument("--force", action="store_true", help="replace the run in a folder that is not empty")
-    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
-                        help="png, pdf, svg (default: png)")  # fmt: skip
-    parser.set_defaults(execute=execute)
+    add_result_options(parser, "session")
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -14,7 +14,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--service", choices=SERVICES, help="default: all")
     parser.add_argument("--host", default="127.0.0.1", help="where these programs find the rig (default: 127.0.0.1)")
     parser.add_argument("--port-base", type=port_base, metavar="PORT", help="first of three consecutive ports")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -10,23 +10,21 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--out", type=Path, metavar="FILE", help="page (default: report.html in the folder of the run)")
     parser.add_argument("--force", action="store_true", help="replace a page that exists")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Write the page."""
-    from coldloop.errors import ResultsError, UsageError
+    from coldloop.errors import UsageError
+    from coldloop.whole_file import require_regular_file, whole_text
     from rig.report.run_page import run_page
-    from rig.results.folders import require_regular_file, whole_file
+    from rig.results.folders import writing
 
     path: Path = options.out or options.run / "report.html"
     require_regular_file(path)
     if path.exists() and not options.force:
         raise UsageError(f"{path}: exists; name another page with --out, or overwrite with --force")
     page = run_page(options.run)
-    try:
-        whole_file(path, lambda draft: draft.write_text(page, encoding="utf-8"))
-    except OSError as error:
-        raise ResultsError(f"{path}: {error.strerror}; choose another --out") from None
+    with writing(path):
+        whole_text(path, page)
     sys.stdout.write(f"{path}\n")
     return 0

@@ -9,7 +9,6 @@ from rig.cli.commands.study import add_scale_options, study_options, workers
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_scale_options(parser)
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -15,7 +15,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("manifest", type=Path, metavar="MANIFEST", help="manifest.json of a run, or its folder")
     parser.add_argument("--out", type=Path, help="folder for the results of the repetition (default: none are kept)")
     parser.add_argument("--force", action="store_true", help="replace the run in a folder that is not empty")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

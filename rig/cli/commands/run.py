@@ -1,20 +1,20 @@
 """`coldloop run`: one run of the loop, recorded, evaluated and drawn."""
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
-from rig.cli.commands.choices import FIGURE_FORMATS, LOADS, MODES, PRESETS, SOLVERS
+from rig.cli.commands.choices import MODES
 from rig.cli.commands.options import (
     OWN_PORTS,
     PLACES,
+    add_loop_options,
+    add_result_options,
     check_load,
     configuration,
     endpoint,
     refuse_ineffective,
-    updating_period,
 )
 from rig.durations import duration
 
@@ -32,21 +32,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--attach", nargs=3, type=endpoint, metavar="HOST:PORT",
                      help="use a rig that is up: plant, control PLC, optimiser PLC")  # fmt: skip
     parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s (default: that of the load)")
-    load = parser.add_argument(
-        "--load",
-        help=f"{', '.join(LOADS)}, another draw such as a@2, or a CSV file time_s,load_w (default: 2h)",
-    )  # fmt: skip
-    load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
-    parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
-    parser.add_argument("--preset", choices=PRESETS, help="penalties and start of the solver (default: tuned)")
-    parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
-                        help="default: adaptive")  # fmt: skip
-    parser.add_argument("--seed", type=int, help="seed of the sensors' noise (default: 1)")
-    parser.add_argument("--out", type=Path, help="folder for the results (default: runs/<load>-<time>)")
-    parser.add_argument("--force", action="store_true", help="replace the run in a folder that is not empty")
-    parser.add_argument("--figures", nargs="+", choices=FIGURE_FORMATS, default=["png"], metavar="FORMAT",
-                        help="png, pdf, svg (default: png)")  # fmt: skip
-    parser.set_defaults(execute=execute)
+    add_loop_options(parser, "another draw such as a@2, or a CSV file time_s,load_w")
+    add_result_options(parser, "<load>")
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -5,14 +5,12 @@ Each is a Modbus request that any client with the operator's role can make; the 
 
 import argparse
 import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
 from coldloop.process.signals import TICK_S
-from coldloop.service.command_line import add_configuration_options
-from rig.cli.commands.options import add_rig_options, operator_settings, rig_endpoints
+from rig.cli.commands.options import add_rig_options, add_to_subcommands, operator_settings, rig_endpoints, tell
 from rig.durations import LONGEST_TICKS
 
 if TYPE_CHECKING:
@@ -25,7 +23,6 @@ INPUTS: Final = {"cv155": "CV155", "ncr22": "NCR22_A", "cv156": "CV156"}
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_configuration_options(parser)
     add_rig_options(parser)
     what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
     load = what.add_parser("load", help="watts, or a CSV file time_s,load_w")
@@ -51,10 +48,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     acknowledge = what.add_parser("acknowledge", help="an alarm, or all")
     acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as t5-band (default: all)")
     acknowledge.set_defaults(document=_acknowledgement)
-    for subcommand in what.choices.values():  # options are accepted before and after the subcommand
-        add_configuration_options(subcommand, again=True)
-        add_rig_options(subcommand, again=True)
-    parser.set_defaults(execute=execute)
+    add_to_subcommands(what)
 
 
 def _seconds(text: str) -> float:
@@ -107,7 +101,7 @@ def _stream(options: argparse.Namespace) -> tuple[tuple[str, ...], "Work"]:
     if not Path(options.new_load).is_file():
         raise UsageError(f"load '{options.new_load}': neither watts nor a file")
     load = read_load_file(Path(options.new_load))
-    return ("plant",), lambda clients: stream_load(clients, load, _tick(options), _say)
+    return ("plant",), lambda clients: stream_load(clients, load, _tick(options), tell)
 
 
 def _is_stream(options: argparse.Namespace) -> bool:
@@ -137,9 +131,3 @@ def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
         raise UsageError(f"unknown alarm '{options.alarm}'; choose from {', '.join(kinds)}")
     alarm = ALL_ALARMS if options.alarm is None else kinds[options.alarm]
     return {"kind": "alarm", "alarm": alarm, "action": int(AlarmAction.ACKNOWLEDGE)}
-
-
-def _say(text: str) -> None:
-    with suppress(BrokenPipeError):  # no reader: the command has been carried out all the same
-        sys.stdout.write(f"{text}\n")
-        sys.stdout.flush()

@@ -6,7 +6,6 @@ import sys
 from contextlib import AsyncExitStack
 from typing import Final
 
-from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.options import add_rig_options, operator_settings, rig_endpoints
 
 LOOK_S: Final = 1.0
@@ -14,10 +13,8 @@ LOOK_S: Final = 1.0
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_configuration_options(parser)
     add_rig_options(parser)
     parser.add_argument("--follow", action="store_true", help="a line a second until Ctrl-C")
-    parser.set_defaults(execute=execute)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -33,7 +33,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
                        help="collect the runs of all shards from their --out folders, and evaluate"
                        )  # fmt: skip
     add_scale_options(parser)
-    parser.set_defaults(execute=execute)
 
 
 def add_scale_options(parser: argparse.ArgumentParser) -> None:

@@ -4,23 +4,14 @@ import argparse
 from pathlib import Path
 
 from coldloop.service.command_line import add_configuration_options
-from rig.cli.commands.choices import LOADS, PRESETS, SOLVERS
-from rig.cli.commands.options import PLACES, check_load, port_base, refuse_ineffective, updating_period
+from rig.cli.commands.options import PLACES, add_loop_options, check_load, port_base, refuse_ineffective
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
     parser.add_argument("--factor", type=float, help="seconds of plant time per second (default: 1)")
-    load = parser.add_argument(
-        "--load", help=f"{', '.join(LOADS)}, or a CSV file time_s,load_w; its end is held (default: 2h)"
-    )
-    load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
-    parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
-    parser.add_argument("--preset", choices=PRESETS, help="penalties and start of the solver (default: tuned)")
-    parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
-                        help="default: adaptive")  # fmt: skip
-    parser.add_argument("--seed", type=int, help="seed of the sensors' noise (default: 1)")
+    add_loop_options(parser, "or a CSV file time_s,load_w; its end is held")
     parser.add_argument("--tls", type=Path, metavar="FOLDER",
                         help="Modbus/TCP Security with what `coldloop certificates --out FOLDER` made")  # fmt: skip
     parser.add_argument("--port-base", type=port_base, metavar="PORT",
@@ -32,7 +23,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")
     parser.add_argument("--quiet", action="store_true", help="do not print addresses and commands")
     parser.add_argument("--locked", type=int, help=argparse.SUPPRESS)  # what --detach has locked for this process
-    parser.set_defaults(execute=execute, mode="realtime")
+    parser.set_defaults(mode="realtime")
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -5,12 +5,14 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from coldloop.process.load_profile import MAX_LOAD_W, LoadProfile
+from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from control_plc.program import ControlProgram
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.solvers import KernelSolver
 from plant.program import PlantProgram
-from rig.cosim.compiled import control, loops, optimizer, plants
-from rig.cosim.compiled.records import BLOCK_TICKS, PlantState, World, empty_reports, empty_trace
+from rig.cosim.compiled import control, loops, plants
+from rig.cosim.compiled.records import BLOCK_TICKS, Optimizer, PlantState, Reports, World, empty_reports, empty_trace
 from rig.results.recorded import NO_STATION, STATION_COLUMNS, SampleBlock
 
 SHORTEST: Final = 6
@@ -38,7 +40,7 @@ class CompiledStretches:
         self, plant: PlantProgram, control_plc: ControlProgram, optimizer_plc: OptimizerProgram, load: LoadProfile
     ) -> None:  # fmt: skip
         self._plant, self._control, self._optimizer = plant, control_plc, optimizer_plc
-        self._is_compiled = optimizer.is_compiled(optimizer_plc)
+        self._is_compiled = _is_compiled(optimizer_plc)
         self._trace, self._reports = empty_trace(STATION_COLUMNS if plant.station else 0), empty_reports()
         self._pause_until = 0
         sensors = control_plc.sensors
@@ -53,7 +55,7 @@ class CompiledStretches:
         if self._control.tick < self._pause_until or not control.is_ordinary(self._control):
             return None
         answered = self._control.player.has_answer
-        whole = self._is_compiled and not answered and optimizer.is_ordinary(self._optimizer)
+        whole = self._is_compiled and not answered and _is_ordinary(self._optimizer)
         if not whole and not answered and self._control.player.load_step:
             return None  # the programs deliver at once what a load step may cut off
         until = min(until, (self._control.tick // BLOCK_TICKS + 1) * BLOCK_TICKS)
@@ -84,9 +86,11 @@ class CompiledStretches:
             raise RuntimeError("an ordinary update plays a sequence")
         scans, guards = control.scan_record(program), control.guard_records(program.guard.state)
         rows = control.sequence_rows(playing)
+        o = optimizer_plc
+        parts = Optimizer(o.constants, o.method, o.rule, o.state)
         loops.run_block(
-            self._world, control.alarms_of(program), optimizer.parts_of(optimizer_plc), scans, guards, rows, plant,
-            self._trace, self._reports, until,
+            self._world, control.alarms_of(program), parts, scans, guards, rows, plant, self._trace, self._reports,
+            until,
         )  # fmt: skip
         s = scans[0]
         if s["tick"] == s["first"]:
@@ -96,7 +100,7 @@ class CompiledStretches:
             update = control.latched_update(program, s, self._trace)
             sequence = control.played_sequence(s, update.update - 1, rows[0], optimizer_plc.model_digest)
             program.player.take_over(sequence, update, int(s["next_update"]), int(s["accepted"]))
-        return Stretch(block, optimizer.optimizations(self._reports, solved))
+        return Stretch(block, _optimizations(self._reports, solved))
 
     def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:
         """Hand the state of the loop back to plant and control PLC; return the ticks it has run."""
@@ -106,3 +110,23 @@ class CompiledStretches:
         ticks = int(s["tick"]) - int(s["first"])
         load, u, y, x, station = (part[:ticks].copy() for part in self._trace)
         return SampleBlock(int(s["first"]), load, u, y, x, station if station.size else NO_STATION)
+
+
+def _is_compiled(program: OptimizerProgram) -> bool:
+    """Tell whether the program's updates have a compiled form: those of a solver of our own."""
+    if type(program) is not OptimizerProgram:  # who has made another kind of it wants to be asked
+        return False
+    return isinstance(program.solver, KernelSolver)
+
+
+def _is_ordinary(program: OptimizerProgram) -> bool:
+    """Tell whether the update under way is one of many: what is played began at its instant."""
+    now, playing = program.state.numbers[0], program.state.playing.numbers[0]
+    return bool(now["planned"] and playing["length"] and playing["first_tick"] == now["tick"])
+
+
+def _optimizations(reports: Reports, solved: int) -> list[Optimization]:
+    """Return what was reported, as the recorder takes it."""
+    counts, values = reports.counts[:solved].tolist(), reports.values[:solved].tolist()
+    rows = ([*row, int(Verdict.ACCEPTED), *of_row] for row, of_row in zip(counts, values, strict=True))
+    return [Optimization(*row) for row in rows]

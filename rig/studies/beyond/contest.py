@@ -6,12 +6,12 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from rig.figures.plot import COLOURS
-from rig.studies.drawing import legend_outside, panels
+from rig.studies.drawing import ratio_rows
 from rig.studies.intervals import Interval, mean_ratio
-from rig.studies.paper.updating_period import ADAPTIVE, INTERRUPT, RULE, TUNING_DRAWS, Policy
+from rig.studies.paper.updating_period import ADAPTIVE, INTERRUPT, RULE, Policy
 from rig.studies.request import RunRequest, Series
-from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, StudyResult, first_and_fresh, loads
+from rig.text_tables import markdown_table
 
 SOLVERS: Final = {
     "ODE": (),
@@ -70,11 +70,7 @@ class ContestStudy:
 
 def _groups(options: StudyOptions) -> dict[str, list[Load]]:
     """Return the first draws, and those that no constant was chosen on."""
-    names = ("a", "c", "e") if options.quick else tuple("abcdef")
-    hours = [load for draws in loads(options, *names, usual=DRAWS).values() for load in draws]
-    first = [load for load in hours if load.draw == 1]
-    fresh = [load for load in hours if load.draw not in (1, *TUNING_DRAWS)]
-    return {title: group for title, group in (("hours", first), ("fresh hours", fresh)) if group}
+    return first_and_fresh(loads(options, *options.hours, usual=DRAWS))
 
 
 def _request(load: Load, solver: str, way: Policy) -> RunRequest:
@@ -90,32 +86,17 @@ def _ratios(costs: Series, reference: Series) -> Ratio:
 
 
 def _table(title: str, ratios: Mapping[tuple[str, str], Ratio], hours: int) -> str:
-    lines = [
-        (
-            f"**{title}** over that of {' under '.join(REFERENCE)}, geometric mean of {hours} hours with its 95 % "
-            "interval; in brackets the worst hour."
-        ),
-        "",
-        "| way | " + " | ".join(SOLVERS) + " |",
-        "|---|" + "---|" * len(SOLVERS),
-    ]
+    caption = (
+        f"**{title}** over that of {' under '.join(REFERENCE)}, geometric mean of {hours} hours with its 95 % "
+        "interval; in brackets the worst hour."
+    )
+    rows = []
     for way in WAYS:
-        cells = [f"{mean.text()} ({worst:.2f})" for mean, worst in (ratios[solver, way.label] for solver in SOLVERS)]
-        lines.append(f"| {way.label} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        found = (ratios[solver, way.label] for solver in SOLVERS)
+        rows.append((way.label, *(f"{mean.text()} ({worst:.2f})" for mean, worst in found)))
+    return markdown_table(("way", *SOLVERS), rows, caption)
 
 
 def _figure(ratios: Mapping[tuple[str, str], Ratio], cost: str) -> Figure:
-    with panels(1, 1, (8.0, 4.0)) as (figure, (place,)):
-        for number, (solver, colour) in enumerate(zip(SOLVERS, COLOURS, strict=False)):
-            rows = np.arange(len(WAYS)) + 0.16 * (number - 0.5 * (len(SOLVERS) - 1))
-            means = [ratios[solver, way.label][0] for way in WAYS]
-            place.plot([one.value for one in means], rows, "o", markersize=4, color=colour, label=solver)
-            place.hlines(rows, [one.low for one in means], [one.high for one in means], color=colour, linewidth=1.0)
-        place.axvline(1.0, color="#888888", linewidth=0.8)
-        place.set_yticks(range(len(WAYS)), [way.label for way in WAYS])
-        place.invert_yaxis()
-        place.set_xscale("log")
-        place.set_xlabel(f"{cost} over that of {' under '.join(REFERENCE)} (1)")
-        legend_outside(figure, place, len(SOLVERS))
-    return figure
+    means = {solver: {way.label: ratios[solver, way.label][0] for way in WAYS} for solver in SOLVERS}
+    return ratio_rows(means, f"{cost} over that of {' under '.join(REFERENCE)} (1)", (8.0, 4.0), 0.16, len(SOLVERS))

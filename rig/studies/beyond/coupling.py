@@ -2,13 +2,10 @@
 
 from typing import Final
 
-import numpy as np
-from matplotlib.figure import Figure
-
-from rig.figures.plot import COLOURS
-from rig.studies.drawing import legend_outside, panels
+from rig.studies.drawing import cost_bars, over_time
 from rig.studies.request import Outcome, RunRequest
-from rig.studies.study import Cell, Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.text_tables import Cell
 
 REFRIGERATOR: Final = "plant.kind=refrigerator"
 CASES: Final = {
@@ -18,12 +15,11 @@ CASES: Final = {
     "refrigerator, LQ, its model": (REFRIGERATOR, "model.file=refrigerator"),
 }
 TRACE_TICKS: Final = 4
-SHOWN_ANYWAY: Final = 24
-"""Rows of a table that each section of a report shows."""
 COLUMNS: Final = (
     "load", "plant", "J_BF", "L1 outside (%)", "T5 outside (%)", "tau_u mean (s)", "HP (bar)", "LP (bar)", "T9 (K)",
     "power (kW)", "nitrogen (g/s)",
 )  # fmt: skip
+SHOWN: Final = {"load": "load (W)", "P12": "HP (bar)", "P11": "LP (bar)", "T9": "T9 (K)", "T5": "T5 (K)"}
 
 
 class CouplingStudy:
@@ -34,12 +30,12 @@ class CouplingStudy:
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
         """Return every plant under every draw."""
-        return [request for load in _loads(options) for request in _runs(load)]
+        return [request for load in loads(options, *"abcdef") for request in _runs(load)]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare closed-loop costs, bands, updating periods and what the pressures do."""
-        result = StudyResult(COLUMNS, [], {})
-        for load in _loads(options):
+        result = StudyResult(COLUMNS, [], {}, always_shown=True)
+        for load in loads(options, *"abcdef"):
             runs = [outcomes[request] for request in _runs(load)]
             for label, run in zip(CASES, runs, strict=True):
                 i = run.indicators
@@ -48,12 +44,11 @@ class CouplingStudy:
                 )
             for label, run in list(zip(CASES, runs, strict=True))[1:]:
                 ratio = run.indicators.J_BF / runs[0].indicators.J_BF
-                result.values.setdefault(f"J_BF on the {label}, over the cold box alone", []).append(ratio)
+                result.note(f"J_BF on the {label}, over the cold box alone", ratio)
             if "pressures" not in result.figures:
-                result.figures["pressures"] = _pressures(load, runs)
-        result.figures["closed-loop cost"] = _costs(result)
-        if len(result.rows) > SHOWN_ANYWAY:
-            result.remarks.append(_table(result))
+                labelled = list(zip(CASES, runs, strict=True))
+                result.figures["pressures"] = over_time(f"hour {load.name}", labelled, SHOWN, 8.0)
+        result.figures["closed-loop cost"] = cost_bars(result, CASES, 0.19)
         return result
 
 
@@ -70,47 +65,5 @@ def _range(run: Outcome, name: str, digits: int) -> str:
     return f"{series.min():.{digits}f}..{series.max():.{digits}f}"
 
 
-def _loads(options: StudyOptions) -> list[Load]:
-    return [load for draws in loads(options, *"abcdef").values() for load in draws]
-
-
 def _runs(load: Load) -> list[RunRequest]:
     return [load.request(0.0, *assignments, trace_ticks=TRACE_TICKS) for assignments in CASES.values()]
-
-
-def _table(result: StudyResult) -> str:
-    """Return a table of one line a run."""
-    lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
-    for row in result.rows:
-        cells = [f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def _costs(result: StudyResult) -> Figure:
-    names = list(dict.fromkeys(str(row[0]) for row in result.rows))
-    with panels(1, 1, (9.0, 3.6)) as (figure, (place,)):
-        for offset, (label, colour) in enumerate(zip(CASES, COLOURS, strict=False)):
-            heights = [float(row[2]) for row in result.rows if row[1] == label]
-            place.bar(np.arange(len(names)) + 0.21 * (offset - 1.5), heights, 0.19, color=colour, label=label)
-        place.set_xticks(range(len(names)), names, rotation=0 if len(names) < 9 else 60)
-        place.set_xlabel("load")
-        place.set_ylabel("$J^{BF}$ (1)")
-        legend_outside(figure, place)
-    return figure
-
-
-def _pressures(load: Load, runs: list[Outcome]) -> Figure:
-    shown = (("load", "load (W)"), ("P12", "HP (bar)"), ("P11", "LP (bar)"), ("T9", "T9 (K)"), ("T5", "T5 (K)"))
-    with panels(len(shown), 1, (9.0, 8.0), sharex=True) as (figure, axes):
-        for (label, run), colour in zip(zip(CASES, runs, strict=True), COLOURS, strict=False):
-            for (name, _), place in zip(shown, axes, strict=True):
-                if name in run.trace:
-                    place.plot(run.series("time_s") / 60, run.series(name), color=colour, linewidth=0.9, label=label)
-        for (_, label), place in zip(shown, axes, strict=True):
-            place.set_ylabel(label)
-        axes[0].set_title(f"hour {load.name}", loc="left", fontsize=8)
-        axes[-1].set_xlabel("plant time (min)")
-        legend_outside(figure, axes[0])
-        figure.align_ylabels(axes)
-    return figure

@@ -1,13 +1,11 @@
 """What happens to a refrigerator besides its load: trips, nitrogen, leaks, weather, pulses; under MPC and the loops."""
 
+from dataclasses import replace
 from typing import Final, NamedTuple
 
-from matplotlib.figure import Figure
-
 from coldloop.registers.plant import StationAlarm, StationMode
-from rig.figures.plot import COLOURS
-from rig.studies.beyond.coupling import REFRIGERATOR, SHOWN_ANYWAY, TRACE_TICKS
-from rig.studies.drawing import legend_outside, panels
+from rig.studies.beyond.coupling import REFRIGERATOR, TRACE_TICKS
+from rig.studies.drawing import over_time
 from rig.studies.request import Outcome, RunRequest
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
 
@@ -41,6 +39,10 @@ COLUMNS: Final = (
     "event", "cold box", "station", "J_BF", "L1 outside (%)", "T5 outside (%)", "L1 (%)", "T5 (K)", "HP (bar)",
     "LP (bar)", "lost (kg)", "modes", "alarms",
 )  # fmt: skip
+SHOWN: Final = {
+    "load": "load (W)", "L1": "L1 (%)", "T5": "T5 (K)", "P12": "HP (bar)", "P11": "LP (bar)", "L_N2": "nitrogen (%)",
+    "T9": "T9 (K)", "mode": "station",
+}  # fmt: skip
 
 
 class DisturbancesStudy:
@@ -55,19 +57,15 @@ class DisturbancesStudy:
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Tabulate bands, pressures, modes and alarms of each run."""
-        result = StudyResult(COLUMNS, [], {})
-        lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
+        result = StudyResult(COLUMNS, [], {}, always_shown=True)
         for name, event in CASES.items():
             for load in _loads(event, options):
                 runs = [outcomes[request] for request in _runs(event, load)]
                 for (driver, station), run in zip(_pairs(), runs, strict=True):
-                    row = (f"{name} ({load.name})", driver, station, *_measures(run))
-                    result.rows.append(row)
-                    lines.append("| " + " | ".join(f"{c:.4g}" if isinstance(c, float) else str(c) for c in row) + " |")
+                    result.rows.append((f"{name} ({load.name})", driver, station, *_measures(run)))
                 if load.draw == 1:
-                    result.figures[name] = _courses(runs)
-        if len(result.rows) > SHOWN_ANYWAY:
-            result.remarks.append("\n".join(lines))
+                    labelled = list(zip(map(", ".join, _pairs()), runs, strict=True))
+                    result.figures[name] = over_time("", labelled, SHOWN, 11.0)
         return result
 
 
@@ -76,7 +74,7 @@ def _pairs() -> list[tuple[str, str]]:
 
 
 def _loads(event: DisturbanceCase, options: StudyOptions) -> list[Load]:
-    return loads(options, event.load)[options.loads[0] if options.loads else event.load]
+    return loads(replace(options, loads=options.loads[:1]), event.load)
 
 
 def _runs(event: DisturbanceCase, load: Load) -> list[RunRequest]:
@@ -103,23 +101,3 @@ def _measures(run: Outcome) -> tuple[str | float, ...]:
         i.J_BF, i.L1_outside_band_pct, i.T5_outside_band_pct, *spans, lost, ", ".join(modes),
         ", ".join(sorted(raised)) or "none",
     )  # fmt: skip
-
-
-def _courses(runs: list[Outcome]) -> Figure:
-    shown = (
-        ("load", "load (W)"), ("L1", "L1 (%)"), ("T5", "T5 (K)"), ("P12", "HP (bar)"), ("P11", "LP (bar)"),
-        ("L_N2", "nitrogen (%)"), ("T9", "T9 (K)"), ("mode", "station"),
-    )  # fmt: skip
-    with panels(len(shown), 1, (9.0, 11.0), sharex=True) as (figure, axes):
-        for (pair, run), colour in zip(zip(_pairs(), runs, strict=True), COLOURS, strict=False):
-            for (name, _), place in zip(shown, axes, strict=True):
-                place.plot(
-                    run.series("time_s") / 60, run.series(name), color=colour, linewidth=0.9, label=", ".join(pair)
-                )
-        for (_, label), place in zip(shown, axes, strict=True):
-            place.set_ylabel(label)
-        axes[-1].set_yticks(list(StationMode), [mode.name.lower().replace("_", " ") for mode in StationMode])
-        axes[-1].set_xlabel("plant time (min)")
-        legend_outside(figure, axes[0])
-        figure.align_ylabels(axes)
-    return figure

@@ -10,9 +10,10 @@ from rig.figures.plot import COLOURS
 from rig.studies.drawing import legend_outside, panels
 from rig.studies.hindsight import PERIODS_S, SETTLING_S, WIDTH, Objective
 from rig.studies.intervals import Interval, gap_closed, mean_ratio
-from rig.studies.paper.updating_period import ADAPTIVE, INTERRUPT, RULE, TUNING_DRAWS
+from rig.studies.paper.updating_period import ADAPTIVE, INTERRUPT, RULE
 from rig.studies.request import Outcome, Procedure, RunRequest, Series
-from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, first_and_fresh, loads
+from rig.text_tables import markdown_table
 
 FIXED_S: Final = (1.0, 1.5, 2.5, 3.5, 5.0)
 INTERRUPTED_S: Final = (1.0, 1.5, 2.5)
@@ -88,7 +89,7 @@ class OraclesStudy:
             result.rows += [
                 (load.name, name, run.indicators.J_open_mean, run.indicators.J_BF) for name, run in runs.items()
             ]
-        for title, hours in _groups(_hours(options)).items():
+        for title, hours in first_and_fresh(_hours(options)).items():
             for objective in Objective:
                 table = cost_table([costs[load.name] for load in hours], objective)
                 shares = shares_of_gap(table)
@@ -104,14 +105,7 @@ class OraclesStudy:
 
 
 def _hours(options: StudyOptions) -> list[Load]:
-    names = ("a", "c", "e") if options.quick else tuple("abcdef")
-    return [load for draws in loads(options, *names).values() for load in draws]
-
-
-def _groups(hours: Sequence[Load]) -> dict[str, list[Load]]:
-    first = [load for load in hours if load.draw == 1]
-    fresh = [load for load in hours if load.draw not in (1, *TUNING_DRAWS)]
-    return {title: group for title, group in (("hours", first), ("fresh hours", fresh)) if group}
+    return loads(options, *options.hours)
 
 
 def _request(load: Load, way: PeriodRule) -> RunRequest:
@@ -158,29 +152,23 @@ def worst(table: Mapping[str, Series], name: str) -> float:
 
 
 def _table(title: str, table: Mapping[str, Series], shares: Mapping[str, Interval]) -> str:
-    lines = [
-        f"**{title}** ({len(table[LITERAL])} hours)",
-        "",
-        (
-            "| way | over the best sequence | share of the gap closed, to the best sequence "
-            "| to the infinitely fast PLC | worst hour over Algorithm 1 | hours below Algorithm 1 |"
-        ),
-        "|---|---|---|---|---|---|",
-    ]
+    header = (
+        "way", "over the best sequence", "share of the gap closed, to the best sequence",
+        "to the infinitely fast PLC", "worst hour over Algorithm 1", "hours below Algorithm 1",
+    )  # fmt: skip
+    rows = []
     closed_loop = bool(np.isfinite(table[FASTEST]).all())  # an infinitely fast PLC has no open-loop cost
     for name in (*RULES, *CONSTANT):
         fast = gap_closed(table[name], table[LITERAL], table[FASTEST]).text(2) if closed_loop else ""
-        below = int((table[name] < table[LITERAL]).sum())
-        lines.append(
-            f"| {name} | {mean_ratio(table[name], table[BEST]).text()} | {shares[name].text(2)} | {fast} "
-            f"| {worst(table, name):.3f} | {below} |"
-        )
-    lines += [
-        f"| {name} | {mean_ratio(table[name], table[BEST]).text()} | | | {worst(table, name):.3f} | |"
+        below = str((table[name] < table[LITERAL]).sum())
+        over = mean_ratio(table[name], table[BEST]).text()
+        rows.append((name, over, shares[name].text(2), fast, f"{worst(table, name):.3f}", below))
+    rows += [
+        (name, mean_ratio(table[name], table[BEST]).text(), "", "", f"{worst(table, name):.3f}", "")
         for name in (*FAST, FASTEST) if closed_loop
     ]  # fmt: skip
-    lines.append(f"| {BEST} | 1 | 1 | | {worst(table, BEST):.3f} | |")
-    return "\n".join(lines)
+    rows.append((BEST, "1", "1", "", f"{worst(table, BEST):.3f}", ""))
+    return markdown_table(header, rows, f"**{title}** ({len(table[LITERAL])} hours)")
 
 
 def _figure(shares: Mapping[str, Interval], what: str) -> Figure:

@@ -8,29 +8,30 @@ from matplotlib.figure import Figure
 
 from optimizer_plc.qp.penalties import Preset
 from rig.studies import published
-from rig.studies.beyond.penalty_sums import QPOASES, Paired
 from rig.studies.beyond.penalty_variants import (
     PRESETS,
+    QPOASES,
     SETTLED,
     START_POWERS,
+    Paired,
     PenaltyVariant,
     closed,
     closed_loads,
     hours,
     of_period,
+    paired_sums,
     periods,
     requests,
     timed_variants,
     variants,
 )
 from rig.studies.crossing import crossing
-from rig.studies.drawing import legend_outside, panels, paper
+from rig.studies.drawing import LEAST_DRAWN, above_lowest, legend_outside, panels, paper
 from rig.studies.intervals import mean_ratio, over_draws
 from rig.studies.paper.best_periods import PeriodCosts, period_figure, period_remarks, period_values
-from rig.studies.paper.open_loop import LEAST_DRAWN
 from rig.studies.request import RunRequest, Series
-from rig.studies.results import markdown_table
-from rig.studies.study import Cell, Outcomes, StudyOptions, StudyResult
+from rig.studies.study import Outcomes, StudyOptions, StudyResult
+from rig.text_tables import Cell, markdown_table
 
 COLOURS: Final = {QPOASES: "#888888", Preset.TUNED.value: "#1f5fa8", Preset.AS_PRINTED.value: "#b3261e"}
 NOMINAL: Final = 1.0
@@ -51,7 +52,7 @@ class PenaltiesStudy:
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare the variants with the lowest cost, with converged qpOASES and with the paper's points."""
-        found = Paired(options, outcomes)
+        found = paired_sums(options, outcomes)
         loops = {
             variant: np.array([outcomes[closed(load, variant)].indicators.J_BF for load in closed_loads(options)])
             for variant in variants(options)
@@ -63,7 +64,7 @@ class PenaltiesStudy:
         })  # fmt: skip
         for preset, variant in PRESETS.items():
             result.values |= {
-                f"{preset}: crossing in total cost": found.crossings(variant),
+                f"{preset}: crossing in total cost": found.crossings(None, variant),
                 f"{preset}: c1 at P = 1": [one.c1 for one in found.sums[variant, NOMINAL]],
                 f"{preset}: c2 at P = 1": [one.c2 for one in found.sums[variant, NOMINAL]],
                 **period_values(str(preset), timed[variant]),
@@ -120,7 +121,7 @@ def _rows(
 
 def _crossing_text(found: Paired) -> str:
     def said(variant: PenaltyVariant) -> str:
-        power = found.crossing(variant)
+        power = found.crossing(None, variant)
         where = f"from P = {power.brief()} on" if np.isfinite(power.value) else "at no power"
         return f"{variant.preset}: {where}"
 
@@ -168,7 +169,7 @@ def _table(preset: Preset, options: StudyOptions, found: Paired, loops: Mapping[
         "at P = 1."
     )
     header = ("change", "total, P = 1", "total, P = 10", "J_dev", "J_cst", "c1", "c2", "J_BF")
-    return f"{caption}\n\n{markdown_table(header, rows)}"
+    return markdown_table(header, rows, caption)
 
 
 def _settled(found: Paired, variant: PenaltyVariant) -> tuple[str, str, str]:
@@ -176,7 +177,7 @@ def _settled(found: Paired, variant: PenaltyVariant) -> tuple[str, str, str]:
     if (variant, SETTLED) not in found.sums:
         return "", "", ""
     total = found.interval(variant, SETTLED).brief(4)
-    dev, cst = (found.over_converged(part, variant, SETTLED).brief() for part in ("J_dev", "J_cst"))
+    dev, cst = (found.over_converged(part, variant, SETTLED, None).brief() for part in ("J_dev", "J_cst"))
     return total, dev, cst
 
 
@@ -208,7 +209,7 @@ def _start_table(options: StudyOptions, found: Paired) -> list[str]:
         "**Starts**: total cost at few iterations over that of the same preset at P = 10, all draws together, and how "
         "far that is from the paper's points, over theirs at P = 25: root mean square of the logarithm of the ratio."
     )
-    return [f"{caption}\n\n{markdown_table(('start', *(f'P = {p:g}' for p in some), 'misfit'), rows)}"]
+    return [markdown_table(("start", *(f"P = {p:g}" for p in some), "misfit"), rows, caption)]
 
 
 def _misfit_of(curve: Callable[[Sequence[int]], Series], theirs: Series) -> Callable[[list[int]], float]:
@@ -222,20 +223,11 @@ def _figure(found: Paired) -> Figure:
     with panels(1, 1, (8.0, 4.4)) as (figure, (place,)):
         for variant in (None, *PRESETS.values()):
             label = variant.label if variant else QPOASES
-            powers = found.powers(variant)
-            intervals = [found.interval(variant, power) for power in powers]
-            value, low, high = (
-                np.maximum(np.array(series) - 1.0, LEAST_DRAWN) for series in list(zip(*intervals, strict=True))[:3]
-            )
-            place.plot(powers, value, color=COLOURS[label], marker=".", label=label)
-            place.fill_between(powers, low, high, color=COLOURS[label], alpha=0.18, linewidth=0)
+            powers = found.powers[variant]
+            above_lowest(place, powers, [found.interval(variant, power) for power in powers], COLOURS[label], label)
         for solver, label in (("qpoases", QPOASES), ("ode", str(Preset.AS_PRINTED))):
             total = np.maximum(points[solver]["J_total"] / converged - 1.0, LEAST_DRAWN)
             name = "qpOASES" if solver == "qpoases" else "ODE"
             paper(place, points[solver]["normalized_power"], total, COLOURS[label], f"{name}, paper")
-        place.set_xscale("log")
-        place.set_yscale("log")
-        place.set_xlabel("normalised power $P$ (1)")
-        place.set_ylabel("total cost above the lowest, share of it (1)")
         legend_outside(figure, place, 5)
     return figure

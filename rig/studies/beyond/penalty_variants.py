@@ -6,11 +6,12 @@ from typing import Final, NamedTuple
 
 from optimizer_plc.qp.penalties import Preset
 from plant.load import HOUR_TICKS
+from rig.studies.paired_sums import PairedSums
 from rig.studies.paper.open_loop import paired_loads, paired_request
 from rig.studies.paper.updating_period import FEW, NINE
 from rig.studies.request import Procedure, RunRequest
 from rig.studies.solver_runs import throttled
-from rig.studies.study import PROGRAM, Load, StudyOptions, loads
+from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, loads
 
 
 class PenaltyVariant(NamedTuple):
@@ -42,6 +43,9 @@ class PenaltyVariant(NamedTuple):
         return not self.change or self.change in TIMED
 
 
+Paired = PairedSums[PenaltyVariant | None]
+
+QPOASES: Final = "qpOASES"
 COST_SCALE: Final = "cost_scale"
 TIMED: Final = (f"{COST_SCALE} 0.0001", f"{COST_SCALE} 1e-08")
 """Starts whose best periods are looked for: that of the other preset."""
@@ -127,11 +131,21 @@ def paired(load: Load, variant: PenaltyVariant | None, power: float) -> RunReque
     return _with(throttled(load, "ode", power, procedure=Procedure.PAIRED_PROBLEMS), variant)
 
 
+def paired_sums(options: StudyOptions, outcomes: Outcomes) -> Paired:
+    """Gather what presets, variants and qpOASES, which is no variant, gave on the same problems.
+
+    Raises:
+        StudyError: A profile costs less than the optimum.
+    """
+    powers = {variant: sorted(powers_of(variant, options)) for variant in (None, *variants(options))}
+    return PairedSums(
+        paired_loads(options), powers, paired, lambda variant: variant.label if variant else QPOASES, outcomes
+    )
+
+
 def closed_loads(options: StudyOptions) -> list[Load]:
     """Return the draws of the closed loop at 5 s, an hour of each."""
-    longest = options.ticks or HOUR_TICKS
-    drawn = loads(options, "8h", usual=CLOSED_DRAWS).values()
-    return [replace(load, ticks=min(load.ticks, longest)) for draws in drawn for load in draws]
+    return loads(options, "8h", usual=CLOSED_DRAWS, longest_ticks=HOUR_TICKS)
 
 
 def closed(load: Load, variant: PenaltyVariant) -> RunRequest:
@@ -141,8 +155,7 @@ def closed(load: Load, variant: PenaltyVariant) -> RunRequest:
 
 def hours(options: StudyOptions) -> list[Load]:
     """Return the hours that periods are compared in."""
-    names = ("a", "c", "e") if options.quick else tuple("abcdef")
-    return [load for draws in loads(options, *names, usual=FRESH_DRAWS).values() for load in draws]
+    return loads(options, *options.hours, usual=FRESH_DRAWS)
 
 
 def periods(options: StudyOptions) -> tuple[float, ...]:

@@ -7,12 +7,12 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from rig.figures.plot import COLOURS
-from rig.studies.drawing import legend_outside, panels
+from rig.studies.drawing import ratio_rows
 from rig.studies.intervals import Interval, mean_ratio
 from rig.studies.paper.updating_period import ADAPTIVE, INTERRUPT, RULE
 from rig.studies.request import RunRequest, Series
 from rig.studies.study import NOISE, PROGRAM, Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.text_tables import markdown_table
 
 MISMATCH: Final = "plant.mismatch."
 OFF: Final = (0.8, 0.9, 1.1, 1.2)
@@ -82,9 +82,7 @@ class RobustnessStudy:
 
 def _cases(options: StudyOptions) -> Iterator[tuple[str, str, Load]]:
     options = replace(options, ticks=options.ticks or USUAL_TICKS)
-    hours = [
-        load for draws in loads(options, *("ace" if options.quick else "abcdef"), usual=1).values() for load in draws
-    ]
+    hours = loads(options, *options.hours, usual=1)
     return ((condition, policy, load) for condition in CONDITIONS for policy in POLICIES for load in hours)
 
 
@@ -110,34 +108,17 @@ def _table(ratios: Ratios, cost: str, costs: dict[tuple[str, str], Series]) -> s
     others = [policy for policy in POLICIES if policy != REFERENCE]
     nominal = next(iter(CONDITIONS))
     hours = len(costs[nominal, REFERENCE])
-    lines = [
-        (
-            f"**{cost}** over that of {REFERENCE} under the same condition, geometric mean of {hours} runs with its "
-            f"95 % interval; before it, that of {REFERENCE} over its own without mismatch."
-        ),
-        "",
-        f"| condition | {REFERENCE} | " + " | ".join(others) + " |",
-        "|---|---|" + "---|" * len(others),
-    ]
+    caption = (
+        f"**{cost}** over that of {REFERENCE} under the same condition, geometric mean of {hours} runs with its "
+        f"95 % interval; before it, that of {REFERENCE} over its own without mismatch."
+    )
+    rows = []
     for condition, row in ratios.items():
         own = mean_ratio(costs[condition, REFERENCE], costs[nominal, REFERENCE])
-        cells = [own.text(2), *(row[policy].text() for policy in others)]
-        lines.append(f"| {condition} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        rows.append((condition, own.text(2), *(row[policy].text() for policy in others)))
+    return markdown_table(("condition", REFERENCE, *others), rows, caption)
 
 
 def _figure(ratios: Ratios, cost: str) -> Figure:
-    conditions = list(ratios)
-    with panels(1, 1, (9.0, 6.5)) as (figure, (place,)):
-        for number, (policy, colour) in enumerate(zip(POLICIES, COLOURS, strict=False)):
-            rows = np.arange(len(conditions)) + 0.13 * (number - 2.5)
-            found = [ratios[condition][policy] for condition in conditions]
-            place.plot([one.value for one in found], rows, "o", markersize=3, color=colour, label=policy)
-            place.hlines(rows, [one.low for one in found], [one.high for one in found], color=colour, linewidth=0.8)
-        place.axvline(1.0, color="#888888", linewidth=0.8)
-        place.set_yticks(range(len(conditions)), conditions)
-        place.invert_yaxis()
-        place.set_xscale("log")
-        place.set_xlabel(f"{cost} over that of {REFERENCE} (1)")
-        legend_outside(figure, place, 3)
-    return figure
+    by_policy = {policy: {condition: row[policy] for condition, row in ratios.items()} for policy in POLICIES}
+    return ratio_rows(by_policy, f"{cost} over that of {REFERENCE} (1)", (9.0, 6.5), 0.13, 3)

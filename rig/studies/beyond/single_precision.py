@@ -1,6 +1,5 @@
 """What single precision, the PLC's, costs against double: the same hours in both."""
 
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -37,18 +36,16 @@ class SinglePrecision:
             largest = [float(np.abs(_difference(double, single, name)).max()) for name in INPUTS]
             change = single.indicators.J_BF / double.indicators.J_BF - 1.0
             result.rows.append((load.name, double.indicators.J_BF, single.indicators.J_BF, *largest))
-            result.values.setdefault("change of J_BF in single precision", []).append(change)
+            result.note("change of J_BF in single precision", change)
             for (name, unit), value in zip(INPUTS.items(), largest, strict=True):
-                result.values.setdefault(f"largest difference of {name} ({unit}) in single precision", []).append(value)
+                result.note(f"largest difference of {name} ({unit}) in single precision", value)
             if not result.figures:
                 result.figures["difference of the inputs"] = _figure(double, single)
         return result
 
 
 def _loads(options: StudyOptions) -> list[Load]:
-    longest = options.ticks or LONGEST_TICKS
-    drawn = loads(options, "8h").values()
-    return [replace(load, ticks=min(load.ticks, longest)) for draws in drawn for load in draws]
+    return loads(options, "8h", longest_ticks=LONGEST_TICKS)
 
 
 def _both(load: Load) -> list[RunRequest]:

@@ -4,29 +4,24 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from optimizer_plc.qp.penalties import Preset
 from rig.figures.plot import ACCENT, INK, THIRD
 from rig.studies import published
 from rig.studies.beyond.penalty_variants import PenaltyVariant
-from rig.studies.drawing import legend_outside, panels, paper
+from rig.studies.drawing import hour_panels, paper
 from rig.studies.intervals import Interval, geometric_mean, resampled
-from rig.studies.paper.updating_period import TUNING_DRAWS, is_inside
+from rig.studies.paper.updating_period import is_inside
 from rig.studies.request import Series
-from rig.studies.results import markdown_table
-from rig.studies.study import Cell, Load
+from rig.studies.study import Load, first_and_fresh
+from rig.text_tables import Cell, markdown_table
 
+FIRST: Final = "hours a to f"
 COSTS: Final = {"J_open_mean": "open loop", "J_BF": "J_BF"}
 PeriodCosts = dict[Load, Mapping[str, Series]]
 """By hour: costs of the periods, by kind of cost."""
-
-
-def groups(costs: PeriodCosts) -> dict[str, list[Load]]:
-    """Return the hours a to f, and those of other draws that nothing was tuned on."""
-    first = [load for load in costs if load.draw == 1]
-    fresh = [load for load in costs if load.draw not in (1, *TUNING_DRAWS)]
-    return {title: some for title, some in (("hours a to f", first), ("fresh hours", fresh)) if some}
 
 
 def table_of(costs: PeriodCosts, some: Sequence[Load], cost: str) -> Series:
@@ -48,7 +43,7 @@ def period_values(preset: str, costs: PeriodCosts) -> dict[str, list[float]]:
     """Return shares of hours with an interior best period by name."""
     return {
         f"{preset}: interior optimum, share of {title}, {name}": [share_inside(table_of(costs, some, cost)).value]
-        for title, some in groups(costs).items()
+        for title, some in first_and_fresh(costs, FIRST).items()
         for cost, name in COSTS.items()
     }
 
@@ -60,10 +55,10 @@ def period_remarks(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequenc
     for cost, name in COSTS.items():
         rows: list[tuple[Cell, ...]] = []
         for setting, costs in timed.items():
-            for title, some in groups(costs).items():
+            for title, some in first_and_fresh(costs, FIRST).items():
                 rows.append((setting.label, title, *_row(table_of(costs, some, cost), periods)))
         if cost == "J_open_mean" and theirs.shape[1] == len(periods):
-            rows.insert(0, ("the paper's points", "hours a to f", *_row(theirs, periods)))
+            rows.insert(0, ("the paper's points", FIRST, *_row(theirs, periods)))
         caption = (
             f"**Best of the fixed periods, {name}**: in how many hours it is neither the shortest nor the longest, "
             "which it is in each (s), and what the shortest and the longest cost over it, geometric mean of the hours; "
@@ -71,7 +66,7 @@ def period_remarks(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequenc
         )
         header = ("setting", "hours", "inside, share", "best in each hour (s)", f"{periods[0]:g} s over the best",
                   f"{periods[-1]:g} s over the best")  # fmt: skip
-        remarks.append(f"{caption}\n\n{markdown_table(header, rows)}")
+        remarks.append(markdown_table(header, rows, caption))
     return remarks
 
 
@@ -86,25 +81,15 @@ def period_figure(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequence
     colours = {Preset.TUNED: INK, Preset.AS_PRINTED: ACCENT}
     presets = {setting: costs for setting, costs in timed.items() if not setting.change}
     names = [load.name for load in next(iter(presets.values())) if load.draw == 1]
-    rows = -(-len(names) // 2)
-    with panels(rows, 2, (9.5, 3.1 * rows)) as (figure, axes):
-        for name, place in zip(names, axes, strict=False):
-            for setting, costs in presets.items():
-                of_hour = next(of_load for load, of_load in costs.items() if load.name == name)["J_open_mean"]
-                place.plot(periods, of_hour / of_hour.min(), color=colours[setting.preset], marker=".",
-                           label=setting.label)  # fmt: skip
-            theirs = published.updating_period().get(name)
-            if theirs:
-                fixed = theirs["cost_fixed_pct"]
-                paper(place, theirs["tau_u_s"], fixed / fixed.min(), THIRD, "paper")
-            place.set_title(f"({name})", loc="left")
-            place.set_ylabel("cost over that of the best (1)")
-            place.set_yscale("log")
-            place.set_yticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
-            place.minorticks_off()
-        legend_outside(figure, axes[0])
-        for place in axes[-2:]:
-            place.set_xlabel("updating period (s)")
-        for place in axes[len(names) :]:
-            place.set_visible(False)
-    return figure
+
+    def draw(name: str, place: Axes) -> None:
+        for setting, costs in presets.items():
+            of_hour = next(of_load for load, of_load in costs.items() if load.name == name)["J_open_mean"]
+            place.plot(periods, of_hour / of_hour.min(), color=colours[setting.preset], marker=".",
+                       label=setting.label)  # fmt: skip
+        theirs = published.updating_period().get(name)
+        if theirs:
+            fixed = theirs["cost_fixed_pct"]
+            paper(place, theirs["tau_u_s"], fixed / fixed.min(), THIRD, "paper")
+
+    return hour_panels(names, draw, "cost over that of the best (1)", (1, 2, 5, 10, 20, 50))

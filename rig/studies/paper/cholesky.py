@@ -36,7 +36,8 @@ from rig.plc_sizing.reference_plc import (
 )
 from rig.studies.drawing import legend_outside, panels, paper
 from rig.studies.request import RunRequest, Series
-from rig.studies.study import Cell, Outcomes, StudyOptions, StudyResult
+from rig.studies.study import Outcomes, StudyOptions, StudyResult
+from rig.text_tables import Cell, markdown_table
 
 SPEED: Final = "Mflop/s from n = 50 on"
 SLOW_DOWN: Final = "slow-down against the laptop, sizes 40 to 125"
@@ -139,17 +140,12 @@ def _iterations(curve: SpeedCurve) -> str:
         "fast gradient (counted)": _counted_s(curve, operations.fast_gradient(N, M, ACTIVE_ROWS.mean)),
     }
     powers = (0.2, 0.6, 1.0, 2.0, 5.0, 10.0, 25.0)
-    lines = [
-        "**Iterations in 5 s** against the power P:",
-        "",
-        "| solver | tau_1 (s) | " + " | ".join(f"P = {power:g}" for power in powers) + " |",
-        "|---|---|" + "---|" * len(powers),
-    ]
-    lines += [
-        f"| {name} | {seconds:.3f} | " + " | ".join(str(int(5 * power / seconds + 1e-9)) for power in powers) + " |"
+    rows = [
+        (name, f"{seconds:.3f}", *(str(int(5 * power / seconds + 1e-9)) for power in powers))
         for name, seconds in tau.items()
     ]
-    return "\n".join(lines)
+    header = ("solver", "tau_1 (s)", *(f"P = {power:g}" for power in powers))
+    return markdown_table(header, rows, "**Iterations in 5 s** against the power P:")
 
 
 def _figure(rows: list[tuple[Cell, ...]]) -> Figure:

@@ -26,7 +26,7 @@ class ExperimentStudy:
         return [request for load in self._loads(options) for _, period in self.cases for request in _both(load, period)]
 
     def _loads(self, options: StudyOptions) -> list[Load]:
-        return [draws[0] for draws in loads(options, "2h").values()]
+        return [load for load in loads(options, "2h") if load.draw == 1]
 
     def evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         """Compare traces, bands and updating periods."""
@@ -46,12 +46,12 @@ class ExperimentStudy:
                          i.tau_u_mean_per_update, run.trace_sha256)
                     )  # fmt: skip
                 same = networked.trace_sha256 == alone.trace_sha256
-                result.values.setdefault(f"{self.name}: same trace, {label}", []).append(float(same))
+                result.note(f"{self.name}: same trace, {label}", same)
                 outside = max(networked.indicators.L1_outside_band_pct, networked.indicators.T5_outside_band_pct)
-                result.values.setdefault(f"{self.name}: time outside the bands, {label}", []).append(outside)
+                result.note(f"{self.name}: time outside the bands, {label}", outside)
                 if not period:
                     for what, value in response([(networked, load)], label).items():
-                        result.values.setdefault(f"{self.name}: {what}", []).append(value)
+                        result.note(f"{self.name}: {what}", value)
             if not result.figures:
                 result.figures["time courses"] = time_panels(labelled, BANDS)
         return result

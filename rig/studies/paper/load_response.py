@@ -18,6 +18,7 @@ from rig.studies.drawing import legend_outside, panels
 from rig.studies.paper.trajectories import load_steps, seconds_since_step
 from rig.studies.request import Outcome, Series
 from rig.studies.study import Load
+from rig.text_tables import markdown_table
 
 SOON_S: Final = (0.0, 30.0)
 """The window after a load step by which the response is judged."""
@@ -97,16 +98,12 @@ def response_table(runs_of: Mapping[str, Sequence[Run]]) -> str:
     """Return the mean period of each policy in each window, as Markdown."""
     spans = list(pairwise(EDGES_S.tolist()))
     names = [f"{low:g}-{high:g} s" if np.isfinite(high) else f"from {low:g} s on" for low, high in spans]
-    lines = [
-        "**Mean updating period (s) against the time since the load step**, weighted by time, all hours together.",
-        "",
-        "| policy | " + " | ".join(names) + " |",
-        "|---|" + "---|" * len(names),
-    ]
+    caption = "**Mean updating period (s) against the time since the load step**, weighted by time, all hours together."
+    rows = []
     for policy, runs in runs_of.items():
         means = [held_periods(runs).mean(span) for span in spans]
-        lines.append(f"| {policy} | " + " | ".join("" if np.isnan(mean) else f"{mean:.2f}" for mean in means) + " |")
-    return "\n".join(lines)
+        rows.append((policy, *("" if np.isnan(mean) else f"{mean:.2f}" for mean in means)))
+    return markdown_table(("policy", *names), rows, caption)
 
 
 def response_figure(runs_of: Mapping[str, Sequence[Run]]) -> Figure:

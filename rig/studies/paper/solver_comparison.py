@@ -1,7 +1,6 @@
 """Costs of throttled solvers against the computing power of the PLC (paper, figure `solv_cmp`)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -15,10 +14,11 @@ from rig.studies import published
 from rig.studies.crossing import crossing
 from rig.studies.drawing import legend_outside, panels, paper, spans_decade, spread
 from rig.studies.harsh_problems import harsh_ratios, harsh_requests, harsh_table, harsh_values
-from rig.studies.paper.open_loop import OpenLoop, open_loop_figure, open_loop_table, paired_requests, paper_powers
+from rig.studies.paper.open_loop import open_loop, open_loop_figure, open_loop_table, paired_requests, paper_powers
 from rig.studies.request import RunRequest, Series
 from rig.studies.solver_runs import throttled
-from rig.studies.study import Cell, Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.text_tables import Cell
 
 Table = Mapping[str, Mapping[str, Series]]
 """Values against power, by solver and indicator."""
@@ -54,13 +54,14 @@ class SolverComparison:
 
     def _evaluate(self, options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         powers = np.array(paper_powers(options))
-        paired = OpenLoop.of(options, outcomes)
+        paired = open_loop(options, outcomes)
+        tables: list[Table] = [paired.table(draw) for draw in range(len(paired.loads))]
         closed = [_closed_table(load, powers, outcomes) for load in _closed_loads(options)]
         result = StudyResult(COLUMNS, [], {
-            "indicators": _figure(powers, paired.tables, closed),
+            "indicators": _figure(powers, tables, closed),
             "paired open loop": open_loop_figure(paired),
         })  # fmt: skip
-        for load, table in zip(paired.loads, paired.tables, strict=True):
+        for load, table in zip(paired.loads, tables, strict=True):
             result.rows += _open_rows(load, table, paired.powers)
             _gather(result, open_loop_measures(powers, table))
         for load, table in zip(_closed_loads(options), closed, strict=True):
@@ -85,24 +86,22 @@ class SolverComparison:
 
 def _gather(result: StudyResult, values: Mapping[str, float]) -> None:
     for claim, value in values.items():
-        result.values.setdefault(claim, []).append(value)
+        result.note(claim, value)
 
 
 def _open_rows(
-    load: Load, table: Mapping[str, Mapping[str, Series]], powers: Mapping[str, Series]
+    load: Load, table: Mapping[str, Mapping[str, Series]], powers: Mapping[str, Sequence[float]]
 ) -> list[tuple[Cell, ...]]:
     return [
         ("paired", load.name, solver, power, *(columns[name][i] for name in INDICATORS[:-1]), np.nan,
          columns["J_total"][i] / columns["lowest"][i])
         for solver, columns in table.items()
-        for i, power in enumerate(powers[solver].tolist())
+        for i, power in enumerate(powers[solver])
     ]  # fmt: skip
 
 
 def _closed_loads(options: StudyOptions) -> list[Load]:
-    longest = options.ticks or CLOSED_TICKS
-    drawn = loads(options, "8h", usual=CLOSED_DRAWS).values()
-    return [replace(load, ticks=min(load.ticks, longest)) for draws in drawn for load in draws]
+    return loads(options, "8h", usual=CLOSED_DRAWS, longest_ticks=CLOSED_TICKS)
 
 
 def _closed_table(load: Load, powers: Series, outcomes: Outcomes) -> Table:

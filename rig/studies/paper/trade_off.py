@@ -35,7 +35,7 @@ class TradeOff:
         """Return every solver at every period."""
         return [
             _request(load, solver, period)
-            for load in _loads(options)
+            for load in loads(options, "c")
             for solver in SOLVERS
             for period in _periods(options)
         ]
@@ -45,7 +45,7 @@ class TradeOff:
         periods = _periods(options)
         result = StudyResult(COLUMNS, [], {})
         curves: dict[str, list[list[tuple[float, float]]]] = {solver: [] for solver in SOLVERS}
-        for load in _loads(options):
+        for load in loads(options, "c"):
             for solver, label in SOLVERS.items():
                 points = [won_and_lost(outcomes[_request(load, solver, period)], load) for period in periods]
                 curves[solver].append(points)
@@ -54,13 +54,9 @@ class TradeOff:
                     for period, (won, lost) in zip(periods, points, strict=True)
                 ]
             for what, value in _discriminating(load, periods, outcomes).items():
-                result.values.setdefault(what, []).append(value)
+                result.note(what, value)
         result.figures["efficiency and degradation"] = _figure(periods, curves)
         return result
-
-
-def _loads(options: StudyOptions) -> list[Load]:
-    return [load for draws in loads(options, "c").values() for load in draws]
 
 
 def _periods(options: StudyOptions) -> tuple[float, ...]:

@@ -36,10 +36,7 @@ class TrajectoryStudy:
 
     def requests(self, options: StudyOptions) -> list[RunRequest]:
         """Return a run of every case under every draw."""
-        return [request for load in self._loads(options) for request in self._runs(load)]
-
-    def _loads(self, options: StudyOptions) -> list[Load]:
-        return [load for draws in loads(options, "d").values() for load in draws]
+        return [request for load in loads(options, "d") for request in self._runs(load)]
 
     def _runs(self, load: Load) -> list[RunRequest]:
         return [throttled(load, solver, power, TRACE_TICKS) for _, solver, power in self.cases]
@@ -50,7 +47,7 @@ class TrajectoryStudy:
             ("load", "case", "J_BF", "L1 outside (%)", "T5 outside (%)", "furthest outside", "iterations after a step",
              "iterations in quiet"), [], {},
         )  # fmt: skip
-        for load in self._loads(options):
+        for load in loads(options, "d"):
             runs = [outcomes[request] for request in self._runs(load)]
             labelled = [(label, run) for (label, _, _), run in zip(self.cases, runs, strict=True)]
             if not result.figures:
@@ -78,7 +75,7 @@ class TrajectoryStudy:
         if len(runs) > 2:
             values["J_BF of qpOASES over ODE"] = runs[1].indicators.J_BF / runs[0].indicators.J_BF
         for what, value in values.items():
-            result.values.setdefault(f"{self.name}: {what}", []).append(float(value))
+            result.note(f"{self.name}: {what}", value)
 
 
 def furthest_outside(run: Outcome) -> float:

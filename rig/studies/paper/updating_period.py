@@ -5,15 +5,17 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rig.figures.plot import ACCENT, INK, THIRD
 from rig.studies import published
-from rig.studies.drawing import legend_outside, panels
+from rig.studies.drawing import hour_panels
+from rig.studies.intervals import geometric_mean
 from rig.studies.paper.load_response import response, response_figure, response_table
 from rig.studies.request import Outcome, RunRequest, Series
-from rig.studies.results import markdown_table
-from rig.studies.study import NOISE, PROGRAM, Cell, Load, Outcomes, StudyOptions, StudyResult, loads
+from rig.studies.study import NOISE, PROGRAM, Load, Outcomes, StudyOptions, StudyResult, first_and_fresh, loads
+from rig.text_tables import Cell, markdown_table
 
 NINE: Final = tuple(published.updating_period()["a"]["tau_u_s"].tolist())
 """Periods of the paper, s."""
@@ -41,8 +43,6 @@ CONTROL: Final = Policy("fixed 2.5 s, interrupt", 2.5, (INTERRUPT,))
 POLICIES: Final = (LITERAL, OWN, OWN_INTERRUPT, CONTROL, Policy("fixed 1.5 s, interrupt", 1.5, (INTERRUPT,)))
 RESPONDING: Final = (LITERAL, OWN, OWN_INTERRUPT)
 """Policies whose response to load steps is reported."""
-TUNING_DRAWS: Final = (11, 12)
-"""Draws that the constants of the contraction rule were chosen on."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,10 @@ class UpdatingPeriodStudy:
                 labels = [f"fixed {period:g} s" for period in variant.periods] + [p.label for p in variant.policies]
                 for label, request in zip(labels, _variant_runs(load, variant), strict=True):
                     result.rows.append(_row(variant.label, load.name, label, outcomes[request]))
-        first = {name: hour for name, hour in hours.items() if hour.load.draw == 1}
-        fresh = {name: hour for name, hour in hours.items() if hour.load.draw not in (1, *TUNING_DRAWS)}
+        groups = first_and_fresh(hour.load for hour in hours.values())
+        first, fresh = (
+            {load.name: hours[load.name] for load in groups.get(title, ())} for title in ("hours", "fresh hours")
+        )
         result.figures["cost against period"] = _figure(first, fresh)
         responses = {p.label: [(hour.policies[p.label], hour.load) for hour in hours.values()] for p in RESPONDING}
         result.figures["period after a load step"] = response_figure(responses)
@@ -129,8 +131,7 @@ def _row(variant: str, load: str, policy: str, run: Outcome) -> tuple[Cell, ...]
 
 
 def _hours(options: StudyOptions) -> list[Load]:
-    names = ("a", "c", "e") if options.quick else tuple("abcdef")
-    return [load for draws in loads(options, *names).values() for load in draws]
+    return loads(options, *options.hours)
 
 
 def _periods(load: Load, options: StudyOptions) -> tuple[float, ...]:
@@ -208,11 +209,11 @@ def _judge(result: StudyResult, which: str, hours: Mapping[str, _Hour]) -> None:
         values[f"better than the mean fixed period, share: {of}"] = [_share(costs < mean)]
         values[f"best of all, share: {of}"] = [_share(costs < best)]
         values[f"within 2 % of the best fixed period, share: {of}"] = [_share(costs <= 1.02 * best)]
-        values[f"cost over that of the best fixed period, geometric mean: {of}"] = [_geometric_mean(costs / best)]
+        values[f"cost over that of the best fixed period, geometric mean: {of}"] = [geometric_mean(costs / best)]
         values[f"J_BF over that of fixed 2.5 s, all together: {of}"] = [float(closed.sum() / usual.sum())]
         closed_best = np.array([h.nine("J_BF").min() for h in some])
         values[f"J_BF over that of the best fixed period, geometric mean: {of}"] = [
-            _geometric_mean(closed / closed_best)
+            geometric_mean(closed / closed_best)
         ]
 
 
@@ -225,46 +226,31 @@ def _share(which: Iterable[bool]) -> float:
     return float(np.mean(list(which)))
 
 
-def _geometric_mean(ratios: Series) -> float:
-    return float(np.exp(np.log(ratios).mean()))
-
-
 def _figure(first: Mapping[str, _Hour], fresh: Mapping[str, _Hour]) -> Figure:
     """Draw each hour in % of its worst of the paper's periods, the paper's points beside it."""
-    rows = -(-len(first) // 2)
-    with panels(rows, 2, (9.5, 3.1 * rows)) as (figure, axes):
-        for (name, hour), place in zip(first.items(), axes, strict=False):
-            base = hour.nine("J_open_mean").max() / 100.0
-            periods = list(hour.fixed)
-            costs = [run.indicators.J_open_mean / base for run in hour.fixed.values()]
-            place.plot(periods, costs, color=INK, marker=".", label="fixed, here")
-            place.axhline(hour.cost(LITERAL.label) / base, color=ACCENT, linestyle="--", label="Algorithm 1, here")
-            place.axhline(hour.cost(OWN_INTERRUPT.label) / base, color=THIRD, linestyle="-.",
-                          label="contraction rule, interrupt")  # fmt: skip
-            theirs = published.updating_period().get(name)
-            if theirs:
-                place.plot(theirs["tau_u_s"], theirs["cost_fixed_pct"], ":o", color=INK, markerfacecolor="white",
-                           markersize=4, linewidth=0.8, label="fixed, paper")  # fmt: skip
-                place.plot(
-                    theirs["tau_u_s"], theirs["cost_adaptive_pct"], ":", color=ACCENT, label="Algorithm 1, paper"
-                )
-            others = [other for other in fresh.values() if other.load.name.startswith((f"{name}@", f"{name}#"))]
-            for number, other in enumerate(others):
-                label = "" if number else "fixed, other draws"
-                scale = other.nine("J_open_mean").max() / 100.0
-                place.plot(list(other.fixed), [run.indicators.J_open_mean / scale for run in other.fixed.values()],
-                           color=INK, alpha=0.25, linewidth=0.8, label=label)  # fmt: skip
-            place.set_title(f"({name})", loc="left")
-            place.set_ylabel("cost (% of the worst)")
-            place.set_yscale("log")
-            place.set_yticks([20, 30, 50, 70, 100], ["20", "30", "50", "70", "100"])
-            place.minorticks_off()
-        legend_outside(figure, axes[0], 3)
-        for place in axes[-2:]:
-            place.set_xlabel("updating period (s)")
-        for place in axes[len(first) :]:
-            place.set_visible(False)
-    return figure
+
+    def draw(name: str, place: Axes) -> None:
+        hour = first[name]
+        base = hour.nine("J_open_mean").max() / 100.0
+        periods = list(hour.fixed)
+        costs = [run.indicators.J_open_mean / base for run in hour.fixed.values()]
+        place.plot(periods, costs, color=INK, marker=".", label="fixed, here")
+        place.axhline(hour.cost(LITERAL.label) / base, color=ACCENT, linestyle="--", label="Algorithm 1, here")
+        place.axhline(hour.cost(OWN_INTERRUPT.label) / base, color=THIRD, linestyle="-.",
+                      label="contraction rule, interrupt")  # fmt: skip
+        theirs = published.updating_period().get(name)
+        if theirs:
+            place.plot(theirs["tau_u_s"], theirs["cost_fixed_pct"], ":o", color=INK, markerfacecolor="white",
+                       markersize=4, linewidth=0.8, label="fixed, paper")  # fmt: skip
+            place.plot(theirs["tau_u_s"], theirs["cost_adaptive_pct"], ":", color=ACCENT, label="Algorithm 1, paper")
+        others = [other for other in fresh.values() if other.load.name.startswith((f"{name}@", f"{name}#"))]
+        for number, other in enumerate(others):
+            label = "" if number else "fixed, other draws"
+            scale = other.nine("J_open_mean").max() / 100.0
+            place.plot(list(other.fixed), [run.indicators.J_open_mean / scale for run in other.fixed.values()],
+                       color=INK, alpha=0.25, linewidth=0.8, label=label)  # fmt: skip
+
+    return hour_panels(list(first), draw, "cost (% of the worst)", (20, 30, 50, 70, 100), 3)
 
 
 def _table(title: str, hours: Mapping[str, _Hour]) -> str:
@@ -287,7 +273,7 @@ def _table(title: str, hours: Mapping[str, _Hour]) -> str:
         periods = [period for period in hour.fixed if period in NINE]
         best = periods[int(np.argmin(nine))]
         rows.append((name, f"{best:g}", f"{nine.mean() / nine.min():.3f}", *cells))
-    return f"{caption}\n\n{markdown_table(('hour', 'best fixed (s)', 'mean of nine', *labels), rows)}"
+    return markdown_table(("hour", "best fixed (s)", "mean of nine", *labels), rows, caption)
 
 
 def _variant_table(result: StudyResult) -> str:
@@ -311,4 +297,4 @@ def _variant_table(result: StudyResult) -> str:
             open_loop, closed = np.exp(np.log(ratios[:, :2]).mean(axis=0))
             lines.append((variant, policy, f"{open_loop:.3f}", f"{closed:.3f}", f"{ratios[:, 2].mean():.2f}"))
     header = ("variant", "policy", "open loop", "J_BF", "mean tau_u, by time (s)")
-    return f"{caption}\n\n{markdown_table(header, lines)}"
+    return markdown_table(header, lines, caption)

@@ -5,13 +5,12 @@ Needs the standard library only, so that the control PLC can check which model i
 
 import hashlib
 import json
-import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from coldloop.errors import ModelFileError
+from coldloop.whole_file import whole_text
 
 FORMAT = 1
 REMEDY = "make a new one with `python -m plant.cold_box.model FILE`"
@@ -108,17 +107,7 @@ def write_document(path: Path, document: dict[str, Any]) -> None:
         OSError: the file cannot be written.
     """
     text = json.dumps({**document, "digest": digest_of(document)}, sort_keys=True, indent=1, allow_nan=False)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    whole_text(path, text + "\n", synced=True)
 
 
 def digest_of(document: dict[str, Any]) -> str:
