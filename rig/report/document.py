@@ -10,7 +10,7 @@ from typing import Final
 
 from markdown_it import MarkdownIt
 
-from rig.report.scorecard import Claim, ClaimVerdict, Judged, counted, counts
+from rig.report.scorecard import Claim, ClaimVerdict, Judged, Revision, counted, counts
 from rig.studies.intervals import interval_of_mean
 from rig.text_tables import markdown_table
 
@@ -71,8 +71,16 @@ def deviations(judged: Sequence[Judged], explanations: Mapping[str, str], values
 
 def _marks(claim: Claim) -> str:
     """Return what a reader must know of a claim before its verdict."""
-    calibrated = f"<br>**calibrated**: {claim.calibrated}" if claim.calibrated else ""
-    return calibrated + (f"<br>changed {claim.changed}: {claim.because}" if claim.changed else "")
+    return f"<br>**calibrated**: {claim.calibrated}" if claim.calibrated else ""
+
+
+def revisions(some: Sequence[Revision]) -> str:
+    """Return what was added, changed or withdrawn after a report, by date and reason."""
+    by_reason: dict[tuple[str, str], list[str]] = {}
+    for one in some:
+        if one.changed is not None:
+            by_reason.setdefault((one.changed.isoformat(), one.because), []).append(f"*{one.value}*")
+    return "\n".join(f"- {day}, {because}: {'; '.join(values)}" for (day, because), values in by_reason.items())
 
 
 def _of_paper(judged: Judged) -> str:

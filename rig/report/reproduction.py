@@ -9,8 +9,8 @@ from pathlib import Path
 
 from coldloop import __version__
 from coldloop.whole_file import whole_text
-from rig.report.document import as_page, deviations, scorecard_table, verdict_counts
-from rig.report.scorecard import COUNTED, TOLERANCES, Judged, as_json, counted, counts, judge
+from rig.report.document import as_page, deviations, revisions, scorecard_table, verdict_counts
+from rig.report.scorecard import COUNTED, TOLERANCES, Judged, as_json, counted, counts, judge, withdrawn
 from rig.results.folders import write_json, writing
 from rig.studies import STUDIES
 from rig.studies.execution import Workers
@@ -23,8 +23,8 @@ TITLE = "Coldloop: the paper, figure by figure"
 QUICK = "**A quick run: ten minutes a run and one draw. Its verdicts say that it works, not more.**"
 READING = (
     "Tolerances were set before the runs (`rig/report/tolerances.toml`), and what was added or changed after a report "
-    "has its date and reason; the paper's numbers are computed from the points of its figures by the same formulas as "
-    "ours. Ours are the mean over the draws, its 95 % percentile interval, and the range of the draws. Weights, loads "
+    "is listed below with date and reason; the paper's numbers are computed from the points of its figures by the same "
+    "formulas as ours. Ours are the mean over the draws, its 95 % percentile interval, and the range of the draws. Weights, loads "
     "and operating point are this project's own, for the paper leaves them open: costs are compared as ratios. The "
     "load of the solver comparison was chosen after the tolerances, by a few hours of several families, so that "
     "throttled qpOASES predicts violations as large as in the paper (c1) and converged qpOASES pays more for "
@@ -89,6 +89,13 @@ def report(options: StudyOptions, results: Mapping[str, StudyResult], judged: Se
         deviations(judged, explanations, _values(results)),
         "## Checks and variants, which do not count",
         scorecard_table([j for j in judged if j.claim.kind not in COUNTED], commands),
+        "## Revised after a report",
+        revisions([j.claim for j in judged]),
+        "Withdrawn:",
+        revisions(withdrawn()),
+        "## Added or changed after a report",
+        revisions([j.claim for j in judged]),
+        f"Withdrawn:\n\n{revisions(withdrawn())}",
         "## Slips in the paper, and how we read them",
         SLIPS.read_text(encoding="utf-8"),
     ]

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from rig.report.document import PLACEHOLDER, as_page, deviations, explained, scorecard_table
+from rig.report.document import PLACEHOLDER, as_page, deviations, explained, revisions, scorecard_table
 from rig.report.reproduction import EXPLANATIONS, circumstances
 from rig.report.scorecard import (
     FROM_POINTS,
@@ -24,6 +24,7 @@ from rig.report.scorecard import (
     Claim,
     ClaimKind,
     ClaimVerdict,
+    Revision,
     as_json,
     claims,
     counted,
@@ -291,6 +292,14 @@ def test_the_scorecard_is_plain_json_and_counts_every_verdict() -> None:
     assert total == len(counted(judged)) < len(judged)
     text = json.dumps(as_json(judged), allow_nan=False)
     assert json.loads(text)[0]["verdict"] in set(ClaimVerdict)
+
+
+def test_what_was_changed_after_a_report_is_listed_once_for_each_reason() -> None:
+    day = date(2026, 11, 22)
+    some = [Revision(value=value, changed=day, because=why) for value, why in (("a", "x"), ("b", "y"), ("c", "x"))]
+    assert revisions([*some, Revision(value="as it was")]) == "- 2026-11-22, x: *a*; *c*\n- 2026-11-22, y: *b*"
+    judged = judge({claim.value: [1.0] for claim in claims()})
+    assert "changed 20" not in scorecard_table(judged, dict.fromkeys(STUDIES, "coldloop"))
 
 
 def test_the_page_holds_its_pictures_and_colours_its_verdicts(tmp_path: Path) -> None:
