@@ -1,4 +1,4 @@
-"""The columns of the files of a run: names, types, units, descriptions."""
+"""The columns of the files of a run: names, types, units, descriptions; `tables.py` fills them, in the same order."""
 
 from collections.abc import Sequence
 from enum import IntEnum
