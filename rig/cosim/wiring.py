@@ -11,7 +11,7 @@ from rig.settings import Settings
 
 SERVICES: Final = ("plant", "control_plc", "optimizer_plc")
 RETAINING: Final = ("plant", "control_plc")
-"""Services that go on after a restart where they were, with a file for their state."""
+"""Services that resume after a restart, from a state file."""
 START_PATIENCE_S: Final = 600.0
 """Services that need other kernels than before compile them first, on a slow machine for minutes."""
 

@@ -127,7 +127,7 @@ def add_result_options(parser: argparse.ArgumentParser, folder: str) -> None:
 
 
 def tell(text: str) -> None:
-    """Write a line of what goes on, also where nobody listens any more: it is done all the same."""
+    """Write a line about progress; a closed output does not stop the command."""
     with suppress(BrokenPipeError):
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()
