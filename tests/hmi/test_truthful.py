@@ -79,7 +79,7 @@ def test_a_second_command_waits_with_a_word_until_the_first_is_over(operated: "P
     operated.click("#load-set")
     operated.click("#load-set")
     eventually(lambda: "load: waits until the command before it is over" in outcome(operated), "it says so")
-    for text in ("stand still", "444"):
+    for text in ("Pause plant time", "444"):
         eventually(lambda: operated.evaluate("1") and held, "it is prepared")
         held.pop().continue_()
         operated.wait_for_selector("#confirm[open]")

@@ -56,7 +56,7 @@ def test_a_bias_is_shown_and_changes_nothing_else() -> None:
 
 def test_a_refrigerator_is_as_its_model() -> None:
     section = PlantSection(kind=PlantKind.REFRIGERATOR, mismatch=MismatchSettings(jt_valve=1.1))
-    with pytest.raises(ConfigurationError, match=r"plant\.mismatch: of a cold box alone; set plant\.kind to cold-box"):
+    with pytest.raises(ConfigurationError, match=r"plant\.mismatch: for a cold box alone; set plant\.kind to cold-box"):
         plant_maker(read_header(SHIPPED_MODELS["refrigerator"]), section)
 
 

@@ -118,7 +118,7 @@ def test_each_command_says_what_came_back(coldloop: Coldloop, up: str) -> None:
         (("setpoint", "cv155", "45"), "take over in manual first"),
         (("load", "-1"), "watts: input should be greater"),
         (("load", "absent.csv"), "neither watts nor a file"),
-        (("acknowledge", "everything"), "no alarm is called"),
+        (("acknowledge", "everything"), "unknown alarm"),
         (("factor", "0"), "0.01"),
     ],
 )

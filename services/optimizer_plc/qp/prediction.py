@@ -6,7 +6,6 @@ exponential is needed on line.
 
 from collections.abc import Sequence
 from copy import copy
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -95,7 +94,7 @@ class PredictionModel:
         """Number of states."""
         return len(self.x0)
 
-    @cached_property
+    @property
     def sample(self) -> Transition:
         """The transition over one sampling period of 5 s."""
         return self.transitions[TICKS_PER_SAMPLE]
