@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 
 from coldloop.errors import LinkError, ModelFileError, PeerUnreachableError
 from coldloop.modbus.client import RegisterClient
-from coldloop.operating.load_stream import LAST_TICK, LoadStream, write_table
+from coldloop.operating.load_stream import LoadStream, write_table
 from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, LadderStatus, Mode, Status
@@ -225,13 +225,16 @@ class SessionClient:
     async def grant(self, until: int) -> None:
         """Advance the rig to a tick, limited by the known load and by the length of the plant's history."""
         done = self._samples.read_until
+        most = AHEAD if self._samples.has_station is False else STATION_AHEAD
+        await self.advance(done, min(until, done + most), realtime=self._scenario.realtime)
+
+    async def advance(self, tick: int, until: int, *, realtime: bool = False) -> None:
+        """Write the load that follows a tick; in lock-step grant the ticks before `until`, as far as it is known."""
         if self.load is not None:
-            await self.contact(self.load.feed(done))
-        if not self._scenario.realtime:
+            await self.contact(self.load.feed(tick))
+        if not realtime:
             known = None if self.load is None else self.load.known_until
-            most = AHEAD if self._samples.has_station is False else STATION_AHEAD
-            ahead = min(until, done + most, LAST_TICK if known is None else known)
-            await self.contact(self.control.write(Grant(ahead)))
+            await self.contact(self.control.write(Grant(until if known is None else min(until, known))))
 
     async def look(self) -> int | None:
         """Record what has happened since the last look; return the plant's tick, None when it does not answer.

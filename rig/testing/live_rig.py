@@ -15,7 +15,6 @@ from coldloop.errors import LinkError, PeerUnreachableError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.signals import TICK_S
 from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import Grant
 from coldloop.registers.maps import MAPS
 from rig.chaos.faults import AnyFault, WrongModel
 from rig.chaos.injection import Injector
@@ -92,7 +91,7 @@ class LiveRig:
         until, moved = tick + ticks, time.monotonic()
         while tick < until:
             if not self._scenario.realtime:
-                await self._grant(tick, until)
+                await self._driver.advance(tick, until)
             await asyncio.sleep(LOOK_S)
             before, tick = tick, (await self._clients["plant"].read(Identity)).tick
             if tick != before:
@@ -103,13 +102,6 @@ class LiveRig:
                     f"{self._folder / 'logs'}"
                 )
         return tick
-
-    async def _grant(self, tick: int, until: int) -> None:
-        load = self._driver.load
-        if load is not None:
-            await load.feed(tick)
-        known = None if load is None else load.known_until
-        await self._clients["control_plc"].write(Grant(until if known is None else min(until, known)))
 
     def wait_until(self, condition: Callable[[], bool], within_s: float = 60.0) -> float:
         """Wait until `condition()` is true, for at most `within_s` of plant time; return the plant time then.
