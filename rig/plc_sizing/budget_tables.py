@@ -39,7 +39,7 @@ def budget_tables(settings: Settings, power: float | None, period_s: float | Non
     powers = POWERS if power is None else (power,)
     periods = PERIODS_S if period_s is None else (period_s,)
     program = settings.optimizer_plc.program
-    prediction = PredictionModel(load(settings.model.file))
+    prediction = PredictionModel(load(settings.model.file)).with_disturbances(program.estimator.disturbed)
     real = real_of(Arithmetic.FLOAT32)
     problem = PredictiveProblem(prediction, program.design, settings.limits, real, program.penalties)
     trivial = PredictiveProblem(prediction, trivial_design(program.design), settings.limits, real, program.penalties)

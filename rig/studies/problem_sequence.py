@@ -88,7 +88,7 @@ def _recorded(scenario: Scenario, assignments: tuple[str, ...]) -> ProblemSequen
     rig = OneProcessRig(settings, compiled=False)
     listening = rig.optimizer = _ListeningOptimizer(model, program, settings.limits)
     rig.run(scenario, Recorder(scenario.ticks, []))
-    prediction = PredictionModel(model)
+    prediction = PredictionModel(model).with_disturbances(program.estimator.disturbed)
     problem = PredictiveProblem(prediction, program.design, settings.limits)
     profiles = PlayedProfiles(problem)
     return ProblemSequence(prediction, settings.limits, problem, profiles, listening.heard, np.array([
