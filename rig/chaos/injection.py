@@ -1,7 +1,6 @@
 """Brings faults about, and takes them back."""
 
 import asyncio
-import contextlib
 import signal
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
@@ -117,9 +116,14 @@ class Injector:
 
 async def _insisted(request: Callable[[], Awaitable[T]], what: str) -> T:
     """Return the answer to a request, which is repeated for a while."""
+    reason = "no answer in time"
     for _ in range(ATTEMPTS):
-        with contextlib.suppress(PeerUnreachableError, RequestRefusedError, TimeoutError):
+        try:
             async with asyncio.timeout(CONTACT_S):
                 return await request()
+        except (PeerUnreachableError, RequestRefusedError) as error:
+            reason = str(error)
+        except TimeoutError:
+            pass
         await asyncio.sleep(0.5)
-    raise LinkError(f"the plant did not accept {what}: see its log")
+    raise LinkError(f"the plant did not accept {what}: {reason}")

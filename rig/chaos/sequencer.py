@@ -124,8 +124,8 @@ class FaultSequencer:
                 return self._timeline.take(end)
         if not self._timeline.on and stopped_s > max(STANDSTILL_PATIENCE_S, 4 * TICK_S / self._plan.factor):
             raise LinkError(
-                f"plan {self._plan.name}: the plant stays at {self.tick * TICK_S:g} s for {stopped_s:.0f} s without a "
-                f"fault: see {self._services.log('control_plc')}"
+                f"plan {self._plan.name}: the plant has been at {self.tick * TICK_S:g} s for {stopped_s:.0f} s "
+                f"without a fault: see {self._services.log('control_plc')}"
             )
         return None
 

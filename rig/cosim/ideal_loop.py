@@ -51,7 +51,8 @@ def run_ideal_loop(
         solved: Called with each problem.
     """
     header, model = own_header(settings.model.file), load(settings.model.file)
-    prediction, program = PredictionModel(model), settings.optimizer_plc.program
+    program = settings.optimizer_plc.program
+    prediction = PredictionModel(model).with_disturbances(program.estimator.disturbed)
     problem = PredictiveProblem(prediction, program.design, settings.limits)
     kalman = program.estimator.model_copy(update={"kind": EstimatorKind.KALMAN})
     estimator, belief = estimator_of(prediction, kalman), no_belief(prediction.n_states)

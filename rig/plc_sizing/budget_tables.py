@@ -8,6 +8,7 @@ from coldloop.process.lti_model import load
 from coldloop.process.signals import TICK_S
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
+from optimizer_plc.estimator import check_detectability
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.design import N_SLACKS, trivial_design
 from optimizer_plc.qp.prediction import PredictionModel
@@ -40,6 +41,7 @@ def budget_tables(settings: Settings, power: float | None, period_s: float | Non
     periods = PERIODS_S if period_s is None else (period_s,)
     program = settings.optimizer_plc.program
     prediction = PredictionModel(load(settings.model.file)).with_disturbances(program.estimator.disturbed)
+    check_detectability(prediction)
     real = real_of(Arithmetic.FLOAT32)
     problem = PredictiveProblem(prediction, program.design, settings.limits, real, program.penalties)
     trivial = PredictiveProblem(prediction, trivial_design(program.design), settings.limits, real, program.penalties)

@@ -52,7 +52,7 @@ def repeat(folder: Path, out: Path | None, *, force: bool) -> tuple[bool, str]:
     effective = _configuration(run)
     scenario = make_scenario(effective.settings, manifest["recorded_ticks"])
     if profile_digest(scenario.load) != manifest["inputs"]["load"]["profile_sha256"]:
-        raise UsageError(f"load {manifest['inputs']['load']['source']}: this version has another load of the name")
+        raise UsageError(f"load {manifest['inputs']['load']['source']}: this version has another load of that name")
     trace = _trace(effective, scenario, out, force=force)
     if trace == manifest["hashes"]["trace_sha256"]:
         return True, f"{scenario.ticks} ticks, the same trace {trace}\n"

@@ -191,7 +191,7 @@ def _branch(update: Optimization, before: Optimization | None, rule: UpdatingRul
         return _by_sign(update.gamma)
     if rule.rule == UpdatingRuleKind.CONTRACTION:
         return Branch.CONTRACTION
-    raise ValueError(f"no words for the rule {rule.rule} of the updating period: add a branch")
+    raise NotImplementedError(f"no words for the rule {rule.rule} of the updating period: add a branch")
 
 
 def _by_sign(gamma: float) -> Branch:

@@ -16,7 +16,7 @@ def require_regular_file(path: Path) -> None:
         UsageError: The path exists and is something else than a regular file.
     """
     if path.exists() and not path.is_file():
-        raise UsageError(f"{path}: exists and is not a regular file; choose another --out")
+        raise UsageError(f"{path}: exists and is not a regular file; name another one")
 
 
 def whole_file(path: Path, write: Callable[[Path], object]) -> None:

@@ -84,7 +84,7 @@ def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, re
     """
     adaptive, own = settings.adaptive, settings.adaptive.contraction
     return Rule(
-        FIXED_PERIOD if fixed_ticks else UpdatingRuleKind[adaptive.rule.name],
+        FIXED_PERIOD if fixed_ticks else int(UpdatingRuleKind[adaptive.rule.name]),  # one type, compiled once
         FixedPeriod(budget.iterations(fixed_ticks)),
         Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta),
         ContractionRule(own.q_busy, own.q_quiet, own.q_step, real(own.rate), real(own.memory), real(own.surprise)),

@@ -142,7 +142,7 @@ class RegisterClient:
                 await asyncio.sleep(min(CONNECT_PAUSE_S, patience_s))
             except RequestRefusedError as error:
                 raise PeerUnreachableError(
-                    f"{self.peer} is not that service (no identity block): check host and port"
+                    f"{self.peer}: another program answers there (no identity block): check host and port"
                 ) from error
             else:
                 check_peer(raw, self._map, self._order, self.peer)

@@ -19,7 +19,9 @@ def check_peer(raw: bytes, register_map: RegisterMap, order: WordOrder, peer: st
         other = WordOrder.LOW_FIRST if order is WordOrder.HIGH_FIRST else WordOrder.HIGH_FIRST
         if _has_magic(_identity(raw, other)):
             raise PeerUnreachableError(f"{peer} has the other word order: set it to {other} here, or {order} there")
-        raise PeerUnreachableError(f"{peer} is not that service (register 0 is not {MAGIC}): check host and port")
+        raise PeerUnreachableError(
+            f"{peer}: another program answers there (register 0 is not {MAGIC}): check host and port"
+        )
     if identity.map_digest != register_map.digest:
         raise PeerUnreachableError(
             f"{peer} has another register map (version {identity.map_version}, digest {identity.map_digest:08x}, "

@@ -108,6 +108,7 @@ def write_document(path: Path, document: dict[str, Any]) -> None:
     """
     text = json.dumps({**document, "digest": digest_of(document)}, sort_keys=True, indent=1, allow_nan=False)
     whole_text(path, text + "\n", synced=True)
+    path.chmod(0o644)  # the services that load it may be other users
 
 
 def digest_of(document: dict[str, Any]) -> str:
