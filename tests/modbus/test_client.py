@@ -151,8 +151,11 @@ IMPOSTORS = {
     "silence": (b"", "did not answer in time"),
     "hangs up": (None, "closed the connection"),
     "HTTP": (b"TP/1.1 400 Bad Request\r\n\r\n", "with something invalid: check host and port"),
-    "no identity block": (bytes.fromhex("0000 0003 01 83 02"), "not that service .*no identity block"),
-    "other registers": (bytes.fromhex("0000 001d 01 03 1a") + bytes(26), r"not that service .*not 123.456"),
+    "no identity block": (bytes.fromhex("0000 0003 01 83 02"), "another program answers there .*no identity block"),
+    "other registers": (
+        bytes.fromhex("0000 001d 01 03 1a") + bytes(26),
+        r"another program answers there .*not 123.456",
+    ),
     "too few registers": (bytes.fromhex("0000 0005 01 03 02 0000"), "with something invalid"),
     "another function": (bytes.fromhex("0000 0005 01 04 02 0000"), "with something invalid"),
     "an unknown function": (bytes.fromhex("0000 0003 01 55 02"), "with something invalid"),

@@ -1,5 +1,6 @@
 import math
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -245,3 +246,10 @@ def test_each_kind_is_decided_by_its_rule(kind: UpdatingRuleKind, observation: O
     (of_all, a), (alone, _) = Deciding(rule).next(observation), Deciding(rule.chosen).next(observation)
     assert of_all == alone
     assert a == assess(observation)
+
+
+def test_one_compilation_serves_fixed_and_adaptive_periods() -> None:
+    """Else the first update of a session with the other one would wait for the compiler."""
+    budget = PlcBudget(BudgetSettings(), 0.25)
+    adaptive, fixed = (make_rule(ProgramSettings(), budget, ticks) for ticks in (0, 8))
+    assert numba.typeof(adaptive) == numba.typeof(fixed) == numba.typeof(adaptive.fixed(3))
