@@ -154,7 +154,7 @@ IMPOSTORS = {
     "no identity block": (bytes.fromhex("0000 0003 01 83 02"), "another program answers there .*no identity block"),
     "other registers": (
         bytes.fromhex("0000 001d 01 03 1a") + bytes(26),
-        r"another program answers there .*not 123.456",
+        r"another program .*not 123.456",
     ),
     "too few registers": (bytes.fromhex("0000 0005 01 03 02 0000"), "with something invalid"),
     "another function": (bytes.fromhex("0000 0005 01 04 02 0000"), "with something invalid"),
