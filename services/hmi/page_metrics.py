@@ -16,12 +16,8 @@ def page_families(model: Model, browsers: int) -> Iterator[Metric]:
     """Yield everything; of a service that is silent only that it is."""
     yield build_family()
     live = [service for service in MAPS if model.is_live(service)]
-    yield gauge(
-        "coldloop_up",
-        "1 while a service answers the page",
-        {service: service in live for service in MAPS},
-        label="service",
-    )
+    up = {service: service in live for service in MAPS}
+    yield gauge("coldloop_up", "1 while a service answers the page", up, label="service")
     ages = {service: age for service in MAPS if (age := model.age_s(service)) is not None}
     yield gauge("coldloop_age_seconds", "Time since the last answer of a service", ages, label="service")
     yield gauge("coldloop_page_browsers", "Streams to browsers", browsers)

@@ -102,7 +102,7 @@ def add_rig_options(parser: argparse.ArgumentParser, *, again: bool = False) -> 
 
 
 def add_to_subcommands(what: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare the same for subcommands: options are taken before and behind what is to be done."""
+    """Declare the same options for subcommands, so that they are accepted before and after them."""
     for subcommand in what.choices.values():
         add_rig_options(subcommand, again=True)
 
