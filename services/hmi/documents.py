@@ -13,13 +13,20 @@ from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode, OperatorMode
 from coldloop.registers.maps import MAPS
-from coldloop.registers.optimizer_plc import BANDED_OUTPUTS, INPUT_SAMPLES, PREDICTED_SAMPLES, Optimization, Prediction
+from coldloop.registers.optimizer_plc import (
+    BANDED_OUTPUTS,
+    INPUT_SAMPLES,
+    PREDICTED_SAMPLES,
+    ModelDeviation,
+    Optimization,
+    Prediction,
+)
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.event_text import alarm_cause, word
 from hmi.compression_station import plant_document
 from hmi.explanation import explain
 from hmi.process_image import JournalEntry, Model
-from hmi.sentences import sentence
+from hmi.sentences import deviation, sentence
 from hmi.signals import signals_of
 from hmi.trends import NAMES, Gap, mode_name, rounded, thin
 
@@ -155,6 +162,7 @@ def state_document(model: Model, changed: Iterable[str] | None = None) -> Docume
         "time_s": model.tick * TICK_S,
         "services": services_document(model),
         "plant": plant_document(model),
+        "deviation": deviation(model.record("optimizer_plc", ModelDeviation) or ModelDeviation()),
         "stale": model.stale_prefixes(),
         "values": {name: finite(model.values[name]) for name in names},
     }

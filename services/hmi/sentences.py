@@ -3,14 +3,32 @@
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.optimizer_plc import UpdatingRuleStatus
+from coldloop.registers.optimizer_plc import ModelDeviation, UpdatingRuleStatus
 from coldloop.service.event_text import word
 from hmi.explanation import Branch, Explanation, is_rounded_to_one
 
 AT_REST: Final = 1e-9
 """A Gamma that is smaller is rounding: the cost is at its floor."""
+
+NOTABLE: Final = {"W": 2.0, "%": 0.2, "Hz": 5.0, "K": 0.05, "bar": 0.005}
+"""A plant that differs from its model by less is not worth a word."""
+MOST_DEVIATIONS: Final = 4
+
+
+def deviation(found: ModelDeviation) -> str:
+    """Return how the plant differs from its model beside the load, the most notable first; empty where it does not."""
+    parts = [
+        (value, unit, f"needs {abs(value):.3g} {unit} {'less' if value > 0 else 'more'} {name}")
+        for name, unit, value in zip(INPUT_NAMES, INPUT_UNITS, found.u, strict=True)
+    ]
+    parts += [
+        (value, unit, f"{name} {value:+.3g} {unit}")
+        for name, unit, value in zip(OUTPUT_NAMES, OUTPUT_UNITS, found.y, strict=True)
+    ]
+    notable = [(abs(value) / NOTABLE[unit], text) for value, unit, text in parts if abs(value) >= NOTABLE[unit]]
+    return ", ".join(text for _, text in sorted(notable, reverse=True)[:MOST_DEVIATIONS])
 
 
 def sentence(found: Explanation, rule: UpdatingRuleStatus) -> str:

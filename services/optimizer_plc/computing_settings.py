@@ -5,15 +5,20 @@ from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
 
-from coldloop.process.signals import L1, OUTPUT_NAMES
+from coldloop.process.signals import INPUT_NAMES, L1, OUTPUT_NAMES
 
 PENALTY_WEIGHT = 3000.0
 """alpha that all solvers are judged by with the default weights. In a program's settings it follows from `penalties`
 and `design.violation_weight` wherever it is not set."""
 
 
-ALL_OUTPUTS: Final = "outputs"
-"""What `estimator.disturbances` calls all outputs that may have one."""
+SIGNALS: Final = (*OUTPUT_NAMES, *INPUT_NAMES)
+GROUPS: Final = {
+    "outputs": tuple(name for name in OUTPUT_NAMES if name != OUTPUT_NAMES[L1]),
+    "inputs": ("CV155", "CV156"),
+}
+"""What `estimator.disturbances` calls all outputs, or inputs, that may have one: no sensor tells a constant error of L1
+from liquid helium, nor one of the heater from the load."""
 
 
 class Arithmetic(StrEnum):
@@ -63,10 +68,12 @@ class EstimatorSettings(BaseModel):
     """Of one measurement, whatever the updating period; or of a mean over a sampling period, so that measurements which
     follow each other sooner count for less: a model error is then not taken for more load the shorter the period is."""
     disturbances: tuple[str, ...] = ()
-    """Outputs, by name, whose readings may differ from the model's by a constant that is estimated: no offset on a
-    plant that is not the model. `outputs` are all but L1, whose constant no estimator could tell from liquid helium."""
+    """Signals, by name or group (`GROUPS`), with an unknown constant that is estimated, so that there is no offset on a
+    plant that is not the model. That of an output is added to its reading, that of an input acts like more of it."""
     disturbance_walk: PositiveFloat = 3.0
-    """Random walk of such a constant, per square root of a sampling period, over the sensor's standard deviation."""
+    """Random walk of an output's constant over its sensor's standard deviation."""
+    input_walk: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (0.05, 0.5, 0.05)
+    """Random walk of an input's constant: %, W, %."""
     longest_riccati: Annotated[int, Field(ge=1)] = 2000
     """Longest run of the Riccati recursion for a stationary gain, in periods."""
 
@@ -78,19 +85,15 @@ class EstimatorSettings(BaseModel):
     @field_validator("disturbances")
     @classmethod
     def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        if names == (ALL_OUTPUTS,):
-            return names
-        unknown = [name for name in names if name not in OUTPUT_NAMES]
-        if unknown or len(set(names)) < len(names):
-            raise ValueError(f"disturbances are '{ALL_OUTPUTS}' or a list, each once, of {', '.join(OUTPUT_NAMES)}")
+        found = _members(names)
+        if any(name not in SIGNALS for name in found) or len(set(found)) < len(found):
+            raise ValueError(f"disturbances are a list, each once, of {', '.join((*GROUPS, *SIGNALS))}")
         return names
 
     @property
     def disturbed(self) -> tuple[int, ...]:
-        """Indices of the outputs with a disturbance."""
-        if self.disturbances == (ALL_OUTPUTS,):
-            return tuple(index for index in range(len(OUTPUT_NAMES)) if index != L1)
-        return tuple(sorted(OUTPUT_NAMES.index(name) for name in self.disturbances))
+        """Which of `SIGNALS` have a disturbance, rising."""
+        return tuple(sorted(map(SIGNALS.index, _members(self.disturbances))))
 
     @model_validator(mode="after")
     def _what_is_estimated(self) -> Self:
@@ -99,6 +102,10 @@ class EstimatorSettings(BaseModel):
         if self.kind is EstimatorKind.STATE_FEEDBACK and not self.load_known:
             raise ValueError("state-feedback estimates no load; choose kind = kalman for load_known = false")
         return self
+
+
+def _members(names: tuple[str, ...]) -> list[str]:
+    return [member for name in names for member in GROUPS.get(name, (name,))]
 
 
 class OdeSettings(BaseModel):

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
-from coldloop.process.signals import OUTPUT_NAMES, SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
-from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
+from coldloop.process.signals import SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
+from optimizer_plc.computing_settings import SIGNALS, EstimatorKind, EstimatorSettings, NoiseReference
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.linear_algebra import add_transposed_product, multiply, respond
 from optimizer_plc.qp.prediction import PredictionModel, Transition
@@ -141,10 +141,10 @@ def check_detectability(prediction: PredictionModel) -> None:
     if sizes[-1] > UNDETECTABLE:
         return
     shares = np.abs(directions[-1][n - len(prediction.disturbances) : n])
-    worst = OUTPUT_NAMES[prediction.disturbances[int(np.argmax(shares))]]
+    worst = SIGNALS[prediction.disturbances[int(np.argmax(shares))]]
     raise ConfigurationError(
-        f"optimizer_plc.program.estimator.disturbances: a constant error of {worst} cannot be told from the plant's"
-        " state by any sensor: leave it out"
+        f"optimizer_plc.program.estimator.disturbances: no sensor tells a constant error of {worst} from the plant's"
+        " state, the load and the other errors: leave it out"
     )
 
 
@@ -158,9 +158,10 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
     }  # fmt: skip
     sensors = np.full(C.shape[0], settings.temperature_sensor)
     sensors[0], sensors[1], sensors[12:] = settings.level_sensor, settings.speed_sensor, settings.pressure_sensor
+    walks = np.concatenate([settings.disturbance_walk * sensors, settings.input_walk])
     drift = np.array([
         *(by_unit[unit] for unit in prediction.model.state_units),
-        *(settings.disturbance_walk * sensors[output] for output in prediction.disturbances),
+        *walks[list(prediction.disturbances)],
         settings.load_walk_w,
     ])  # fmt: skip
 

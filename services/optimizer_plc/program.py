@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import (
     INPUT_SAMPLES,
     PREDICTED_SAMPLES,
+    ModelDeviation,
     OperatingLimits,
     Optimization,
     Prediction,
@@ -54,7 +55,8 @@ class OptimizerProgram:
             self.settings = settings
             self.model_digest = model.short_digest
             self._real = real_of(settings.arithmetic)
-            prediction = PredictionModel(model).with_disturbances(settings.estimator.disturbed)
+            self.disturbances = settings.estimator.disturbed
+            prediction = PredictionModel(model).with_disturbances(self.disturbances)
             self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
             self.solver = make_solver(settings)
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
@@ -245,6 +247,15 @@ class OptimizerProgram:
             int(self._now["update"]), int(header["first_tick"]), tuple(shown[:, 0].tolist()),
             tuple(shown[:, 1].tolist()), tuple(planned.ravel().tolist()),
         )  # fmt: skip
+
+    def model_deviation(self) -> ModelDeviation:
+        """Return how the plant differs from the model, as the filter has estimated it at the last update."""
+        belief, n_y = self.state.belief, len(OUTPUT_NAMES)
+        constants = np.zeros(n_y + len(INPUT_NAMES))
+        constants[list(self.disturbances)] = belief.x[belief.x.size - len(self.disturbances) :]
+        return ModelDeviation(
+            float(belief.numbers[0]["mismatch"]), tuple(constants[n_y:].tolist()), tuple(constants[:n_y].tolist())
+        )
 
     @property
     def operating_limits(self) -> OperatingLimits:

@@ -25,7 +25,7 @@ from coldloop.process.lti_model import load
 from coldloop.process.signals import TICK_S
 from coldloop.registers.configuration import publish_configuration
 from coldloop.registers.control_plc import AwaitUpdate, Update, Verdict
-from coldloop.registers.optimizer_plc import ControlLinkState
+from coldloop.registers.optimizer_plc import ControlLinkState, ModelDeviation
 from coldloop.safety.sequence import InputSequence
 from coldloop.service.metrics_server import MetricsServer
 from coldloop.service.start import SERVING
@@ -85,6 +85,7 @@ class OptimizerPlc:
         self.publication = OptimizerPublication(
             section.word_order, self._program.budget, self._program.operating_limits, digest, holder
         )
+        self.publication.bank.keep_fresh(ModelDeviation, self._program.model_deviation)
         publish_configuration(self.publication.bank, selected(settings, SHOWN))
         self._link = self.publication.link
         self._control = ControlClient(section.control_plc, self._link, digest, str(settings.model.file))

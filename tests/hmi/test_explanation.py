@@ -13,11 +13,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from coldloop.process.signals import OUTPUT_NAMES, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
+from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, UpdatingRuleKind, UpdatingRuleStatus
 from hmi.explanation import Branch, Explanation, explain, increments_of, period_ticks
-from hmi.sentences import sentence
+from hmi.sentences import deviation, sentence
 from optimizer_plc.rules import Algorithm1, Observation, algorithm_1, assess
 
 getcontext().prec = 40
@@ -36,6 +37,9 @@ class ByHand(NamedTuple):
     """dK/dq."""
     gamma: Decimal
     q: int
+
+
+P1 = OUTPUT_NAMES.index("P1")
 
 
 def by_hand(q: int, before: float, hot_start: float, last_but_one: float, delivered: float, effective: float) -> ByHand:
@@ -232,3 +236,13 @@ def test_a_slope_where_k_rounds_to_one_is_not_told_as_the_slope_of_k() -> None:
     text = sentence(found, RULE)
     assert "K is 1 to the precision of the registers" in text
     assert "dK/dq" not in text
+
+
+def test_a_plant_that_differs_from_its_model_is_described_the_most_notable_first() -> None:
+    y = [0.0] * 22
+    y[T5], y[1], y[P1] = 0.31, -4.9, -0.0151
+    found = ModelDeviation(load=31.0, u=(-4.1, 0.0, 0.2), y=tuple(y))
+    assert deviation(found) == "needs 4.1 % more CV155, T5 +0.31 K, P1 -0.0151 bar, needs 0.2 % less CV156"
+    assert deviation(ModelDeviation(load=31.0)) == ""
+    everything = ModelDeviation(u=(1.0, 1.0, 1.0), y=(1.0,) * 22)
+    assert deviation(everything).count(",") == 3

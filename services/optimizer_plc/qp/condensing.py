@@ -17,7 +17,10 @@ Array = NDArray[np.float64]
 
 
 class Condensed(NamedTuple):
-    """J_0 = z' Phi z + (phi_map' s)' z + s' constant_map s, and the constrained outputs of the N samples."""
+    """J_0 = z' Phi z + (phi_map' s)' z + s' constant_map s, and the constrained outputs of the N samples.
+
+    J_0 is about the state at rest and the inputs that keep it there under the estimated disturbances.
+    """
 
     Phi: Array
     """Shape (n, n), with the weights of the slacks."""
@@ -40,6 +43,8 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
     Q = np.zeros(nx)  # disturbances weigh nothing
     Q[: len(prediction.model.x0)] = state_weights(prediction.model, design)
     R = np.asarray(design.input_weight)
+    resting = np.hstack([prediction.resting_inputs, np.zeros((N_INPUTS, 1))])
+    weighted_resting = multiply(transposed(resting), np.diag(R))
     C, D, G = (matrix[list(prediction.constrained)] for matrix in (prediction.C, prediction.D, prediction.G))
     Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))
     outputs_z, outputs_s = [], []
@@ -50,8 +55,8 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
         to_s[:, -1] += F[:, 0]
         weighted_z, weighted_s = Q[:, None] * to_z, Q[:, None] * to_s
         Phi += multiply(transposed(to_z), weighted_z) + multiply(transposed(u_of_z), R[:, None] * u_of_z)
-        cross += 2.0 * multiply(transposed(to_s), weighted_z)
-        constant += multiply(transposed(to_s), weighted_s)
+        cross += 2.0 * (multiply(transposed(to_s), weighted_z) - multiply(weighted_resting, u_of_z))
+        constant += multiply(transposed(to_s), weighted_s) + multiply(weighted_resting, resting)
         outputs_z.append(multiply(C, to_z) + multiply(D, u_of_z))
         through_w = multiply(C, to_s)
         through_w[:, -1] += G[:, 0]

@@ -53,6 +53,9 @@ class PredictionModel:
         self.w0 = DOUBLE(model.w0)
         self.real = DOUBLE
         self.disturbances: tuple[int, ...] = ()
+        """Signals whose constants are states."""
+        self.resting_inputs = np.zeros((self.D.shape[1], len(self.x0)))
+        """Inputs at which the plant rests at the operating point, by the states, shape (3, n)."""
         self.transitions = {1: tick}
         for ticks in range(2, TICKS_PER_SAMPLE + 1):
             self.transitions[ticks] = self.transitions[ticks - 1].then(tick)
@@ -69,22 +72,31 @@ class PredictionModel:
         }
         return twin
 
-    def with_disturbances(self, outputs: Sequence[int]) -> "PredictionModel":
-        """Return this model with a constant disturbance of each of these outputs as a further state.
+    def with_disturbances(self, signals: Sequence[int]) -> "PredictionModel":
+        """Return this model with a constant disturbance of each of these signals as a further state.
 
         An estimator of these leaves no offset (Pannocchia and Rawlings 2003); costs and rows follow from the states.
+
+        Args:
+            signals: Outputs, counted from 0, and then inputs, counted on from there.
         """
-        if not outputs:
+        if not signals:
             return self
-        n, extra = self.n_states, len(outputs)
+        n, extra, n_outputs = self.n_states, len(signals), len(self.y0)
+        inputs = [(n + place, signal - n_outputs) for place, signal in enumerate(signals) if signal >= n_outputs]
         twin = copy(self)
-        twin.disturbances = tuple(outputs)
+        twin.disturbances = tuple(signals)
         twin.x0 = np.concatenate([self.x0, np.zeros(extra)])
-        twin.C = np.hstack([self.C, np.eye(len(self.y0))[:, list(outputs)]])
+        twin.C = np.hstack([self.C, np.hstack([np.eye(n_outputs), self.D])[:, list(signals)]])
+        twin.resting_inputs = np.zeros((self.D.shape[1], n + extra))
+        for state, i in inputs:
+            twin.resting_inputs[i, state] = -1.0
         twin.transitions = {}
         for ticks, step in self.transitions.items():
             A = np.eye(n + extra)
             A[:n, :n] = step.A
+            for state, i in inputs:
+                A[:n, state] = step.B[:, i]
             B, F = (np.vstack([M, np.zeros((extra, M.shape[1]))]) for M in (step.B, step.F))
             twin.transitions[ticks] = Transition(A, B, F)
         return twin

@@ -3,7 +3,7 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, SAMPLING_PERIOD_S
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
@@ -158,6 +158,19 @@ class Prediction(NamedTuple):
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
+class ModelDeviation(NamedTuple):
+    """By how much the plant differs from the prediction model, as the filter estimates it; 0 where it does not."""
+
+    load: Annotated[float, f32("Acts like so much more heat load than is measured", unit="W", finite=False)] = 0.0
+    u: Annotated[
+        tuple[float, ...], f32_array("Acts like so much more of the input", INPUT_NAMES, INPUT_UNITS, finite=False)
+    ] = (0.0,) * len(INPUT_NAMES)
+    y: Annotated[
+        tuple[float, ...],
+        f32_array("Constant difference of the reading from the model's", OUTPUT_NAMES, OUTPUT_UNITS, finite=False),
+    ] = (0.0,) * len(OUTPUT_NAMES)
+
+
 OPTIMIZER_MAP: Final = RegisterMap(
     service="optimizer_plc",
     version=3,
@@ -170,6 +183,7 @@ OPTIMIZER_MAP: Final = RegisterMap(
         Block("updating rule", 120, UpdatingRuleStatus, "What decides the updating period"),
         Block("operating limits", 140, OperatingLimits, "Bands of the outputs, bounds and rates of the inputs"),
         Block("prediction", 200, Prediction, "Predicted result of the last sequence", sealed=True),
+        Block("model deviation", 320, ModelDeviation, "How the plant differs from the prediction model"),
         Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
         Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
         Block("journal page", 45010, JournalPage, "State of the journal"),

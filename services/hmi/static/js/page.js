@@ -62,7 +62,8 @@ function overview() {
     note.hidden = inUse;
     if (!inUse) note.textContent = "Of the last update: MPC is not active now.";
     const rows = [["expected next", state.replay ? "–" : upcoming ? `${values["plant.load status.next_watts"]?.toFixed(1)} W in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
-      ["estimated mismatch", state.update ? `${state.update.update.load_mismatch.toFixed(1)} W` : "–", "optimizer_plc.", "update"]];
+      ["estimated mismatch", state.update ? `${state.update.update.load_mismatch.toFixed(1)} W` : "–", "optimizer_plc.", "update"],
+      ["plant against model", state.deviation || "–", "optimizer_plc."]];
     const text = JSON.stringify(rows);
     if (facts.dataset.text !== text) { facts.dataset.text = text; facts.replaceChildren(...rows.flatMap(([name, value, ...sources]) => [element("dt", { text: name }), element("dd", { class: "value", text: value, "data-sources": sources.join(" ") })])); }
     for (const one of facts.querySelectorAll("dd")) one.classList.toggle("stale", one.dataset.sources.split(" ").some(isStale));

@@ -1,6 +1,6 @@
 // What the server has sent, the clock for its age, and the listeners to its changes.
 
-export const state = { catalog: null, me: null, values: {}, services: {}, stale: [], alarms: [], update: null, plant: { kind: "" }, tick: 0, heard: 0, refused: "" };
+export const state = { catalog: null, me: null, values: {}, services: {}, stale: [], alarms: [], update: null, plant: { kind: "" }, deviation: "", tick: 0, heard: 0, refused: "" };
 const listeners = [];
 const SILENT_MS = 1500, GIVEN_UP_MS = 5000, SEND_MS = 20000;
 
@@ -27,7 +27,7 @@ export function take(message) {
   const reset = message.whole;
   if (reset) state.values = {};
   Object.assign(state.values, message.values);
-  Object.assign(state, { services: message.services, plant: message.plant, stale: message.stale, tick: message.tick, heard: performance.now() });
+  Object.assign(state, { services: message.services, plant: message.plant, deviation: message.deviation, stale: message.stale, tick: message.tick, heard: performance.now() });
   if ("alarms" in message) state.alarms = message.alarms;
   if ("update" in message) state.update = message.update;
   if ("replay" in message) state.replay = message.replay;
