@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from coldloop.process.signals import TICK_S
 from optimizer_plc.budget import BudgetSettings, PlcBudget
 from optimizer_plc.solvers import make_solver
-from rig.studies.request import Outcome, Procedure, RunRequest, decisive_digest, settings_of
+from rig.studies.request import Outcome, Procedure, RunRequest, decisive_digest
+from rig.studies.settings import settings_of
 
 
 def iteration_limit(request: RunRequest) -> int | None:

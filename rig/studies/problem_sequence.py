@@ -7,7 +7,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.config import load_configuration
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load as load_model
 from coldloop.safety.sequence import InputSequence
@@ -19,8 +18,8 @@ from optimizer_plc.settings import ProgramSettings, SolverName
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
 from rig.results.recording import Recorder
-from rig.settings import Settings
 from rig.studies.played_profiles import PlayedProfiles
+from rig.studies.settings import settings_of
 
 Array = NDArray[np.float64]
 
@@ -82,7 +81,7 @@ def problem_sequence(scenario: Scenario, assignments: tuple[str, ...]) -> Proble
 
 @lru_cache(maxsize=2)
 def _recorded(scenario: Scenario, assignments: tuple[str, ...]) -> ProblemSequence:
-    settings = load_configuration(Settings, environment={}, assignments=(*assignments, *CONVERGED)).settings
+    settings = settings_of((*assignments, *CONVERGED))
     program = settings.optimizer_plc.program
     model = load_model(settings.model.file)
     rig = OneProcessRig(settings, compiled=False)

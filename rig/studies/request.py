@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.config import load_configuration
 from coldloop.errors import UsageError
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
@@ -32,6 +31,7 @@ from rig.settings import Settings
 from rig.studies.hindsight import Objective, run_best_in_hindsight
 from rig.studies.paired_run import harsh_run, paired_indicators, paired_run
 from rig.studies.problem_sequence import problem_sequence
+from rig.studies.settings import settings_of
 
 Series = NDArray[np.float64]
 
@@ -55,6 +55,7 @@ RIG_MODULES = (
     "rig.studies.played_profiles",
     "rig.studies.problem_sequence",
     "rig.studies.request",
+    "rig.studies.settings",
 )
 SUFFIXES = (".py", ".json", ".npz", ".csv")
 T9 = OUTPUT_NAMES.index("T9")
@@ -95,7 +96,7 @@ class RunRequest:
     updating_period_s: float
     """0 is adaptive."""
     assignments: tuple[str, ...] = ()
-    """Configuration that differs from the defaults, as `section.key=value`."""
+    """Configuration that differs from the paper's preset, as `section.key=value`."""
     draw: int = 1
     """Which draw of a named load this is; of a load file, which draw of the sensors' noise."""
     networked: bool = False
@@ -231,12 +232,6 @@ def perform(request: RunRequest) -> str:
         case Procedure.CONFIGURED:
             _rig(request.assignments).run(scenario, recorder)
     return _outcome(recorder.recording(), settings, request.trace_ticks).to_json()
-
-
-@lru_cache(maxsize=1024)
-def settings_of(assignments: tuple[str, ...]) -> Settings:
-    """Return the settings of a request; those of the environment do not count."""
-    return load_configuration(Settings, environment={}, assignments=assignments).settings
 
 
 @lru_cache(maxsize=1)

@@ -20,6 +20,7 @@ from optimizer_plc.budget import MAX_PERIOD_TICKS, BudgetSettings
 from optimizer_plc.computing_settings import (
     Arithmetic,
     DaqpSettings,
+    EstimatorKind,
     EstimatorSettings,
     FastGradientSettings,
     HybridSettings,
@@ -124,7 +125,7 @@ class ProgramSettings(BaseModel):
     adaptive: AdaptiveSettings = AdaptiveSettings()
     design: ControlDesign = ControlDesign()
     preset: Preset = Preset.TUNED
-    """Penalties and start of the ODE-based solver, as far as they are not set themselves."""
+    """Penalties, start of the ODE-based solver and disturbances, as far as they are not set themselves."""
     penalties: PenaltySettings = PenaltySettings()
     budget: BudgetSettings = BudgetSettings()
     estimator: EstimatorSettings = EstimatorSettings()
@@ -150,6 +151,8 @@ class ProgramSettings(BaseModel):
     def _completed(self) -> Self:
         """Take what was not set from the preset, and alpha of the solvers from the penalties."""
         for name, values in PRESETS[self.preset].items():
+            if name == "estimator" and self.estimator.kind is not EstimatorKind.KALMAN:
+                continue  # state feedback estimates nothing
             self.__dict__[name] = completed(getattr(self, name), values)  # before it is used: it is frozen then
         alpha = alpha_of(self.penalties, self.design)
         for key in ALPHAS:

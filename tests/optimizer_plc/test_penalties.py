@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from coldloop.process.limits import InputLimits
-from optimizer_plc.computing_settings import PENALTY_WEIGHT, OdeSettings
+from optimizer_plc.computing_settings import PENALTY_WEIGHT, EstimatorSettings, OdeSettings
 from optimizer_plc.qp.costs import augmented_cost, indicators
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.penalties import PRESETS, PenaltySettings, Preset
@@ -31,11 +31,16 @@ def as_printed_problem(prediction: PredictionModel) -> PredictiveProblem:
 # -- settings ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_tuned_preset_is_the_default() -> None:
-    chosen = ProgramSettings(preset=Preset.TUNED)
+def test_the_tuned_preset_is_the_default_and_differs_from_the_paper_s_in_the_estimator() -> None:
+    chosen, paper = ProgramSettings(preset=Preset.TUNED), ProgramSettings(preset=Preset.PAPER)
     assert chosen == ProgramSettings()
-    assert chosen.penalties == PenaltySettings()
-    assert chosen.ode == OdeSettings()
+    assert (chosen.penalties, chosen.ode) == (paper.penalties, paper.ode) == (PenaltySettings(), OdeSettings())
+    assert (chosen.estimator.disturbances, paper.estimator) == (("outputs",), EstimatorSettings())
+
+
+def test_state_feedback_estimates_no_disturbances_whatever_the_preset() -> None:
+    chosen = ProgramSettings.model_validate({"estimator": {"kind": "state-feedback"}})
+    assert not chosen.estimator.disturbances
 
 
 def test_a_preset_fills_what_is_not_set() -> None:

@@ -87,10 +87,13 @@ def test_commands_find_the_one_rig_that_is_up(coldloop: Coldloop, up: str) -> No
         assert outcome.out.split()[0] == coldloop(*words, "--port-base", up).out.split()[0]
 
 
-def test_a_rig_that_was_started_has_not_lost_anything_yet(coldloop: Coldloop, up: str) -> None:
-    outcome = coldloop("events", f"127.0.0.1:{int(up) + 1}", "--kind", "alarm raised")
+def test_a_rig_that_is_started_has_lost_nothing(coldloop: Coldloop, up: str) -> None:
+    """Its parts are powered up one after the other. On a busy machine the plant may be lost later."""
+    outcome = coldloop("events", f"127.0.0.1:{int(up) + 1}")
     assert outcome.code == 0, outcome.complaints
-    assert "plant" not in outcome.out, "its parts are powered up one after the other"
+    start, found, _ = outcome.out.partition("plant link synchronised")
+    assert found
+    assert "alarm raised" not in start
 
 
 def test_each_command_says_what_came_back(coldloop: Coldloop, up: str) -> None:

@@ -7,7 +7,8 @@ import pytest
 
 from rig.results.indicators import Indicators
 from rig.studies.beyond.contest import REFERENCE, SOLVERS, WAYS, ContestStudy
-from rig.studies.request import Outcome, RunRequest, settings_of
+from rig.studies.request import Outcome, RunRequest
+from rig.studies.settings import settings_of
 from rig.studies.study import StudyOptions
 
 if TYPE_CHECKING:

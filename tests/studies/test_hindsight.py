@@ -23,7 +23,8 @@ from rig.studies.hindsight import (
     segment_ends,
 )
 from rig.studies.paper.updating_period import INTERRUPT
-from rig.studies.request import Outcome, Procedure, perform, settings_of
+from rig.studies.request import Outcome, Procedure, perform
+from rig.studies.settings import settings_of
 from rig.studies.study import Load, StudyOptions, draw_of
 
 NOTHING = Optimization(*[0] * len(Optimization._fields))

@@ -9,7 +9,6 @@ import pytest
 
 from coldloop.errors import StudyError
 from coldloop.process.load_profile import LoadProfile
-from optimizer_plc.qp.penalties import Preset
 from rig.results.indicators import Indicators
 from rig.studies.beyond.penalties import PenaltiesStudy, misfit
 from rig.studies.beyond.penalty_variants import (
@@ -25,14 +24,15 @@ from rig.studies.beyond.penalty_variants import (
 from rig.studies.paper.best_periods import FIRST, end_over_best, share_inside
 from rig.studies.paper.open_loop import paired_loads
 from rig.studies.paper.updating_period import is_inside
-from rig.studies.request import Outcome, RunRequest, settings_of
+from rig.studies.request import Outcome, RunRequest
+from rig.studies.settings import settings_of
 from rig.studies.study import Load, StudyOptions, first_and_fresh
 
 if TYPE_CHECKING:
     from tests.studies.conftest import Conducted
 
 QUICK = StudyOptions(quick=True)
-TUNED, AS_PRINTED = PRESETS[Preset.TUNED], PRESETS[Preset.AS_PRINTED]
+TUNED, AS_PRINTED = PRESETS["tuned"], PRESETS["as-printed"]
 
 
 def test_each_variant_changes_what_its_preset_has() -> None:
@@ -40,7 +40,7 @@ def test_each_variant_changes_what_its_preset_has() -> None:
     settings = [settings_of(variant.assignments).optimizer_plc.program for variant in VARIANTS]
     documents = [one.model_dump_json() for one in settings]
     assert len(set(documents)) == len(VARIANTS)
-    assert sum(not variant.change for variant in VARIANTS) == len(Preset)
+    assert sum(not variant.change for variant in VARIANTS) == len(OWN)
     assert [len(own) for own in OWN.values()] == [7, 7]
 
 

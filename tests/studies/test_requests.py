@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.errors import ConfigurationError
-from rig.studies.request import Outcome, perform, settings_of
+from rig.studies.request import Outcome, perform
+from rig.studies.settings import settings_of
 from rig.studies.study import NOISE, StudyOptions, draw_of, loads
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Final
 
 MODES: Final = ("lockstep", "realtime")
 SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "hybrid", "daqp")
-PRESETS: Final = ("tuned", "as-printed")
+PRESETS: Final = ("tuned", "paper", "as-printed")
 LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h", "pulses")
 SERVICES: Final = ("control_plc", "optimizer_plc", "plant")
 REGISTER_FORMATS: Final = ("csv", "json", "markdown", "table")

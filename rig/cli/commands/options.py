@@ -112,7 +112,7 @@ def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
     load = parser.add_argument("--load", help=f"{', '.join(LOADS)}, {loads} (default: 2h)")
     load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
-    parser.add_argument("--preset", choices=PRESETS, help="penalties and start of the solver (default: tuned)")
+    parser.add_argument("--preset", choices=PRESETS, help="of solver and estimator (default: tuned)")
     parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
                         help="default: adaptive")  # fmt: skip
     parser.add_argument("--seed", type=int, help="seed of the sensors' noise (default: 1)")

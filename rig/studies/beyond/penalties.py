@@ -6,13 +6,14 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from optimizer_plc.qp.penalties import Preset
 from rig.studies import published
 from rig.studies.beyond.penalty_variants import (
+    AS_PRINTED,
     PRESETS,
     QPOASES,
     SETTLED,
     START_POWERS,
+    TUNED,
     Paired,
     PenaltyVariant,
     closed,
@@ -33,7 +34,7 @@ from rig.studies.request import RunRequest, Series
 from rig.studies.study import Outcomes, StudyOptions, StudyResult
 from rig.text_tables import Cell, markdown_table
 
-COLOURS: Final = {QPOASES: "#888888", Preset.TUNED.value: "#1f5fa8", Preset.AS_PRINTED.value: "#b3261e"}
+COLOURS: Final = {QPOASES: "#888888", TUNED: "#1f5fa8", AS_PRINTED: "#b3261e"}
 NOMINAL: Final = 1.0
 COLUMNS: Final = (
     "part", "load", "preset", "change", "power or period", "J_dev", "J_cst", "c1", "c2", "lowest", "J per time", "J_BF",
@@ -67,11 +68,11 @@ class PenaltiesStudy:
                 f"{preset}: crossing in total cost": found.crossings(None, variant),
                 f"{preset}: c1 at P = 1": [one.c1 for one in found.sums[variant, NOMINAL]],
                 f"{preset}: c2 at P = 1": [one.c2 for one in found.sums[variant, NOMINAL]],
-                **period_values(str(preset), timed[variant]),
+                **period_values(preset, timed[variant]),
             }
         result.remarks += [
             _crossing_text(found),
-            *(_table(preset, options, found, loops) for preset in Preset),
+            *(_table(preset, options, found, loops) for preset in PRESETS),
             *_start_table(options, found),
             *period_remarks(timed, list(periods(options))),
         ]
@@ -97,7 +98,7 @@ def _rows(
     timed: Mapping[PenaltyVariant, PeriodCosts],
 ) -> list[tuple[Cell, ...]]:
     def names(variant: PenaltyVariant | None) -> tuple[str, str]:
-        return (str(variant.preset), variant.change) if variant else ("", QPOASES)
+        return (variant.preset, variant.change) if variant else ("", QPOASES)
 
     nothing = (np.nan,) * 5
     rows: list[tuple[Cell, ...]] = [
@@ -145,16 +146,16 @@ def _of_paper(what: str) -> float:
     return value / float(qpoases[what][-1]) if what.startswith("J") else value
 
 
-def _table(preset: Preset, options: StudyOptions, found: Paired, loops: Mapping[PenaltyVariant, Series]) -> str:
+def _table(preset: str, options: StudyOptions, found: Paired, loops: Mapping[PenaltyVariant, Series]) -> str:
     """Return what one change at a time does to a preset, and the paper's points."""
     rows: list[tuple[Cell, ...]] = [(
         "the paper's points", f"{_of_paper('J_total'):.3f}", "", f"{_of_paper('J_dev'):.3f}",
         f"{_of_paper('J_cst'):.3f}", f"{_of_paper('c1'):.2f}", f"{_of_paper('c2'):.2f}", "",
     )]  # fmt: skip
     for variant in variants(options):
-        if variant.preset is not preset:
+        if variant.preset != preset:
             continue
-        closed_loop = mean_ratio(loops[variant], loops[PRESETS[Preset.TUNED]])
+        closed_loop = mean_ratio(loops[variant], loops[PRESETS[TUNED]])
         rows.append((
             variant.change or f"**{preset}**",
             found.interval(variant, NOMINAL).brief(4), *_settled(found, variant),
@@ -225,7 +226,7 @@ def _figure(found: Paired) -> Figure:
             label = variant.label if variant else QPOASES
             powers = found.powers[variant]
             above_lowest(place, powers, [found.interval(variant, power) for power in powers], COLOURS[label], label)
-        for solver, label in (("qpoases", QPOASES), ("ode", str(Preset.AS_PRINTED))):
+        for solver, label in (("qpoases", QPOASES), ("ode", AS_PRINTED)):
             total = np.maximum(points[solver]["J_total"] / converged - 1.0, LEAST_DRAWN)
             name = "qpOASES" if solver == "qpoases" else "ODE"
             paper(place, points[solver]["normalized_power"], total, COLOURS[label], f"{name}, paper")

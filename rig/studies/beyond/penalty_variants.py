@@ -1,4 +1,4 @@
-"""The two presets, what is changed of each, one thing at a time, and the runs that it takes to compare them."""
+"""The solver tuned and as printed, what is changed of each, one thing at a time, and the runs to compare them."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,11 +13,14 @@ from rig.studies.request import Procedure, RunRequest
 from rig.studies.solver_runs import throttled
 from rig.studies.study import PROGRAM, Load, Outcomes, StudyOptions, loads
 
+TUNED: Final = "tuned"
+AS_PRINTED: Final = Preset.AS_PRINTED.value
+
 
 class PenaltyVariant(NamedTuple):
-    """A preset, or a preset with one thing changed."""
+    """Penalties and start of the solver, tuned or as printed, or these with one thing changed."""
 
-    preset: Preset
+    preset: str
     change: str
     """Empty for the preset itself."""
     assignments: tuple[str, ...]
@@ -25,7 +28,7 @@ class PenaltyVariant(NamedTuple):
     @property
     def label(self) -> str:
         """Name in tables and figures."""
-        return f"{self.preset}, {self.change}" if self.change else str(self.preset)
+        return f"{self.preset}, {self.change}" if self.change else self.preset
 
     @property
     def is_start(self) -> bool:
@@ -61,23 +64,23 @@ CHANGES: Final = {
     "box penalty": "penalties.box=1", "no box penalty": "penalties.box=0",
 }  # fmt: skip
 OWN: Final = {
-    Preset.TUNED: ("alpha = 30 rho", "rate rows x 16", f"{COST_SCALE} 0.0001", "with look-ahead rows",
+    TUNED: ("alpha = 30 rho", "rate rows x 16", f"{COST_SCALE} 0.0001", "with look-ahead rows",
                    "held at bounds", "first knot as a box", "no box penalty"),
-    Preset.AS_PRINTED: ("alpha = 1 rho", "rate rows in % and W", f"{COST_SCALE} 1e-08", "without look-ahead rows",
+    AS_PRINTED: ("alpha = 1 rho", "rate rows in % and W", f"{COST_SCALE} 1e-08", "without look-ahead rows",
                         "not held at bounds", "first knot as rows", "box penalty"),
 }  # fmt: skip
 """What each preset has itself. A test compares it with the presets."""
 
 
-def _preset(preset: Preset) -> tuple[str, ...]:
-    """Return what asks for a preset; the default one is asked for by nothing, so that other studies share its runs."""
-    return () if preset is Preset.TUNED else (f"{PROGRAM}preset={preset}",)
+def _preset(preset: str) -> tuple[str, ...]:
+    """Return what asks for it; studies set out from the tuned one."""
+    return () if preset == TUNED else (f"{PROGRAM}preset={preset}",)
 
 
-PRESETS: Final = {preset: PenaltyVariant(preset, "", _preset(preset)) for preset in Preset}
+PRESETS: Final = {preset: PenaltyVariant(preset, "", _preset(preset)) for preset in OWN}
 VARIANTS: Final = tuple(
     variant
-    for preset in Preset
+    for preset in OWN
     for variant in (
         PRESETS[preset],
         *(

@@ -7,10 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from optimizer_plc.qp.penalties import Preset
 from rig.figures.plot import ACCENT, INK, THIRD
 from rig.studies import published
-from rig.studies.beyond.penalty_variants import PenaltyVariant
+from rig.studies.beyond.penalty_variants import AS_PRINTED, TUNED, PenaltyVariant
 from rig.studies.drawing import hour_panels, paper
 from rig.studies.intervals import Interval, geometric_mean, resampled
 from rig.studies.paper.updating_period import is_inside
@@ -78,7 +77,7 @@ def _row(table: Series, periods: Sequence[float]) -> tuple[Cell, ...]:
 
 def period_figure(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequence[float]) -> Figure:
     """Draw the first draw of each hour over its best period, both presets and the paper's points."""
-    colours = {Preset.TUNED: INK, Preset.AS_PRINTED: ACCENT}
+    colours = {TUNED: INK, AS_PRINTED: ACCENT}
     presets = {setting: costs for setting, costs in timed.items() if not setting.change}
     names = [load.name for load in next(iter(presets.values())) if load.draw == 1]
 

@@ -1,4 +1,4 @@
-"""What broken constraints cost in the augmented cost J, and presets of it; it imports nothing that takes time.
+"""What broken constraints cost in the augmented cost J, and presets; it imports nothing that takes time.
 
 J = J_0 + alpha sum max(Gamma z - gamma, 0)^2 + box alpha sum max(z - high, low - z, 0)^2 is the paper's eq. augmentedJ
 with mu = 2. `docs/penalties.md` says what each of these settings does to costs and figures.
@@ -46,14 +46,17 @@ class Preset(StrEnum):
     """Sets of settings by name; what is set explicitly in the same place comes before the preset's."""
 
     TUNED = "tuned"
-    """The defaults: as good as this project knows how to make the truncated solver."""
+    """As good as this project knows how to make it: the paper's preset, and an estimator that leaves no offset."""
+    PAPER = "paper"
+    """The paper's problem and estimator, with the truncated solver as good as this project knows how to make it."""
     AS_PRINTED = "as-printed"
     """What the paper prints and no more. Of the numbers that it leaves open, alpha is rho, all rows have the same alpha
     in their own units, and cost_scale is the one whose costs come down with the iterations as in the paper's figure."""
 
 
 PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
-    Preset.TUNED: {},
+    Preset.TUNED: {"estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0}},
+    Preset.PAPER: {},
     Preset.AS_PRINTED: {
         "penalties": {"output_rows": 1.0, "rate_rows": (100.0, 2500.0, 100.0), "box": 1.0, "first_knot_in_box": False},
         "ode": {"cost_scale": 1e-8, "look_ahead_rows": False, "hold_at_bounds": False},
@@ -61,7 +64,7 @@ PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
 }
 """Settings of each preset by section of `optimizer_plc.program`."""
 OF_PRESETS: Final = tuple(
-    f"{section}.{key}" for section, values in PRESETS[Preset.AS_PRINTED].items() for key in values
+    f"{section}.{key}" for preset in PRESETS.values() for section, values in preset.items() for key in values
 )
 """Keys of `optimizer_plc.program` that a preset decides."""
 OF_ALPHA: Final = ("penalties.output_rows", "design.violation_weight")
