@@ -1,6 +1,7 @@
 """What the reference PLC can do in an updating period, and whether its memory holds the problem, as text."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,17 +11,16 @@ from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import check_detectability
 from optimizer_plc.qp.arithmetic import real_of
-from optimizer_plc.qp.design import N_SLACKS, trivial_design
+from optimizer_plc.qp.design import trivial_design
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem
-from optimizer_plc.settings import ProgramSettings
+from optimizer_plc.settings import ProgramSettings, SolverName
 from rig.plc_sizing import operations
-from rig.plc_sizing.memory import Footprint, estimator_memory, footprint
+from rig.plc_sizing.memory import Footprint, estimator_memory, footprint, workspaces
 from rig.plc_sizing.operations import Operations
 from rig.plc_sizing.reference_plc import (
     ACTIVE_ROWS,
     MEMORY_BYTES,
-    QPOASES_ON_LAPTOP_S,
     WORKING_SET,
     SpeedCurve,
     cholesky_times,
@@ -28,18 +28,27 @@ from rig.plc_sizing.reference_plc import (
     residuals,
     slow_down,
 )
+from rig.plc_sizing.sizes import QpSizes, dense_sizes, sizes_without_zeros
+from rig.plc_sizing.solver_counts import SOLVERS
 from rig.settings import Settings
 from rig.text_tables import aligned
 
-POWERS = (0.2, 0.4, 0.6, 1.0, 2.0, 5.0, 10.0, 25.0)
-PERIODS_S = (1.0, 2.0, 3.0, 4.0, 5.0)
+PERIODS_S = (1.0, 2.5, 5.0)
+SOLVER_COLUMNS = ("solver", "paper s", "dense s", "without zeros s", "tau_1_s", "default follows")
+
+
+class CountedSizes(NamedTuple):
+    """The sizes of a problem, counted in both ways."""
+
+    dense: QpSizes
+    without_zeros: QpSizes
 
 
 def budget_tables(settings: Settings, power: float | None, period_s: float | None) -> str:
-    """Return the tables as text, for one power and one updating period or for several."""
-    powers = POWERS if power is None else (power,)
-    periods = PERIODS_S if period_s is None else (period_s,)
+    """Return the tables as text, for one power (default: the configured one) and one updating period or several."""
     program = settings.optimizer_plc.program
+    if power is not None:
+        program = program.model_copy(update={"budget": program.budget.model_copy(update={"power": power})})
     prediction = PredictionModel(load(settings.model.file)).with_disturbances(program.estimator.disturbed)
     check_detectability(prediction)
     real = real_of(Arithmetic.FLOAT32)
@@ -49,11 +58,20 @@ def budget_tables(settings: Settings, power: float | None, period_s: float | Non
     estimator = estimator_memory(prediction, program.estimator)
     parts = [
         _speed(curve, problem.size),
-        _operations(problem, prediction, curve),
-        _iterations(program, powers, periods),
+        _operations(problem, prediction),
+        f"seconds at P = 1, iterations done at P = {program.budget.power:g}\n"
+        + aligned(solver_table(program, problem, PERIODS_S if period_s is None else (period_s,)), numbers=True),
         _memory([footprint(one, estimator) for one in (problem, trivial)], [problem.size, trivial.size]),
     ]
     return "\n".join(parts)
+
+
+def counted_sizes(problem: PredictiveProblem) -> CountedSizes:
+    """Return the sizes of a problem, counted in both ways."""
+    return CountedSizes(
+        dense_sizes(problem.size, len(problem.Gamma), problem.n_inputs),
+        sizes_without_zeros(problem.Phi, problem.Gamma, np.isfinite(problem.maps.high)),
+    )
 
 
 def _speed(curve: SpeedCurve, size: int) -> str:
@@ -66,62 +84,53 @@ def _speed(curve: SpeedCurve, size: int) -> str:
     )
 
 
-def _operations(problem: PredictiveProblem, prediction: PredictionModel, curve: SpeedCurve) -> str:
-    n, m, mean = problem.size, len(problem.Gamma), ACTIVE_ROWS.mean
+def _operations(problem: PredictiveProblem, prediction: PredictionModel) -> str:
+    dense, without_zeros = counted_sizes(problem)
+    m, mean = dense.m, ACTIVE_ROWS.mean
+    variants: dict[str, Callable[[QpSizes], Operations]] = {
+        "ode, no row active": lambda sizes: operations.ode(sizes, 0),
+        f"ode, {mean:g} rows active (mean)": lambda sizes: operations.ode(sizes, mean),
+        f"ode, {mean:g} rows active (mean), velocity kept": lambda sizes: operations.ode_kept(sizes, mean),
+        f"ode, {ACTIVE_ROWS.worst:g} rows active (worst seen)": lambda sizes: operations.ode(sizes, ACTIVE_ROWS.worst),
+        f"ode, all {m} rows active": lambda sizes: operations.ode(sizes, m),
+        f"qpoases, {WORKING_SET:g} constraints held": SOLVERS[SolverName.QPOASES].operations,
+        "osqp": SOLVERS[SolverName.OSQP].operations,
+        f"fast-gradient, {mean:g} rows active": SOLVERS[SolverName.FAST_GRADIENT].operations,
+        "interior-point": SOLVERS[SolverName.INTERIOR_POINT].operations,
+        f"daqp, {WORKING_SET:g} constraints held": SOLVERS[SolverName.DAQP].operations,
+    }
+    rows: list[tuple[str, ...]] = [("one iteration", "operations", "without zeros", "kB moved", "without zeros")]
+    for name, count in variants.items():
+        both = count(dense), count(without_zeros)
+        rows.append((name, *(f"{one.flops:,.0f}" for one in both), *(f"{one.bytes / 1e3:.1f}" for one in both)))
     sizes = operations.PreparationSizes(
-        n, m, m - 4 * len(problem.design.constraint_instants), problem.n_knots, prediction.n_states,
+        dense, m - 4 * len(problem.design.constraint_instants), problem.n_knots, prediction.n_states,
         prediction.D.shape[1], prediction.D.shape[0], segments=1, samples=1,
     )  # fmt: skip
-    counts: dict[str, Operations] = {
-        "ODE, no row active": operations.ode(n, m, 0),
-        f"ODE, {mean:g} rows active (mean)": operations.ode(n, m, mean),
-        f"ODE, {mean:g} rows active (mean), velocity kept": operations.ode_kept(n, m, mean),
-        f"ODE, {ACTIVE_ROWS.worst:g} rows active (worst seen)": operations.ode(n, m, ACTIVE_ROWS.worst),
-        f"ODE, all {m} rows active": operations.ode(n, m, m),
-        f"qpOASES, {WORKING_SET:g} constraints held": operations.qpoases(n, m, WORKING_SET),
-        "OSQP": operations.osqp(n, m),
-        f"fast gradient, {mean:g} rows active": operations.fast_gradient(n, m, mean),
-        "interior point": interior_point(problem),
-        f"DAQP, {WORKING_SET:g} constraints held": operations.daqp(n, m, WORKING_SET),
-        "preparation, once an updating period": operations.preparation(sizes, mean),
-    }
-    speed = curve.flops_per_s(n)
-    rows = [("one iteration", "operations", "kB moved", "s at P = 1")]
-    rows += [
-        (name, f"{count.flops:,.0f}", f"{count.bytes / 1e3:.1f}", f"{count.flops / speed:.3f}")
-        for name, count in counts.items()
-    ]
-    rows.append(("qpOASES, as in the paper", "", "", f"{QPOASES_ON_LAPTOP_S * slow_down(cholesky_times(), n):.3f}"))
+    once = operations.preparation(sizes, mean)
+    rows.append(("preparation, once an updating period", f"{once.flops:,.0f}", "", f"{once.bytes / 1e3:.1f}", ""))
     return aligned(rows, numbers=True)
 
 
-def interior_point(problem: PredictiveProblem) -> Operations:
-    """Return the operations of an iteration of the interior-point method, its J included."""
-    n, m, inputs = problem.size, len(problem.Gamma), problem.n_inputs
-    k = np.count_nonzero(problem.Gamma, axis=1)
-    rows = operations.SparseRows(float(k.sum()), float((k * (k + 1) / 2).sum()))
-    factorisation = operations.slacks_first(n, n - inputs, N_SLACKS)
-    step = operations.interior_point(n, m, inputs, rows, factorisation)
-    return step.plus(operations.augmented_cost(n, m, ACTIVE_ROWS.mean))
+def solver_table(
+    program: ProgramSettings, problem: PredictiveProblem, periods_s: Sequence[float]
+) -> list[tuple[str, ...]]:  # fmt: skip
+    """Return, solver by solver, the times of an iteration at P = 1, the iterations done in periods, and the memory.
 
-
-def _iterations(program: ProgramSettings, powers: Sequence[float], periods: Sequence[float]) -> str:
-    """Return the iterations with the tau_1 that runs use."""
-    tau_1_s = {
-        "ODE": program.ode.tau_1_s,
-        "qpOASES": program.qpoases.tau_1_s,
-        "OSQP": program.osqp.tau_1_s,
-        "fast gradient": program.fast_gradient.tau_1_s,
-        "interior point": program.interior_point.tau_1_s,
-        "DAQP": program.daqp.tau_1_s,
-    }
-    rows = [("iterations", "s", "P", *(f"tau_u {period:g} s" for period in periods))]
-    for solver, seconds in tau_1_s.items():
-        for power in powers:
-            plc = PlcBudget(program.budget.model_copy(update={"power": power}), seconds)
-            done = (str(plc.iterations(round(period / TICK_S))) for period in periods)
-            rows.append((solver, f"{seconds:.3f}", f"{power:g}", *done))
-    return aligned(rows, numbers=True)
+    The first row is the header.
+    """
+    sizes, speed = counted_sizes(problem), fitted(cholesky_times()).flops_per_s(problem.size)
+    memory = workspaces(problem.size, len(problem.Gamma))
+    rows: list[tuple[str, ...]] = [(*SOLVER_COLUMNS, *(f"in {period:g} s" for period in periods_s), "kB")]
+    for name, solver in SOLVERS.items():
+        tau_1_s = solver.tau_1_s(program)
+        plc = PlcBudget(program.budget, tau_1_s)
+        rows.append((
+            name, "" if solver.paper_s is None else f"{solver.paper_s:.2f}",
+            *(f"{solver.operations(one).flops / speed:.3f}" for one in sizes), f"{tau_1_s:g}", solver.default,
+            *(str(plc.iterations(round(period / TICK_S))) for period in periods_s), f"{memory[name] / 1e3:.1f}",
+        ))  # fmt: skip
+    return rows
 
 
 def _memory(footprints: Sequence[Footprint], sizes: Sequence[int]) -> str:

@@ -11,10 +11,45 @@ from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.design import N_INPUTS
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem
+from optimizer_plc.settings import SolverName
 from rig.plc_sizing.operations import WORD
 
-N_VECTORS = 8
-"""Vectors of z's size that a step of the ODE solver has at a time, and half as many of gamma's."""
+
+class Workspace(NamedTuple):
+    """What a solver holds at a time besides the problem, in numbers of single precision; zeros are stored.
+
+    Our own solvers as in their code, without copies of Phi and Gamma in another order; the others as their papers have
+    them.
+    """
+
+    matrices: int
+    """Elements of matrices."""
+    by_variable: int
+    """Vectors with an element for each variable."""
+    by_row: int
+    """Vectors with an element for each row of Gamma."""
+
+
+def workspaces(n: int, m: int) -> dict[SolverName, int]:
+    """Return the bytes of each solver's workspace for n variables and m rows."""
+    triangle = n * (n + 1) // 2
+    held = {
+        # stage matrix; three points, four velocities, variables held; excess and three sets of active rows
+        SolverName.ODE: Workspace(n * n, 8, 4),
+        # Q, R, T; z, multipliers and data (gradient, bounds) with their steps, two products
+        SolverName.QPOASES: Workspace(3 * n * n, 12, 6),
+        # L; z and z~ with scaling, five vectors of the rows of Gamma and of the n bounds, D of L D L'
+        SolverName.OSQP: Workspace(n * m + triangle, 10, 6),
+        # z, the extrapolated point, gradient, change, step sizes; excess and active rows
+        SolverName.FAST_GRADIENT: Workspace(0, 5, 2),
+        # Newton matrix; point, step, predicted point (z and two multipliers each), distances of both points, products,
+        # gradient, best point
+        SolverName.INTERIOR_POINT: Workspace(n * n, 17, 8),
+        # M, R^-1, L; nine vectors of variables, three of rows and bounds
+        SolverName.DAQP: Workspace(n * m + 2 * triangle + n + 1, 12, 3),
+    }
+    sizes = {name: WORD * (one.matrices + one.by_variable * n + one.by_row * m) for name, one in held.items()}
+    return {**sizes, SolverName.HYBRID: max(sizes[SolverName.ODE], sizes[SolverName.INTERIOR_POINT])}
 
 
 class Footprint(NamedTuple):
@@ -27,7 +62,7 @@ class Footprint(NamedTuple):
     shift: int
     """One shift of the profile; its other shifts are computed when they are needed."""
     solver: int
-    """Stage matrix and vectors."""
+    """Workspace of the ODE-based solver."""
     estimator: int
     """Transitions and Kalman gains of every updating period, output matrices."""
     sequence: int
@@ -52,12 +87,11 @@ def footprint(problem: PredictiveProblem, estimator: int) -> Footprint:
     """Return what a problem made in single precision needs in addition to an estimator of so many bytes."""
     if problem.Phi.dtype != np.float32:
         raise ValueError("the PLC computes in single precision")
-    profile = problem.hold(np.zeros(N_INPUTS, problem.Phi.dtype.type))
     return Footprint(
         hessian=problem.Phi.nbytes,
         problem=problem.memory() - problem.Phi.nbytes,
         shift=problem.Phi.nbytes,
-        solver=problem.Phi.nbytes + N_VECTORS * profile.nbytes + N_VECTORS // 2 * WORD * len(problem.Gamma),
+        solver=workspaces(problem.size, len(problem.Gamma))[SolverName.ODE],
         estimator=estimator,
         sequence=2 * SEQUENCE_ROWS * N_INPUTS * WORD,
     )

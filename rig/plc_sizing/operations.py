@@ -3,10 +3,17 @@
 Convention, the same for the Cholesky factorisation that the PLC's speed was measured with: an addition, subtraction,
 multiplication, division, square root or power is one operation; comparisons, minima, maxima, signs, masks and
 indices are none. Bytes are single-precision matrix elements read or written, pass by pass; vectors are left out.
-n variables, m rows of Gamma, a of them active; matrices are dense.
+The sizes say which elements count: all, or those that can be non-zero. Active rows are mean ones.
 """
 
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.plc_sizing.sizes import QpSizes
+
+Array = NDArray[np.float64] | NDArray[np.int64]
 
 WORD = 4
 """Bytes of a number."""
@@ -28,141 +35,132 @@ class Operations(NamedTuple):
         return Operations(self.flops * count, self.bytes * count)
 
 
-def matrix_vector(rows: float, columns: float) -> Operations:
-    """Return those of y += A x."""
-    return Operations(2 * rows * columns, WORD * rows * columns)
+def product(elements: float) -> Operations:
+    """Return those of y += A x, where A has so many elements."""
+    return Operations(2 * elements, WORD * elements)
 
 
-def cholesky(n: float) -> Operations:
-    """Return those of `linear_algebra.cholesky`: n^3/3 + n^2/2 + 7n/6."""
-    return Operations(n**3 / 3 + n**2 / 2 + 7 * n / 6, WORD * (3 * (n**3 - n) / 6 + n**2))
+def cholesky(factor: Array) -> Operations:
+    """Return those of a factorisation U' U = A, where the rows of U have so many elements right of the diagonal, (n,).
+
+    Row by row: a root, a reciprocal, the row, and its outer product with itself, subtracted from the rows below.
+    """
+    return Operations(
+        float((2 + 2 * factor + factor**2).sum()), WORD * float((1.5 * factor * (factor + 1) + 2 * factor + 1).sum())
+    )
 
 
-def cholesky_solve(n: float) -> Operations:
+def dense_cholesky(n: float) -> Operations:
+    """Return those of a dense factorisation: n^3/3 + n^2/2 + 7n/6."""
+    return cholesky(np.arange(n))
+
+
+def cholesky_solve(factor: Array) -> Operations:
     """Return those of both triangular solves."""
-    return Operations(2 * n**2, WORD * (n**2 + n))
+    n, elements = len(factor), float(factor.sum())
+    return Operations(4 * elements + 2 * n, 2 * WORD * (elements + n))
 
 
-def gradient(n: float, m: float, active: float) -> Operations:
+def gradient(s: QpSizes, active: float) -> Operations:
     """Return those of the gradient of the augmented cost."""
-    rows = Operations(2 * n + 2, WORD * n).times(active)
-    return matrix_vector(n, n).plus(matrix_vector(m, n), rows, Operations(3 * n))
+    rows = Operations(2 * s.row + 2, WORD * s.row).times(active)
+    return product(s.Phi).plus(product(s.Gamma), rows, Operations(2 * s.n))
 
 
-def augmented_cost(n: float, m: float, active: float) -> Operations:
+def augmented_cost(s: QpSizes, active: float) -> Operations:
     """Return those of the augmented cost."""
-    return matrix_vector(n, n).plus(matrix_vector(m, n), Operations(2 * n + 2 * active + 2))
+    return product(s.Phi).plus(product(s.Gamma), Operations(2 * s.n + 2 * active + 2))
 
 
-def stage_matrix(n: float, active: float) -> Operations:
+def stage_matrix(s: QpSizes, active: float) -> Operations:
     """Return those of I + w Hess(J), upper triangle."""
-    triangle = n * (n + 1) / 2
-    row = Operations(2 * n + 2 * triangle, WORD * (2 * n + 3 * triangle))
-    return Operations(3 + triangle + n, 2 * WORD * triangle).plus(row.times(active))
+    outer = s.outer / s.m
+    row = Operations(2 * s.row + 2 * outer, WORD * (2 * s.row + 3 * outer))
+    return Operations(3 + s.triangle + s.n, 2 * WORD * s.triangle).plus(row.times(active))
 
 
-def ode(n: float, m: float, active: float) -> Operations:
+def ode(s: QpSizes, active: float) -> Operations:
     """Return those of one step of TR-BDF2 that is accepted, with the same rows active at its three points."""
-    vectors = Operations(18 * n + 5)  # two stages 11n + 2, error 7n, next step size 3
-    return gradient(n, m, active).times(3).plus(
-        stage_matrix(n, active), cholesky(n), cholesky_solve(n).times(2), augmented_cost(n, m, active), vectors
+    velocity = gradient(s, active).plus(Operations(s.n))
+    vectors = Operations(18 * s.n + 5)  # two stages 11n + 2, error 7n, next step size 3
+    return velocity.times(3).plus(
+        stage_matrix(s, active), cholesky(s.factor), cholesky_solve(s.factor).times(2), augmented_cost(s, active),
+        vectors,
     )  # fmt: skip
 
 
-def ode_kept(n: float, m: float, active: float) -> Operations:
+def ode_kept(s: QpSizes, active: float) -> Operations:
     """Return those of the same step after another one: its first velocity and the cost's Gamma z are known."""
-    known = gradient(n, m, active).plus(matrix_vector(m, n))
-    return ode(n, m, active).plus(known.times(-1))
+    known = gradient(s, active).plus(Operations(s.n), product(s.Gamma))
+    return ode(s, active).plus(known.times(-1))
 
 
-def qpoases(n: float, m: float, active: float) -> Operations:
-    """Return those of one working-set change of a dense null-space active-set method with `active` constraints fixed.
+def qpoases(s: QpSizes, active: float) -> Operations:
+    """Return those of one working-set change of a null-space active-set method with `active` constraints fixed.
 
     After Ferreau et al., qpOASES: a parametric active-set algorithm (Math. Prog. Comp. 6, 2014), and Gill et al.,
     Procedures for optimization problems with a mixture of bounds and general linear constraints (ACM TOMS 10, 1984):
     products with Q = (Z Y) and H, solves with T and the Cholesky factor R of Z' H Z, the steps of all rows and of
-    the multipliers for the ratio test, then plane rotations (6 operations a pair) of Q, T and R.
+    the multipliers for the ratio test, then plane rotations (6 operations a pair) of Q, T and R, which are dense.
     """
-    free = n - active
-    direction = matrix_vector(n, n).times(3).plus(matrix_vector(active, active), matrix_vector(free, free))
-    ratio_test = matrix_vector(m, n).plus(matrix_vector(n, active), Operations(2 * (n + m)))
+    n, free = s.n, s.n - active
+    direction = product(n * n).times(2).plus(product(s.Phi), product(active**2), product(free**2))
+    ratio_test = product(s.Gamma).plus(product(n * active), Operations(2 * (n + s.m)))
     rotated = free * n + (active**2 + free**2) / 2
     return direction.plus(ratio_test, Operations(6 * rotated, 4 * WORD * rotated))
 
 
-def osqp(n: float, m: float) -> Operations:
+def osqp(s: QpSizes) -> Operations:
     """Return those of one ADMM iteration; rows are those of Gamma and the n bounds.
 
     After Stellato et al., OSQP (Math. Prog. Comp. 12, 2020), algorithm 1. The rows' diagonal block is eliminated first,
-    so L has the rows' elements and a dense triangle.
+    so L has the rows' elements and the factor of what is left.
     """
-    rows = m + n
-    elements = n * m + n + n * (n - 1) / 2
-    return Operations(4 * elements + (n + rows), 2 * WORD * elements).plus(Operations(5 * n + 14 * rows))
+    rows = s.m + s.n
+    elements = s.Gamma + s.n + float(s.factor.sum())
+    return Operations(4 * elements + (s.n + rows), 2 * WORD * elements).plus(Operations(5 * s.n + 14 * rows))
 
 
-def fast_gradient(n: float, m: float, active: float) -> Operations:
+def fast_gradient(s: QpSizes, active: float) -> Operations:
     """Return those of one gradient step of the augmented cost with momentum; its projection only compares."""
-    return gradient(n, m, active).plus(Operations(5 * n))
+    return gradient(s, active).plus(Operations(9 * s.n + 8))
 
 
-class SparseRows(NamedTuple):
-    """Elements of Gamma that are not zero: k_r in row r."""
-
-    elements: float
-    """Their number: the sum of k_r."""
-    pairs: float
-    """The sum of k_r (k_r + 1) / 2: elements of the upper triangle that the rows add to."""
-
-
-def slacks_first(n: float, slacks: int, chains: int) -> Operations:
-    """Return those of `linear_algebra.cholesky` where the first `slacks` variables are `chains` tridiagonal blocks.
-
-    Each is coupled with the next one of its chain, `chains` places on, and with all variables behind the slacks.
-    """
-    dense = n - slacks
-    flops = bytes_moved = 0.0
-    for k in range(slacks):
-        neighbour = 2 * (n - k - chains) if k + chains < slacks else 0.0
-        flops += n - k + 1 + neighbour + dense * (dense + 1)
-        bytes_moved += WORD * (2 * (n - k) + 1.5 * (neighbour + dense * (dense + 1)))
-    return Operations(flops, bytes_moved).plus(cholesky(dense))
-
-
-def interior_point(n: float, m: float, bounded: float, rows: SparseRows, factorisation: Operations) -> Operations:
-    """Return those of one predictor and corrector step; `bounded` variables have an upper bound, too.
-
-    With each step the augmented cost is computed, which is not part of this.
-    """
-    bounds = n + bounded
-    through = Operations(2 * rows.elements, WORD * rows.elements)  # Gamma z, or Gamma' lambda
+def interior_point(s: QpSizes, active: float) -> Operations:
+    """Return those of one predictor and corrector step, and of the augmented cost after it."""
+    n, m = s.n, s.m
+    bounds = n + s.bounded
+    through = product(s.Gamma)  # Gamma z, or Gamma' lambda
     away = through.plus(Operations(3 * m + 2 * n))
     mean = Operations(2 * (m + bounds) + 1)
-    gradient = matrix_vector(n, n).plus(through, Operations(2 * n))
-    matrix = Operations(2 * bounds + 3 * m + rows.elements + 2 * rows.pairs, 2 * WORD * (rows.pairs + n * n / 2))
-    solve = through.times(2).plus(cholesky_solve(n), Operations(10 * m + 5 * bounds))
+    slope = product(s.Phi).plus(through, Operations(2 * n))
+    matrix = Operations(2 * bounds + 3 * m + s.Gamma + 2 * s.outer, 2 * WORD * (s.outer + s.triangle))
+    solve = through.times(2).plus(cholesky_solve(s.factor), Operations(10 * m + 5 * bounds))
     products = Operations(4 * (m + bounds) + 4)
-    reach = Operations(2 * (2 * m + 2 * n + n + bounded))
+    reach = Operations(2 * (2 * m + 2 * n + bounds))
     moves = Operations(2 * (3 * n + m)).plus(reach).times(2)
-    return away.times(2).plus(mean.times(2), gradient, matrix, factorisation, solve.times(2), products, moves)
+    return away.times(2).plus(
+        mean.times(2), slope, matrix, cholesky(s.factor), solve.times(2), products, moves, augmented_cost(s, active)
+    )
 
 
-def daqp(n: float, m: float, active: float) -> Operations:
+def daqp(s: QpSizes, active: float) -> Operations:
     """Return those of one working-set change of a dual active-set method with an LDL' factor of size `active`.
 
     After Arnstroem, Bemporad, Axehill, A dual active-set solver for embedded quadratic programming using recursive
-    LDL' updates (IEEE TAC 67, 2022): the new row of M M', its row of L, two solves, u = M' lambda, and all rows' slack.
+    LDL' updates (IEEE TAC 67, 2022), with M = (I; Gamma) R^-1: the new row of M M', its row of L, two solves,
+    u = M' lambda, and all rows' slack.
     """
-    update = matrix_vector(active, n).plus(matrix_vector(active, active).times(0.5))
-    direction = matrix_vector(active, active).plus(matrix_vector(n, active), Operations(4 * active))
-    return update.plus(direction, matrix_vector(m + n, n))
+    held = product(active * s.transformed / (s.m + s.n))
+    update = held.plus(product(active**2).times(0.5))
+    direction = product(active**2).plus(held, Operations(4 * active))
+    return update.plus(direction, product(s.transformed))
 
 
 class PreparationSizes(NamedTuple):
     """Sizes of what happens once an updating period."""
 
-    n: int
-    rows: int
+    problem: QpSizes
     rate_rows: int
     knots: int
     states: int
@@ -176,28 +174,25 @@ class PreparationSizes(NamedTuple):
 
 def preparation(sizes: PreparationSizes, active: float) -> Operations:
     """Return those of the Kalman correction, J_k, the prediction, the instance, the shift, the start, the sequence."""
-    n, m, states = sizes.n, sizes.rows, sizes.states
+    n, states = sizes.problem.n, sizes.states
     correct = _response(sizes.outputs, sizes).plus(
-        matrix_vector(states + 1, sizes.outputs), Operations(states + sizes.inputs + 2 * sizes.outputs + 4)
+        product((states + 1) * sizes.outputs), Operations(states + sizes.inputs + 2 * sizes.outputs + 4)
     )
     predict = _response(states, sizes).times(sizes.segments)
-    start = gradient(n, m, active).plus(Operations(2 * n + 2))
-    sequence = matrix_vector(sizes.samples * sizes.inputs, sizes.knots).plus(
-        Operations(4 * sizes.samples * sizes.inputs)
-    )
-    costs = augmented_cost(n, m, active).times(2)
-    return correct.plus(predict, instance(sizes).times(2), matrix_vector(n, n), costs, start, sequence)
+    start = gradient(sizes.problem, active).plus(Operations(3 * n + 2))
+    sequence = product(sizes.samples * sizes.inputs * sizes.knots).plus(Operations(4 * sizes.samples * sizes.inputs))
+    costs = augmented_cost(sizes.problem, active).times(2)
+    return correct.plus(predict, instance(sizes).times(2), product(n * n), costs, start, sequence)
 
 
 def instance(sizes: PreparationSizes) -> Operations:
     """Return those of phi, gamma, the bounds and the constant."""
     s = sizes.states + 1
-    maps = matrix_vector(sizes.n, s).plus(matrix_vector(sizes.rows - sizes.rate_rows, s), matrix_vector(s, s))
-    return maps.plus(
-        matrix_vector(sizes.rate_rows, sizes.inputs), Operations(sizes.rate_rows + 4 * sizes.inputs + 2 * s)
-    )
+    output_rows = sizes.problem.m - sizes.rate_rows
+    maps = product(sizes.problem.n * s).plus(product(output_rows * s), product(s * s))
+    return maps.plus(product(sizes.rate_rows * sizes.inputs), Operations(sizes.rate_rows + 4 * sizes.inputs + 2 * s))
 
 
 def _response(results: int, sizes: PreparationSizes) -> Operations:
     """Return those of A x + B u + F w."""
-    return matrix_vector(results, sizes.states + sizes.inputs).plus(Operations(results, WORD * results))
+    return product(results * (sizes.states + sizes.inputs)).plus(Operations(results, WORD * results))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.plc_sizing.operations import cholesky
+from rig.plc_sizing.operations import dense_cholesky
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class SpeedCurve(NamedTuple):
 
     def flops_per_s(self, length: float) -> float:
         """Return the speed in loops as long as those of a factorisation of size `length`."""
-        return cholesky(length).flops / self.time_s(length)
+        return dense_cholesky(length).flops / self.time_s(length)
 
 
 def cholesky_times() -> CholeskyTimes:

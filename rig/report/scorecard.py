@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
 
-from rig.plc_sizing.operations import cholesky
+from rig.plc_sizing.operations import dense_cholesky
 from rig.plc_sizing.reference_plc import cholesky_times
 from rig.studies import published as paper
 from rig.studies.intervals import geometric_mean
@@ -183,7 +183,7 @@ def _updating_period() -> dict[str, float]:
 
 def _cholesky() -> dict[str, float]:
     size, plc_s, laptop_s = cholesky_times()
-    speed = np.array([cholesky(n).flops for n in size.tolist()]) / plc_s / 1e6
+    speed = np.array([dense_cholesky(n).flops for n in size.tolist()]) / plc_s / 1e6
     return {SPEED: float(speed[size >= 50].mean()), SLOW_DOWN: float((plc_s / laptop_s)[size >= 40].mean())}
 
 

@@ -156,7 +156,7 @@ class OsqpSettings(BaseModel):
     relaxation: Annotated[float, Field(gt=0.0, lt=2.0)] = 1.6
     """What OSQP calls alpha."""
     tau_1_s: PositiveFloat = 0.05
-    """25,763 operations at 0.529 Mflop/s (`docs/budget.md`)."""
+    """25,763 operations, dense, at 0.529 Mflop/s (`docs/budget.md`)."""
 
 
 class FastGradientSettings(BaseModel):
@@ -168,7 +168,7 @@ class FastGradientSettings(BaseModel):
     adaptive_restart: bool = True
     """Whether the momentum is dropped when it points uphill."""
     tau_1_s: PositiveFloat = 0.03
-    """14,656 operations at 0.529 Mflop/s are 0.028 s (`docs/budget.md`)."""
+    """14,811 operations, dense, at 0.529 Mflop/s are 0.028 s (`docs/budget.md`)."""
 
 
 class DaqpSettings(BaseModel):
@@ -197,7 +197,7 @@ class InteriorPointSettings(BaseModel):
     margin: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1
     """Share of the box's width by which the guess is at least moved away from its bounds."""
     tau_1_s: PositiveFloat = 0.17
-    """87,700 operations at 0.529 Mflop/s are 0.166 s (`docs/budget.md`)."""
+    """From an upper bound of our code's 78,769 operations, 0.149 s at 0.529 Mflop/s (`docs/budget.md`)."""
 
 
 class HybridSettings(BaseModel):

@@ -15,9 +15,11 @@ USUAL_SCENARIOS: Final = 100
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument("--power", type=_power, metavar="P", help="one power relative to the PLC (default: several)")
+    parser.add_argument(
+        "--power", type=_power, metavar="P", help="one power relative to the PLC (default: as configured)"
+    )
     parser.add_argument("--updating-period", dest="period", type=fixed_updating_period, metavar="SECONDS",
-                        help="one updating period (default: 1 to 5 s)")  # fmt: skip
+                        help="one updating period (default: 1, 2.5 and 5 s)")  # fmt: skip
     parser.add_argument("--certify", type=_scenarios, nargs="?", const=USUAL_SCENARIOS, metavar="N",
                         help="how many iterations are enough, by N sampled scenarios, with its confidence "
                         f"(default: {USUAL_SCENARIOS})")  # fmt: skip

@@ -34,6 +34,7 @@ from rig.plc_sizing.reference_plc import (
     residuals,
     slow_down,
 )
+from rig.plc_sizing.sizes import dense_sizes
 from rig.studies.drawing import legend_outside, panels, paper
 from rig.studies.request import RunRequest, Series
 from rig.studies.study import Outcomes, StudyOptions, StudyResult
@@ -41,8 +42,10 @@ from rig.text_tables import Cell, markdown_table
 
 SPEED: Final = "Mflop/s from n = 50 on"
 SLOW_DOWN: Final = "slow-down against the laptop, sizes 40 to 125"
-N, M = 49, 94
-"""Variables and rows of the paper's problem."""
+N: Final = 49
+"""Variables of the paper's problem."""
+SIZES: Final = dense_sizes(N, 94, 21)
+"""Of the paper's problem, zeros counted."""
 REPEATS = 20
 
 
@@ -72,9 +75,9 @@ class CholeskyStudy:
         modelled = np.array([curve.time_s(n) for n in times.size.tolist()])
         reduced, trivial = _footprints()
         values = {
-            SPEED: float(np.mean([operations.cholesky(n).flops / curve.time_s(n) / 1e6 for n in large.tolist()])),
+            SPEED: float(np.mean([operations.dense_cholesky(n).flops / curve.time_s(n) / 1e6 for n in large.tolist()])),
             SLOW_DOWN: float((modelled / times.laptop_s)[times.size >= 40].mean()),
-            "tau_1 of the ODE-based solver (s)": _counted_s(curve, operations.ode(N, M, ACTIVE_ROWS.mean)),
+            "tau_1 of the ODE-based solver (s)": _counted_s(curve, operations.ode(SIZES, ACTIVE_ROWS.mean)),
             "tau_1 of qpOASES by the paper's route (s)": QPOASES_ON_LAPTOP_S * slow_down(times, N),
             "memory of the trivial problem over that of the PLC": trivial.total / MEMORY_BYTES,
             "memory of the reduced problem over that of the PLC": reduced.total / MEMORY_BYTES,
@@ -116,8 +119,8 @@ def _footprints() -> tuple[Footprint, Footprint]:
 
 
 def _remark(curve: SpeedCurve, error: float) -> str:
-    mean, none, worst = (operations.ode(N, M, active) for active in (ACTIVE_ROWS.mean, 0, ACTIVE_ROWS.worst))
-    qpoases = _counted_s(curve, operations.qpoases(N, M, WORKING_SET))
+    mean, none, worst = (operations.ode(SIZES, active) for active in (ACTIVE_ROWS.mean, 0, ACTIVE_ROWS.worst))
+    qpoases = _counted_s(curve, operations.qpoases(SIZES, WORKING_SET))
     return (
         f"Fitted: {curve.c1 * 1e6:.3g} n + {curve.c2 * 1e6:.3g} n² + {curve.c3 * 1e6:.3g} n³ µs, within "
         f"{100 * error:.2f} % of the 25 measured times; {curve.flops_per_s(N) / 1e6:.3f} Mflop/s at n = {N}. An "
@@ -133,11 +136,11 @@ def _iterations(curve: SpeedCurve) -> str:
     """Return a table of iterations in 5 s against power."""
     tau = {
         "ODE (slot of 0.25 s)": 0.25,
-        "ODE (counted)": _counted_s(curve, operations.ode(N, M, ACTIVE_ROWS.mean)),
+        "ODE (counted dense)": _counted_s(curve, operations.ode(SIZES, ACTIVE_ROWS.mean)),
         "qpOASES (0.48 s)": 0.48,
-        "qpOASES (counted)": _counted_s(curve, operations.qpoases(N, M, WORKING_SET)),
-        "OSQP (counted)": _counted_s(curve, operations.osqp(N, M)),
-        "fast gradient (counted)": _counted_s(curve, operations.fast_gradient(N, M, ACTIVE_ROWS.mean)),
+        "qpOASES (counted dense)": _counted_s(curve, operations.qpoases(SIZES, WORKING_SET)),
+        "OSQP (counted dense)": _counted_s(curve, operations.osqp(SIZES)),
+        "fast gradient (counted dense)": _counted_s(curve, operations.fast_gradient(SIZES, ACTIVE_ROWS.mean)),
     }
     powers = (0.2, 0.6, 1.0, 2.0, 5.0, 10.0, 25.0)
     rows = [
