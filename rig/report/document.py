@@ -11,7 +11,6 @@ from typing import Final
 from markdown_it import MarkdownIt
 
 from rig.report.scorecard import Claim, ClaimVerdict, Judged, Revision, counted, counts
-from rig.studies.intervals import interval_of_mean
 from rig.text_tables import markdown_table
 
 STYLE: Final = """
@@ -37,11 +36,20 @@ def scorecard_table(judged: Sequence[Judged], commands: Mapping[str, str]) -> st
     """Return a row for each claim; `commands` says how each study is repeated."""
     header = ("figure", "claim", "paper's value", "ours", "tolerance and why", "verdict", "command")
     rows = [
-        (j.claim.figure, f"{j.claim.says}<br>*{j.claim.value}*{_marks(j.claim)}", _of_paper(j), _ours(j.values),
+        (j.claim.figure, f"{j.claim.says}<br>*{j.claim.value}*{_marks(j.claim)}", _of_paper(j), _ours(j),
          _tolerance(j.claim), j.verdict, f"`{commands[j.claim.study]}`")
         for j in judged
     ]  # fmt: skip
     return markdown_table(header, rows)
+
+
+def findings(judged: Sequence[Judged]) -> str:
+    """Return our values by verdict, with the paper's where they are computed from its points."""
+    found: dict[ClaimVerdict, list[str]] = {verdict: [] for verdict in ClaimVerdict}
+    for j in judged:
+        paper = "" if j.of_paper is None else f" (paper {_of_paper(j)})"
+        found[j.verdict].append(f"*{j.claim.value}* {j.claim.mean(j.values).brief()}{paper}")
+    return "\n".join(f"- **{verdict}**: {'; '.join(some)}" for verdict, some in found.items() if some)
 
 
 PLACEHOLDER: Final = re.compile(r"\{([^{}]+)\}")
@@ -64,7 +72,7 @@ def deviations(judged: Sequence[Judged], explanations: Mapping[str, str], values
     for j in counted(judged):
         if j.verdict in (ClaimVerdict.PARTLY, ClaimVerdict.NOT_REPRODUCED):
             why = explained(explanations.get(j.claim.value, "Not explained yet."), values)
-            lines.append(f"- **{j.verdict}: {j.claim.value}** ({j.claim.figure}): ours {_ours(j.values)}, "
+            lines.append(f"- **{j.verdict}: {j.claim.value}** ({j.claim.figure}): ours {_ours(j)}, "
                          f"paper {_of_paper(j)}. {why}")  # fmt: skip
     return "\n".join(lines) or "Everything that has data in the paper is reproduced."
 
@@ -87,8 +95,9 @@ def _of_paper(judged: Judged) -> str:
     return judged.claim.of_paper if judged.of_paper is None else _number(judged.of_paper)
 
 
-def _ours(values: Sequence[float]) -> str:
-    """Return the mean over the draws with its percentile interval, their range and their number."""
+def _ours(judged: Judged) -> str:
+    """Return the mean over the draws with its interval, their range and their number."""
+    claim, values, *_ = judged
     there = [value for value in values if math.isfinite(value)]
     if not there:
         return "none"
@@ -96,7 +105,7 @@ def _ours(values: Sequence[float]) -> str:
         return _number(there[0])
     spread = f" ({_number(min(there))} to {_number(max(there))} in {len(there)} draws)"
     missing = f", none in {len(values) - len(there)}" if len(there) < len(values) else ""
-    return interval_of_mean(there).brief() + spread + missing
+    return claim.mean(there).brief() + spread + missing
 
 
 def _number(value: float) -> str:

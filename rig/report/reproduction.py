@@ -9,7 +9,7 @@ from pathlib import Path
 
 from coldloop import __version__
 from coldloop.whole_file import whole_text
-from rig.report.document import as_page, deviations, revisions, scorecard_table, verdict_counts
+from rig.report.document import as_page, deviations, findings, revisions, scorecard_table, verdict_counts
 from rig.report.scorecard import COUNTED, TOLERANCES, Judged, as_json, counted, counts, judge, withdrawn
 from rig.results.folders import write_json, writing
 from rig.studies import STUDIES
@@ -22,9 +22,11 @@ SLIPS = TOLERANCES.with_name("slips.md")
 TITLE = "Coldloop: the paper, figure by figure"
 QUICK = "**A quick run: ten minutes a run and one draw. Its verdicts say that it works, not more.**"
 READING = (
-    "Tolerances were set before the runs (`rig/report/tolerances.toml`), and what was added or changed after a report "
-    "is listed below with date and reason; the paper's numbers are computed from the points of its figures by the same"
-    " formulas as ours. Ours are the mean over the draws, its 95 % percentile interval, and the range of the draws. "
+    "Tolerances were set before the runs (`rig/report/tolerances.toml`): {changed} of these {counted} claims and aims "
+    "were added or changed after a report, and {withdrawn} were withdrawn, which is listed below with date and reason. "
+    "The paper's numbers are computed from the points of its figures by the same formulas as ours. Ours are the mean "
+    "over the draws, its 95 % interval (`rig/studies/intervals.py`), and the range of the draws. A claim is reproduced "
+    "if this interval is within the tolerance, or its only value; until 2026-11-23 all draws had to be. "
     "Weights, loads and operating point are this project's own, for the paper leaves them open: costs are compared as "
     "ratios. The load of the solver comparison was chosen after the tolerances, by a few hours of several families, so"
     " that throttled qpOASES predicts violations as large as in the paper (c1) and converged qpOASES pays more for "
@@ -73,6 +75,14 @@ def _draws(options: StudyOptions) -> str:
     return f"{USUAL_DRAWS} draws of each load, where a study has no other number"
 
 
+def lead(judged: Sequence[Judged]) -> str:
+    """Return the verdicts, the findings, and how to read them."""
+    some = counted(judged)
+    changed = sum(j.claim.changed is not None for j in some)
+    reading = READING.format(changed=changed, counted=len(some), withdrawn=len(withdrawn()))
+    return f"**{verdict_counts(judged)}.**\n\n{findings(some)}\n\n{reading}"
+
+
 def report(options: StudyOptions, results: Mapping[str, StudyResult], judged: Sequence[Judged], effort: str) -> str:
     """Return the report as Markdown."""
     scale = " --quick" if options.quick else f" --draws {options.seeds}" if options.seeds else ""
@@ -82,7 +92,7 @@ def report(options: StudyOptions, results: Mapping[str, StudyResult], judged: Se
         f"# {TITLE}",
         circumstances(options, effort),
         QUICK if options.quick else "",
-        f"**{verdict_counts(judged)}.** {READING}",
+        lead(judged),
         "## Scorecard",
         scorecard_table(counted(judged), commands),
         "## What does not reproduce, and why",

@@ -15,7 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
 from rig.plc_sizing.operations import dense_cholesky
 from rig.plc_sizing.reference_plc import cholesky_times
 from rig.studies import published as paper
-from rig.studies.intervals import geometric_mean
+from rig.studies.intervals import Interval, geometric_mean, interval_of_mean
 from rig.studies.paper.cholesky import SLOW_DOWN, SPEED
 from rig.studies.paper.solver_comparison import measures
 from rig.studies.paper.updating_period import is_inside
@@ -91,6 +91,12 @@ class Claim(Revision):
     partly: Range | None = None
     calibrated: str = ""
     """What was chosen with this value in view; empty if nothing was."""
+    signed: bool = False
+    """Whether a value of a draw can be negative."""
+
+    def mean(self, values: Sequence[float]) -> Interval:
+        """Return the mean over the draws that have a value, with its interval."""
+        return interval_of_mean(values, above=-math.inf if self.signed else 0.0)
 
 
 class Judged(NamedTuple):
@@ -131,21 +137,27 @@ def _judged(claim: Claim, values: tuple[float, ...]) -> Judged:
 
 
 def verdict(claim: Claim, values: tuple[float, ...]) -> ClaimVerdict:
-    """Return the verdict on a claim, given one value a draw."""
+    """Return the verdict on a claim, given one value a draw, by the 95 % interval of their mean.
+
+    A single value is judged as it is. A claim that has no value in some draw has no mean, and is not reproduced.
+    """
     if not values:
         return ClaimVerdict.NOT_RUN
     if claim.reproduced is None or claim.partly is None:
         return ClaimVerdict.NO_DATA
-    if all(_within(claim.reproduced, value) for value in values):
+    if not all(map(math.isfinite, values)):
+        return ClaimVerdict.NOT_REPRODUCED
+    mean, *interval = claim.mean(values)
+    ends = interval if len(values) > 1 else values
+    if _within(claim.reproduced, *ends):
         return ClaimVerdict.REPRODUCED
-    mean = float(np.mean(values))
-    if _within(claim.reproduced, mean) or all(_within(claim.partly, value) for value in values):
+    if _within(claim.reproduced, mean) or _within(claim.partly, *ends):
         return ClaimVerdict.PARTLY
     return ClaimVerdict.NOT_REPRODUCED
 
 
-def _within(limits: tuple[float, float], value: float) -> bool:
-    return math.isfinite(value) and limits[0] <= value <= limits[1]
+def _within(limits: tuple[float, float], *values: float) -> bool:
+    return all(limits[0] <= value <= limits[1] for value in values)
 
 
 @cache

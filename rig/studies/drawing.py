@@ -175,9 +175,7 @@ LEAST_DRAWN: Final = 1e-5
 
 def above_lowest(axes: Axes, powers: ArrayLike, totals: Sequence[Interval], colour: str, label: str) -> None:
     """Draw by which share total costs over the lowest, with intervals, are above it, against power."""
-    value, low, high = (
-        np.maximum(np.array(series) - 1.0, LEAST_DRAWN) for series in list(zip(*totals, strict=True))[:3]
-    )
+    value, low, high = np.maximum(np.transpose(totals) - 1.0, LEAST_DRAWN)
     axes.plot(powers, value, color=colour, marker=".", label=label)
     axes.fill_between(np.asarray(powers), low, high, color=colour, alpha=0.18, linewidth=0)
     axes.set_xscale("log")

@@ -1,25 +1,24 @@
-"""Means over hours with intervals, and the share of a gap that a rule closes."""
+"""Statistics of some hours or draws with their 95 % intervals."""
 
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
+from rig.plc_sizing.certification import failure_bound
 from rig.studies.request import Series
 
-RESAMPLES: Final = 2000
-LEVEL: Final = 0.95
-SEED: Final = 20
+TAIL: Final = 0.025
+"""Probability on each side of an interval."""
 
 
 class Interval(NamedTuple):
-    """A value with its percentile interval."""
+    """A value with its interval: NaN if there is none, infinite on a side where nothing is known."""
 
     value: float
     low: float
     high: float
-    missing: float = 0.0
-    """Share of the resamples in which there is no such value; the interval is of the others."""
 
     def text(self, digits: int = 3) -> str:
         """Write the value and the interval in brackets, which a single hour has not."""
@@ -28,29 +27,48 @@ class Interval(NamedTuple):
         return f"{self.value:.{digits}f} [{self.low:.{digits}f}, {self.high:.{digits}f}]"
 
     def brief(self, digits: int = 3) -> str:
-        """Write value and interval with so many significant digits, and how often there is none."""
+        """Write value and interval with so many significant digits."""
         value = f"{self.value:.{digits}g}" if np.isfinite(self.value) else "none"
-        if not np.isfinite(self.low):
-            return value
-        absent = f"; none in {100 * self.missing:.0f} %" if self.missing >= 0.005 else ""
-        return f"{value} [{self.low:.{digits}g} to {self.high:.{digits}g}{absent}]"
+        return value if np.isnan(self.low) else f"{value} [{self.low:.{digits}g} to {self.high:.{digits}g}]"
 
 
-def resampled(statistic: Callable[[Series], float], hours: Series) -> Interval:
-    """Return a statistic of some hours, with its bootstrap percentile interval at `LEVEL` (Efron and Tibshirani, 1993).
+def jackknife(statistic: Callable[[list[int]], float], draws: int, above: float = -np.inf) -> Interval:
+    """Return a statistic of draws with its interval by the jackknife and Student's t (Efron and Tibshirani, 1993).
+
+    Its values without each draw in turn give its variance, with draws - 1 degrees of freedom. Of a mean this is
+    Student's interval, and of a geometric mean that of the logarithms. With 3 to 12 log-normal draws it covers
+    geometric means in 95 %, means and ratios of sums in 92 to 95 % if draws are alike, and in less if few decide
+    (docs/studies.md); percentiles of a bootstrap cover 72 to 91 %.
 
     Args:
-        statistic: Of rows of `hours`; whole rows are drawn, so what was measured in one hour stays together.
-        hours: One row an hour, shape (n, k). Of one hour there is no interval: it is NaN.
+        statistic: Of the numbers of the draws it is computed from, 0 to `draws` - 1.
+        draws: Of one draw there is no interval: it is NaN. Without limits if there is no value without some draw.
+        above: The statistic cannot be less: the interval is one of the logarithm of the distance from it, unless the
+            statistic reaches it.
     """
-    value = statistic(hours)
-    if len(hours) < 2:
+    every = range(draws)
+    value = statistic(list(every))
+    if draws < 2 or not np.isfinite(value):
         return Interval(value, np.nan, np.nan)
-    picks = np.random.default_rng(SEED).integers(len(hours), size=(RESAMPLES, len(hours)))
-    drawn = np.array([statistic(hours[pick]) for pick in picks])
-    known = drawn[np.isfinite(drawn)]
-    low, high = np.quantile(known, [(1 - LEVEL) / 2, (1 + LEVEL) / 2]) if len(known) else (np.nan, np.nan)
-    return Interval(value, float(low), float(high), 1.0 - len(known) / RESAMPLES)
+    without = np.array([statistic([draw for draw in every if draw != left]) for left in every])
+    if not np.isfinite(without).all():
+        return Interval(value, above, np.inf)
+    logarithmic = -np.inf < above < min(value, *without)
+    changes = np.log((without - above) / (value - above)) if logarithmic else without - value
+    reach = float(stdtrit(draws - 1, 1.0 - TAIL) * np.sqrt((draws - 1) * changes.var()))
+    if logarithmic:
+        factor = float(np.exp(reach))
+        return Interval(value, above + (value - above) / factor, above + (value - above) * factor)
+    return Interval(value, max(value - reach, above), value + reach)
+
+
+def interval_of_share(of_interest: int, hours: int) -> Interval:
+    """Return a share of the hours with its Clopper-Pearson interval.
+
+    It covers 95 to 100 %, with 3 hours 98 to 100 %: a count has few values, and no interval covers 95 % of each share.
+    """
+    low = 1.0 - failure_bound(hours - of_interest, hours, TAIL)
+    return Interval(of_interest / hours, low, failure_bound(of_interest, hours, TAIL))
 
 
 def geometric_mean(ratios: Series) -> float:
@@ -60,7 +78,16 @@ def geometric_mean(ratios: Series) -> float:
 
 def mean_ratio(costs: Series, reference: Series) -> Interval:
     """Return the geometric mean over the hours of costs over reference, shape (n,) each."""
-    return resampled(lambda rows: geometric_mean(rows[:, 0] / rows[:, 1]), np.column_stack([costs, reference]))
+    ratios = costs / reference
+    return jackknife(lambda which: geometric_mean(ratios[which]), len(ratios), above=0.0)
+
+
+def interval_of_mean(values: Sequence[float], above: float = -np.inf) -> Interval:
+    """Return the mean of one value a draw, none less than `above`; draws without a value are left out."""
+    known = np.array([value for value in values if np.isfinite(value)])
+    if not len(known):
+        return Interval(np.nan, np.nan, np.nan)
+    return jackknife(lambda which: float(known[which].mean()), len(known), above)
 
 
 def gap_closed(costs: Series, reference: Series, best: Series) -> Interval:
@@ -69,23 +96,10 @@ def gap_closed(costs: Series, reference: Series, best: Series) -> Interval:
     It is sum ln(reference / costs) over sum ln(reference / best), over the hours: 0 for the reference itself, 1 for the
     best, below 0 for what is worse than the reference. All have shape (n,). NaN where there is no gap.
     """
+    won, gap = np.log(reference / costs), np.log(reference / best)
 
-    def share(rows: Series) -> float:
-        cost, usual, least = np.log(rows).T
-        gap = float((usual - least).sum())
-        return float((usual - cost).sum()) / gap if gap > 0 else np.nan
+    def closed(which: list[int]) -> float:
+        total = float(gap[which].sum())
+        return float(won[which].sum()) / total if total > 0 else np.nan
 
-    return resampled(share, np.column_stack([costs, reference, best]))
-
-
-def over_draws(statistic: Callable[[list[int]], float], draws: int) -> Interval:
-    """Return the interval of a statistic that is a function of the numbers of the draws it is computed from."""
-    return resampled(lambda rows: statistic([int(number) for number in rows[:, 0]]), np.arange(float(draws))[:, None])
-
-
-def interval_of_mean(values: Sequence[float]) -> Interval:
-    """Return the interval of the mean of one value a draw; draws without a value are left out."""
-    known = np.array([value for value in values if np.isfinite(value)])
-    if not len(known):
-        return Interval(np.nan, np.nan, np.nan, 1.0)
-    return resampled(lambda rows: float(rows.mean()), known[:, None])
+    return jackknife(closed, len(costs))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import StudyError
 from rig.studies.crossing import crossing
-from rig.studies.intervals import Interval, interval_of_mean, over_draws
+from rig.studies.intervals import Interval, interval_of_mean, jackknife
 from rig.studies.request import Outcome, RunRequest, Series
 from rig.studies.study import Load, Outcomes
 
@@ -88,7 +88,7 @@ class PairedSums(Generic[S]):
 
     def interval(self, solver: S, power: float) -> Interval:
         """Return the interval of `over_lowest`."""
-        return over_draws(partial(self.over_lowest, solver, power), len(self.loads))
+        return jackknife(partial(self.over_lowest, solver, power), len(self.loads), above=1.0)
 
     def over_converged(self, part: str, solver: S, power: float, reference: S) -> Interval:
         """Return the interval of a part of the cost over that of a reference at its largest power."""
@@ -100,15 +100,15 @@ class PairedSums(Generic[S]):
             )
             return float(mine / theirs) if theirs else np.nan
 
-        return over_draws(ratio, len(self.loads))
+        return jackknife(ratio, len(self.loads), above=0.0)
 
     def mean(self, what: str, solver: S, power: float) -> Interval:
         """Return the interval of the mean over the draws of c1 or c2."""
-        return interval_of_mean([getattr(one, what) for one in self.sums[solver, power]])
+        return interval_of_mean([getattr(one, what) for one in self.sums[solver, power]], above=0.0)
 
     def crossing(self, one: S, other: S) -> Interval:
         """Return from which power on `one` costs no more than `other`, all draws together."""
-        return over_draws(partial(self._crossing, one, other), len(self.loads))
+        return jackknife(partial(self._crossing, one, other), len(self.loads), above=0.0)
 
     def crossings(self, one: S, other: S) -> list[float]:
         """Return the same of each draw by itself."""

@@ -16,14 +16,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from rig.report.document import PLACEHOLDER, as_page, deviations, explained, revisions, scorecard_table
-from rig.report.reproduction import EXPLANATIONS, circumstances
+from rig.report.document import (
+    PLACEHOLDER,
+    as_page,
+    deviations,
+    explained,
+    findings,
+    revisions,
+    scorecard_table,
+    verdict_counts,
+)
+from rig.report.reproduction import EXPLANATIONS, circumstances, lead
 from rig.report.scorecard import (
     FROM_POINTS,
     TOLERANCES,
     Claim,
     ClaimKind,
     ClaimVerdict,
+    Judged,
     Revision,
     as_json,
     claims,
@@ -53,18 +63,32 @@ CLAIM = Claim(
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        ((1.0, 3.0), ClaimVerdict.REPRODUCED),
-        ((1.0, 4.0), ClaimVerdict.PARTLY),
+        ((3.0,), ClaimVerdict.REPRODUCED),  # a single value is judged as it is
+        ((9.0,), ClaimVerdict.PARTLY),
+        ((9.1,), ClaimVerdict.NOT_REPRODUCED),
+        ((3.0, 3.0), ClaimVerdict.REPRODUCED),  # an interval of no width
         ((9.0, 9.0), ClaimVerdict.PARTLY),
-        ((0.5, 4.5), ClaimVerdict.PARTLY),
-        ((9.1, 9.0), ClaimVerdict.NOT_REPRODUCED),
+        ((2.0, 2.1, 2.2), ClaimVerdict.REPRODUCED),  # 1.86 to 2.36
+        ((1.9,) * 9 + (3.1,), ClaimVerdict.REPRODUCED),  # one draw of ten is outside, the interval is not
+        ((1.0, 3.0), ClaimVerdict.PARTLY),  # both draws are inside, the interval is not, the mean is
+        ((4.0, 4.1, 4.2), ClaimVerdict.PARTLY),  # the interval is within the wider range
+        ((4.0, 9.0, 14.0), ClaimVerdict.NOT_REPRODUCED),
         ((math.nan,), ClaimVerdict.NOT_REPRODUCED),
-        ((), ClaimVerdict.NOT_RUN),
+        ((2.0, 2.0, math.nan), ClaimVerdict.NOT_REPRODUCED),
         ((math.inf,), ClaimVerdict.NOT_REPRODUCED),
+        ((), ClaimVerdict.NOT_RUN),
     ],
 )
-def test_a_verdict_needs_all_draws(values: tuple[float, ...], expected: ClaimVerdict) -> None:
+def test_a_verdict_is_that_of_the_interval_of_the_mean(values: tuple[float, ...], expected: ClaimVerdict) -> None:
     assert verdict(CLAIM, values) is expected
+
+
+def test_a_value_that_can_be_negative_has_no_interval_of_logarithms() -> None:
+    """Of 0.001, 0.001 and 0.007 Student's interval begins below 0, and that of logarithms does not."""
+    near_zero = CLAIM.model_copy(update={"reproduced": (0.0, 1.0), "partly": (0.0, 1.0)})
+    values = (0.001, 0.001, 0.007)
+    assert verdict(near_zero, values) is ClaimVerdict.REPRODUCED
+    assert verdict(near_zero.model_copy(update={"signed": True}), values) is ClaimVerdict.PARTLY
 
 
 def test_without_data_in_the_paper_there_is_no_verdict() -> None:
@@ -216,6 +240,35 @@ def test_the_line_below_the_title_is_the_programs() -> None:
     assert re.fullmatch(pattern, line)
     kept = (ROOT / "docs" / "report" / "report.md").read_text("utf-8").splitlines()[2]
     assert re.fullmatch(pattern, kept), "the report that is kept has it too"
+
+
+def test_the_report_that_is_kept_has_the_verdicts_that_its_values_have() -> None:
+    kept = json.loads((ROOT / "docs" / "report" / "scorecard.json").read_text("utf-8"))
+    judged = []
+    for one in kept["claims"]:
+        ends = {name: ["-" if limit is None else limit for limit in one[name]] for name in RANGES if one[name]}
+        fields = {name: one[name] for name in Claim.model_fields if name in one}
+        claim = Claim.model_validate(fields | dict.fromkeys(RANGES) | ends)
+        values = tuple(math.nan if value is None else value for value in one["values"])
+        assert verdict(claim, values) == one["verdict"], claim.value
+        judged.append(Judged(claim, values, one["paper"], ClaimVerdict(one["verdict"])))
+    assert counts(judged) == kept["counts"]
+    report = (ROOT / "docs" / "report" / "report.md").read_text("utf-8")
+    assert f"**{verdict_counts(judged)}.**\n\n{findings(counted(judged))}\n\n" in report
+
+
+RANGES = ("reproduced", "partly")
+
+
+def test_the_lead_has_findings_and_the_number_of_changes() -> None:
+    judged = judge({claim.value: [1.0, 1.0] for claim in claims() if claim.value != "limited: J_BF"})
+    text = lead(judged)
+    assert "\n- **reproduced**: *unlimited: furthest outside* 1 [1 to 1]; " in text
+    assert "\n- **not run**: *limited: J_BF* none (paper 1.17)\n" in text
+    some = counted(judged)
+    changed = sum(j.claim.changed is not None for j in some)
+    assert f"{changed} of these {len(some)} claims and aims were added or changed after a report" in text
+    assert f" and {len(withdrawn())} were withdrawn" in text
 
 
 # -- values of the paper ----------------------------------------------------------------------------------------------

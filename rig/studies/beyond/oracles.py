@@ -65,7 +65,7 @@ METHOD: Final = (
     "a wider search may find a lower one. **Infinitely fast PLC**: the exact optimum at the estimated state, applied "
     "at once through the control PLC's guard, at instants of different distance; the least of them is what the "
     "gap goes to. It is a reference, not a bound that could be proved. Shares of a gap are sums of logarithms over the "
-    "hours, from Algorithm 1 (0) to the oracle (1); intervals are bootstrap percentiles over the hours, 95 %."
+    "hours, from Algorithm 1 (0) to the oracle (1); intervals are of 95 % over the hours."
 )
 
 

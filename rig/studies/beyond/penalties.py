@@ -28,7 +28,7 @@ from rig.studies.beyond.penalty_variants import (
 )
 from rig.studies.crossing import crossing
 from rig.studies.drawing import LEAST_DRAWN, above_lowest, legend_outside, panels, paper
-from rig.studies.intervals import mean_ratio, over_draws
+from rig.studies.intervals import jackknife, mean_ratio
 from rig.studies.paper.best_periods import PeriodCosts, period_figure, period_remarks, period_values
 from rig.studies.request import RunRequest, Series
 from rig.studies.study import Outcomes, StudyOptions, StudyResult
@@ -166,7 +166,7 @@ def _table(preset: str, options: StudyOptions, found: Paired, loops: Mapping[Pen
         f"**{preset}** and one change at a time. Total cost over the lowest at P = 1 and 10; J_dev and J_cst at P = 10 "
         f"over those of converged qpOASES; c1 and c2 at P = 1, means over {len(found.loads)} draws; J_BF at 5 s and "
         f"P = 1 over that of `tuned`, geometric mean of {len(closed_loads(options))} draws. In brackets 95 % "
-        "percentile intervals over the draws. The paper's total is over its converged qpOASES, its J_dev and J_cst "
+        "intervals over the draws. The paper's total is over its converged qpOASES, its J_dev and J_cst "
         "at P = 1."
     )
     header = ("change", "total, P = 1", "total, P = 10", "J_dev", "J_cst", "c1", "c2", "J_BF")
@@ -204,7 +204,7 @@ def _start_table(options: StudyOptions, found: Paired) -> list[str]:
             base = found.over_lowest(PRESETS[variant.preset], SETTLED, which)
             return np.array([found.over_lowest(variant, power, which) / base for power in some])
 
-        distance = over_draws(_misfit_of(curve, theirs[places]), len(found.loads))
+        distance = jackknife(_misfit_of(curve, theirs[places]), len(found.loads), above=0.0)
         rows.append((variant.label, *(f"{value:.3f}" for value in curve(every)), distance.brief()))
     caption = (
         "**Starts**: total cost at few iterations over that of the same preset at P = 10, all draws together, and how "

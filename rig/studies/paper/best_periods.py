@@ -11,7 +11,7 @@ from rig.figures.plot import ACCENT, INK, THIRD
 from rig.studies import published
 from rig.studies.beyond.penalty_variants import AS_PRINTED, TUNED, PenaltyVariant
 from rig.studies.drawing import hour_panels, paper
-from rig.studies.intervals import Interval, geometric_mean, resampled
+from rig.studies.intervals import Interval, interval_of_share, mean_ratio
 from rig.studies.paper.updating_period import is_inside
 from rig.studies.request import Series
 from rig.studies.study import Load, first_and_fresh
@@ -30,12 +30,12 @@ def table_of(costs: PeriodCosts, some: Sequence[Load], cost: str) -> Series:
 
 def share_inside(table: Series) -> Interval:
     """Return the share of hours, rows of `table`, whose best period is inside, with its interval over the hours."""
-    return resampled(lambda rows: float(np.mean([is_inside(row) for row in rows])), table)
+    return interval_of_share(sum(map(is_inside, table)), len(table))
 
 
 def end_over_best(table: Series, end: int) -> Interval:
     """Return by how much the first (0) or the last (-1) period costs more than the best, geometric mean of hours."""
-    return resampled(lambda rows: geometric_mean(rows[:, end] / rows.min(axis=1)), table)
+    return mean_ratio(table[:, end], table.min(axis=1))
 
 
 def period_values(preset: str, costs: PeriodCosts) -> dict[str, list[float]]:
@@ -61,7 +61,7 @@ def period_remarks(timed: Mapping[PenaltyVariant, PeriodCosts], periods: Sequenc
         caption = (
             f"**Best of the fixed periods, {name}**: in how many hours it is neither the shortest nor the longest, "
             "which it is in each (s), and what the shortest and the longest cost over it, geometric mean of the hours; "
-            "in brackets 95 % percentile intervals over the hours."
+            "in brackets 95 % intervals over the hours."
         )
         header = ("setting", "hours", "inside, share", "best in each hour (s)", f"{periods[0]:g} s over the best",
                   f"{periods[-1]:g} s over the best")  # fmt: skip

@@ -76,7 +76,7 @@ def open_loop_table(found: OpenLoop) -> str:
     some = [power for power in FEW_POWERS if any(power in powers for powers in found.powers.values())]
     caption = (
         f"**Paired, open loop**: total cost of all draws ({len(found.loads)}) over the lowest cost of any profile "
-        "that can be played [95 % percentile interval over the draws]. All solvers have the same problems, each with "
+        "that can be played [95 % interval over the draws]. All solvers have the same problems, each with "
         "its own hot starts, and are judged by what the control PLC would play; no ratio can be below 1."
     )
     rows = []
