@@ -22,6 +22,7 @@ from control_plc.program import make_program
 from control_plc.settings import ControlSection
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from optimizer_plc.settings import ProgramSettings
@@ -132,7 +133,8 @@ def recorded_jumps(model: LtiModel, hour: str, minutes: float) -> list[Jump]:
     recorder = Recorder(make_solver(ProgramSettings()))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(optimizer_plc.program, "make_solver", lambda _settings: recorder)
-        optimizer = OptimizerProgram(model, ProgramSettings(updating_period_s=5.0), InputLimits())
+        settings = ProgramSettings(preset=Preset.PAPER, updating_period_s=5.0)
+        optimizer = OptimizerProgram(model, settings, InputLimits())
     control = make_program(read_header(DEFAULT_MODEL_FILE), ControlSection(), InputLimits())
     control.restart(session=1)
     plant = PlantProgram(

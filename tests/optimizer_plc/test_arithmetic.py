@@ -16,6 +16,7 @@ from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, OdeSetti
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.costs import augmented_cost
+from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings
 from optimizer_plc.solvers.ode import ode_solver
@@ -78,7 +79,9 @@ def rounded(qp: QuadraticProblem) -> QuadraticProblem:
 def test_an_instance_in_single_precision_is_that_in_double_rounded(
     model: LtiModel, problem: PredictiveProblem, situations: Callable[..., Any]
 ) -> None:
-    program = OptimizerProgram(model, ProgramSettings(arithmetic=Arithmetic.FLOAT32), InputLimits())
+    program = OptimizerProgram(
+        model, ProgramSettings(preset=Preset.PAPER, arithmetic=Arithmetic.FLOAT32), InputLimits()
+    )
     single = program.problem
     rng = np.random.default_rng(21)
     for _ in range(20):

@@ -90,6 +90,12 @@ def test_the_problem_has_the_papers_49_variables_56_output_rows_and_38_rate_rows
     assert len(ControlDesign().constraint_instants) * 4 == 56
 
 
+def test_a_state_of_another_model_is_refused(problem: PredictiveProblem) -> None:
+    for states in (27, 49):
+        with pytest.raises(ValueError, match=rf"a state of shape \({states},\) for a problem with 28 states"):
+            problem.at(QpParameters(np.zeros(states), 0.0, np.zeros(3)))
+
+
 def test_only_the_heaters_rate_rows_of_the_last_two_intervals_are_left_out(problem: PredictiveProblem) -> None:
     rate_rows = problem.Gamma[56:, :21]
     concerned = np.zeros((7, 3), dtype=int)

@@ -128,7 +128,14 @@ class PredictiveProblem:
     # -- instances ---------------------------------------------------------------------------------------------------
 
     def at(self, parameters: QpParameters) -> QuadraticProblem:
-        """Return the instance of the problem for these parameters."""
+        """Return the instance of the problem for these parameters.
+
+        Raises:
+            ValueError: The state is not one of this problem's model; kernels would read and write beyond it.
+        """
+        n_states = self.stacked_outputs_x.shape[0]
+        if parameters.x.shape != (n_states,):
+            raise ValueError(f"a state of shape {parameters.x.shape} for a problem with {n_states} states")
         share = self._real(self.limits.rate_share(parameters.elapsed_ticks))
         phi, gamma, low, high, constant = instance(self.maps, parameters.x, parameters.w, parameters.u_before, share)
         return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, self._real(constant))
