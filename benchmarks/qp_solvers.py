@@ -26,7 +26,7 @@ from plant.load import find_load
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
 from rig.results.recording import Recorder
-from rig.settings import Settings
+from rig.studies.settings import settings_of
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class RecordingSolver:
 
 def record(hours: str, minutes: float, period_s: float) -> list[RecordedProblem]:
     """Run the loop with the ODE-based solver; return its problems and guesses."""
-    settings = Settings()
+    settings = settings_of(())
     heard: list[RecordedProblem] = []
     for hour in hours:
         rig = OneProcessRig(settings)

@@ -20,6 +20,8 @@ from rig.results.columns import FORMAT
 Curves = dict[str, NDArray[np.float64]]
 """Columns by name; what is null is NaN."""
 
+OLDER: Final[dict[str, Any]] = {"optimizer_plc.program.estimator.disturbances": []}
+"""Configuration of runs that were recorded before there was a key."""
 DRAWN_TICKS: Final = 60_000
 """A longer trace is drawn by the least and the largest value of many ticks."""
 
@@ -88,8 +90,8 @@ class RunFolder:
 
     @property
     def configuration(self) -> dict[str, Any]:
-        """The configuration by dotted key."""
-        configured: dict[str, Any] = self.manifest["configuration"]
+        """The configuration by dotted key; of an older run with what held then."""
+        configured: dict[str, Any] = OLDER | self.manifest["configuration"]
         return configured
 
     def file(self, name: str) -> pq.ParquetFile:

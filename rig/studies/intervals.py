@@ -11,6 +11,8 @@ from rig.studies.request import Series
 
 TAIL: Final = 0.025
 """Probability on each side of an interval."""
+MOST_CHANGE: Final = 2.0
+"""Change of a logarithm when a draw is left out, up to which it is taken for smooth."""
 
 
 class Interval(NamedTuple):
@@ -43,8 +45,11 @@ def jackknife(statistic: Callable[[list[int]], float], draws: int, above: float 
     Args:
         statistic: Of the numbers of the draws it is computed from, 0 to `draws` - 1.
         draws: Of one draw there is no interval: it is NaN. Without limits if there is no value without some draw.
-        above: The statistic cannot be less: the interval is one of the logarithm of the distance from it, unless the
-            statistic reaches it.
+        above: The statistic cannot be less: the interval is one of the logarithm of the distance from it, unless a
+            draw changes this by more than `MOST_CHANGE`; then it is cut off there.
+
+    Raises:
+        ValueError: The statistic is below `above`.
     """
     every = range(draws)
     value = statistic(list(every))
@@ -53,8 +58,15 @@ def jackknife(statistic: Callable[[list[int]], float], draws: int, above: float 
     without = np.array([statistic([draw for draw in every if draw != left]) for left in every])
     if not np.isfinite(without).all():
         return Interval(value, above, np.inf)
-    logarithmic = -np.inf < above < min(value, *without)
-    changes = np.log((without - above) / (value - above)) if logarithmic else without - value
+    least = min(value, *without)
+    if least < above:
+        raise ValueError(f"a statistic of {least:g} that cannot be below {above:g}")
+    changes = without - value
+    logarithmic = -np.inf < above < least
+    if logarithmic:
+        logarithms = np.log((without - above) / (value - above))
+        logarithmic = bool(np.abs(logarithms).max() < MOST_CHANGE)
+        changes = logarithms if logarithmic else changes
     reach = float(stdtrit(draws - 1, 1.0 - TAIL) * np.sqrt((draws - 1) * changes.var()))
     if logarithmic:
         factor = float(np.exp(reach))

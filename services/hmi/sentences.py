@@ -18,9 +18,9 @@ MOST_DEVIATIONS: Final = 4
 
 
 def deviation(found: ModelDeviation) -> str:
-    """Return how the plant differs from its model beside the load, the most notable first; empty where it does not."""
+    """Return how the plant differs from its model, without the load, the most notable first; empty where it agrees."""
     parts = [
-        (value, unit, f"needs {abs(value):.3g} {unit} {'less' if value > 0 else 'more'} {name}")
+        (value, unit, f"needs {abs(value):.3g} {unit} {'less' if value > 0 else 'more'} of {name}")
         for name, unit, value in zip(INPUT_NAMES, INPUT_UNITS, found.u, strict=True)
     ]
     parts += [

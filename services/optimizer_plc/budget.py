@@ -23,8 +23,8 @@ class BudgetSettings(BaseModel):
     """P, relative to the reference PLC."""
     preparation_slots: Annotated[int, Field(ge=0, le=20)] = 1
     """Slots of 0.25 s / P that the preparation is given in an updating period."""
-    preparation_s: Annotated[float, Field(ge=0)] = 0.13
-    """Time that it takes at P = 1: 68,000 operations at 0.53 Mflop/s (`docs/budget.md`)."""
+    preparation_s: Annotated[float, Field(ge=0)] = 0.17
+    """Time that it takes at P = 1: 89,000 operations at 0.53 Mflop/s (`docs/budget.md`)."""
 
 
 class ComputingTimes(NamedTuple):

@@ -151,8 +151,9 @@ class ProgramSettings(BaseModel):
     def _completed(self) -> Self:
         """Take what was not set from the preset, and alpha of the solvers from the penalties."""
         for name, values in PRESETS[self.preset].items():
-            if name == "estimator" and self.estimator.kind is not EstimatorKind.KALMAN:
-                continue  # state feedback estimates nothing
+            tells = self.estimator.kind is EstimatorKind.KALMAN and self.estimator.load_known
+            if name == "estimator" and not tells:
+                continue  # state feedback estimates nothing, and an unmeasured load needs a walk of its own
             self.__dict__[name] = completed(getattr(self, name), values)  # before it is used: it is frozen then
         alpha = alpha_of(self.penalties, self.design)
         for key in ALPHAS:
@@ -187,7 +188,11 @@ ALPHAS: Final = tuple(
     if "alpha" in getattr(field.annotation, "model_fields", ())
 )
 """The weight of broken constraints, by solver: keys of `optimizer_plc.program` that follow from the penalties."""
-ProgramSettings.decides = {"preset": (*OF_PRESETS, *ALPHAS), **dict.fromkeys(OF_ALPHA, ALPHAS)}
+ProgramSettings.decides = {
+    "preset": (*OF_PRESETS, *ALPHAS),
+    "estimator.kind": ("estimator.disturbances",),
+    **dict.fromkeys(OF_ALPHA, ALPHAS),
+}
 
 
 class OptimizerServer(ServerSettings):

@@ -242,7 +242,7 @@ def test_a_plant_that_differs_from_its_model_is_described_the_most_notable_first
     y = [0.0] * 22
     y[T5], y[1], y[P1] = 0.31, -4.9, -0.0151
     found = ModelDeviation(load=31.0, u=(-4.1, 0.0, 0.2), y=tuple(y))
-    assert deviation(found) == "needs 4.1 % more CV155, T5 +0.31 K, P1 -0.0151 bar, needs 0.2 % less CV156"
+    assert deviation(found) == "needs 4.1 % more of CV155, T5 +0.31 K, P1 -0.0151 bar, needs 0.2 % less of CV156"
     assert deviation(ModelDeviation(load=31.0)) == ""
     everything = ModelDeviation(u=(1.0, 1.0, 1.0), y=(1.0,) * 22)
     assert deviation(everything).count(",") == 3

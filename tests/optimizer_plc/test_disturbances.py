@@ -73,20 +73,17 @@ def test_what_no_sensor_tells_apart_is_refused(prediction: PredictionModel, name
 
 @given(names=st.sets(st.sampled_from(SIGNALS), min_size=1))
 @example(names={"CV155", "CV156"})
+@example(names=set(OUTPUT_NAMES[1:]))
 @example(names=set(OUTPUT_NAMES[1:]) | {"CV155"})
-def test_what_is_accepted_is_what_the_rank_allows(prediction: PredictionModel, names: set[str]) -> None:
-    """By Hautus' test in exact form: with the plant's only integrator, the level, at one."""
+def test_what_the_sensors_tell_apart_is_accepted(prediction: PredictionModel, names: set[str]) -> None:
+    """As many constants as outputs, the load among them, but for that of the integrator and that which is a load."""
     chosen = EstimatorSettings(disturbances=tuple(names))
     model = prediction.with_disturbances(chosen.disturbed)
-    n, step = model.n_states, model.sample
-    modes = np.block([[step.A - np.eye(n), step.F], [model.C, model.G]])
-    rank = np.linalg.matrix_rank(modes / np.linalg.norm(modes, axis=0), tol=1e-9)
-    try:
-        check_detectability(model)
-    except ConfigurationError:
-        assert rank <= n
+    if names & {"L1", "NCR22_A"} or len(names) + 1 > len(OUTPUT_NAMES):
+        with pytest.raises(ConfigurationError, match="leave it out"):
+            check_detectability(model)
     else:
-        assert rank == n + 1
+        check_detectability(model)
 
 
 @pytest.mark.parametrize("ticks", [2, 8, 20])

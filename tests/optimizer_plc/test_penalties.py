@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from coldloop.process.limits import InputLimits
-from optimizer_plc.computing_settings import PENALTY_WEIGHT, EstimatorSettings, OdeSettings
+from optimizer_plc.computing_settings import PENALTY_WEIGHT, EstimatorKind, EstimatorSettings, OdeSettings
 from optimizer_plc.qp.costs import augmented_cost, indicators
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.penalties import PRESETS, PenaltySettings, Preset
@@ -40,7 +40,12 @@ def test_the_tuned_preset_is_the_default_and_differs_from_the_paper_s_in_the_est
 
 def test_state_feedback_estimates_no_disturbances_whatever_the_preset() -> None:
     chosen = ProgramSettings.model_validate({"estimator": {"kind": "state-feedback"}})
-    assert not chosen.estimator.disturbances
+    assert chosen.estimator == EstimatorSettings(kind=EstimatorKind.STATE_FEEDBACK)
+
+
+def test_a_load_that_is_not_measured_is_estimated_as_before() -> None:
+    chosen = ProgramSettings.model_validate({"estimator": {"load_known": False}})
+    assert chosen.estimator == EstimatorSettings(load_known=False)
 
 
 def test_a_preset_fills_what_is_not_set() -> None:

@@ -94,6 +94,8 @@ def test_a_state_of_another_model_is_refused(problem: PredictiveProblem) -> None
     for states in (27, 49):
         with pytest.raises(ValueError, match=rf"a state of shape \({states},\) for a problem with 28 states"):
             problem.at(QpParameters(np.zeros(states), 0.0, np.zeros(3)))
+        with pytest.raises(ValueError, match="for a problem with 28 states"):
+            problem.outputs(np.zeros(49), QpParameters(np.zeros(states), 0.0, np.zeros(3)))
 
 
 def test_only_the_heaters_rate_rows_of_the_last_two_intervals_are_left_out(problem: PredictiveProblem) -> None:

@@ -148,3 +148,14 @@ def test_shares_of_a_gap_of_two_hours(costs: list[float], share: float) -> None:
 
 def test_where_there_is_no_gap_there_is_no_share() -> None:
     assert math.isnan(gap_closed(np.array([2.0]), np.array([1.0]), np.array([1.0])).value)
+
+
+def test_where_one_draw_has_nearly_all_of_the_excess_the_interval_stays_of_its_size() -> None:
+    low, high = interval_of_mean([1.07, *[1.000001] * 9], above=1.0)[1:]
+    assert low == 1.0
+    assert 1.01 < high < 1.05
+
+
+def test_values_below_what_they_cannot_be_below_are_refused() -> None:
+    with pytest.raises(ValueError, match="cannot be below 0"):
+        interval_of_mean([-1.0, -2.0, -1.5], above=0.0)

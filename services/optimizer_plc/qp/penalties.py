@@ -46,7 +46,7 @@ class Preset(StrEnum):
     """Sets of settings by name; what is set explicitly in the same place comes before the preset's."""
 
     TUNED = "tuned"
-    """As good as this project knows how to make it: the paper's preset, and an estimator that leaves no offset."""
+    """As good as this project knows how to make it: the paper's preset, and an estimator of constant errors."""
     PAPER = "paper"
     """The paper's problem and estimator, with the truncated solver as good as this project knows how to make it."""
     AS_PRINTED = "as-printed"

@@ -75,7 +75,8 @@ class PredictionModel:
     def with_disturbances(self, signals: Sequence[int]) -> "PredictionModel":
         """Return this model with a constant disturbance of each of these signals as a further state.
 
-        An estimator of these leaves no offset (Pannocchia and Rawlings 2003); costs and rows follow from the states.
+        With as many as outputs, predictions have no offset at rest (Pannocchia and Rawlings 2003). Costs and rows
+        follow from the states.
 
         Args:
             signals: Outputs, counted from 0, and then inputs, counted on from there.

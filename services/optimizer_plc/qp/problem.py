@@ -133,12 +133,15 @@ class PredictiveProblem:
         Raises:
             ValueError: The state is not one of this problem's model; kernels would read and write beyond it.
         """
-        n_states = self.stacked_outputs_x.shape[0]
-        if parameters.x.shape != (n_states,):
-            raise ValueError(f"a state of shape {parameters.x.shape} for a problem with {n_states} states")
+        self._check(parameters)
         share = self._real(self.limits.rate_share(parameters.elapsed_ticks))
         phi, gamma, low, high, constant = instance(self.maps, parameters.x, parameters.w, parameters.u_before, share)
         return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, self._real(constant))
+
+    def _check(self, parameters: QpParameters) -> None:
+        n_states = self.stacked_outputs_x.shape[0]
+        if parameters.x.shape != (n_states,):
+            raise ValueError(f"a state of shape {parameters.x.shape} for a problem with {n_states} states")
 
     def memory(self) -> int:
         """Return the bytes of the constant arrays that an instance is made of: Phi, Gamma and the maps."""
@@ -168,6 +171,7 @@ class PredictiveProblem:
 
     def outputs(self, z: Array, parameters: QpParameters) -> Array:
         """Return L1 and T5 predicted for a profile at the end of each sampling period, shape (horizon, 2)."""
+        self._check(parameters)
         outputs = self.resting_outputs.copy()
         add_transposed_product(self.stacked_outputs_z, z, outputs)
         add_transposed_product(self.stacked_outputs_x, parameters.x, outputs)

@@ -159,9 +159,9 @@ class Prediction(NamedTuple):
 
 
 class ModelDeviation(NamedTuple):
-    """By how much the plant differs from the prediction model, as the filter estimates it; 0 where it does not."""
+    """By how much the plant differs from its model, as the filter estimates it; also 0 where nothing is estimated."""
 
-    load: Annotated[float, f32("Acts like so much more heat load than is measured", unit="W", finite=False)] = 0.0
+    load: Annotated[float, f32("Heat load beyond what is measured or, unmeasured, usual", unit="W", finite=False)] = 0.0
     u: Annotated[
         tuple[float, ...], f32_array("Acts like so much more of the input", INPUT_NAMES, INPUT_UNITS, finite=False)
     ] = (0.0,) * len(INPUT_NAMES)
@@ -173,7 +173,7 @@ class ModelDeviation(NamedTuple):
 
 OPTIMIZER_MAP: Final = RegisterMap(
     service="optimizer_plc",
-    version=3,
+    version=4,
     blocks=(
         IDENTITY_BLOCK,
         Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
