@@ -91,7 +91,7 @@ def test_a_rig_that_is_started_has_lost_nothing(coldloop: Coldloop, up: str) -> 
     """Its parts are powered up one after the other. On a busy machine the plant may be lost later."""
     outcome = coldloop("events", f"127.0.0.1:{int(up) + 1}")
     assert outcome.code == 0, outcome.complaints
-    start, found, _ = outcome.out.partition("plant link synchronised")
+    start, found, _ = outcome.out.partition("plant link: synchronised")
     assert found
     assert "alarm raised" not in start
 
