@@ -151,8 +151,8 @@ class ProgramSettings(BaseModel):
     def _completed(self) -> Self:
         """Take what was not set from the preset, and alpha of the solvers from the penalties."""
         for name, values in PRESETS[self.preset].items():
-            tells = self.estimator.kind is EstimatorKind.KALMAN and self.estimator.load_known
-            if name == "estimator" and not tells:
+            usual_filter = self.estimator.kind is EstimatorKind.KALMAN and self.estimator.load_known
+            if name == "estimator" and not usual_filter:
                 continue  # state feedback estimates nothing, and an unmeasured load needs a walk of its own
             self.__dict__[name] = completed(getattr(self, name), values)  # before it is used: it is frozen then
         alpha = alpha_of(self.penalties, self.design)
