@@ -15,11 +15,9 @@ import pytest
 from hypothesis import settings
 
 from coldloop.config import PREFIX
-from coldloop.errors import UsageError
 from rig import cli
 from rig.cosim.ports import ReservedPorts
 from rig.figures.worker import FigureProcess
-from rig.live.started_rigs import check_ports
 from tests.harness.processes import Processes
 
 QUICK: Final = settings(deadline=None, print_blob=True, max_examples=20, derandomize="CI" in os.environ)
@@ -119,19 +117,6 @@ def _no_configuration_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in tuple(os.environ):
         if name.startswith(PREFIX):
             monkeypatch.delenv(name)
-
-
-def first_of_three_ports() -> int:
-    """Return the first of three ports in a row that are free now, as `coldloop up` takes them."""
-    for _ in range(100):
-        with ReservedPorts(1) as reserved:
-            base = reserved.numbers[0]
-        try:
-            check_ports((base, base + 1, base + 2))
-        except UsageError:  # taken by somebody else
-            continue
-        return base
-    raise AssertionError("no three free ports in a row")
 
 
 @pytest.fixture

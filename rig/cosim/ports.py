@@ -13,13 +13,24 @@ class ReservedPorts:
     A socket that never listens is bound to each. Servers may listen there all the same, again and again, as they set
     SO_REUSEADDR; while none does, connections are refused. Other systems than Linux do not let two sockets have a port
     in this way: there the sockets are closed at once, and another program may take a port before its server does.
+
+    Args:
+        count: How many.
+        first: Reserve it and those that follow it; 0 is any.
+
+    Raises:
+        OSError: One of them is in use.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, first: int = 0) -> None:
         self._sockets = [socket.socket() for _ in range(count)]
-        for one in self._sockets:
-            one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            one.bind((HOST, 0))
+        try:
+            for place, one in enumerate(self._sockets):
+                one.bind((HOST, first and first + place))  # alone: only then it lets servers in
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        except (OSError, OverflowError):
+            self.release()
+            raise
         self.numbers = [int(one.getsockname()[1]) for one in self._sockets]
         if sys.platform != "linux":
             self.release()

@@ -19,7 +19,7 @@ import pytest
 from coldloop.modbus.client import RegisterClient
 from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, Mode
 from rig import cli
-from tests.conftest import Coldloop, draw_nothing, first_of_three_ports
+from tests.conftest import Coldloop, draw_nothing
 from tests.harness.processes import Process, Processes
 
 ROOT = Path(__file__).parents[2]
@@ -207,7 +207,7 @@ class Reader:
     @contextmanager
     def _up(self, command: str) -> Iterator[int]:
         """Keep a rig up; its first port is not that of the page."""
-        base = first_of_three_ports()
+        base = self._processes.three_ports()
         rig = self._started([*shlex.split(command), "--port-base", str(base)])
         wait_until_up(rig, base)
         yield base
@@ -269,7 +269,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def page_rig(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) -> int:
     """The first port of a rig that is up for all pages."""
-    base, files = first_of_three_ports(), {"XDG_RUNTIME_DIR": str(tmp_path_factory.mktemp("runtime"))}
+    base, files = shared_processes.three_ports(), {"XDG_RUNTIME_DIR": str(tmp_path_factory.mktemp("runtime"))}
     words = ("up", "--load", "e", "--factor", "5", "--port-base", base)
     wait_until_up(shared_processes.coldloop(*words, stdout=subprocess.PIPE, more=files), base)
     return base

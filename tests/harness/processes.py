@@ -105,6 +105,16 @@ class Processes:
         self._ports.append(ReservedPorts(1))
         return self._ports[-1].numbers[0]
 
+    def three_ports(self) -> int:
+        """Return the first of three ports in a row, as `coldloop up` takes them, that nobody else gets."""
+        while True:
+            first = self.free_port()
+            try:
+                self._ports.append(ReservedPorts(2, first + 1))
+            except (OSError, OverflowError):  # taken by somebody else
+                continue
+            return first
+
     def service(
         self, name: str, *assignments: str, port: int | None = None, settings: BaseModel | None = None,
         level: str = "info", stderr: int | None = None,

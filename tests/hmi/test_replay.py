@@ -18,7 +18,7 @@ from hmi.process_image import Model
 from hmi.replay import Replay
 from rig.live.recorded_page import RecordedPage, _bits
 from rig.results.run_folder import RunFolder
-from tests.conftest import Coldloop, first_of_three_ports
+from tests.conftest import Coldloop
 from tests.harness.processes import END_S, Processes
 from tests.hmi.conftest import RECORDED_S, Served, eventually
 
@@ -96,7 +96,7 @@ def test_what_cannot_be_shown_is_one_line(coldloop: Coldloop, arguments: tuple[s
 
 def test_up_with_its_page_prints_where_it_is_and_a_password_that_operates(processes: Processes, tmp_path: Path) -> None:
     port = processes.free_port()
-    words, more = ("--port-base", first_of_three_ports()), {"XDG_RUNTIME_DIR": str(tmp_path)}
+    words, more = ("--port-base", processes.three_ports()), {"XDG_RUNTIME_DIR": str(tmp_path)}
     up = processes.coldloop("up", *words, "--page-port", port, "--detach", stdout=subprocess.PIPE, more=more)
     try:
         said, _ = up.popen.communicate(timeout=2 * END_S)

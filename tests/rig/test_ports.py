@@ -38,3 +38,12 @@ def test_the_server_of_an_event_loop_may_listen_there(new_loop: type[asyncio.Abs
 def test_nobody_else_gets_them() -> None:
     with ReservedPorts(50) as reserved, ReservedPorts(400) as others:
         assert len({*reserved.numbers, *others.numbers}) == 450
+
+
+def test_ports_in_a_row_are_refused_where_one_is_taken() -> None:
+    with ReservedPorts(1) as taken:
+        (port,) = taken.numbers
+        with pytest.raises(OSError, match="in use"):
+            ReservedPorts(2, port - 1)
+    with ReservedPorts(2, port - 1) as reserved:
+        assert reserved.numbers == [port - 1, port]

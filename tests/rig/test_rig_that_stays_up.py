@@ -18,7 +18,7 @@ from coldloop.registers.control_plc import CONTROL_MAP, Operator, OperatorMode
 from rig import cli
 from rig.live.link_cuts import CUT_FILES, CuttableLinks
 from rig.live.started_rigs import running_rig, state_folder
-from tests.conftest import Coldloop, first_of_three_ports
+from tests.conftest import Coldloop
 from tests.harness.processes import Processes
 
 pytestmark = pytest.mark.usefixtures("realtime", "undrawn")
@@ -31,7 +31,7 @@ PATIENCE_S = 120.0
 def up(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) -> Iterator[str]:
     """The first port of a rig that is up."""
     os.environ["XDG_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
-    base = str(first_of_three_ports())
+    base = str(shared_processes.three_ports())
     words = (
         "up",
         "--port-base",
@@ -259,9 +259,10 @@ def test_a_second_rig_on_the_same_ports_is_refused_and_the_holder_named(coldloop
     assert "coldloop down" in outcome.complaints[0]
 
 
-def test_a_port_of_another_program_is_named(coldloop: Coldloop) -> None:
-    base = first_of_three_ports()
+def test_a_port_of_another_program_is_named(coldloop: Coldloop, processes: Processes) -> None:
+    base = processes.three_ports()
     with socket.socket() as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         other.bind(("127.0.0.1", base + 1))
         other.listen()
         outcome = coldloop("up", "--port-base", str(base))

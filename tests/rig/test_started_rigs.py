@@ -30,7 +30,6 @@ from rig.live.started_rigs import (
     running_rig,
     state_folder,
 )
-from tests.conftest import first_of_three_ports
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -194,8 +193,8 @@ def test_several_rigs_are_listed(coldloop: "Coldloop", other: Process) -> None:
     assert other.poll() is None
 
 
-def test_without_a_rig_every_command_says_so(coldloop: "Coldloop") -> None:
-    base = str(first_of_three_ports())
+def test_without_a_rig_every_command_says_so(coldloop: "Coldloop", processes: "Processes") -> None:
+    base = str(processes.three_ports())
     for command in COMMANDS:
         outcome = coldloop(*command, "--port-base", base)
         assert (outcome.code, len(outcome.complaints)) == (2, 1)
@@ -313,7 +312,7 @@ def test_a_second_rig_that_is_started_at_the_same_time_is_refused(coldloop: "Col
 
 @pytest.mark.usefixtures("realtime")
 def test_ctrl_c_while_a_detached_rig_starts_ends_that(processes: "Processes") -> None:
-    base = str(first_of_three_ports())
+    base = str(processes.three_ports())
     starting = processes.coldloop("up", "--det", "--port-base", base, "--load", "e")  # an abbreviation is taken, too
     lock, deadline = state_folder(int(base)) / LOCK_FILE, time.monotonic() + 120.0
     number = 0
@@ -326,9 +325,9 @@ def test_ctrl_c_while_a_detached_rig_starts_ends_that(processes: "Processes") ->
     assert rigs_up() == []
 
 
-@pytest.mark.usefixtures("processes", "realtime")
-def test_of_two_that_are_started_together_one_is_up() -> None:
-    base = str(first_of_three_ports())
+@pytest.mark.usefixtures("realtime")
+def test_of_two_that_are_started_together_one_is_up(processes: "Processes") -> None:
+    base = str(processes.three_ports())
     command = [sys.executable, "-m", "rig", "up", "--detach", "--port-base", base, "--load", "e"]
     both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     ends = [(process.communicate(timeout=120), process.returncode) for process in both]
