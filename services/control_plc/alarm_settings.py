@@ -14,6 +14,8 @@ from coldloop.registers.safety import AlarmKind, AlarmPriority
 PASSING: Final = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED, AlarmKind.SECOND_WRITER)
 """Alarms for something that happens at an instant: their off-delay is how long ago the last time must be."""
 BANDS: Final = (AlarmKind.LEVEL_BAND, AlarmKind.T5_BAND)
+OF_THE_PROCESS: Final = (*BANDS, AlarmKind.CAPACITY)
+"""Alarms that say nothing against PLCs, links and sensors."""
 
 LOW, MEDIUM, HIGH, CRITICAL = AlarmPriority
 
@@ -48,6 +50,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     AlarmKind.LEVEL_BAND: AlarmRule(HIGH),  # the bath may run dry or flood; on-delay: `band_delay_s`
     AlarmKind.T5_BAND: AlarmRule(HIGH),  # the turbines leave their range; on-delay: `band_delay_s`
     AlarmKind.PLANT_FROZEN: AlarmRule(HIGH),  # measurements are old
+    AlarmKind.CAPACITY: AlarmRule(HIGH, on_delay_s=30.0, off_delay_s=30.0),  # no control holds this load
     # Control is degraded, or a protection is lost: act within the shift.
     AlarmKind.MODE: AlarmRule(MEDIUM),  # the ladder has left MPC
     AlarmKind.SEQUENCE_EXHAUSTED: AlarmRule(MEDIUM),  # outputs are held, then the classical loops control

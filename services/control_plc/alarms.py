@@ -9,6 +9,7 @@ by ticks and not by scans: scans can be missed.
 "Suppressed by design" of the standard is not there: no alarm depends on another one.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -16,7 +17,7 @@ from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.service.journal import Journal
-from control_plc.alarm_settings import BANDS, PASSING, AlarmSettings
+from control_plc.alarm_settings import OF_THE_PROCESS, PASSING, AlarmSettings, RuleSettings
 
 TRANSITIONS: Final[Mapping[AlarmState, Mapping[EventKind, AlarmState]]] = {
     AlarmState.NORMAL: {
@@ -65,7 +66,7 @@ COMMANDED: Final[Mapping[int, EventKind]] = {
 }
 """The event that an operator's action asks for."""
 
-WITHOUT_DELAY: Final = AlarmSettings(band_delay_s=0.0)
+WITHOUT_DELAY: Final = AlarmSettings(band_delay_s=0.0, rules={"capacity": RuleSettings(on_delay_s=0.0)})
 
 
 class _Pending(NamedTuple):
@@ -160,9 +161,18 @@ class AlarmPanel:
 
     @property
     def are_quiet(self) -> bool:
-        """No alarm but those of the bands is active, or about to be."""
-        others = (row for kind, row in zip(AlarmKind, self.rows, strict=True) if kind not in BANDS)
-        return not any(row.active for row in others) and all(kind in BANDS for kind in self._pending)
+        """No alarm but those of the process is active, or about to be."""
+        others = (row for kind, row in zip(AlarmKind, self.rows, strict=True) if kind not in OF_THE_PROCESS)
+        return not any(row.active for row in others) and all(kind in OF_THE_PROCESS for kind in self._pending)
+
+    def holds(self, kind: AlarmKind) -> bool:
+        """Return whether the condition of an alarm was last reported to hold, whatever its delay."""
+        return bool(self.rows[kind].active) != (kind in self._pending)
+
+    def due(self, kind: AlarmKind) -> float:
+        """Return the tick at which an alarm follows its condition; infinite where it already does."""
+        (since,) = self.pending(kind)
+        return math.inf if since is None else since + self.delay(kind)
 
     def delay(self, kind: AlarmKind) -> int:
         """Return the delay (ticks) after which an alarm follows its condition."""

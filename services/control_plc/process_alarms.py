@@ -5,7 +5,7 @@ from collections.abc import Collection, Sequence
 from coldloop.process.signals import L1, T5
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode
-from coldloop.registers.safety import AlarmKind
+from coldloop.registers.safety import AlarmKind, capacity_cause
 from coldloop.service.journal import Journal
 from control_plc.alarm_settings import AlarmSettings
 from control_plc.alarms import AlarmPanel
@@ -28,7 +28,15 @@ class ProcessAlarms:
         self._bad_before: frozenset[int] = frozenset()
 
     def watch(
-        self, tick: int, y: Sequence[float], ladder: Ladder, *, late: bool, optimizer: bool, bad: Collection[int]
+        self,
+        tick: int,
+        y: Sequence[float],
+        ladder: Ladder,
+        *,
+        late: bool,
+        optimizer: bool,
+        shortage: float,
+        bad: Collection[int],
     ) -> None:
         """Look at everything after a scan.
 
@@ -38,6 +46,7 @@ class ProcessAlarms:
             ladder: Mode and its cause.
             late: The rest of a sequence is being played.
             optimizer: Its heartbeat is present.
+            shortage: What the load is above what can be held, in W; negative: below what is needed.
             bad: Outputs that are substituted.
         """
         report = self._panel.report
@@ -53,6 +62,9 @@ class ProcessAlarms:
         report(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
         report(AlarmKind.SEQUENCE_LATE, condition=late)
         report(AlarmKind.OPTIMIZER_LOST, condition=not optimizer)
+        capacity = self._panel.rows[AlarmKind.CAPACITY]
+        watts = capacity.cause if capacity.active else capacity_cause(shortage)  # one alarm, however large it gets
+        report(AlarmKind.CAPACITY, condition=mode is Mode.MPC and shortage != 0.0, cause=watts)
         self._watch_sensors(tick, frozenset(bad))
 
     def _watch_sensors(self, tick: int, bad: frozenset[int]) -> None:

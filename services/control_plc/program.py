@@ -148,6 +148,8 @@ class ControlProgram:
         self.tick = tick
         self.process: Process | None = None
         self.optimizer_present = True
+        self.shortage = 0.0
+        """Of the last plan."""
         self.guard = OutputGuard(self._limits, self._initial)
         if applied != self._initial:
             self.guard.begin_at(tick, applied)
@@ -296,8 +298,9 @@ class ControlProgram:
                 )
             )  # fmt: skip
         self._process_alarms.watch(
-            self.tick, y, self.ladder, late=self.player.late, optimizer=self.optimizer_present, bad=self.sensors.bad
-        )
+            self.tick, y, self.ladder, late=self.player.late, optimizer=self.optimizer_present,
+            shortage=self.shortage, bad=self.sensors.bad,
+        )  # fmt: skip
         self.tick += 1
         self._in_scan = False
         return latched
@@ -361,7 +364,10 @@ class ControlProgram:
     def accept_plan(self, plan: Plan) -> bool:
         """Take the updating period of the last update; return whether it was acceptable."""
         self.optimizer_seen()
-        return self.player.accept_plan(plan, self._earliest)
+        accepted = self.player.accept_plan(plan, self._earliest)
+        if accepted:
+            self.shortage = plan.shortage
+        return accepted
 
     def abandon(self) -> None:
         """Give up the update under way: an optimiser that has lost the thread asks for a new one."""

@@ -138,7 +138,7 @@ class OptimizerProgram:
         )  # fmt: skip
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
-        return Plan(update.update, update.tick + int(now["ticks"]), load_step)
+        return Plan(update.update, update.tick + int(now["ticks"]), load_step, float(now["shortage"]))
 
     def _knows_what_is_played(self, update: Update) -> bool:
         """Return whether the control PLC plays something of ours, or has not begun to."""

@@ -53,6 +53,9 @@ class Constants(NamedTuple):
     """Penalty weight."""
     floor: float
     """Constant added to J."""
+    least_load: float
+    """That can be held, as a deviation, W."""
+    largest_load: float
     sequence_ticks: int
     fixed_ticks: int
     """Fixed updating period; 0 is adaptive."""
@@ -81,6 +84,8 @@ def constants_of(
         rate_shares=np.array([problem.limits.rate_share(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)], real),
         n_inputs=problem.n_inputs,
         alpha=real(alpha), floor=real(settings.adaptive.cost_floor),
+        least_load=real(settings.holdable_load_w[0] - estimator.w0),
+        largest_load=real(settings.holdable_load_w[1] - estimator.w0),
         sequence_ticks=settings.sequence_ticks,
         fixed_ticks=0, most=most,
         periods=np.array([budget.period(iterations) for iterations in range(most + 1)]),
@@ -226,7 +231,9 @@ def plan(
         now.guessed_before, now.delivered_before = m.sent.numbers[0].hot_start, m.sent.numbers[0].delivered
         now.solved = False
     correct(c.estimator, m.belief, u_before, load, y, x)
-    qp = problem_at(c, m.belief.x, m.belief.numbers[0].w, m.playing.u_before, played.share)
+    w = m.belief.numbers[0].w
+    now.shortage = max(w - c.largest_load, real(0.0)) + min(w - c.least_load, real(0.0))
+    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share)
     effective = with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
     now.efficiency = now.mismatch = now.contraction = real(1.0)
     now.gamma = real(0.0)

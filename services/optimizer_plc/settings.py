@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, ClassVar, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
 
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
@@ -119,6 +119,9 @@ class ProgramSettings(BaseModel):
     """Fixed updating period, a multiple of 0.25 s; 0 is adaptive."""
     interrupting_load_step_w: Annotated[float, Field(ge=0)] = 0.0
     """A load step of more than this ends an updating period at once, whatever decides its length; 0 is never."""
+    holdable_load_w: tuple[FiniteFloat, FiniteFloat] = (138.0, 553.0)
+    """Loads that some inputs within their limits hold at rest within the bands, W: of the cold box, by steady states of
+    its nonlinear plant. A load that is estimated outside raises the alarm `capacity`."""
     sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 18
     """Shortest sequence sent; 18 rows fit into one Modbus request with their header. It is never shorter than two
     updating periods: one to be played, one in case the next sequence is late."""
@@ -166,6 +169,13 @@ class ProgramSettings(BaseModel):
         if self.interrupting_load_step_w and not self.estimator.load_known:
             raise ValueError("interrupting_load_step_w needs a load that is measured, estimator.load_known = true")
         return self
+
+    @field_validator("holdable_load_w")
+    @classmethod
+    def _least_first(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] >= value[1]:
+            raise ValueError("give the least load that can be held, then the largest, in W")
+        return value
 
     @model_validator(mode="after")
     def _one_cost(self) -> Self:

@@ -29,6 +29,8 @@ class Bench:
         self.program.restart(session=1)
         self.number = 0
         self.load = 384.0
+        self.shortage = 0.0
+        """What the optimiser says of it."""
         self.steady = False
         """The process stands at its setpoints, moved by `level` and `temperature`; else the outputs count the ticks."""
         self.level = self.temperature = 0.0
@@ -66,7 +68,7 @@ class Bench:
         """Plan the next updating instant so many ticks after the last one, or at a load step."""
         update = self.program.player.update
         assert update is not None
-        return self.program.accept_plan(Plan(update.update, update.tick + ticks, load_step))
+        return self.program.accept_plan(Plan(update.update, update.tick + ticks, load_step, self.shortage))
 
     def sequence(self, rows: Sequence[SequenceRow], **changed: int) -> InputSequence:
         """Return an answer to the last update, with header fields changed before its checksum is taken."""

@@ -12,7 +12,7 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmPriority, AlarmState
 from coldloop.registers.text import from_words
 from coldloop.service.journal import Journal
-from control_plc.alarm_settings import DEFAULT_RULES, AlarmSettings
+from control_plc.alarm_settings import DEFAULT_RULES, OF_THE_PROCESS, AlarmSettings
 from control_plc.alarms import TRANSITIONS, AlarmPanel
 
 KIND = AlarmKind.LEVEL_BAND
@@ -277,9 +277,9 @@ def test_a_condition_that_does_not_last_as_long_as_its_delay_changes_nothing() -
     assert course(DELAYED, [(0, True), (20, True), *[(tick, tick % 8 == 0) for tick in range(21, 200)]]) == raised
 
 
-def test_the_band_alarms_have_the_delay_of_the_band_and_others_none() -> None:
+def test_the_alarms_of_the_process_have_delays_and_others_none() -> None:
     settings = AlarmSettings()
-    assert {kind for kind in AlarmKind if settings.rule(kind).on_delay_s} == {AlarmKind.LEVEL_BAND, AlarmKind.T5_BAND}
+    assert {kind for kind in AlarmKind if settings.rule(kind).on_delay_s} == set(OF_THE_PROCESS)
     assert course(settings, [(tick, True) for tick in range(40)]) == [(EventKind.ALARM_RAISED, 20)]
 
 

@@ -45,6 +45,10 @@ COMPILED = {
     "hybrid": (f'{PROGRAM}solver="hybrid"', f"{PROGRAM}updating_period_s=1.5"),
     "hybrid on a fast PLC": (f'{PROGRAM}solver="hybrid"', f"{PROGRAM}budget.power=10"),
     "fast gradient": (f'{PROGRAM}solver="fast-gradient"',),
+    "loads that cannot be held": (
+        f"{PROGRAM}holdable_load_w=[330,345]",
+        "control_plc.alarms.rules.capacity.on_delay_s=2",
+    ),
     "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
     "load steps that interrupt a rule": (
         f'{PROGRAM}adaptive.rule="contraction"',
@@ -128,7 +132,7 @@ def left_by(assignments: tuple[str, ...], load: LoadProfile, ticks: int, *, comp
 USUALLY = {
     "adaptive", "noise", "interior point, cut off", "hybrid", "fast gradient", "load steps that interrupt",
     "refrigerator", "as printed", "single precision", "osqp", "sequences that are refused", "an impatient watchdog",
-    "the classical loops",
+    "the classical loops", "loads that cannot be held",
 }  # fmt: skip
 """One of each kind; the others differ from one of them in a part of the configuration."""
 

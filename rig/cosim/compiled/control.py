@@ -26,6 +26,8 @@ def is_ordinary(program: ControlProgram) -> bool:
         and not program.sensors.bad
         and not program.guard.state.out_of_bounds
         and program.alarms.are_quiet
+        and program.alarms.holds(AlarmKind.CAPACITY) == (program.shortage != 0.0)
+        and program.alarms.due(AlarmKind.CAPACITY) > program.tick
         and not program.watchdog.expired
         and (not program.watchdog.time or program.watchdog.time > LONGEST_SILENCE)
     )
@@ -54,6 +56,7 @@ def scan_record(program: ControlProgram) -> Any:  # noqa: ANN401 a record
     s["triggered"], s["lowest"] = program.watchdog.triggered, program.watchdog.lowest
     s["level_since"], s["t5_since"] = (NOT if since is None else since for since in program.alarms.pending(*BANDS))
     s["unchanged"], s["seen"] = program.sensors.unchanged, program.sensors.before
+    s["short"] = program.shortage != 0.0
     return scans
 
 

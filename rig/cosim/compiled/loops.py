@@ -112,7 +112,7 @@ def run_block(
     reports: Reports,
     until: int,
 ) -> int:
-    """Do ticks and updates; return DONE at the tick `until`, or UNUSUAL.
+    """Do ticks and updates; return DONE at the tick `until` or where a shortage begins or ends, or UNUSUAL.
 
     An answer is computed when the programs would deliver it: at its instant, or at once where a load step may cut it
     off. One that has not begun when something unusual happens is not reported: it is computed again, with the same
@@ -137,9 +137,11 @@ def run_block(
             break
         u_before[:] = guard.applied
         scan(w, alarms, s, guard, rows[0], plant, trace)
+        outcome = DONE
         if instant:
             latch(w, o, s, trace, tick, u_before)
-        outcome = DONE
+            if (o.memory.numbers[0].shortage != 0.0) != s.short:
+                break
     if answered:
         s.solved -= 1
     return outcome

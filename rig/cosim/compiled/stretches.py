@@ -7,6 +7,7 @@ import numpy as np
 from coldloop.process.load_profile import MAX_LOAD_W, LoadProfile
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers.safety import AlarmKind
 from control_plc.program import ControlProgram
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.solvers import KernelSolver
@@ -59,6 +60,7 @@ class CompiledStretches:
         if not whole and not answered and self._control.player.load_step:
             return None  # the programs deliver at once what a load step may cut off
         until = min(until, (self._control.tick // BLOCK_TICKS + 1) * BLOCK_TICKS)
+        until = int(min(until, self._control.alarms.due(AlarmKind.CAPACITY)))
         ticks = until - self._control.tick
         with self._plant.noise(ticks) as noise:
             plant = plants.state_of(self._plant, noise, ticks)
@@ -100,6 +102,7 @@ class CompiledStretches:
             update = control.latched_update(program, s, self._trace)
             sequence = control.played_sequence(s, update.update - 1, rows[0], optimizer_plc.model_digest)
             program.player.take_over(sequence, update, int(s["next_update"]), int(s["accepted"]))
+            program.shortage = float(np.float32(o.state.numbers[0]["shortage"]))
         return Stretch(block, _optimizations(self._reports, solved))
 
     def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:

@@ -222,6 +222,9 @@ class Plan(NamedTuple):
         float,
         f32("An update is latched at once when the load has moved by more than this; 0 is never", unit="W", low=0),
     ] = 0.0
+    shortage: Annotated[
+        float, f32("Estimated load above what can be held; negative: below what is needed; 0 is neither", unit="W")
+    ] = 0.0
     crc: Annotated[int, u32("CRC-32 of the registers before; none, or a wrong one, is refused")] = 0
 
 
@@ -336,7 +339,7 @@ class Grant(NamedTuple):
 
 CONTROL_MAP: Final = RegisterMap(
     service="control_plc",
-    version=3,
+    version=4,
     blocks=(
         IDENTITY_BLOCK,
         Block("status", 30, Status, "Sequence player and scan cycle"),

@@ -1,5 +1,6 @@
 """Records that the fail-safe side of both PLCs and the rack shares: watchdog, lease, alarms."""
 
+import math
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
@@ -80,6 +81,17 @@ class AlarmKind(IntEnum):
     STATE_NOT_RETAINED = 18
     SCANS_STOPPED = 19
     """In real time no scan is made, and the link to the rack has no reason for it."""
+    CAPACITY = 20
+    """The load is one that no inputs within their limits hold: the bands will be left."""
+
+
+TOO_LITTLE: Final = 0x8000
+"""In the cause of the alarm CAPACITY: so many watts of load are missing; otherwise they are too many."""
+
+
+def capacity_cause(shortage: float) -> int:
+    """Return the cause of the alarm CAPACITY: the shortage in whole watts; a negative one with `TOO_LITTLE`."""
+    return min(math.ceil(abs(shortage)), TOO_LITTLE - 1) | (TOO_LITTLE if shortage < 0.0 else 0)
 
 
 class AlarmState(IntEnum):
@@ -125,7 +137,7 @@ class Alarm(NamedTuple):
     ] = 0
     active: Annotated[int, u16("1 while the condition holds, whatever the state", high=1)] = 0
     cause: Annotated[
-        int, u16("Cause: of a mode its ladder cause, of a sensor its output, of a sequence its verdict")
+        int, u16("Of a mode its ladder cause, of a sensor its output, of a sequence its verdict, of the capacity watts")
     ] = 0
     times: Annotated[int, u16("Times that it was raised")] = 0
     raised: Annotated[int, u32("Tick at which it was last raised")] = 0

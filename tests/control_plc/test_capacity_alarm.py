@@ -1,0 +1,50 @@
+"""A load that cannot be held is one alarm, however the shortage moves, and stands as long as MPC drives and says so."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import pytest
+
+from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow
+from coldloop.registers.safety import TOO_LITTLE, Alarm, AlarmKind
+
+if TYPE_CHECKING:
+    from tests.control_plc.conftest import Bench
+
+At = Callable[..., SequenceRow]
+
+
+def after(bench: "Bench", at: At, shortages: list[float]) -> Alarm:
+    """Return the alarm after an updating period of 2.5 s with each shortage."""
+    for bench.shortage in shortages:
+        bench.play([at()] * 20, ticks=10)
+        bench.scan()
+    return bench.program.alarms.rows[AlarmKind.CAPACITY]
+
+
+@pytest.mark.parametrize(("sign", "mark"), [(1.0, 0), (-1.0, TOO_LITTLE)], ids=["too much", "too little"])
+def test_it_is_raised_once_after_half_a_minute_with_the_watts_of_then(
+    sign: float, mark: int, bench: "Bench", at: At
+) -> None:
+    bench.steady = bench.moving = True
+    assert not after(bench, at, [sign * (1.0 + i) for i in range(12)]).active
+    alarm = after(bench, at, [sign * 30.2] * 2)
+    assert (alarm.active, alarm.times, alarm.cause) == (1, 1, 31 | mark)
+    alarm = after(bench, at, [sign * watts for watts in (60.0, 2.0, 90.0)])
+    assert (alarm.active, alarm.times, alarm.cause) == (1, 1, 31 | mark)
+    assert after(bench, at, [0.0] * 12).active
+    assert not after(bench, at, [0.0] * 2).active
+
+
+def test_a_shortage_that_does_not_last_is_none(bench: "Bench", at: At) -> None:
+    bench.steady = bench.moving = True
+    assert after(bench, at, [40.0] * 11 + [0.0] + [40.0] * 11).times == 0
+
+
+def test_it_returns_when_others_drive(bench: "Bench", at: At) -> None:
+    bench.steady = bench.moving = True
+    assert after(bench, at, [40.0] * 14).active
+    bench.program.operate(Operator(OperatorMode.CLASSICAL, *bench.program.applied))
+    bench.scans(2 + 4 * 30)
+    assert bench.program.mode is Mode.CLASSICAL
+    assert not bench.program.alarms.rows[AlarmKind.CAPACITY].active
