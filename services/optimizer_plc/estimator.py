@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
-from coldloop.process.signals import SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
+from coldloop.process.signals import L1, SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
 from optimizer_plc.computing_settings import SIGNALS, EstimatorKind, EstimatorSettings, NoiseReference
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.linear_algebra import add_transposed_product, multiply, respond
@@ -58,6 +58,14 @@ class Belief(NamedTuple):
         self.x[:] = self.predicted[:] = 0.0
         self.numbers[0] = (0.0, 0.0, 1)
 
+    def begin_at_rest(self, rest: Array, u: Array, load: float, level: float) -> None:
+        """Begin where the plant would rest with the inputs u (3,), load and L1, all deviations; `rest` is `at_rest`'s."""
+        self.forget()
+        found = rest @ np.array([*u, load, level])
+        self.predicted[: len(found) - 1] = found[:-1]
+        self.x[:] = self.predicted
+        self.numbers["mismatch"] = found[-1]
+
 
 def estimator_of(prediction: PredictionModel, settings: EstimatorSettings, real: Real = DOUBLE) -> Estimator:
     """Return the estimator that the settings name.
@@ -87,6 +95,19 @@ def no_belief(n_states: int, real: Real = DOUBLE) -> Belief:
     belief = Belief(numbers, np.zeros(n_states, real), np.zeros(n_states, real))
     belief.forget()
     return belief
+
+
+def at_rest(prediction: PredictionModel, real: Real = DOUBLE) -> Array:
+    """Return what states and load mismatch are at rest, as a map (n + 1, 5) of inputs, load and L1: all deviations.
+
+    L1 integrates: any level rests, and with the inputs and the load that are given only one mismatch lets it.
+    """
+    n = len(prediction.model.x0)
+    A, B, F = (M[:n] for M in prediction.sample)
+    C, D, G = (M[L1 : L1 + 1] for M in (prediction.C, prediction.D, prediction.G))
+    left = np.block([[np.eye(n) - A[:, :n], -F], [C[:, :n], G]])
+    right = np.block([[B, F, np.zeros((n, 1))], [-D, -G, np.ones((1, 1))]])
+    return np.linalg.solve(left, right).astype(real, copy=False)
 
 
 @kernel

@@ -5,6 +5,7 @@ played from its end on. Here are the decisions; the arithmetic is that of `schem
 Pure: no sockets, no clock, no sleeping.
 """
 
+import math
 from typing import Final
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.signals import INPUT_NAMES, L1, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import (
     INPUT_SAMPLES,
@@ -28,7 +29,7 @@ from coldloop.safety.sequence import InputSequence, with_checksum
 from optimizer_plc import scheme
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
-from optimizer_plc.estimator import estimator_of
+from optimizer_plc.estimator import at_rest, estimator_of
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
@@ -62,6 +63,7 @@ class OptimizerProgram:
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
             self.state = empty_state(prediction.n_states, self.problem.size, self._real)
             estimator = estimator_of(prediction, settings.estimator, self._real)
+            self._at_rest = at_rest(prediction, self._real)
             at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
             self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
             self.constants = scheme.constants_of(estimator, self.problem, self.solver.alpha, settings, self.budget)
@@ -122,7 +124,8 @@ class OptimizerProgram:
         now, state, estimator = self._now, self.state, self.constants.estimator
         u = np.asarray(update.u, self._real) - estimator.u0
         elapsed = update.tick - int(now["tick"]) if now["planned"] else 0
-        if not 0 <= elapsed <= LONGEST_GAP_TICKS or not self._knows_what_is_played(update):
+        known = now["planned"] or update.tick == 0  # a session begins at the operating point
+        if not (known and 0 <= elapsed <= LONGEST_GAP_TICKS and self._knows_what_is_played(update)):
             self._begin_again(update, u)
         elif 0 < elapsed != now["ticks"]:
             scheme.predict_played(self.constants, state, elapsed)
@@ -146,8 +149,14 @@ class OptimizerProgram:
         return not self._playing["length"] or update.playing in ours
 
     def _begin_again(self, update: Update, u: Array) -> None:
-        """Forget what was sent: others have moved the inputs since, from which the next profile sets out."""
-        self.state.belief.forget()
+        """Forget what was sent: others have moved the inputs since, from which the next profile sets out.
+
+        For want of a past the plant is believed to rest: a filter that began at the operating point would take minutes.
+        """
+        estimator = self.constants.estimator
+        load = update.load - estimator.w0 if estimator.load_known else 0.0
+        level = update.y[L1] - estimator.y0[L1] if math.isfinite(update.y[L1]) else 0.0
+        self.state.belief.begin_at_rest(self._at_rest, u, load, level)
         playing = self.state.playing
         playing.z[:], playing.u_before[:] = self.problem.hold(u), u
         self._playing["first_tick"], self._playing["length"] = update.tick, 0

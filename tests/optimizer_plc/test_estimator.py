@@ -3,12 +3,15 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import scipy.linalg
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from coldloop.process.lti_model import LtiModel
+from coldloop.process.signals import L1
 from coldloop.registers.control_plc import Update
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
-from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
+from optimizer_plc.estimator import at_rest, begin_prediction, correct, estimator_of, no_belief, predict
 from optimizer_plc.qp.linear_algebra import respond
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.settings import ProgramSettings
@@ -227,3 +230,24 @@ def test_a_load_that_is_not_measured_neither_interrupts_nor_goes_with_state_feed
         ProgramSettings(estimator=unknown, interrupting_load_step_w=10.0)
     with pytest.raises(ValueError, match="state-feedback estimates no load; choose kind = kalman"):
         EstimatorSettings(kind=EstimatorKind.STATE_FEEDBACK, load_known=False)
+
+
+@given(u=st.tuples(*[st.floats(-20.0, 20.0)] * 3), load=st.floats(-300.0, 300.0), level=st.floats(-5.0, 5.0))
+def test_a_filter_without_a_past_begins_where_the_plant_rests_with_its_inputs_load_and_level(
+    prediction: PredictionModel, u: tuple[float, ...], load: float, level: float
+) -> None:
+    belief = no_belief(prediction.n_states)
+    belief.begin_at_rest(at_rest(prediction), np.array(u), load, level)
+    x, (_, mismatch, _) = belief.predicted, belief.numbers[0].tolist()
+    step, applied, load_acting = prediction.sample, np.array(u), load + mismatch
+    scale = 1.0 + np.abs(x).max()
+    assert np.allclose(respond(step.A, step.B, step.F, x, applied, load_acting), x, atol=1e-7 * scale)
+    y = respond(prediction.C, prediction.D, prediction.G, x, applied, load_acting)
+    assert y[L1] == pytest.approx(level, abs=1e-6)
+
+
+def test_at_the_operating_point_that_is_the_operating_point(prediction: PredictionModel) -> None:
+    belief = no_belief(prediction.n_states)
+    belief.begin_at_rest(at_rest(prediction), np.zeros(3), 0.0, 0.0)
+    assert not belief.x.any()
+    assert belief.numbers[0].tolist() == (0.0, 0.0, 1)
