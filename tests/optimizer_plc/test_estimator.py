@@ -137,7 +137,7 @@ def test_noise_per_time_weighs_a_measurement_by_the_time_since_the_last(predicti
     sensors = ("level_sensor", "speed_sensor", "temperature_sensor", "pressure_sensor")
     doubled = SETTINGS.model_copy(update={name: 2.0 * getattr(SETTINGS, name) for name in sensors})
     by_time = SETTINGS.model_copy(update={"noise_reference": NoiseReference.TIME})
-    usual, twice, found = (estimator_of(prediction, one).gains for one in (SETTINGS, doubled, by_time))
+    usual, twice, found = (estimator_of(prediction, one).stationary.gains for one in (SETTINGS, doubled, by_time))
     assert found[19] == pytest.approx(usual[19], rel=1e-5, abs=1e-9 * np.abs(usual[19]).max())
     assert found[4] == pytest.approx(twice[4], rel=1e-5, abs=1e-9 * np.abs(twice[4]).max())
     assert np.abs(found[4] - usual[4]).max() > 1e-3 * np.abs(usual[4]).max()
