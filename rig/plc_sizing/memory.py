@@ -64,7 +64,7 @@ class Footprint(NamedTuple):
     solver: int
     """Workspace of the ODE-based solver."""
     estimator: int
-    """Transitions and Kalman gains of every updating period, output matrices."""
+    """Transitions, Kalman gains and inverse covariances of every updating period, output matrices."""
     sequence: int
     """Two buffers of the longest sequence: the one being played, the one being written."""
 
@@ -78,7 +78,7 @@ def estimator_memory(prediction: PredictionModel, settings: EstimatorSettings) -
     """Return the bytes of the estimator."""
     real = real_of(Arithmetic.FLOAT32)
     single = prediction.rounded(real)
-    gains = (gain.astype(real) for gain in stationary_gains(prediction, settings).values())
+    gains = (array.astype(real) for array in stationary_gains(prediction, settings))
     transitions = (M for step in single.transitions.values() for M in step)
     return sum(M.nbytes for M in (*gains, *transitions, single.C, single.D, single.G))
 

@@ -294,7 +294,8 @@ class ControlProgram:
             latched = self.player.latch(
                 Update(
                     session=self.session, update=0, tick=self.tick, playing=0, load=measurement.load,
-                    u_before=tuple(self._before), u=applied, y=y, x=measurement.x,
+                    u_before=tuple(self._before), u=applied,
+                    y=tuple(math.nan if i in self.sensors.bad else value for i, value in enumerate(y)), x=measurement.x,
                 )
             )  # fmt: skip
         self._process_alarms.watch(

@@ -10,7 +10,7 @@ from coldloop.kernels.compiled import kept, kernel
 from coldloop.process.signals import L1, SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
 from optimizer_plc.computing_settings import SIGNALS, EstimatorKind, EstimatorSettings, NoiseReference
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
-from optimizer_plc.qp.linear_algebra import add_transposed_product, multiply, respond
+from optimizer_plc.qp.linear_algebra import add_transposed_product, cholesky, cholesky_solve, multiply, respond
 from optimizer_plc.qp.prediction import PredictionModel, Transition
 
 Array = NDArray[np.float64]
@@ -18,6 +18,15 @@ Array = NDArray[np.float64]
 
 UNDETECTABLE: Final = 1e-9
 """Relative size of a direction that no measurement sees."""
+
+
+class StationaryGains(NamedTuple):
+    """What a stationary Kalman filter corrects with after periods of 1, 2, ... ticks."""
+
+    gains: Array
+    """Transposed, shape (ticks, n_y, n + 1); the load mismatch comes last."""
+    inverse_covariances: Array
+    """Inverses of the covariance of the innovation, shape (ticks, n_y, n_y)."""
 
 
 class Estimator(NamedTuple):
@@ -38,8 +47,8 @@ class Estimator(NamedTuple):
     kalman: bool
     """Kalman filter, or else state feedback."""
     load_known: bool
-    gains: Array
-    """Of the Kalman filter for periods of 1, 2, ... ticks, shape (ticks, n_y, n + 1)."""
+    stationary: StationaryGains
+    """Of the Kalman filter."""
 
 
 class Belief(NamedTuple):
@@ -59,7 +68,7 @@ class Belief(NamedTuple):
         self.numbers[0] = (0.0, 0.0, 1)
 
     def begin_at_rest(self, rest: Array, u: Array, load: float, level: float) -> None:
-        """Begin where the plant would rest with the inputs u (3,), load and L1, all deviations; `rest` is `at_rest`'s."""
+        """Begin where the plant would rest with the inputs u (3,), load and L1, deviations; `rest` is `rest_map`'s."""
         self.forget()
         found = rest @ np.array([*u, load, level])
         self.predicted[: len(found) - 1] = found[:-1]
@@ -81,11 +90,11 @@ def estimator_of(prediction: PredictionModel, settings: EstimatorSettings, real:
             "use kalman"
         )
     m = prediction.rounded(real)
-    gains = np.array(list(stationary_gains(prediction, settings).values())) if kalman else np.zeros((1, 1, 1))
+    stationary = stationary_gains(prediction, settings) if kalman else StationaryGains(*np.zeros((2, 1, 1, 1)))
     return Estimator(
         Transition(*(np.array(M) for M in zip(*m.transitions.values(), strict=True))),
         m.outputs, np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, kalman, settings.load_known,
-        gains.astype(real, copy=False),
+        StationaryGains(*(array.astype(real, copy=False) for array in stationary)),
     )  # fmt: skip
 
 
@@ -97,7 +106,7 @@ def no_belief(n_states: int, real: Real = DOUBLE) -> Belief:
     return belief
 
 
-def at_rest(prediction: PredictionModel, real: Real = DOUBLE) -> Array:
+def rest_map(prediction: PredictionModel, real: Real = DOUBLE) -> Array:
     """Return what states and load mismatch are at rest, as a map (n + 1, 5) of inputs, load and L1: all deviations.
 
     L1 integrates: any level rests, and with the inputs and the load that are given only one mismatch lets it.
@@ -112,17 +121,50 @@ def at_rest(prediction: PredictionModel, real: Real = DOUBLE) -> Array:
 
 @kernel
 def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array, x: Array) -> None:
-    """Take a measurement (u_before (3,), load, y (22,), x (28,), in physical units and the on-line type)."""
+    """Take a measurement (u_before (3,), load, y (22,), x (28,), in physical units and the on-line type).
+
+    The Kalman filter corrects by the outputs that are finite.
+    """
     b = belief.numbers[0]
     known = load - c.w0 if c.load_known else belief.x.dtype.type(0.0)
     if not c.kalman:
         belief.x[:] = x - c.x0
         b.w, b.mismatch = known, belief.x.dtype.type(0.0)
         return
-    gain = c.gains[min(b.since, c.gains.shape[0]) - 1]
-    belief.x[:], b.mismatch = corrected(gain, c.outputs, belief.predicted, b.mismatch, u_before - c.u0, known, y - c.y0)
+    period, maps = min(b.since, c.stationary.gains.shape[0]) - 1, c.outputs
+    expected = respond(maps.A, maps.B, maps.F, belief.predicted, u_before - c.u0, known + b.mismatch)
+    innovation = y - c.y0 - expected
+    if not np.isfinite(innovation).all():
+        innovation = imputed(innovation, c.stationary.inverse_covariances[period])
+    correction = np.zeros(belief.x.size + 1, belief.x.dtype)
+    add_transposed_product(c.stationary.gains[period], innovation, correction)
+    belief.x[:] = belief.predicted + correction[:-1]
     belief.predicted[:] = belief.x
+    b.mismatch += correction[-1]
     b.w = known + b.mismatch
+
+
+@kernel
+def imputed(innovation: Array, inverse_covariance: Array) -> Array:
+    """Return the innovation (n_y,), its elements that are not finite replaced by their mean given the others.
+
+    J_MM e_M = -J_MO e_O, with the inverse covariance J (n_y, n_y): the gain for all outputs then corrects as that for
+    the others alone. Without any it is zero.
+    """
+    n, real = innovation.size, innovation.dtype.type
+    M, mean = np.zeros((n, n), innovation.dtype), np.zeros(n, innovation.dtype)
+    finite = np.isfinite(innovation)
+    for i in range(n):
+        if finite[i]:
+            M[i, i], mean[i] = real(1.0), innovation[i]
+            continue
+        for j in range(n):
+            if finite[j]:
+                mean[i] -= inverse_covariance[i, j] * innovation[j]
+            else:
+                M[i, j] = inverse_covariance[i, j]
+    cholesky_solve(M, cholesky(M), mean)
+    return mean
 
 
 @kernel
@@ -169,8 +211,8 @@ def check_detectability(prediction: PredictionModel) -> None:
     )
 
 
-def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> dict[int, Array]:
-    """Return the gain of every updating period, in ticks, transposed: (n_y, n + 1); the load mismatch comes last."""
+def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> StationaryGains:
+    """Return what the Kalman filter corrects with after every updating period."""
     nx = prediction.n_states
     C = np.ascontiguousarray(np.hstack([prediction.C, prediction.G]))
     by_unit = {
@@ -188,35 +230,34 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
 
     def computed() -> Array:
         P = np.diag(100.0 * drift**2)
-        gains = []
+        found = []
         for ticks, step in prediction.transitions.items():
             A = np.eye(nx + 1)
             A[:nx, :nx], A[:nx, nx] = step.A, step.F[:, 0]
             process = drift**2 * (ticks * TICK_S / SAMPLING_PERIOD_S)
             measured = sensors**2 * (SAMPLING_PERIOD_S / (ticks * TICK_S) if of_time else 1.0)
-            gains.append(stationary_gain(A, C, process, measured, P, settings.longest_riccati).T)
-        return np.array(gains)
+            gain = stationary_gain(A, C, process, measured, P, settings.longest_riccati)
+            found.append(np.hstack([gain.T, inverse_covariance(A, C, process, measured, P)]))
+        return np.array(found)
 
     tick = prediction.transitions[1]
     of_time = settings.noise_reference is NoiseReference.TIME
     decided_by = (tick.A, tick.F, C, drift, sensors, np.array(settings.longest_riccati), np.ones(int(of_time)))
     found = kept("kalman", b"".join(part.tobytes() for part in decided_by), computed)
-    return {ticks: np.ascontiguousarray(gain) for ticks, gain in zip(prediction.transitions, found, strict=True)}
+    return StationaryGains(*(np.ascontiguousarray(part) for part in np.split(found, [nx + 1], axis=2)))
 
 
-@kernel
-def corrected(
-    gain: Array, outputs: Transition, x: Array, mismatch: float, u: Array, w: float, y: Array
-) -> tuple[Array, float]:
-    """Return the state (n,) and the load mismatch (W) after a measurement y (22,); all are deviations.
+def inverse_covariance(A: Array, C: Array, process: Array, sensors: Array, P: Array) -> Array:
+    """Return the inverse (n_y, n_y) of the innovation's covariance; P (n, n) is that of the state before the period.
 
-    `gain` (22, n + 1) is that of the period which ends; `x` and `mismatch` are predicted, `u` (3,) was applied and `w`
-    is the known load (W).
+    `process` (n) and `sensors` (n_y) are variances.
     """
-    innovation = y - respond(outputs.A, outputs.B, outputs.F, x, u, w + mismatch)
-    correction = np.zeros(gain.shape[1], gain.dtype)
-    add_transposed_product(gain, innovation, correction)
-    return x + correction[:-1], mismatch + correction[-1]
+    before = multiply(multiply(A, P), np.ascontiguousarray(A.T)) + np.diag(process)
+    S = multiply(multiply(C, before), np.ascontiguousarray(C.T)) + np.diag(sensors)
+    inverse, skyline = np.eye(len(C)), cholesky(S)
+    for column in inverse:
+        cholesky_solve(S, skyline, column)
+    return inverse
 
 
 @kernel

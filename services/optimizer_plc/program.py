@@ -29,7 +29,7 @@ from coldloop.safety.sequence import InputSequence, with_checksum
 from optimizer_plc import scheme
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
-from optimizer_plc.estimator import at_rest, estimator_of
+from optimizer_plc.estimator import estimator_of, rest_map
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
@@ -63,7 +63,7 @@ class OptimizerProgram:
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
             self.state = empty_state(prediction.n_states, self.problem.size, self._real)
             estimator = estimator_of(prediction, settings.estimator, self._real)
-            self._at_rest = at_rest(prediction, self._real)
+            self._rest_map = rest_map(prediction, self._real)
             at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
             self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
             self.constants = scheme.constants_of(estimator, self.problem, self.solver.alpha, settings, self.budget)
@@ -156,7 +156,7 @@ class OptimizerProgram:
         estimator = self.constants.estimator
         load = update.load - estimator.w0 if estimator.load_known else 0.0
         level = update.y[L1] - estimator.y0[L1] if math.isfinite(update.y[L1]) else 0.0
-        self.state.belief.begin_at_rest(self._at_rest, u, load, level)
+        self.state.belief.begin_at_rest(self._rest_map, u, load, level)
         playing = self.state.playing
         playing.z[:], playing.u_before[:] = self.problem.hold(u), u
         self._playing["first_tick"], self._playing["length"] = update.tick, 0

@@ -231,6 +231,20 @@ def test_a_bad_measurement_is_replaced_by_the_last_good_one_and_told(rig: "Bench
     assert alarm(rig, AlarmKind.SENSOR_BAD) is AlarmState.RETURNED
 
 
+def test_an_update_has_no_number_for_a_bad_measurement(rig: "Bench", at: At) -> None:
+    p4 = OUTPUT_NAMES.index("P4")
+    for reading, bad in ((None, []), (1e6, [p4]), (math.nan, [p4])):
+        rig.play([at()] * 200, ticks=2)
+        if reading is not None:
+            rig.readings[p4] = reading
+        _, update = rig.scan()
+        assert update is not None
+        assert [output for output, value in enumerate(update.y) if not math.isfinite(value)] == bad
+        process = rig.program.process
+        assert process is not None
+        assert all(map(math.isfinite, process.y)), "the others see the last good value"
+
+
 @pytest.mark.parametrize(("output", "stands", "moves"), [(L1, 1, 2), (T5, 2, 1)], ids=["L1", "T5"])
 def test_a_controlled_output_that_stays_bad_ends_mpc_and_only_the_loop_that_needs_it(
     rig: "Bench", at: At, output: int, stands: int, moves: int

@@ -97,7 +97,7 @@ def test_the_gain_is_that_of_the_riccati_equation(disturbed: PredictionModel, ti
     R = np.diag(SENSORS**2)
     P = scipy.linalg.solve_discrete_are(A.T, C.T, np.eye(50) * ticks / 20, R)
     expected = drift[:, None] * (P @ C.T @ np.linalg.inv(C @ P @ C.T + R))
-    found = stationary_gains(disturbed, ALL)[ticks].T
+    found = stationary_gains(disturbed, ALL).gains[ticks - 1].T
     size = np.abs(expected).max(axis=1, keepdims=True)
     assert np.abs((found - expected) / size).max() < 1e-4
 

@@ -11,7 +11,7 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import L1
 from coldloop.registers.control_plc import Update
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
-from optimizer_plc.estimator import at_rest, begin_prediction, correct, estimator_of, no_belief, predict
+from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict, rest_map
 from optimizer_plc.qp.linear_algebra import respond
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.settings import ProgramSettings
@@ -140,7 +140,7 @@ def test_noise_per_time_weighs_a_measurement_by_the_time_since_the_last(predicti
     sensors = ("level_sensor", "speed_sensor", "temperature_sensor", "pressure_sensor")
     doubled = SETTINGS.model_copy(update={name: 2.0 * getattr(SETTINGS, name) for name in sensors})
     by_time = SETTINGS.model_copy(update={"noise_reference": NoiseReference.TIME})
-    usual, twice, found = (estimator_of(prediction, one).gains for one in (SETTINGS, doubled, by_time))
+    usual, twice, found = (estimator_of(prediction, one).stationary.gains for one in (SETTINGS, doubled, by_time))
     assert found[19] == pytest.approx(usual[19], rel=1e-5, abs=1e-9 * np.abs(usual[19]).max())
     assert found[4] == pytest.approx(twice[4], rel=1e-5, abs=1e-9 * np.abs(twice[4]).max())
     assert np.abs(found[4] - usual[4]).max() > 1e-3 * np.abs(usual[4]).max()
@@ -237,7 +237,7 @@ def test_a_filter_without_a_past_begins_where_the_plant_rests_with_its_inputs_lo
     prediction: PredictionModel, u: tuple[float, ...], load: float, level: float
 ) -> None:
     belief = no_belief(prediction.n_states)
-    belief.begin_at_rest(at_rest(prediction), np.array(u), load, level)
+    belief.begin_at_rest(rest_map(prediction), np.array(u), load, level)
     x, (_, mismatch, _) = belief.predicted, belief.numbers[0].tolist()
     step, applied, load_acting = prediction.sample, np.array(u), load + mismatch
     scale = 1.0 + np.abs(x).max()
@@ -248,6 +248,6 @@ def test_a_filter_without_a_past_begins_where_the_plant_rests_with_its_inputs_lo
 
 def test_at_the_operating_point_that_is_the_operating_point(prediction: PredictionModel) -> None:
     belief = no_belief(prediction.n_states)
-    belief.begin_at_rest(at_rest(prediction), np.zeros(3), 0.0, 0.0)
+    belief.begin_at_rest(rest_map(prediction), np.zeros(3), 0.0, 0.0)
     assert not belief.x.any()
     assert belief.numbers[0].tolist() == (0.0, 0.0, 1)

@@ -42,7 +42,8 @@ def test_an_age_that_cannot_be_is_no_answer(age: float) -> None:
         UPDATE._replace(playing=0xFFFF_FFFF),
         UPDATE._replace(load=math.inf),
         UPDATE._replace(x=(3.4e38, *HEADER.x0[1:])),
-        UPDATE._replace(y=(*HEADER.y0[:-1], math.nan)),
+        UPDATE._replace(u_before=(43.0, 75.0, math.nan)),
+        UPDATE._replace(y=(*HEADER.y0[:-1], -3.4e38)),
     ],
 )
 def test_other_values_that_cannot_be_are_no_answer_either(record: Measurement | Update) -> None:
@@ -52,9 +53,10 @@ def test_other_values_that_cannot_be_are_no_answer_either(record: Measurement | 
 
 def test_sensors_that_show_no_number_are_for_the_program_to_judge() -> None:
     broken = (math.nan, *HEADER.y0[1:])
-    answer = decoded(MEASURED._replace(y=broken, load=math.nan))
-    assert isinstance(answer, Measurement)
-    assert math.isnan(answer.y[0])
+    for record in (MEASURED._replace(y=broken, load=math.nan), UPDATE._replace(y=broken)):
+        answer = decoded(record)
+        assert isinstance(answer, type(record))
+        assert math.isnan(answer.y[0])
 
 
 def test_registers_that_nobody_has_written_are_read() -> None:

@@ -196,7 +196,14 @@ class Update(NamedTuple):
     ]
     y: Annotated[
         tuple[float, ...],
-        f32_array("Output measured at this instant", OUTPUT_NAMES, OUTPUT_UNITS, low=-MAX_STATE, high=MAX_STATE),
+        f32_array(
+            "Output measured at this instant; not a number where the measurement is bad",
+            OUTPUT_NAMES,
+            OUTPUT_UNITS,
+            low=-MAX_STATE,
+            high=MAX_STATE,
+            finite=False,
+        ),
     ]
     x: Annotated[
         tuple[float, ...],

@@ -1,0 +1,78 @@
+"""Sensors that die while MPC controls: the estimate does without them, and the process stays in its bands."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coldloop.process.load_profile import LoadProfile
+from coldloop.process.signals import L1, OUTPUT_NAMES, T5
+from coldloop.registers.control_plc import Plan, Update
+from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.qp.design import ControlDesign
+from plant.program import PlantProgram
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario
+from rig.results.recording import Recorder
+from rig.settings import Settings
+
+BANDS = ControlDesign()
+BEGIN, TEN_MINUTES, HALF_HOUR = 1200, 2400, 7200
+"""Ticks; sensors die after five minutes."""
+OTHERS = [name for output, name in enumerate(OUTPUT_NAMES) if output not in (L1, T5)]
+
+Outside = Callable[..., NDArray[np.bool_]]
+
+
+@pytest.fixture(scope="module")
+def one_process() -> OneProcessRig:
+    """Its programs do every tick, so that what they see can be changed."""
+    return OneProcessRig(Settings(), compiled=False)
+
+
+@pytest.fixture
+def outside(one_process: OneProcessRig, load_a: LoadProfile, monkeypatch: pytest.MonkeyPatch) -> Outside:
+    """Return whether L1 and T5 are outside their bands in each tick since `dead` sensors showed no number."""
+
+    def run(dead: Sequence[str], ticks: int, *, told: bool = True) -> NDArray[np.bool_]:
+        outputs, missing = [OUTPUT_NAMES.index(name) for name in dead], set()
+        measure, plan = PlantProgram.measure, OptimizerProgram.plan
+
+        def measured(plant: PlantProgram) -> tuple[float, ...]:
+            y = list(measure(plant))
+            for output in outputs:
+                y[output] = math.nan if BEGIN <= plant.tick < BEGIN + ticks else y[output]
+            return tuple(y)
+
+        def planned(program: OptimizerProgram, update: Update) -> Plan:
+            missing.add(tuple(np.flatnonzero(np.isnan(update.y))))
+            process = one_process.control.process
+            return plan(program, update if told or process is None else update._replace(y=process.y))
+
+        recorder = Recorder(BEGIN + ticks + TEN_MINUTES)
+        with monkeypatch.context() as patch:
+            patch.setattr(PlantProgram, "measure", measured)
+            patch.setattr(OptimizerProgram, "plan", planned)
+            one_process.run(Scenario(BEGIN + ticks + TEN_MINUTES, load_a, 0.0, seed=1), recorder)
+        assert missing == {(), tuple(outputs)}
+        y = recorder.recording().y[BEGIN:, [L1, T5]]
+        return (y < BANDS.output_low) | (y > BANDS.output_high)
+
+    return run
+
+
+def test_a_stale_pressure_as_a_measurement_takes_level_and_temperature_out_of_their_bands(outside: Outside) -> None:
+    assert outside(["P1"], TEN_MINUTES, told=False).any(axis=0).all()
+
+
+@pytest.mark.parametrize("dead", [["P1"], ["V1", "T4", "P2"], OTHERS[-10:]], ids=" ".join)
+def test_the_bands_are_kept_without_some_sensors_and_when_they_are_back(outside: Outside, dead: list[str]) -> None:
+    assert not outside(dead, TEN_MINUTES).any()
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("dead", OTHERS)
+def test_the_bands_are_kept_for_half_an_hour_without_any_one_sensor(outside: Outside, dead: str) -> None:
+    assert not outside([dead], HALF_HOUR).any()
