@@ -24,6 +24,7 @@ from optimizer_plc.budget import PlcBudget
 from optimizer_plc.control_link import ControlLink
 
 SHORTEST_PERIOD_TICKS: Final = 2
+NO_UPDATE: Final = Optimization(*(0,) * len(Optimization._fields))
 
 
 class OptimizerPublication:
@@ -103,6 +104,8 @@ class OptimizerPublication:
         """Show that a session has begun."""
         who = self._asked_by if self.asked_for(session) is not None else ""
         self._session, self._last = session, None
+        for row in range(HISTORY_ROWS):  # what another session did is not to be taken for an update of this one
+            self.bank.put(NO_UPDATE, row)
         self._journal.note(self.link.tick, EventKind.SESSION, int(pace.realtime), value=pace.factor, who=who)
         self.pace = pace
         self.bank.put(SessionPace.shown(session, pace))
