@@ -15,10 +15,16 @@ AT_REST: Final = 1e-9
 NOTABLE: Final = {"W": 2.0, "%": 0.2, "Hz": 5.0, "K": 0.05, "bar": 0.005}
 """A plant that differs from its model by less is not worth a word."""
 MOST_DEVIATIONS: Final = 4
+SURPRISING: Final = 3.0
+"""A reading that is so many times further from its prediction than the filter expects is worth a word."""
 
 
 def deviation(found: ModelDeviation) -> str:
-    """Return how the plant differs from its model, without the load, the most notable first; empty where it agrees."""
+    """Return how the plant differs from its model, without the load, the most notable first; empty where it agrees.
+
+    Last comes the reading that is furthest from what is predicted, if it is surprising: the model, or its sensor, is
+    not what the filter takes it for.
+    """
     parts = [
         (value, unit, f"needs {abs(value):.3g} {unit} {'less' if value > 0 else 'more'} of {name}")
         for name, unit, value in zip(INPUT_NAMES, INPUT_UNITS, found.u, strict=True)
@@ -28,7 +34,11 @@ def deviation(found: ModelDeviation) -> str:
         for name, unit, value in zip(OUTPUT_NAMES, OUTPUT_UNITS, found.y, strict=True)
     ]
     notable = [(abs(value) / NOTABLE[unit], text) for value, unit, text in parts if abs(value) >= NOTABLE[unit]]
-    return ", ".join(text for _, text in sorted(notable, reverse=True)[:MOST_DEVIATIONS])
+    texts = [text for _, text in sorted(notable, reverse=True)[:MOST_DEVIATIONS]]
+    surprise, name = max(zip(found.surprise, OUTPUT_NAMES, strict=True))
+    if surprise >= SURPRISING:
+        texts.append(f"{name} {surprise:.2g} times further from its prediction than expected")
+    return ", ".join(texts)
 
 
 def sentence(found: Explanation, rule: UpdatingRuleStatus) -> str:

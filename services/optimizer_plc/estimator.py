@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
-from coldloop.process.signals import L1, SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
+from coldloop.process.signals import L1, OUTPUT_NAMES, SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
 from optimizer_plc.computing_settings import SIGNALS, EstimatorKind, EstimatorSettings, NoiseReference
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.linear_algebra import add_transposed_product, cholesky, cholesky_solve, multiply, respond
@@ -16,6 +16,7 @@ from optimizer_plc.qp.prediction import PredictionModel, Transition
 Array = NDArray[np.float64]
 
 
+MINUTE_S: Final = 60.0
 UNDETECTABLE: Final = 1e-9
 """Relative size of a direction that no measurement sees."""
 
@@ -61,10 +62,13 @@ class Belief(NamedTuple):
     """State at the last measurement, shape (n,)."""
     predicted: Array
     """State predicted since, shape (n,)."""
+    surprise: Array
+    """How far each output was from what the prediction and the other outputs say, over the standard deviation that the
+    filter expects: mean square over about `MINUTE_S`, shape (n_y,)."""
 
     def forget(self) -> None:
         """Begin at the operating point."""
-        self.x[:] = self.predicted[:] = 0.0
+        self.x[:] = self.predicted[:] = self.surprise[:] = 0.0
         self.numbers[0] = (0.0, 0.0, 1)
 
     def begin_at_rest(self, rest: Array, u: Array, load: float, level: float) -> None:
@@ -101,7 +105,7 @@ def estimator_of(prediction: PredictionModel, settings: EstimatorSettings, real:
 def no_belief(n_states: int, real: Real = DOUBLE) -> Belief:
     """Return the belief of an estimator that begins at the operating point."""
     numbers = np.zeros(1, [("w", real), ("mismatch", real), ("since", "i8")])
-    belief = Belief(numbers, np.zeros(n_states, real), np.zeros(n_states, real))
+    belief = Belief(numbers, np.zeros(n_states, real), np.zeros(n_states, real), np.zeros(len(OUTPUT_NAMES), real))
     belief.forget()
     return belief
 
@@ -134,14 +138,29 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     period, maps = min(b.since, c.stationary.gains.shape[0]) - 1, c.outputs
     expected = respond(maps.A, maps.B, maps.F, belief.predicted, u_before - c.u0, known + b.mismatch)
     innovation = y - c.y0 - expected
+    J = c.stationary.inverse_covariances[period]
     if not np.isfinite(innovation).all():
-        innovation = imputed(innovation, c.stationary.inverse_covariances[period])
+        innovation = imputed(innovation, J)
+    note_surprise(belief.surprise, innovation, J, belief.x.dtype.type(b.since * TICK_S / MINUTE_S))
     correction = np.zeros(belief.x.size + 1, belief.x.dtype)
     add_transposed_product(c.stationary.gains[period], innovation, correction)
     belief.x[:] = belief.predicted + correction[:-1]
     belief.predicted[:] = belief.x
     b.mismatch += correction[-1]
     b.w = known + b.mismatch
+
+
+@kernel
+def note_surprise(surprise: Array, innovation: Array, J: Array, share: float) -> None:
+    """Let an innovation (n_y,), whose inverse covariance is J, count with a share of up to 1 in the mean squares.
+
+    (J e)_i / sqrt(J_ii) is the residual of output i given all others, over its standard deviation.
+    """
+    for i in range(surprise.shape[0]):
+        residual = surprise.dtype.type(0.0)
+        for j in range(surprise.shape[0]):
+            residual += J[i, j] * innovation[j]
+        surprise[i] += min(share, surprise.dtype.type(1.0)) * (residual * residual / J[i, i] - surprise[i])
 
 
 @kernel

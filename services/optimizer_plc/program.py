@@ -263,8 +263,9 @@ class OptimizerProgram:
         constants = np.zeros(n_y + len(INPUT_NAMES))
         constants[list(self.disturbances)] = belief.x[belief.x.size - len(self.disturbances) :]
         return ModelDeviation(
-            float(belief.numbers[0]["mismatch"]), tuple(constants[n_y:].tolist()), tuple(constants[:n_y].tolist())
-        )
+            float(belief.numbers[0]["mismatch"]), tuple(constants[n_y:].tolist()), tuple(constants[:n_y].tolist()),
+            tuple(np.sqrt(belief.surprise).tolist()),
+        )  # fmt: skip
 
     @property
     def operating_limits(self) -> OperatingLimits:

@@ -246,3 +246,8 @@ def test_a_plant_that_differs_from_its_model_is_described_the_most_notable_first
     assert deviation(ModelDeviation(load=31.0)) == ""
     everything = ModelDeviation(u=(1.0, 1.0, 1.0), y=(1.0,) * 22)
     assert deviation(everything).count(",") == 3
+    surprise = [1.0] * 22
+    surprise[T5] = 4.23
+    further = "T5 4.2 times further from its prediction than expected"
+    assert deviation(ModelDeviation(surprise=tuple(surprise))) == further
+    assert deviation(found._replace(surprise=tuple(surprise))).endswith(f"less of CV156, {further}")

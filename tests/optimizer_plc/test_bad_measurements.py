@@ -20,6 +20,7 @@ from optimizer_plc.estimator import (
     estimator_of,
     imputed,
     no_belief,
+    note_surprise,
     stationary_gains,
 )
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
@@ -92,6 +93,33 @@ def test_one_output_has_the_mean_that_its_row_says() -> None:
         others = np.arange(N_Y) != i
         assert found[i] == pytest.approx(-(J[i, others] @ innovation[others]) / J[i, i], rel=1e-12)
         assert np.array_equal(found[others], innovation[others])
+
+
+@given(drawn=filters(), seed=st.integers(0, 2**32))
+def test_an_output_surprises_by_what_the_others_do_not_say_over_its_standard_deviation(
+    drawn: Filter, seed: int
+) -> None:
+    innovation, J = np.random.default_rng(seed).normal(size=N_Y), drawn.inverse_covariance
+    surprise = np.zeros(N_Y)
+    note_surprise(surprise, innovation, J, 1.0)
+    S = np.linalg.inv(J)
+    for i in range(N_Y):
+        others = np.arange(N_Y) != i
+        weights = np.linalg.solve(S[np.ix_(others, others)], S[others, i])
+        variance = S[i, i] - S[i, others] @ weights
+        assert surprise[i] == pytest.approx((innovation[i] - weights @ innovation[others]) ** 2 / variance, rel=1e-4)
+
+
+def test_surprises_are_averaged_over_a_minute_and_an_imputed_output_is_none() -> None:
+    J, surprise = np.eye(N_Y), np.zeros(N_Y)
+    innovation = np.full(N_Y, 3.0)
+    innovation[P1] = 0.0
+    for _ in range(12):
+        note_surprise(surprise, innovation, J, 1.0 / 12.0)
+    assert surprise[L1] == pytest.approx(9.0 * (1.0 - (11.0 / 12.0) ** 12))
+    assert surprise[P1] == 0.0
+    note_surprise(surprise, innovation, J, 5.0)
+    assert surprise[L1] == 9.0
 
 
 @by_estimator

@@ -169,6 +169,16 @@ class ModelDeviation(NamedTuple):
         tuple[float, ...],
         f32_array("Constant difference of the reading from the model's", OUTPUT_NAMES, OUTPUT_UNITS, finite=False),
     ] = (0.0,) * len(OUTPUT_NAMES)
+    surprise: Annotated[
+        tuple[float, ...],
+        f32_array(
+            "How far the reading was from what prediction and other readings say, over what the filter expects: "
+            "root mean square over a minute; about 1 or less is as designed",
+            OUTPUT_NAMES,
+            ("",) * len(OUTPUT_NAMES),
+            finite=False,
+        ),
+    ] = (0.0,) * len(OUTPUT_NAMES)
 
 
 OPTIMIZER_MAP: Final = RegisterMap(
