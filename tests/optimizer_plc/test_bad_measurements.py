@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import L1, OUTPUT_NAMES
-from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
+from optimizer_plc.computing_settings import Arithmetic, EstimatorKind, EstimatorSettings
 from optimizer_plc.estimator import (
     Belief,
     Estimator,
@@ -23,7 +23,7 @@ from optimizer_plc.estimator import (
     note_surprise,
     stationary_gains,
 )
-from optimizer_plc.qp.arithmetic import DOUBLE, Real
+from optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
 from optimizer_plc.qp.linear_algebra import add_transposed_product, respond
 from optimizer_plc.qp.prediction import PredictionModel
 
@@ -33,6 +33,7 @@ N_Y = len(OUTPUT_NAMES)
 P1 = OUTPUT_NAMES.index("P1")
 EVERY = frozenset(range(N_Y))
 TICKS = 10
+SINGLE = real_of(Arithmetic.FLOAT32)
 ESTIMATORS = [EstimatorSettings(), EstimatorSettings(disturbances=("outputs",), load_walk_w=1.0)]
 by_estimator = pytest.mark.parametrize("chosen", ESTIMATORS, ids=["paper", "tuned"])
 some_outputs = st.sets(st.sampled_from(range(N_Y)))
@@ -186,11 +187,11 @@ def test_an_update_with_all_measurements_has_the_bits_of_the_plain_filter(
 @by_estimator
 def test_single_precision_loses_little_of_it(prediction: PredictionModel, chosen: EstimatorSettings) -> None:
     model = prediction.with_disturbances(chosen.disturbed)
-    exact, rough = estimator_of(model, chosen), estimator_of(model, chosen, np.float32)
+    exact, rough = estimator_of(model, chosen), estimator_of(model, chosen, SINGLE)
     rng = np.random.default_rng(4)
     for bad in ({P1}, EVERY - set(range(P1)), EVERY - {L1}, rng.choice(N_Y, 11, replace=False)):
         y = without(rng.normal(size=N_Y), bad)
-        found, expected = (correction_in(after(c, y, real)) for c, real in ((rough, np.float32), (exact, DOUBLE)))
+        found, expected = (correction_in(after(c, y, real)) for c, real in ((rough, SINGLE), (exact, DOUBLE)))
         assert np.abs((found - expected) / np.abs(exact.stationary.gains[TICKS - 1]).max(axis=0)).max() < 1e-3
 
 
