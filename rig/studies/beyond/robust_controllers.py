@@ -98,8 +98,8 @@ def comparison(found: Found) -> str:
             condition: mean_ratio(found[condition, DEFAULT].costs, found[condition, other].costs)
             for condition in CONDITIONS
         }
-        less = [f"{condition} ({one.value:.2g})" for condition, one in ratios.items() if one.high < 1.0]
-        more = [f"{condition} ({one.value:.2g})" for condition, one in ratios.items() if one.low > 1.0]
+        less = [f"{condition} ({one.value:.3g})" for condition, one in ratios.items() if one.high < 1.0]
+        more = [f"{condition} ({one.value:.3g})" for condition, one in ratios.items() if one.low > 1.0]
         lines.append(
             f"- of `{other}`: less under {', '.join(less) or 'no condition'}; more under "
             f"{', '.join(more) or 'no condition'}; undecided in {len(ratios) - len(less) - len(more)} of {len(ratios)}."
