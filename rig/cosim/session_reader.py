@@ -141,14 +141,18 @@ class UpdateReader:
                 raise LinkError(f"{self._client.peer} has overwritten update {self._next} before it was recorded")
             self._next = max(0, newest - UPDATE_ROWS)
         for update in await read_ring(self._client, Optimization, UPDATE_ROWS, self._next, newest - 1):
-            if not self._tolerant or self._follows(update):
+            if self._follows(update):
                 self._recorder.update(update)
                 self._last = update
             self._next += 1
 
     def _follows(self, update: Optimization) -> bool:
-        """Return whether a row is the update that is looked for, and not one that was recorded before."""
-        return update.update == self._next and (self._last is None or update.tick > self._last.tick)
+        """Return whether a row is the update that is looked for, and not one that was recorded before.
+
+        An update that was abandoned for a newer one leaves its row empty, or as it was 256 updates before.
+        """
+        later = self._last is None or update.tick > self._last.tick
+        return update.update == self._next and update.tau_u > 0 and later
 
     async def read_until(self, ticks: int, last: int, patience_s: float) -> None:
         """Read on until update `last` is there, and one that reaches beyond the run.

@@ -1,12 +1,22 @@
 """What is known of a session before its recording begins: how everything is, from what was noted last."""
 
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from coldloop.modbus.client import RegisterClient
 from coldloop.registers.audit import Event, EventKind
+from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import Status
+from coldloop.registers.optimizer_plc import HISTORY_ROWS, Optimization
 from coldloop.registers.safety import AlarmState
 from hmi.process_image import JournalEntry
+from rig.cosim.session_reader import UpdateReader
 from rig.cosim.session_recording import Lateness, state_of
 from rig.results.recorded import LinkStatistics
 from rig.results.recorded_alarms import alarms_after
+from rig.results.recording import Records
 
 
 def noted(number: int, kind: EventKind, subject: int = 0, cause: int = 0) -> Event:
@@ -49,3 +59,37 @@ def test_what_was_late_is_counted_over_a_restart_of_the_control_plc() -> None:
     assert late.after(counted(103, 50, 3.0)) == LinkStatistics(3, 0, 3.0, 1.5)
     assert late.after(None) == LinkStatistics(3, 0, 3.0, 1.5), "it is away"
     assert late.after(counted(2, 1, 1.0)) == LinkStatistics(5, 1, 3.0, 0.5), "and has counted from 0 again"
+
+
+NO_UPDATE = Optimization(*(0,) * len(Optimization._fields))
+
+
+class History:
+    """The optimiser's registers, as far as a reader of updates looks."""
+
+    peer = "optimizer_plc"
+
+    def __init__(self, *updates: Optimization) -> None:
+        self.rows = {update.update % HISTORY_ROWS: update for update in updates}
+        self.newest = max(update.update for update in updates)
+
+    async def read(self, _record: type[Identity]) -> Identity:
+        return Identity(
+            map_digest=0, map_version=0, state=1, model_digest=0, session=1, tick=0, heartbeat=self.newest + 1
+        )
+
+    async def read_rows(self, _record: type[Optimization], first: int, count: int) -> list[Optimization]:
+        return [self.rows.get(row, NO_UPDATE) for row in range(first, first + count)]
+
+
+def done(number: int, tick: int) -> Optimization:
+    return NO_UPDATE._replace(update=number, tick=tick, tau_u=4)
+
+
+@pytest.mark.parametrize("tolerant", [False, True])
+async def test_an_update_that_was_abandoned_for_a_newer_one_is_not_recorded(*, tolerant: bool) -> None:
+    """In real time a busy machine may leave the first update unanswered: its row is empty, and its number is 0."""
+    recorded: list[Optimization] = []
+    client, recorder = cast("RegisterClient", History(done(1, 4), done(3, 12))), SimpleNamespace(update=recorded.append)
+    await UpdateReader(client, cast("Records", recorder), session=1, tolerant=tolerant).read()
+    assert [update.update for update in recorded] == [1, 3]
