@@ -235,6 +235,17 @@ def test_tables_are_not_wider_than_a_phone(operated: "Page") -> None:
         assert operated.evaluate(WIDE) == [], name
 
 
+def test_what_is_shown_above_does_not_move_the_links_of_a_phone_away_under_a_finger(page: "Page") -> None:
+    page.set_viewport_size({"width": 390, "height": 844})
+    before, after = page.evaluate("""() => {
+      const place = () => document.querySelector("nav a[href='#commands']").getBoundingClientRect().top;
+      const before = place();
+      for (const one of document.querySelectorAll(".status .value")) one.textContent = "as long as it ever gets";
+      return [before, place()];
+    }""")
+    assert before == after
+
+
 WIDE = """() => [...document.querySelectorAll("main .scroll, main details")].filter((one) => one.offsetParent)
   .filter((one) => one.scrollWidth > one.clientWidth + 1).map((one) => one.innerText.slice(0, 40))"""
 
