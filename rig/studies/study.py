@@ -21,13 +21,15 @@ RUNS = "runs"
 """Folder, beside those of the studies, in which runs are kept: studies share them."""
 QUICK_TICKS = 2400
 """Longest run of a quick study: ten minutes."""
-NOISE = (
-    "plant.sensors.level=0.01",
-    "plant.sensors.speed=1.0",
-    "plant.sensors.temperature=0.02",
-    "plant.sensors.pressure=0.001",
-)
-"""Measurement noise of the size that the Kalman filter reckons with."""
+
+
+def noise(factor: float) -> tuple[str, ...]:
+    """Return measurement noise of so many times the size that the Kalman filter reckons with."""
+    sizes = {"level": 0.01, "speed": 1.0, "temperature": 0.02, "pressure": 0.001}
+    return tuple(f"plant.sensors.{name}={factor * size:g}" for name, size in sizes.items())
+
+
+NOISE = noise(1.0)
 PROGRAM = "optimizer_plc.program."
 
 

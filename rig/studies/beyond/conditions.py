@@ -1,0 +1,34 @@
+"""Plants that are not as their model, and sensors that are not as their plant: the conditions of `robustness`."""
+
+from typing import Final
+
+from rig.studies.study import NOISE, PROGRAM, noise
+
+MISMATCH: Final = "plant.mismatch."
+OFF: Final = (0.8, 0.9, 1.1, 1.2)
+PARAMETERS: Final = {
+    "UA": ("heat_transfer",),
+    "turbine efficiency": ("turbine_efficiency",),
+    "valves": ("jt_valve", "turbine_valve"),
+}
+NOMINAL: Final = "as its model"
+ESTIMATED: Final = "load estimated"
+CONDITIONS: Final = {
+    NOMINAL: (),
+    **{
+        f"{name} {100 * (factor - 1):+.0f} %": tuple(f"{MISMATCH}{key}={factor}" for key in keys)
+        for name, keys in PARAMETERS.items() for factor in OFF
+    },
+    "sensor noise": NOISE,
+    "sensor noise doubled": noise(2.0),
+    "sensor bias": (
+        "plant.sensors.level_bias=0.2", "plant.sensors.temperature_bias=0.2", "plant.sensors.pressure_bias=0.005",
+    ),
+    ESTIMATED: (f"{PROGRAM}estimator.load_known=false", f"{PROGRAM}estimator.load_walk_w=30"),
+}  # fmt: skip
+"""What differs from what the controller believes. Bias: 0.2 % of level, 0.2 K, 5 mbar."""
+LEFT_OUT: Final = (
+    "No setting expresses dead times or loads that are announced wrongly, and several errors at once are not tried. "
+    "Costs and bands are of true values under bias, and of measured ones, which are noisy, under noise. "
+    f"Under '{ESTIMATED}' `tuned` has the estimator of `paper`, and no period can be interrupted: rules run without."
+)
