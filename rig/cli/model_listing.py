@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coldloop.errors import ModelFileError
+from coldloop.errors import ModelFileError, printable
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.signals import L1, T5
 from plant.cold_box.equilibrium import Equilibrium, find_equilibrium
@@ -38,11 +38,13 @@ def describe_model(in_use: Path) -> tuple[LtiModel, str]:
 
 
 def _in_use_line(file: Path) -> list[str]:
-    """Return the digest of the configured model; nothing where there is none, which the command then says."""
+    """Return digest and note of the configured model; nothing where there is none, which the command then says."""
     try:
-        return [f"in use     sha256 {load(file).digest} ({file})"]
+        model = load(file)
     except ModelFileError:
         return []
+    note = [f"           {printable(model.note)}"] if model.note else []
+    return [f"in use     sha256 {model.digest} ({file})", *note]
 
 
 def _equilibrium_lines(model: LtiModel, rest: Equilibrium) -> list[str]:

@@ -88,6 +88,8 @@ class LtiModel:
     """SHA-256 of the plant's parameters and property tables."""
     plant: str = COLD_BOX
     """Which plant it is the model of."""
+    note: str = ""
+    """Where it comes from, if not from the plant's equations."""
 
     def __post_init__(self) -> None:
         n, m, p = len(self.state_names), len(self.input_names), len(self.output_names)
@@ -133,7 +135,7 @@ class LtiModel:
         document: dict[str, Any] = {"format": FORMAT}
         for field in fields(self):
             value = getattr(self, field.name)
-            if (field.name, value) == ("plant", COLD_BOX):
+            if isinstance(value, str) and (field.name, value) in (("plant", COLD_BOX), ("note", "")):
                 continue  # so is any file that names none
             if isinstance(value, np.ndarray):
                 document[field.name] = value.tolist()

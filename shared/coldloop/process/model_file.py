@@ -44,6 +44,8 @@ class ModelHeader:
     """Outputs at the operating point, in `output_units`."""
     plant: str = COLD_BOX
     """Which plant the model was made of."""
+    note: str = ""
+    """Where the model comes from, if not from the plant's equations."""
 
     @property
     def short_digest(self) -> int:
@@ -66,7 +68,8 @@ def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
         described: dict[str, Any] = {name: str(document[name]) for name in TEXTS}
         described |= {name: tuple(str(text) for text in document[name]) for name in LISTS_OF_TEXT}
         described |= {name: tuple(float(number) for number in document[name]) for name in VECTORS}
-        header = ModelHeader(w0=float(document["w0"]), plant=str(document.get("plant", COLD_BOX)), **described)
+        described |= {"plant": str(document.get("plant", COLD_BOX)), "note": str(document.get("note", ""))}
+        header = ModelHeader(w0=float(document["w0"]), **described)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{path}: {error!r} in the model file; {REMEDY}") from error
     for kind, values in zip(KINDS, (header.x0, header.u0, header.y0), strict=True):
