@@ -75,6 +75,7 @@ class _Pending(NamedTuple):
     since: int
     """Tick."""
     cause: int
+    value: float
 
 
 class AlarmPanel:
@@ -133,12 +134,12 @@ class AlarmPanel:
 
     # -- conditions ----------------------------------------------------------------------------------------------------
 
-    def report(self, kind: AlarmKind, *, condition: bool, cause: int = 0) -> None:
-        """Report the condition of an alarm and its cause; a new cause raises the alarm again."""
+    def report(self, kind: AlarmKind, *, condition: bool, cause: int = 0, value: float = 0.0) -> None:
+        """Report the condition of an alarm and its cause; a new cause raises the alarm again, whatever the value."""
         row = self.rows[kind]
         if condition != bool(row.active):
             earlier = self._pending.get(kind)
-            self._pending[kind] = _Pending(self.now if earlier is None else earlier.since, cause)
+            self._pending[kind] = _Pending(self.now if earlier is None else earlier.since, cause, value)
             self._settle(kind)
             return
         self._pending.pop(kind, None)
@@ -146,7 +147,7 @@ class AlarmPanel:
             if cause in self._causes[kind]:  # alternating causes are not new
                 self._store(kind, cause=cause)
             else:
-                self._raise(kind, cause)
+                self._raise(kind, cause, value)
 
     def pending(self, *kinds: AlarmKind) -> list[int | None]:
         """Return since when the condition of each alarm has differed from its shown state; None where it does not."""
@@ -157,7 +158,7 @@ class AlarmPanel:
         """Set since when the condition of an alarm has differed from its shown state."""
         self._pending.pop(kind, None)
         if since is not None:
-            self._pending[kind] = _Pending(since, 0)
+            self._pending[kind] = _Pending(since, 0, 0.0)
 
     @property
     def are_quiet(self) -> bool:
@@ -165,9 +166,12 @@ class AlarmPanel:
         others = (row for kind, row in zip(AlarmKind, self.rows, strict=True) if kind not in OF_THE_PROCESS)
         return not any(row.active for row in others) and all(kind in OF_THE_PROCESS for kind in self._pending)
 
-    def holds(self, kind: AlarmKind) -> bool:
-        """Return whether the condition of an alarm was last reported to hold, whatever its delay."""
-        return bool(self.rows[kind].active) != (kind in self._pending)
+    def reported(self, kind: AlarmKind) -> int:
+        """Return the cause last reported of an alarm, whatever its delay; 0 where its condition does not hold."""
+        pending, row = self._pending.get(kind), self.rows[kind]
+        if pending is None:
+            return row.cause if row.active else 0
+        return 0 if row.active else pending.cause
 
     def due(self, kind: AlarmKind) -> float:
         """Return the tick at which an alarm follows its condition; infinite where it already does."""
@@ -204,9 +208,9 @@ class AlarmPanel:
         if self.rows[kind].active:
             self._return(kind)
         else:
-            self._raise(kind, pending.cause)
+            self._raise(kind, pending.cause, pending.value)
 
-    def _raise(self, kind: AlarmKind, cause: int) -> None:
+    def _raise(self, kind: AlarmKind, cause: int, value: float = 0.0) -> None:
         row = self.rows[kind]
         if not row.active:
             self._causes[kind] = set()
@@ -215,7 +219,7 @@ class AlarmPanel:
             self._store(kind, active=1, cause=cause)
         else:
             times = (row.times + 1) & 0xFFFF
-            self._step(kind, EventKind.ALARM_RAISED, active=1, cause=cause, times=times, raised=self.now)
+            self._step(kind, EventKind.ALARM_RAISED, value=value, active=1, cause=cause, times=times, raised=self.now)
 
     def _return(self, kind: AlarmKind) -> None:
         if self.rows[kind].state == AlarmState.OUT_OF_SERVICE:
@@ -249,7 +253,7 @@ class AlarmPanel:
         self.rows = [row._replace(priority=rule.priority) for row, rule in zip(rows, self._rules, strict=True)]
         self._causes = {kind: {row.cause} for kind, row in zip(AlarmKind, rows, strict=True) if row.active}
         # An instantaneous alarm has no end.
-        self._pending = {kind: _Pending(self.now, 0) for kind in PASSING if self.rows[kind].active}
+        self._pending = {kind: _Pending(self.now, 0, 0.0) for kind in PASSING if self.rows[kind].active}
         self.changes += 1
 
     # -- the state machine ---------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from collections.abc import Collection, Sequence
 from coldloop.process.signals import L1, T5
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode
-from coldloop.registers.safety import AlarmKind, capacity_cause
+from coldloop.registers.safety import AlarmKind, CapacityCause
 from coldloop.service.journal import Journal
 from control_plc.alarm_settings import AlarmSettings
 from control_plc.alarms import AlarmPanel
@@ -62,9 +62,8 @@ class ProcessAlarms:
         report(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)
         report(AlarmKind.SEQUENCE_LATE, condition=late)
         report(AlarmKind.OPTIMIZER_LOST, condition=not optimizer)
-        capacity = self._panel.rows[AlarmKind.CAPACITY]
-        watts = capacity.cause if capacity.active else capacity_cause(shortage)  # one alarm, however large it gets
-        report(AlarmKind.CAPACITY, condition=mode is Mode.MPC and shortage != 0.0, cause=watts)
+        short = CapacityCause.of(shortage if mode is Mode.MPC else 0.0)
+        report(AlarmKind.CAPACITY, condition=bool(short), cause=short, value=abs(shortage))
         self._watch_sensors(tick, frozenset(bad))
 
     def _watch_sensors(self, tick: int, bad: frozenset[int]) -> None:

@@ -23,7 +23,7 @@ from control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")
 
-OWNER: Final = "control_plc/4"
+OWNER: Final = "control_plc/5"
 """Who retained states belong to, and the version of what they hold."""
 ROW: Final = struct.Struct(">3f")
 OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing")

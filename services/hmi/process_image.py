@@ -3,6 +3,7 @@
 Readers of a rig or of a recorded run write into it; the pages are made from it. No sockets here.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -43,6 +44,13 @@ class JournalEntry(NamedTuple):
     def of(cls, service: str, event: Event) -> "JournalEntry":
         """Return an event of a journal."""
         return cls(service, event.number, event.boot, utc_text(event), event.tick, describe(event))
+
+
+def _same(one: Any, other: Any) -> bool:  # noqa: ANN401 a value of any register
+    """Return whether two values are the same; not a number is the same as itself."""
+    if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
+        return math.isnan(other)
+    return bool(one == other)
 
 
 @dataclass
@@ -100,7 +108,7 @@ class Model:
             return
         source.records[block.name] = record
         for name, value in values_of(service, block, record).items():
-            if self._values.get(name) != value:
+            if not _same(self._values.get(name), value):
                 self._values[name] = value
                 self.changed.add(name)
         if isinstance(record, Identity):

@@ -71,13 +71,17 @@ class Belief(NamedTuple):
         self.x[:] = self.predicted[:] = self.surprise[:] = 0.0
         self.numbers[0] = (0.0, 0.0, 1)
 
-    def begin_at_rest(self, rest: Array, u: Array, load: float, level: float) -> None:
-        """Begin where the plant would rest with the inputs u (3,), load and L1, deviations; `rest` is `rest_map`'s."""
+    def begin_at_rest(self, rest: Array, u: Array, load: float | None, level: float) -> None:
+        """Begin where the plant would rest with the inputs u (3,), load and L1, deviations; `rest` is `rest_map`'s.
+
+        A load that is measured (not None) may have moved just now: it then says more than what would let L1 rest.
+        """
         self.forget()
-        found = rest @ np.array([*u, load, level])
+        found = rest @ np.array([*u, load or 0.0, level])
         self.predicted[: len(found) - 1] = found[:-1]
         self.x[:] = self.predicted
-        self.numbers["mismatch"] = found[-1]
+        if load is None:
+            self.numbers["mismatch"] = found[-1]
 
 
 def estimator_of(prediction: PredictionModel, settings: EstimatorSettings, real: Real = DOUBLE) -> Estimator:
@@ -114,13 +118,21 @@ def rest_map(prediction: PredictionModel, real: Real = DOUBLE) -> Array:
     """Return what states and load mismatch are at rest, as a map (n + 1, 5) of inputs, load and L1: all deviations.
 
     L1 integrates: any level rests, and with the inputs and the load that are given only one mismatch lets it.
+
+    Raises:
+        ConfigurationError: With another model, none does.
     """
     n = len(prediction.model.x0)
     A, B, F = (M[:n] for M in prediction.sample)
     C, D, G = (M[L1 : L1 + 1] for M in (prediction.C, prediction.D, prediction.G))
     left = np.block([[np.eye(n) - A[:, :n], -F], [C[:, :n], G]])
     right = np.block([[B, F, np.zeros((n, 1))], [-D, -G, np.ones((1, 1))]])
-    return np.linalg.solve(left, right).astype(real, copy=False)
+    try:
+        return np.linalg.solve(left, right).astype(real, copy=False)
+    except np.linalg.LinAlgError as error:
+        raise ConfigurationError(
+            "model.file: with constant inputs no load lets the model's states and L1 rest; name another model"
+        ) from error
 
 
 @kernel

@@ -154,7 +154,7 @@ class OptimizerProgram:
         For want of a past the plant is believed to rest: a filter that began at the operating point would take minutes.
         """
         estimator = self.constants.estimator
-        load = update.load - estimator.w0 if estimator.load_known else 0.0
+        load = update.load - estimator.w0 if estimator.load_known else None
         level = update.y[L1] - estimator.y0[L1] if math.isfinite(update.y[L1]) else 0.0
         self.state.belief.begin_at_rest(self._rest_map, u, load, level)
         playing = self.state.playing

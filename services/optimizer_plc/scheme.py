@@ -4,13 +4,14 @@
 double precision alike. Decisions outside the arithmetic are in `program.py`.
 """
 
+import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.signals import INPUT_NAMES, T1, T2, TICK_S, TICKS_PER_SAMPLE
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
 from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
@@ -26,6 +27,7 @@ from optimizer_plc.solvers.kernel_solver import solve_by
 
 Array = NDArray[np.float64]
 
+CV155: Final = INPUT_NAMES.index("CV155")
 BY_THE_RULE: Final = 0
 """Iterations that `plan` is given when the rule is to decide them."""
 
@@ -56,6 +58,11 @@ class Constants(NamedTuple):
     least_load: float
     """That can be held, as a deviation, W."""
     largest_load: float
+    approach: float
+    """T2 - T1 at which CV155 is opened no further, K; infinite is any."""
+    opening_per_k: float
+    opening_from: float
+    """A deviation, %."""
     sequence_ticks: int
     fixed_ticks: int
     """Fixed updating period; 0 is adaptive."""
@@ -86,6 +93,9 @@ def constants_of(
         alpha=real(alpha), floor=real(settings.adaptive.cost_floor),
         least_load=real(settings.holdable_load_w[0] - estimator.w0),
         largest_load=real(settings.holdable_load_w[1] - estimator.w0),
+        approach=real(settings.cold_end.approach_k or np.inf),
+        opening_per_k=real(settings.cold_end.opening_per_k),
+        opening_from=real(settings.cold_end.opening_from - estimator.u0[CV155]),
         sequence_ticks=settings.sequence_ticks,
         fixed_ticks=0, most=most,
         periods=np.array([budget.period(iterations) for iterations in range(most + 1)]),
@@ -99,9 +109,14 @@ def with_floor(cost: float, constant: float, floor: float) -> float:
 
 
 @kernel
-def problem_at(c: Constants, x: Array, w: float, u_before: Array, share: float) -> QuadraticProblem:
-    """Return the instance of the problem at a state, a load and the input before; all are deviations."""
+def problem_at(c: Constants, x: Array, w: float, u_before: Array, share: float, most_open: float) -> QuadraticProblem:
+    """Return the instance of the problem at a state, a load and the input before, and with a limit of CV155.
+
+    All are deviations.
+    """
     phi, gamma, low, high, constant = instance(c.maps, x, w, u_before, share)
+    for i in range(CV155, c.n_inputs, u_before.shape[0]):
+        high[i] = min(high[i], max(most_open, low[CV155]))  # the first knot's low is as far as the rate lets it close
     return QuadraticProblem(c.Phi, phi, c.Gamma, gamma, low, high, constant)
 
 
@@ -150,7 +165,9 @@ def pose(c: Constants, m: OptimizerState) -> tuple[QuadraticProblem, Array]:
     sent.x[:] = m.belief.predicted
     s = sent.numbers[0]
     s.w, s.share, s.ticks = m.belief.numbers[0].w, c.rate_shares[ticks], ticks
-    return problem_at(c, sent.x, s.w, sent.u_before, s.share), shifted(c.shifts[ticks], m.playing.z)
+    return problem_at(c, sent.x, s.w, sent.u_before, s.share, m.numbers[0].most_open), shifted(
+        c.shifts[ticks], m.playing.z
+    )
 
 
 @kernel
@@ -209,6 +226,27 @@ def copy_delivery(source: Delivery, target: Delivery) -> None:
 
 
 @kernel
+def shortage(c: Constants, w: float, load: float, none: float) -> float:
+    """Return what the load is above what can be held, W; negative: below what is needed; `none`, that is 0, otherwise.
+
+    The estimate w (a deviation) has what the plant lacks beside its model, and errors of a model far from its operating
+    point; the load itself (W), where it is measured, has neither. Each counts.
+    """
+    measured = load - c.estimator.w0 if c.estimator.load_known else w
+    return max(max(w, measured) - c.largest_load, none) + min(min(w, measured) - c.least_load, none)
+
+
+@kernel
+def most_open(c: Constants, u: Array, y: Array) -> float:
+    """Return how far CV155 may be opened, a scaled deviation, by the inputs (3,), deviations, and the outputs (22,)."""
+    approach = y[T2] - y[T1]
+    if math.isnan(approach):
+        approach = y.dtype.type(0.0)
+    limit: float = max(u[CV155] + c.opening_per_k * (c.approach - approach), c.opening_from) / c.input_scale[CV155]
+    return limit
+
+
+@kernel
 def plan(
     c: Constants,
     rule: UpdatingRule,
@@ -232,8 +270,9 @@ def plan(
         now.solved = False
     correct(c.estimator, m.belief, u_before, load, y, x)
     w = m.belief.numbers[0].w
-    now.shortage = max(w - c.largest_load, real(0.0)) + min(w - c.least_load, real(0.0))
-    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share)
+    now.shortage = shortage(c, w, load, real(0.0))
+    now.most_open = most_open(c, m.u, y)
+    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, now.most_open)
     effective = with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
     now.efficiency = now.mismatch = now.contraction = real(1.0)
     now.gamma = real(0.0)

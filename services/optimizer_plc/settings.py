@@ -29,7 +29,7 @@ from optimizer_plc.computing_settings import (
     OsqpSettings,
     QpoasesSettings,
 )
-from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.qp.design import ColdEndSettings, ControlDesign
 from optimizer_plc.qp.penalties import OF_ALPHA, OF_PRESETS, PRESETS, PenaltySettings, Preset, alpha_of, completed
 
 SHOWN: Final = ("limits", "optimizer_plc.program")
@@ -127,8 +127,9 @@ class ProgramSettings(BaseModel):
     updating periods: one to be played, one in case the next sequence is late."""
     adaptive: AdaptiveSettings = AdaptiveSettings()
     design: ControlDesign = ControlDesign()
+    cold_end: ColdEndSettings = ColdEndSettings()
     preset: Preset = Preset.TUNED
-    """Penalties, start of the ODE-based solver and disturbances, as far as they are not set themselves."""
+    """Penalties, start of the ODE-based solver, disturbances, limit of CV155, as far as they are not set themselves."""
     penalties: PenaltySettings = PenaltySettings()
     budget: BudgetSettings = BudgetSettings()
     estimator: EstimatorSettings = EstimatorSettings()

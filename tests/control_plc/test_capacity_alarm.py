@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Mode, Operator, OperatorMode, SequenceRow
-from coldloop.registers.safety import TOO_LITTLE, Alarm, AlarmKind
+from coldloop.registers.safety import Alarm, AlarmKind, CapacityCause
 
 if TYPE_CHECKING:
     from tests.control_plc.conftest import Bench
@@ -22,18 +23,35 @@ def after(bench: "Bench", at: At, shortages: list[float]) -> Alarm:
     return bench.program.alarms.rows[AlarmKind.CAPACITY]
 
 
-@pytest.mark.parametrize(("sign", "mark"), [(1.0, 0), (-1.0, TOO_LITTLE)], ids=["too much", "too little"])
+def raised(bench: "Bench") -> list[float]:
+    """Return the watts of each time that it was raised."""
+    what = (EventKind.ALARM_RAISED, AlarmKind.CAPACITY)
+    return [event.value for event in bench.program.journal.since(0) if (event.kind, event.subject) == what]
+
+
+@pytest.mark.parametrize(
+    ("sign", "cause"), [(1.0, CapacityCause.TOO_MUCH), (-1.0, CapacityCause.TOO_LITTLE)], ids=["too much", "too little"]
+)
 def test_it_is_raised_once_after_half_a_minute_with_the_watts_of_then(
-    sign: float, mark: int, bench: "Bench", at: At
+    sign: float, cause: CapacityCause, bench: "Bench", at: At
 ) -> None:
     bench.steady = bench.moving = True
     assert not after(bench, at, [sign * (1.0 + i) for i in range(12)]).active
-    alarm = after(bench, at, [sign * 30.2] * 2)
-    assert (alarm.active, alarm.times, alarm.cause) == (1, 1, 31 | mark)
+    alarm = after(bench, at, [sign * 30.5] * 2)
+    assert (alarm.active, alarm.times, alarm.cause) == (1, 1, cause)
+    assert raised(bench) == [30.5]
     alarm = after(bench, at, [sign * watts for watts in (60.0, 2.0, 90.0)])
-    assert (alarm.active, alarm.times, alarm.cause) == (1, 1, 31 | mark)
+    assert (alarm.active, alarm.times, alarm.cause) == (1, 1, cause)
     assert after(bench, at, [0.0] * 12).active
     assert not after(bench, at, [0.0] * 2).active
+
+
+def test_too_little_after_too_much_is_another_alarm(bench: "Bench", at: At) -> None:
+    bench.steady = bench.moving = True
+    assert after(bench, at, [20.0] * 14).cause == CapacityCause.TOO_MUCH
+    alarm = after(bench, at, [-40.0] * 2)
+    assert (alarm.active, alarm.times, alarm.cause) == (1, 2, CapacityCause.TOO_LITTLE)
+    assert raised(bench) == [20.0, 40.0]
 
 
 def test_a_shortage_that_does_not_last_is_none(bench: "Bench", at: At) -> None:

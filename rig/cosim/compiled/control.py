@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from coldloop.registers.control_plc import Mode, OperatorMode, Process, SequenceHeader, SequenceRow, Update
-from coldloop.registers.safety import AlarmKind
+from coldloop.registers.safety import AlarmKind, CapacityCause
 from coldloop.safety.sequence import InputSequence, with_checksum
 from control_plc.output_limits import GuardState
 from control_plc.program import ControlProgram
@@ -26,7 +26,7 @@ def is_ordinary(program: ControlProgram) -> bool:
         and not program.sensors.bad
         and not program.guard.state.out_of_bounds
         and program.alarms.are_quiet
-        and program.alarms.holds(AlarmKind.CAPACITY) == (program.shortage != 0.0)
+        and program.alarms.reported(AlarmKind.CAPACITY) == CapacityCause.of(program.shortage)
         and program.alarms.due(AlarmKind.CAPACITY) > program.tick
         and not program.watchdog.expired
         and (not program.watchdog.time or program.watchdog.time > LONGEST_SILENCE)
@@ -56,7 +56,7 @@ def scan_record(program: ControlProgram) -> Any:  # noqa: ANN401 a record
     s["triggered"], s["lowest"] = program.watchdog.triggered, program.watchdog.lowest
     s["level_since"], s["t5_since"] = (NOT if since is None else since for since in program.alarms.pending(*BANDS))
     s["unchanged"], s["seen"] = program.sensors.unchanged, program.sensors.before
-    s["short"] = program.shortage != 0.0
+    s["short"] = np.sign(program.shortage)
     return scans
 
 

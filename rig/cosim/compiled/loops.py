@@ -140,7 +140,7 @@ def run_block(
         outcome = DONE
         if instant:
             latch(w, o, s, trace, tick, u_before)
-            if (o.memory.numbers[0].shortage != 0.0) != s.short:
+            if np.sign(o.memory.numbers[0].shortage) != s.short:
                 break
     if answered:
         s.solved -= 1

@@ -6,7 +6,7 @@ The paper leaves weights and scaling open; `docs/science.md` says why these were
 from itertools import pairwise
 from typing import Annotated, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveFloat, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 
 from coldloop.process.limits import LEVEL_BAND, T5_BAND
 
@@ -62,6 +62,22 @@ class ControlDesign(BaseModel):
         if min(*self.input_scale, *self.input_weight) <= 0:
             raise ValueError("input_scale and input_weight must be positive")
         return self
+
+
+class ColdEndSettings(BaseModel):
+    """How far CV155 may be opened: where helium before it is warmer than the bath, opening it further cools less.
+
+    The linear model does not know that. T2 - T1 is measured whatever the valves pass and the exchangers transfer.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    approach_k: Annotated[float, Field(ge=0.0)] = 0.0
+    """T2 - T1 at which CV155 is opened no further; 0 is any. Capacity is largest at 0.3 K with CV156 at 36 %."""
+    opening_per_k: PositiveFloat = 20.0
+    """How far CV155 may be from where it is, in % for each K that T2 - T1 is from it."""
+    opening_from: FiniteFloat = 50.0
+    """Opening, %, that is allowed in any case: should T1 or T2 be wrong."""
 
 
 def trivial_design(design: ControlDesign) -> ControlDesign:

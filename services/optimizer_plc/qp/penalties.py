@@ -46,7 +46,8 @@ class Preset(StrEnum):
     """Sets of settings by name; what is set explicitly in the same place comes before the preset's."""
 
     TUNED = "tuned"
-    """As good as this project knows how to make it: the paper's preset, and an estimator of constant errors."""
+    """As good as this project knows how to make it: the paper's preset, an estimator of constant errors, and a limit of
+    CV155 where opening it further cools less."""
     PAPER = "paper"
     """The paper's problem and estimator, with the truncated solver as good as this project knows how to make it."""
     AS_PRINTED = "as-printed"
@@ -55,7 +56,10 @@ class Preset(StrEnum):
 
 
 PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
-    Preset.TUNED: {"estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0}},
+    Preset.TUNED: {
+        "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
+        "cold_end": {"approach_k": 0.3},
+    },
     Preset.PAPER: {},
     Preset.AS_PRINTED: {
         "penalties": {"output_rows": 1.0, "rate_rows": (100.0, 2500.0, 100.0), "box": 1.0, "first_knot_in_box": False},

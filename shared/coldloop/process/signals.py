@@ -32,6 +32,8 @@ STATE_NAMES: Final = (
 STATE_UNITS: Final = ("Pa", "m3", *("K" for _ in range(26)))
 
 L1: Final = OUTPUT_NAMES.index("L1")
+T1: Final = OUTPUT_NAMES.index("T1")
+T2: Final = OUTPUT_NAMES.index("T2")
 T5: Final = OUTPUT_NAMES.index("T5")
 
 STATION_VALVE_NAMES: Final = ("CV956", "CV952", "CV953", "CV167")

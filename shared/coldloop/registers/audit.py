@@ -19,7 +19,7 @@ class EventKind(IntEnum):
     MODE = 1
     """The mode of the ladder changed: subject the new mode, cause why."""
     ALARM_RAISED = 2
-    """Subject is the alarm, cause its cause; so for all alarm events."""
+    """Subject is the alarm, cause its cause; so for all alarm events. Value is the shortage of CAPACITY, W."""
     ALARM_RETURNED = 3
     ALARM_ACKNOWLEDGED = 4
     ALARM_SHELVED = 5

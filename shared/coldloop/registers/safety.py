@@ -1,8 +1,7 @@
 """Records that the fail-safe side of both PLCs and the rack shares: watchdog, lease, alarms."""
 
-import math
 from enum import IntEnum
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final, NamedTuple, Self
 
 from coldloop.registers.audit import NOBODY, WHO_WORDS
 from coldloop.registers.declaration import text, u16, u32
@@ -85,13 +84,17 @@ class AlarmKind(IntEnum):
     """The load is one that no inputs within their limits hold: the bands will be left."""
 
 
-TOO_LITTLE: Final = 0x8000
-"""In the cause of the alarm CAPACITY: so many watts of load are missing; otherwise they are too many."""
+class CapacityCause(IntEnum):
+    """Why a load is not held."""
 
+    NONE = 0
+    TOO_MUCH = 1
+    TOO_LITTLE = 2
 
-def capacity_cause(shortage: float) -> int:
-    """Return the cause of the alarm CAPACITY: the shortage in whole watts; a negative one with `TOO_LITTLE`."""
-    return min(math.ceil(abs(shortage)), TOO_LITTLE - 1) | (TOO_LITTLE if shortage < 0.0 else 0)
+    @classmethod
+    def of(cls, shortage: float) -> Self:
+        """Return the cause of a shortage (W): positive where the load is too large, negative where it is too small."""
+        return cls(cls.TOO_MUCH if shortage > 0.0 else cls.TOO_LITTLE if shortage < 0.0 else cls.NONE)
 
 
 class AlarmState(IntEnum):
@@ -137,7 +140,7 @@ class Alarm(NamedTuple):
     ] = 0
     active: Annotated[int, u16("1 while the condition holds, whatever the state", high=1)] = 0
     cause: Annotated[
-        int, u16("Of a mode its ladder cause, of a sensor its output, of a sequence its verdict, of the capacity watts")
+        int, u16("Cause: of a mode its ladder cause, of a sensor its output, of a sequence its verdict")
     ] = 0
     times: Annotated[int, u16("Times that it was raised")] = 0
     raised: Annotated[int, u32("Tick at which it was last raised")] = 0

@@ -14,7 +14,7 @@ from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TIC
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, LinkCause, Mode, OperatorMode, PlantLinkState, Verdict
 from coldloop.registers.plant import SensorFaultKind, StationAlarm, StationMode, Surroundings
-from coldloop.registers.safety import TOO_LITTLE, AlarmKind
+from coldloop.registers.safety import AlarmKind
 from coldloop.registers.text import from_words
 
 Words = Callable[[int], str]
@@ -52,12 +52,6 @@ def _nothing(number: int) -> str:
 
 def _time_out(ticks: int) -> str:
     return f"{ticks * TICK_S:g} s" if ticks else "off"
-
-
-def _watts(cause: int) -> str:
-    if cause & TOO_LITTLE:
-        return f"raise the load by {cause ^ TOO_LITTLE} W, or the bath will flood"
-    return f"reduce the load by {cause} W, or the bath will run dry"
 
 
 def _row(number: int) -> str:
@@ -117,7 +111,9 @@ _ALARM_CAUSES: Final[Mapping[int, Words]] = {
     AlarmKind.STATE_NOT_RETAINED: _listed(("", "the previous one was set aside")),
     AlarmKind.MODE: _causes(Cause),
     AlarmKind.SENSOR_BAD: _listed(OUTPUT_NAMES),
-    AlarmKind.CAPACITY: _watts,
+    AlarmKind.CAPACITY: _listed(
+        ("", "too much load: reduce it, or the bath will run dry", "too little load: raise it, or the bath will flood")
+    ),
     AlarmKind.SEQUENCE_REJECTED: _causes(Verdict),
     AlarmKind.PLANT_LOST: _causes(LinkCause),
     AlarmKind.PLANT_OTHER_MASTER: _causes(LinkCause),
@@ -162,6 +158,8 @@ def describe(event: Event) -> EventText:
     unit = wording.unit
     if event.kind == EventKind.SETPOINT and event.subject < len(INPUT_UNITS):
         unit = INPUT_UNITS[event.subject]
+    elif event.kind == EventKind.ALARM_RAISED and event.subject == AlarmKind.CAPACITY:
+        unit = "W"
     return EventText(
         kind=kind_word(event.kind),
         subject=wording.subject(event.subject),

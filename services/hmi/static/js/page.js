@@ -64,6 +64,8 @@ function overview() {
     const rows = [["expected next", state.replay ? "–" : upcoming ? `${values["plant.load status.next_watts"]?.toFixed(1)} W in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
       ["estimated mismatch", state.update ? `${state.update.update.load_mismatch.toFixed(1)} W` : "–", "optimizer_plc.", "update"],
       ["plant against model", state.deviation || "–", "optimizer_plc."]];
+    const shortage = values["control_plc.plan.shortage"];
+    if (shortage) rows.unshift(["load", `${Math.abs(shortage).toFixed(0)} W ${shortage > 0 ? "more than can be held" : "less than is needed"}`, "control_plc.", "update"]);
     const text = JSON.stringify(rows);
     if (facts.dataset.text !== text) { facts.dataset.text = text; facts.replaceChildren(...rows.flatMap(([name, value, ...sources]) => [element("dt", { text: name }), element("dd", { class: "value", text: value, "data-sources": sources.join(" ") })])); }
     for (const one of facts.querySelectorAll("dd")) one.classList.toggle("stale", one.dataset.sources.split(" ").some(isStale));
