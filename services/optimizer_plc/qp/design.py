@@ -74,8 +74,8 @@ class ColdEndSettings(BaseModel):
 
     approach_k: Annotated[float, Field(ge=0.0)] = 0.0
     """T2 - T1 at which CV155 is opened no further; 0 is any. Capacity is largest at 0.3 K with CV156 at 36 %."""
-    opening_per_k: PositiveFloat = 20.0
-    """How far CV155 may be from where it is, in % for each K that T2 - T1 is from it."""
+    opening_per_k: PositiveFloat = 70.0
+    """How far CV155 may be from where it is, in % for each K that T2 - T1 is from it. Less slows load steps."""
     opening_from: FiniteFloat = 50.0
     """Opening, %, that is allowed in any case: should T1 or T2 be wrong."""
 
