@@ -153,7 +153,8 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     J = c.stationary.inverse_covariances[period]
     if not np.isfinite(innovation).all():
         innovation = imputed(innovation, J)
-    note_surprise(belief.surprise, innovation, J, belief.x.dtype.type(b.since * TICK_S / MINUTE_S))
+    real = belief.x.dtype.type
+    note_surprise(belief.surprise, innovation, J, real(b.since) * real(TICK_S / MINUTE_S))
     correction = np.zeros(belief.x.size + 1, belief.x.dtype)
     add_transposed_product(c.stationary.gains[period], innovation, correction)
     belief.x[:] = belief.predicted + correction[:-1]

@@ -42,6 +42,8 @@ def up(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) ->
         FACTOR,
         "--set",
         "plant.sensors.level=0.01",
+        "--set",
+        f"control_plc.power_up_s={PATIENCE_S:g}",
         "--cuttable",
     )
     try:
