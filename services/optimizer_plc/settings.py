@@ -129,7 +129,7 @@ class ProgramSettings(BaseModel):
     design: ControlDesign = ControlDesign()
     cold_end: ColdEndSettings = ColdEndSettings()
     preset: Preset = Preset.TUNED
-    """Penalties, start of the ODE-based solver, disturbances, limit of CV155, as far as they are not set themselves."""
+    """Penalties, start of the ODE-based solver, disturbances, limit of CV155, margin of the bands, if not set."""
     penalties: PenaltySettings = PenaltySettings()
     budget: BudgetSettings = BudgetSettings()
     estimator: EstimatorSettings = EstimatorSettings()

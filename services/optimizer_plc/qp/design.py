@@ -37,6 +37,8 @@ class ControlDesign(BaseModel):
     output_low: Pair = (LEVEL_BAND[0], T5_BAND[0])
     """Bands of L1 (%) and T5 (K)."""
     output_high: Pair = (LEVEL_BAND[1], T5_BAND[1])
+    band_margin: Pair = (0.0, 0.0)
+    """How far inside the bands the rows of the problem are, % and K: soft rows let an output rest beyond them."""
     input_scale: Triple = (10.0, 50.0, 10.0)
     input_weight: Triple = (1e-2, 4e-4, 1e-2)
     """Diagonal of R, on deviations from the operating point."""
@@ -59,6 +61,9 @@ class ControlDesign(BaseModel):
             raise ValueError("constraint_instants end behind the last of decision_instants, which is the horizon")
         if any(low >= high for low, high in zip(self.output_low, self.output_high, strict=True)):
             raise ValueError("each output_low must be below its output_high")
+        widths = (high - low for low, high in zip(self.output_low, self.output_high, strict=True))
+        if any(not 0.0 <= margin < width / 2.0 for margin, width in zip(self.band_margin, widths, strict=True)):
+            raise ValueError("each band_margin must be at least 0 and less than half of its band")
         if min(*self.input_scale, *self.input_weight) <= 0:
             raise ValueError("input_scale and input_weight must be positive")
         return self

@@ -46,8 +46,8 @@ class Preset(StrEnum):
     """Sets of settings by name; what is set explicitly in the same place comes before the preset's."""
 
     TUNED = "tuned"
-    """As good as this project knows how to make it: the paper's preset, an estimator of constant errors, and a limit of
-    CV155 where opening it further cools less."""
+    """As good as this project knows how to make it: the paper's preset, an estimator of constant errors, a limit of
+    CV155 where opening it further cools less, and rows that keep outputs inside their bands at rest."""
     PAPER = "paper"
     """The paper's problem and estimator, with the truncated solver as good as this project knows how to make it."""
     AS_PRINTED = "as-printed"
@@ -59,6 +59,7 @@ PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
     Preset.TUNED: {
         "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
         "cold_end": {"approach_k": 0.3},
+        "design": {"band_margin": (0.05, 0.05)},
     },
     Preset.PAPER: {},
     Preset.AS_PRINTED: {
