@@ -104,9 +104,12 @@ class OneProcessRig:
         plant, solver = self._settings.plant.kind.replace("-", " "), self._settings.optimizer_plc.program.solver
         return kernels_of(f"the {plant} and the {solver} solver in one process", about_s=50)
 
+    def _plant(self, load: LoadProfile, seed: int) -> PlantProgram:
+        return plant_maker(self._header, self._settings.plant)(load, seed)
+
     def _run(self, scenario: Scenario, recorder: Recorder) -> None:
         load = load_table(scenario.load)
-        plant = plant_maker(self._header, self._settings.plant)(load, scenario.seed)
+        plant = self._plant(load, scenario.seed)
         programs = Programs(plant, self.control, self.optimizer)
         self.optimizer.restart(scenario.updating_period_s)
         noted = self.control.journal.count

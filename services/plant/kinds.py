@@ -54,7 +54,7 @@ def make_program(
 ) -> PlantProgram:
     """Return the cold box at the operating point of its model file."""
     with kernels_of("the cold box", about_s=10):
-        return PlantProgram(box=_box(mismatch), x0=header.x0, u0=header.u0, load=load, noise=_noise(sensors, seed))
+        return PlantProgram(box=_box(mismatch), x0=header.x0, u0=header.u0, load=load, noise=noise_of(sensors, seed))
 
 
 def _box(mismatch: MismatchSettings) -> ColdBox:
@@ -85,10 +85,11 @@ def _make_refrigerator(
             load=load,
             station=section.station,
             events=EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k),
-            noise=_noise(section.sensors, seed),
+            noise=noise_of(section.sensors, seed),
         )
 
 
-def _noise(sensors: SensorSettings, seed: int) -> MeasurementNoise | None:
+def noise_of(sensors: SensorSettings, seed: int) -> MeasurementNoise | None:
+    """Return the noise of the sensors; None where they are exact."""
     exact = not any(sensors.deviations + sensors.biases)
     return None if exact else MeasurementNoise(sensors.deviations, seed, sensors.biases)

@@ -269,4 +269,4 @@ def test_one_compilation_serves_fixed_and_adaptive_periods() -> None:
     """Else the first update of a session with the other one would wait for the compiler."""
     budget = PlcBudget(BudgetSettings(), 0.25)
     adaptive, fixed = (make_rule(ProgramSettings(), budget, ticks) for ticks in (0, 8))
-    assert numba.typeof(adaptive) == numba.typeof(fixed) == numba.typeof(adaptive.fixed(3))
+    assert numba.typeof(adaptive) == numba.typeof(fixed)

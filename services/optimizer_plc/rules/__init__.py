@@ -57,10 +57,6 @@ class Rule(NamedTuple):
         """Return the q of the period that begins with a load step."""
         return self.chosen.after_interruption(memory)
 
-    def fixed(self, q: int) -> "Rule":
-        """Return the rule that always decides for the same q."""
-        return self._replace(kind=FIXED_PERIOD, fixed_period=FixedPeriod(q))
-
 
 @decides_by(Rule)
 @kernel

@@ -184,7 +184,7 @@ class ModelDeviation(NamedTuple):
 
 OPTIMIZER_MAP: Final = RegisterMap(
     service="optimizer_plc",
-    version=5,
+    version=4,
     blocks=(
         IDENTITY_BLOCK,
         Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
