@@ -115,7 +115,7 @@ class OneProcessRig:
         noted = self.control.journal.count
         self.control.restart(session=1)
         stretches = None
-        if self._compiled:
+        if self._compiled and not self._settings.plant.mismatch.beside_the_box:
             stretches = CompiledStretches(plant, self.control, self.optimizer, load)
         recorder.begin()
         while self.control.tick < scenario.ticks:

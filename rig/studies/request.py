@@ -240,8 +240,10 @@ def _of_problems(request: RunRequest, settings: Settings, scenario: Scenario) ->
 def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outcome:
     model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
     trace_sha256 = recording.trace_sha256
-    if any(settings.plant.sensors.biases):  # costs are those of what was reached, not of what was shown
-        true_y = recording.y - np.array(settings.plant.sensors.biases, dtype=np.float32)
+    sensors, gauge = settings.plant.sensors, settings.plant.mismatch.level_gauge
+    if any(sensors.biases) or gauge != 1.0:  # costs are those of what was reached, not of what was shown
+        true_y = recording.y - np.array(sensors.biases, dtype=np.float32)
+        true_y[:, L1] /= gauge
         recording = recording._replace(y=true_y)
     return Outcome(
         programs=programs_digest(),
