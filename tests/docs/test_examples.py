@@ -268,13 +268,15 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
-def page_rig(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) -> int:
+@pytest.fixture(scope="module")
+def page_rig(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) -> Iterator[int]:
     """The first port of a rig that is up for all pages."""
     base, files = shared_processes.three_ports(), {"XDG_RUNTIME_DIR": str(tmp_path_factory.mktemp("runtime"))}
     words = ("up", "--load", "e", "--factor", "5", "--port-base", base)
-    wait_until_up(shared_processes.coldloop(*words, stdout=subprocess.PIPE, more=files), base)
-    return base
+    rig = shared_processes.coldloop(*words, stdout=subprocess.PIPE, more=files)
+    wait_until_up(rig, base)
+    yield base
+    assert rig.interrupt() in {0, 130}
 
 
 @pytest.fixture
