@@ -11,6 +11,7 @@ from coldloop.modbus.settings import ServerSettings
 from coldloop.process.limits import InputLimits
 from coldloop.process.model_settings import ModelSettings
 from coldloop.process.signals import TICK_S
+from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.service.metrics_settings import MetricsSettings
@@ -93,7 +94,8 @@ class AdaptiveSettings(BaseModel):
     contraction: ContractionSettings = ContractionSettings()
 
     q_first: Annotated[int, Field(ge=1)] = 9
-    """q(t_0); 9 iterations are an updating period of 2.5 s."""
+    """q(t_0), the number of a period in the ladder: 1 is 0.5 s, 9 is 2.5 s at P = 1 and with an iteration of 0.25 s or
+    less. The ladder has each period that holds more iterations than the one before (`coldloop budget`)."""
     q_min: Annotated[int, Field(ge=1)] = 2
     q_max: Annotated[int, Field(ge=1)] = 19
     delta: Annotated[int, Field(ge=1)] = 2
@@ -147,7 +149,7 @@ class ProgramSettings(BaseModel):
     @field_validator("updating_period_s")
     @classmethod
     def _whole_ticks(cls, value: float) -> float:
-        if value % TICK_S or 0 < value < 2 * TICK_S:
+        if value % TICK_S or 0 < value < SHORTEST_TICKS * TICK_S:
             raise ValueError("an updating period is a multiple of 0.25 s from 0.5 s on, or 0 for adaptive")
         return value
 
