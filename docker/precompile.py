@@ -203,7 +203,8 @@ def _show(line: str) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a script's shell ignores it in the background
+    for number in (signal.SIGINT, signal.SIGTERM):  # a script's shell has SIGINT ignored in the background
+        signal.signal(number, signal.default_int_handler)
     if len(sys.argv) == 2:
         PARTS[sys.argv[1]][0]()
         sys.exit()
