@@ -66,7 +66,7 @@ PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
         **_AS_PRINTED,
         "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
         "cold_end": {"approach_k": 0.3},
-        "design": {"band_margin": (0.05, 0.05)},
+        "design": {"band_margin": (0.1, 0.1)},
     },
     Preset.PAPER: {},
     Preset.AS_PRINTED: _AS_PRINTED,
