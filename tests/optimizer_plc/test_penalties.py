@@ -80,8 +80,9 @@ def test_a_preset_names_keys_that_there_are(preset: Preset) -> None:
 
 
 def test_alpha_follows_from_the_weight_of_a_violation_for_all_solvers_alike() -> None:
-    usual, heavy = ProgramSettings(), ProgramSettings(design=ControlDesign(violation_weight=(200.0, 400.0)))
-    own = ProgramSettings.model_validate({"osqp": {"alpha": 7.0}})
+    heavier = ControlDesign(violation_weight=(200.0, 400.0))
+    usual, heavy = ProgramSettings(preset=Preset.PAPER), ProgramSettings(preset=Preset.PAPER, design=heavier)
+    own = ProgramSettings.model_validate({"preset": "paper", "osqp": {"alpha": 7.0}})
     assert {getattr(usual, name).alpha for name in SOLVERS} == {PENALTY_WEIGHT}
     assert {getattr(heavy, name).alpha for name in SOLVERS} == {30.0 * 400.0}
     assert (own.osqp.alpha, own.ode.alpha) == (7.0, PENALTY_WEIGHT)

@@ -13,12 +13,12 @@ from optimizer_plc.qp.problem import QuadraticProblem
 from rig.cosim.ideal_loop import Solved, run_ideal_loop
 from rig.cosim.scenario import Scenario
 from rig.results.recording import Recorder, Recording
-from rig.settings import Settings
 from rig.studies.request import Outcome, perform
+from rig.studies.settings import settings_of
 from rig.studies.study import Load
 
 Array = NDArray[np.float64]
-SETTINGS = Settings()
+SETTINGS = settings_of(())
 MODEL = load_model(Path(SETTINGS.model.file))
 STEP = LoadProfile((0, 40), (MODEL.w0, MODEL.w0 + 100.0))
 
