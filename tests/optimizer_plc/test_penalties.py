@@ -31,11 +31,12 @@ def as_printed_problem(prediction: PredictionModel) -> PredictiveProblem:
 # -- settings ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_tuned_preset_is_the_default_and_the_paper_s_has_no_more_than_the_defaults_of_the_keys() -> None:
+def test_the_tuned_preset_is_the_default_and_has_the_penalties_of_the_paper_s() -> None:
     chosen, paper = ProgramSettings(preset=Preset.TUNED), ProgramSettings(preset=Preset.PAPER)
     assert chosen == ProgramSettings()
     assert (chosen.solver, paper.solver) == (SolverName.HYBRID, SolverName.ODE)
-    assert (paper.penalties, paper.ode) == (PenaltySettings(), OdeSettings())
+    assert chosen.penalties == paper.penalties == PenaltySettings()
+    assert (chosen.ode, paper.ode) == (OdeSettings(cost_scale=1e-7), OdeSettings())
     assert (chosen.estimator.disturbances, paper.estimator) == (("outputs",), EstimatorSettings())
 
 
@@ -80,9 +81,8 @@ def test_a_preset_names_keys_that_there_are(preset: Preset) -> None:
 
 
 def test_alpha_follows_from_the_weight_of_a_violation_for_all_solvers_alike() -> None:
-    heavier = ControlDesign(violation_weight=(200.0, 400.0))
-    usual, heavy = ProgramSettings(preset=Preset.PAPER), ProgramSettings(preset=Preset.PAPER, design=heavier)
-    own = ProgramSettings.model_validate({"preset": "paper", "osqp": {"alpha": 7.0}})
+    usual, heavy = ProgramSettings(), ProgramSettings(design=ControlDesign(violation_weight=(200.0, 400.0)))
+    own = ProgramSettings.model_validate({"osqp": {"alpha": 7.0}})
     assert {getattr(usual, name).alpha for name in SOLVERS} == {PENALTY_WEIGHT}
     assert {getattr(heavy, name).alpha for name in SOLVERS} == {30.0 * 400.0}
     assert (own.osqp.alpha, own.ode.alpha) == (7.0, PENALTY_WEIGHT)

@@ -46,34 +46,36 @@ class Preset(StrEnum):
     """Sets of settings by name; what is set explicitly in the same place comes before the preset's."""
 
     TUNED = "tuned"
-    """As good as this project knows how to make it: the hybrid solver with penalties and start as the paper prints them,
-    an estimator of constant errors, a limit of CV155 where opening it further cools less, and rows that keep outputs
-    inside their bands at rest. Chosen by `docs/default-controller.md`."""
+    """As good as this project knows how to make it: the paper's preset with the hybrid solver, damped, an estimator of
+    constant errors, a limit of CV155 where opening it further cools less, and rows that keep outputs inside their bands
+    at rest (`docs/default-controller.md`)."""
     PAPER = "paper"
-    """The paper's problem, estimator and ODE-based solver, with its penalties and start tuned for the open loop."""
+    """The paper's problem and estimator, with the truncated solver as good as this project knows how to make it."""
     AS_PRINTED = "as-printed"
     """What the paper prints and no more. Of the numbers that it leaves open, alpha is rho, all rows have the same alpha
     in their own units, and cost_scale is the one whose costs come down with the iterations as in the paper's figure."""
 
 
-_AS_PRINTED: Final[Mapping[str, Mapping[str, Any]]] = {
-    "penalties": {"output_rows": 1.0, "rate_rows": (100.0, 2500.0, 100.0), "box": 1.0, "first_knot_in_box": False},
-    "ode": {"cost_scale": 1e-8, "look_ahead_rows": False, "hold_at_bounds": False},
-}
 PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
     Preset.TUNED: {
         "": {"solver": "hybrid"},
-        **_AS_PRINTED,
+        "ode": {"cost_scale": 1e-7},
         "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
         "cold_end": {"approach_k": 0.3},
         "design": {"band_margin": (0.1, 0.1)},
     },
     Preset.PAPER: {},
-    Preset.AS_PRINTED: _AS_PRINTED,
+    Preset.AS_PRINTED: {
+        "penalties": {"output_rows": 1.0, "rate_rows": (100.0, 2500.0, 100.0), "box": 1.0, "first_knot_in_box": False},
+        "ode": {"cost_scale": 1e-8, "look_ahead_rows": False, "hold_at_bounds": False},
+    },
 }
 """Settings of each preset by section of `optimizer_plc.program`, its own ones under no name."""
 OF_PRESETS: Final = tuple(
-    f"{section}.{key}".lstrip(".") for preset in PRESETS.values() for section, values in preset.items() for key in values
+    f"{section}.{key}".lstrip(".")
+    for preset in PRESETS.values()
+    for section, values in preset.items()
+    for key in values
 )
 """Keys of `optimizer_plc.program` that a preset decides."""
 OF_ALPHA: Final = ("penalties.output_rows", "design.violation_weight")
