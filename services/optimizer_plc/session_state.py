@@ -63,6 +63,8 @@ class OptimizerState(NamedTuple):
     """The last answer. An answer may be computed again from the same state, with the same bits."""
     u: Array
     """Input applied at the update under way, as a deviation, shape (3,): played on where no sequence is."""
+    target: Array
+    """Inputs that the plant should come to rest at, scaled deviations, shape (3,)."""
     rule: Array
     """What the rule of the updating period remembers, shape (2,)."""
 
@@ -80,5 +82,5 @@ def empty_state(n_states: int, size: int, real: Real) -> OptimizerState:
 
     return OptimizerState(
         numbers(PERIOD), no_belief(n_states, real), delivery(), delivery(), np.zeros(N_INPUTS, real),
-        np.zeros(MEMORY, real),
+        np.zeros(N_INPUTS, real), np.zeros(MEMORY, real),
     )  # fmt: skip
