@@ -14,7 +14,7 @@ from control_plc.ladder import Ladder
 
 SENSORS: Final = {AlarmKind.SENSOR_BAD: 1, AlarmKind.SENSOR_SUSPECT: 2}
 """Alarms of sensors, and the cause of their events."""
-DRIVEN: Final = (Mode.MPC, Mode.REST)
+OPTIMIZER_DRIVES: Final = (Mode.MPC, Mode.REST)
 """Modes in which the optimiser's sequences are played."""
 
 
@@ -73,7 +73,7 @@ class ProcessAlarms:
         short = CapacityCause.of(shortage if mode is Mode.MPC else 0.0)
         report(AlarmKind.CAPACITY, condition=bool(short), cause=short, value=abs(shortage))
         self._watch_sensors(tick, AlarmKind.SENSOR_BAD, frozenset(bad))
-        suspected = (output for output in range(len(y)) if mode in DRIVEN and suspects >> output & 1)
+        suspected = (output for output in range(len(y)) if mode in OPTIMIZER_DRIVES and suspects >> output & 1)
         self._watch_sensors(tick, AlarmKind.SENSOR_SUSPECT, frozenset(suspected))
 
     def _watch_sensors(self, tick: int, kind: AlarmKind, found: frozenset[int]) -> None:

@@ -39,7 +39,7 @@ from control_plc.classical import ClassicalLoops
 from control_plc.guard import OutputGuard
 from control_plc.ladder import Ladder, LadderInputs
 from control_plc.player import SequencePlayer
-from control_plc.process_alarms import ProcessAlarms
+from control_plc.process_alarms import OPTIMIZER_DRIVES, ProcessAlarms
 from control_plc.sensors import SensorMonitor
 from control_plc.settings import ControlSection, ControlStrategy
 
@@ -211,8 +211,9 @@ class ControlProgram:
 
     @property
     def _usable(self) -> bool:
-        """MPC can work with what is measured."""
-        return not (self._unknown or self.sensors.unestimated)
+        """MPC can work with what is measured: it continues without L1 or T5, and does not begin without them."""
+        drives = self.ladder.mode in OPTIMIZER_DRIVES
+        return not (self._unknown or (self.sensors.unestimated if drives else self.sensors.unusable))
 
     @property
     def _earliest(self) -> int:
