@@ -15,6 +15,7 @@ from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
 CONTROLLED = (L1, T5)
+TEMPERATURES, PRESSURES = range(2, 12), range(12, 22)
 NEVER = 2**31
 """Longest rest of an output that has not moved yet: it is never frozen."""
 FIRST_RESTS = [0 if output in CONTROLLED else NEVER for output in range(len(OUTPUT_NAMES))]
@@ -76,17 +77,22 @@ def count_unchanged(
     before: MutableSequence[float],
     y: Numbers,
     elapsed: int,
-    least: Sequence[int],
+    least: Numbers,
 ) -> None:
     """Count for how many ticks each output is unchanged while most of the others moved.
+
+    For those that are not controlled these are most temperatures and most pressures: exact sensors of one kind rest
+    with the plant while noisy ones of the other kind do not.
 
     `before` (22) becomes `y`, the measurements `elapsed` ticks later. `rests` (22), first `FIRST_RESTS`, are the
     longest such times of those that are not controlled, without the times for which they were frozen.
     """
-    most_moved = 2 * moved(before, y) > len(y)
+    most = 2 * moved(before, y, range(len(y))) > len(y)
+    half = len(PRESSURES) // 2
+    most_of_each = moved(before, y, TEMPERATURES) > half and moved(before, y, PRESSURES) > half
     for output in range(len(y)):
         if y[output] == before[output]:
-            unchanged[output] += elapsed * most_moved
+            unchanged[output] += elapsed * (most if output in CONTROLLED else most_of_each)
             continue
         if output not in CONTROLLED and not is_frozen(unchanged[output], rests[output], least[output]):
             rests[output] = max(unchanged[output], rests[output] % NEVER)
@@ -94,15 +100,15 @@ def count_unchanged(
     before[:] = y
 
 
-def is_frozen(unchanged: int, rest: int, least: int) -> bool:
+def is_frozen(unchanged: float, rest: float, least: float) -> bool:
     """Return whether an output is unchanged for at least so many ticks, and for twice its longest rest."""
     return unchanged >= least and unchanged >= 2 * rest
 
 
-def moved(before: Numbers, y: Numbers) -> int:
-    """Return how many measurements are others than before."""
+def moved(before: Numbers, y: Numbers, outputs: range) -> int:
+    """Return how many of these outputs are others than before."""
     count = 0
-    for output in range(len(y)):
+    for output in outputs:
         count += y[output] != before[output]
     return count
 

@@ -91,7 +91,8 @@ def residual_of(output: int, innovation: Array, J: Array) -> float:
     total = innovation.dtype.type(0.0)
     for j in range(innovation.shape[0]):
         total += J[output, j] * innovation[j]
-    return total / np.sqrt(J[output, output])
+    residual: float = total / np.sqrt(J[output, output])
+    return residual
 
 
 @kernel

@@ -317,6 +317,15 @@ def test_another_sensor_that_stands_still_is_found_if_it_has_not_stood_so_long_b
     assert bench.program.bad_sensors == 1 << t1
 
 
+def test_exact_sensors_of_one_kind_may_rest_while_noisy_ones_of_the_other_move(new_bench: NewBench) -> None:
+    bench = new_bench(InputLimits(), section())
+    bench.steady = bench.moving = True
+    bench.scans(20)
+    bench.readings = dict.fromkeys(range(12, 22), 1.5)
+    bench.scans(400)
+    assert bench.program.bad_sensors == 0
+
+
 def test_what_the_optimiser_does_without_is_an_alarm_while_it_drives(rig: "Bench", at: At) -> None:
     program = rig.program
     rig.suspects = 1 << T5

@@ -156,7 +156,7 @@ def test_the_compiled_loop_leaves_what_the_programs_leave(name: str, lively: Loa
 def test_suspects_come_and_go(lively: LoadProfile) -> None:
     """What the comparison above is about."""
     events = left_by(COMPILED["suspects"], lively, 1500, compiled=True).events
-    assert {cause for _, _, kind, _, cause in events if kind == EventKind.SENSOR} == {0, 2}
+    assert {cause for _, _, kind, _, cause in events if kind == EventKind.SENSOR} == {0, 2}, "none stands still"
     assert sum(kind == EventKind.SENSOR for _, _, kind, _, _ in events) > 20
 
 
