@@ -16,9 +16,9 @@ from control_plc.numbers import Numbers
 Range = tuple[FiniteFloat, FiniteFloat]
 CONTROLLED = (L1, T5)
 TEMPERATURES, PRESSURES = range(2, 12), range(12, 22)
-NEVER = 2**31
-"""Longest rest of an output that has not moved yet: it is never frozen."""
-FIRST_RESTS = [0 if output in CONTROLLED else NEVER for output in range(len(OUTPUT_NAMES))]
+MOVES = 240
+"""Ticks in which an output that is not controlled must have moved before it can be frozen."""
+FIRST_RESTS = [0 if output in CONTROLLED else -MOVES for output in range(len(OUTPUT_NAMES))]
 RECOVERY_TICKS = 8
 """A sensor is good again when its measurements have been good for so long."""
 
@@ -39,8 +39,8 @@ class SensorCheckSettings(BaseModel):
     frozen_s: Annotated[float, Field(gt=0)] = 20.0
     """A controlled output that does not change for so long, while others move, is frozen."""
     resting_s: Annotated[float, Field(gt=0)] = 60.0
-    """Another one, that has moved before, is if it rests for so long and for twice as long as ever before: what is
-    constant in a plant with exact sensors is not taken for frozen."""
+    """Another one, that has moved for a minute before, is if it rests for so long and for twice as long as ever before:
+    what is constant in a plant with exact sensors is not taken for frozen."""
     may_rest: bool = True
     """While its inputs do not move a plant may stand still bit for bit, as a simulated one with exact sensors does.
     False for sensors that are always noisy: an image unchanged for `frozen_s` is then stale in any case."""
@@ -85,7 +85,8 @@ def count_unchanged(
     with the plant while noisy ones of the other kind do not.
 
     `before` (22) becomes `y`, the measurements `elapsed` ticks later. `rests` (22), first `FIRST_RESTS`, are the
-    longest such times of those that are not controlled, without the times for which they were frozen.
+    longest such times of those that are not controlled, without the times for which they were frozen; below 0: the
+    moves that are missing until they count.
     """
     most = 2 * moved(before, y, range(len(y))) > len(y)
     half = len(PRESSURES) // 2
@@ -94,15 +95,17 @@ def count_unchanged(
         if y[output] == before[output]:
             unchanged[output] += elapsed * (most if output in CONTROLLED else most_of_each)
             continue
-        if output not in CONTROLLED and not is_frozen(unchanged[output], rests[output], least[output]):
-            rests[output] = max(unchanged[output], rests[output] % NEVER)
+        if rests[output] < 0:
+            rests[output] += 1
+        elif output not in CONTROLLED and not is_frozen(unchanged[output], rests[output], least[output]):
+            rests[output] = max(unchanged[output], rests[output])
         unchanged[output] = 0
     before[:] = y
 
 
 def is_frozen(unchanged: float, rest: float, least: float) -> bool:
     """Return whether an output is unchanged for at least so many ticks, and for twice its longest rest."""
-    return unchanged >= least and unchanged >= 2 * rest
+    return rest >= 0 and unchanged >= least and unchanged >= 2 * rest
 
 
 def moved(before: Numbers, y: Numbers, outputs: range) -> int:

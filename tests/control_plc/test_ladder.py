@@ -295,12 +295,13 @@ def test_mpc_goes_on_without_the_level_for_as_long_as_an_estimate_is_believed(
 
 
 def test_another_sensor_that_stands_still_is_found_if_it_has_not_stood_so_long_before(new_bench: NewBench) -> None:
-    """What is constant in a plant with exact sensors never moves; what rests at times has moved before."""
+    """What is constant in a plant with exact sensors moves once or never; what rests at times has moved before."""
     p4, t1, constant = (OUTPUT_NAMES.index(name) for name in ("P4", "T1", "P2"))
     bench = new_bench(InputLimits(), section())
     bench.steady = bench.moving = True
+    bench.scans(2)
     bench.readings[constant] = 16.0
-    bench.scans(20)
+    bench.scans(300)
     bench.readings[t1] = 4.5
     bench.scans(200)
     del bench.readings[t1]
@@ -320,7 +321,7 @@ def test_another_sensor_that_stands_still_is_found_if_it_has_not_stood_so_long_b
 def test_exact_sensors_of_one_kind_may_rest_while_noisy_ones_of_the_other_move(new_bench: NewBench) -> None:
     bench = new_bench(InputLimits(), section())
     bench.steady = bench.moving = True
-    bench.scans(20)
+    bench.scans(300)
     bench.readings = dict.fromkeys(range(12, 22), 1.5)
     bench.scans(400)
     assert bench.program.bad_sensors == 0
