@@ -64,7 +64,7 @@ class OptimizerProgram:
             self.solver = make_solver(settings)
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
             self.state = empty_state(prediction.n_states, self.problem.size, self._real)
-            estimator = estimator_of(prediction, settings.estimator, self._real)
+            estimator = estimator_of(prediction, settings.estimator, self._real, settings.plausibility)
             self._rest_map = rest_map(prediction, self._real)
             at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
             self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
@@ -146,7 +146,9 @@ class OptimizerProgram:
         )  # fmt: skip
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
-        return Plan(update.update, update.tick + int(now["ticks"]), load_step, float(now["shortage"]))
+        return Plan(
+            update.update, update.tick + int(now["ticks"]), load_step, float(now["shortage"]), int(now["suspects"])
+        )
 
     def _knows_what_is_played(self, update: Update) -> bool:
         """Return whether the control PLC plays something of ours, or has not begun to."""

@@ -14,6 +14,7 @@ from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import T1, T2, TICK_S, TICKS_PER_SAMPLE
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
+from optimizer_plc.plausibility import suspects_of
 from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
@@ -274,6 +275,7 @@ def plan(
         now.solved = False
     correct(c.estimator, m.belief, u_before, load, y, x)
     w = m.belief.numbers[0].w
+    now.suspects = suspects_of(m.belief.readings)
     now.shortage = shortage(c, w, load, real(0.0))
     now.most_open = most_open(c, m.u, y)
     find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, m.target)
