@@ -230,7 +230,7 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
         [update.tick * TICK_S for update in updates],
         {
             "tau_u": [update.tau_u * TICK_S for update in updates],
-            "q": [float(update.iterations) for update in updates],
+            "q": [float(update.q) for update in updates],
             "J": [update.j_effective for update in updates],
             "J_predicted": [update.j_delivered for update in updates],
         },

@@ -29,10 +29,12 @@ from coldloop.safety.sequence import InputSequence, with_checksum
 from optimizer_plc import scheme
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
-from optimizer_plc.estimator import estimator_of, rest_map
+from optimizer_plc.estimator import estimator_of
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from optimizer_plc.qp.rest import rest_map
+from optimizer_plc.qp.target import target_search
 from optimizer_plc.rules import UpdatingRule, make_rule
 from optimizer_plc.session_state import empty_state
 from optimizer_plc.settings import ProgramSettings
@@ -66,7 +68,10 @@ class OptimizerProgram:
             self._rest_map = rest_map(prediction, self._real)
             at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
             self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
-            self.constants = scheme.constants_of(estimator, self.problem, self.solver.alpha, settings, self.budget)
+            target = target_search(prediction, settings.design, limits, self._real)
+            self.constants = scheme.constants_of(
+                estimator, self.problem, target, self.solver.alpha, settings, self.budget
+            )
             self._compile_kernels(model)
         self.restart(settings.updating_period_s)
 
@@ -93,7 +98,7 @@ class OptimizerProgram:
         self.solver.reset()
         for part in (self.state.numbers, self.state.playing.numbers, self.state.sent.numbers):
             part[:] = np.zeros(1, part.dtype)
-        for array in (*self.state.playing[1:], *self.state.sent[1:], self.state.u, self.state.rule):
+        for array in (*self.state.playing[1:], *self.state.sent[1:], self.state.u, self.state.target, self.state.rule):
             array[:] = 0
         self.state.belief.forget()
         self._now["guessed_before"] = self._now["delivered_before"] = np.inf
@@ -186,12 +191,12 @@ class OptimizerProgram:
         return begun and late == 0
 
     def _wanted(self, *, interrupted: bool, in_time: bool) -> int:
-        """Return the iterations of the period, which the rule decides unless the last sequence never took effect."""
+        """Return the q of the period, which the rule decides unless the last sequence never took effect."""
         if not self._now["planned"]:
             return self.rule.first
         if interrupted:
             return self.rule.after_interruption(self.state.rule)
-        return scheme.BY_THE_RULE if in_time else int(self._now["iterations"])
+        return scheme.BY_THE_RULE if in_time else int(self._now["q"])
 
     # -- step (3): during the updating period -------------------------------------------------------------------------
 
@@ -206,13 +211,13 @@ class OptimizerProgram:
         return int(self._now["iterations"])
 
     def solve(self) -> InputSequence:
-        """Predict the state at t_{i+1}, shift the profile, do q iterations; return the sequence to play from there."""
-        q = self._iterations
+        """Predict the state at t_{i+1}, shift the profile, iterate; return the sequence to play from there."""
+        n = self._iterations
         if isinstance(self.solver, KernelSolver):
             scheme.solve(self.constants, self.method, self.state)
         else:
             qp, guess = scheme.pose(self.constants, self.state)
-            scheme.deliver(self.constants, self.state, qp, self.solver.solve(qp, guess, (q - 1, q)))
+            scheme.deliver(self.constants, self.state, qp, self.solver.solve(qp, guess, (n - 1, n)))
         return self._sequence()
 
     def _sequence(self) -> InputSequence:
@@ -283,7 +288,7 @@ class OptimizerProgram:
             raise RuntimeError("call solve before report")
         now, sent = self._now, self._sent
         return Optimization(
-            update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]),
+            update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]), q=int(now["q"]),
             iterations=int(sent["iterations"]), verdict=verdict, j_effective=float(now["effective"]),
             j_hot_start=float(sent["hot_start"]), j_delivered=float(sent["delivered"]), j_dev=float(sent["j_dev"]),
             j_cst=float(sent["j_cst"]), violation=float(sent["violation"]), efficiency=float(now["efficiency"]),

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import INPUT_NAMES, T1, T2, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.signals import T1, T2, TICK_S, TICKS_PER_SAMPLE
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
 from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.qp.profile import inputs_of, shifted
+from optimizer_plc.qp.target import CV155, TargetSearch, find_target
 from optimizer_plc.rules.assessment import Observation, assessed
 from optimizer_plc.rules.interface import UpdatingRule, decide_by
 from optimizer_plc.session_state import Delivery, OptimizerState
@@ -27,15 +28,15 @@ from optimizer_plc.solvers.kernel_solver import solve_by
 
 Array = NDArray[np.float64]
 
-CV155: Final = INPUT_NAMES.index("CV155")
 BY_THE_RULE: Final = 0
-"""Iterations that `plan` is given when the rule is to decide them."""
+"""The q that `plan` is given when the rule is to decide it."""
 
 
 class Constants(NamedTuple):
     """What an optimiser computes with that does not change in a session, in the on-line floating-point type."""
 
     estimator: Estimator
+    target: TargetSearch
     Phi: Array
     Gamma: Array
     maps: Maps
@@ -67,23 +68,25 @@ class Constants(NamedTuple):
     fixed_ticks: int
     """Fixed updating period; 0 is adaptive."""
     most: int
-    """Iterations that fit into the longest period."""
+    """Largest q, that of the longest period."""
     periods: NDArray[np.int64]
-    """Updating period in ticks for each number of iterations, shape (most + 1,)."""
+    """Updating period in ticks for each q, shape (most + 1,); there is no q = 0."""
+    fitting: NDArray[np.int64]
+    """Iterations that fit into each number of ticks, shape (ticks + 1,)."""
 
 
 def constants_of(
     estimator: Estimator,
     problem: PredictiveProblem,
+    target: TargetSearch,
     alpha: float,
     settings: ProgramSettings,
     budget: PlcBudget,
 ) -> Constants:  # fmt: skip
     """Return the constants of a session with adaptive periods."""
     real = problem.Phi.dtype.type
-    most = budget.iterations(MAX_PERIOD_TICKS)
     return Constants(
-        estimator=estimator,
+        estimator=estimator, target=target,
         Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps, shifts=problem.shifts,
         predicted=output_maps(problem),
         weights=problem.knots_to_samples, input_scale=problem.input_scale, rate=problem.rate,
@@ -97,8 +100,8 @@ def constants_of(
         opening_per_k=real(settings.cold_end.opening_per_k),
         opening_from=real(settings.cold_end.opening_from - estimator.u0[CV155]),
         sequence_ticks=settings.sequence_ticks,
-        fixed_ticks=0, most=most,
-        periods=np.array([budget.period(iterations) for iterations in range(most + 1)]),
+        fixed_ticks=0, most=len(budget.ladder), periods=np.array([0, *budget.ladder]),
+        fitting=np.array([budget.iterations(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)]),
     )  # fmt: skip
 
 
@@ -109,12 +112,14 @@ def with_floor(cost: float, constant: float, floor: float) -> float:
 
 
 @kernel
-def problem_at(c: Constants, x: Array, w: float, u_before: Array, share: float, most_open: float) -> QuadraticProblem:
-    """Return the instance of the problem at a state, a load and the input before, and with a limit of CV155.
+def problem_at(
+    c: Constants, x: Array, w: float, u_before: Array, share: float, target: Array, most_open: float
+) -> QuadraticProblem:  # fmt: skip
+    """Return the instance of the problem at a state, a load and the input before, about a target.
 
-    All are deviations.
+    With a limit of CV155; all are deviations.
     """
-    phi, gamma, low, high, constant = instance(c.maps, x, w, u_before, share)
+    phi, gamma, low, high, constant = instance(c.maps, x, w, u_before, share, target)
     for i in range(CV155, c.n_inputs, u_before.shape[0]):
         high[i] = min(high[i], max(most_open, low[CV155]))  # the first knot's low is as far as the rate lets it close
     return QuadraticProblem(c.Phi, phi, c.Gamma, gamma, low, high, constant)
@@ -165,9 +170,8 @@ def pose(c: Constants, m: OptimizerState) -> tuple[QuadraticProblem, Array]:
     sent.x[:] = m.belief.predicted
     s = sent.numbers[0]
     s.w, s.share, s.ticks = m.belief.numbers[0].w, c.rate_shares[ticks], ticks
-    return problem_at(c, sent.x, s.w, sent.u_before, s.share, m.numbers[0].most_open), shifted(
-        c.shifts[ticks], m.playing.z
-    )
+    qp = problem_at(c, sent.x, s.w, sent.u_before, s.share, m.target, m.numbers[0].most_open)
+    return qp, shifted(c.shifts[ticks], m.playing.z)
 
 
 @kernel
@@ -261,7 +265,7 @@ def plan(
 ) -> None:
     """Take the update latched at `tick`, in physical units and the on-line type; decide the updating period.
 
-    `wanted` are its iterations, or BY_THE_RULE where what is played is the answer to the update before, in time.
+    `wanted` is its q, or BY_THE_RULE where what is played is the answer to the update before, in time.
     """
     now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
     if now.solved:
@@ -272,18 +276,22 @@ def plan(
     w = m.belief.numbers[0].w
     now.shortage = shortage(c, w, load, real(0.0))
     now.most_open = most_open(c, m.u, y)
-    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, now.most_open)
+    find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, m.target)
+    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, m.target, now.most_open)
     effective = with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
     now.efficiency = now.mismatch = now.contraction = real(1.0)
     now.gamma = real(0.0)
     if wanted == BY_THE_RULE:  # step (4): q(t_{k+1}) from the costs
         o = Observation(
-            now.iterations, real(now.ticks) * real(TICK_S), now.effective, played.hot_start, played.last_but_one,
+            now.q, now.iterations, real(now.ticks) * real(TICK_S), now.effective, played.hot_start, played.last_but_one,
             played.delivered, effective,
         )  # fmt: skip
         a = assessed(o)
         wanted = decide_by(rule, m.rule, o, a)
         now.efficiency, now.mismatch, now.contraction, now.gamma = a.efficiency, a.mismatch, a.contraction, a.gamma
-    now.iterations = min(wanted, c.most)  # step (5): the period that holds them; then step (2), what was sent is played
-    now.ticks = c.fixed_ticks or min(c.periods[now.iterations] + now.allowance, MAX_PERIOD_TICKS)
+    now.q = min(wanted, c.most)  # step (5): its period, and what fits; then step (2), what was sent is played
+    now.ticks = c.fixed_ticks or c.periods[now.q]
+    now.iterations = c.fitting[now.ticks]
+    if not c.fixed_ticks:
+        now.ticks = min(now.ticks + now.allowance, MAX_PERIOD_TICKS)
     now.update, now.tick, now.load, now.effective, now.planned = update, tick, load, effective, True

@@ -219,7 +219,7 @@ def report(s: Any, m: OptimizerState, reports: Reports) -> None:  # noqa: ANN401
     """Write what was done with the update under way."""
     now, sent = m.numbers[0], m.sent.numbers[0]
     counts, values = reports.counts[s.solved], reports.values[s.solved]
-    counts[0], counts[1], counts[2], counts[3] = now.update, now.tick, now.ticks, sent.iterations
+    counts[0], counts[1], counts[2], counts[3], counts[4] = now.update, now.tick, now.ticks, now.q, sent.iterations
     values[0], values[1], values[2], values[3] = now.effective, sent.hot_start, sent.delivered, sent.j_dev
     values[4], values[5] = sent.j_cst, sent.violation
     values[6], values[7], values[8], values[9] = now.efficiency, now.mismatch, now.contraction, now.gamma

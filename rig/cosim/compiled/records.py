@@ -161,7 +161,7 @@ class Reports(NamedTuple):
     """What the optimiser did, a row an update."""
 
     counts: NDArray[np.int64]
-    """Update, tick, tau_u, iterations."""
+    """Update, tick, tau_u, q, iterations."""
     values: NDArray[np.float32]
     """The numbers of `Optimization` from `j_effective` on."""
 
@@ -174,7 +174,7 @@ def empty_trace(station: int) -> Trace:
 
 def empty_reports() -> Reports:
     """Return room for the updates of a block."""
-    return Reports(np.empty((BLOCK_TICKS, 4), np.int64), np.empty((BLOCK_TICKS, 11), np.float32))
+    return Reports(np.empty((BLOCK_TICKS, 5), np.int64), np.empty((BLOCK_TICKS, 11), np.float32))
 
 
 def empty_rows() -> Array:

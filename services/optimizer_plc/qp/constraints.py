@@ -52,8 +52,9 @@ def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0:
         slack_of_z = slack_map(weights[instant - 1])
         for output in range(2):
             y_z, y_s = condensed.outputs_z[instant - 1][output], condensed.outputs_s[instant - 1][output]
-            inside = design.band_margin[output]
-            low, high = design.output_low[output] + inside - y0[output], design.output_high[output] - inside - y0[output]
+            margin = design.band_margin[output]
+            low = design.output_low[output] + margin - y0[output]
+            high = design.output_high[output] - margin - y0[output]
             rows += [-y_z - slack_of_z[2 * output], y_z - slack_of_z[2 * output + 1]]
             states += [y_s, -y_s]
             bounds += [-low, high]
