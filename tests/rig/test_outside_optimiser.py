@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "optimiser_by_registers.py"
 FACTOR = 5.0
-PATIENCE_S = 100.0
+PATIENCE_S = 120.0
 
 
 def start(processes: Processes, port: int) -> Process:
