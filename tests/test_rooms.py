@@ -14,7 +14,7 @@ FLOORS = {
     "services/plant": [["helium"], ["components"], ["cold_box"], ["refrigerator", "rack"]],
     "services/optimizer_plc": [["qp"], ["solvers", "rules"]],
     "rig": [
-        ["results"], ["figures", "cosim"], ["runs", "plc_sizing"], ["studies", "chaos"], ["live"],
+        ["results"], ["figures", "cosim"], ["runs", "plc_sizing", "plc_export"], ["studies", "chaos"], ["live"],
         ["testing", "report"], ["cli"],
     ],
 }  # fmt: skip

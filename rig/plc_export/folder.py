@@ -1,0 +1,222 @@
+"""The ODE-based solver as a folder of C99: sources, constants, golden vectors and a self-test that runs them."""
+
+import zlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from numpy.typing import NDArray
+
+from optimizer_plc.qp.problem import QuadraticProblem
+from optimizer_plc.solvers.interface import Costs
+from optimizer_plc.solvers.ode import OdeMethod, solve
+from rig.plc_export.c99 import Printer, helpers, identifier, records_in
+from rig.plc_export.reading import Program
+from rig.plc_export.recorded_problems import GoldenVector
+from rig.plc_export.subset import type_of
+from rig.plc_export.tree import Kind
+
+Array = NDArray[Any]
+
+PER_PROBLEM: Final = ("phi", "gamma", "low", "high")
+"""Vectors of a problem that change from one to the next."""
+TEMPLATE: Final = Path(__file__).with_name("self_test.c")
+POWER: Final = frozenset({"power"})
+"""The step size has a cube root by `**`: its last bit is that of the platform's library."""
+
+
+class OdeExport:
+    """The solver for the matrices of one problem and a table of iteration counts.
+
+    Args:
+        method: Constants of the solver; their type, single or double precision, is that of the export.
+        problem: One of the problems.
+        counts: Iterations after which there is an answer.
+
+    Raises:
+        UnfitKernelError: A kernel uses what is not in the subset.
+    """
+
+    def __init__(self, method: OdeMethod, problem: QuadraticProblem, counts: Array) -> None:
+        self.method, self.problem, self.counts = method, problem, counts
+        real = problem.phi.dtype.type
+        self.printer = Printer(real)
+        self.real = self.printer.scalars[Kind.REAL]
+        none = Costs(real(np.inf), real(np.inf))
+        types = tuple(map(type_of, (method, problem, np.zeros_like(problem.phi), counts, none)))
+        program = Program(POWER)
+        self.entry = program.function(cast("Dispatcher", solve), types)
+        self.kernels = "\n".join(
+            self.printer.function(each, "" if each is self.entry else "static ") for each in program.functions
+        )
+        self.records = "\n".join(map(self.printer.structure, records_in(types)))
+
+    # -- files ---------------------------------------------------------------------------------------------------------
+
+    def write(self, folder: Path, vectors: Iterable[GoldenVector]) -> list[Path]:
+        """Write the files, with some golden vectors, into a folder that is made; return their paths."""
+        folder.mkdir(parents=True, exist_ok=True)
+        files = {
+            "kernels.h": self._header(), "kernels.c": self._kernels(), "problem.h": self._problem_header(),
+            "problem.c": self._problem(), **self._golden(list(vectors)), "self_test.c": self._self_test(),
+        }  # fmt: skip
+        for name, text in files.items():
+            (folder / name).write_text(text, encoding="ascii")
+        return [folder / name for name in files]
+
+    def _header(self) -> str:
+        signature = self.printer.signature(self.entry)
+        return f"""{GENERATED}#ifndef KERNELS_H
+#define KERNELS_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#define N_LITERALS {len(self.printer.literals)}
+extern const {self.real} literals[N_LITERALS];
+
+{self.records}
+{signature};
+
+#endif
+"""
+
+    def _kernels(self) -> str:
+        literals = "".join(f"    {each},\n" for each in self.printer.literals)
+        return f"""{GENERATED}#include <math.h>
+
+#include "kernels.h"
+
+const {self.real} literals[N_LITERALS] = {{
+{literals}}};
+
+{helpers(self.real)}
+{self.kernels}"""
+
+    def _problem_header(self) -> str:
+        n, m, k = len(self.problem.phi), len(self.problem.gamma), len(self.counts)
+        return f"""{GENERATED}#ifndef PROBLEM_H
+#define PROBLEM_H
+
+#include "kernels.h"
+
+#define N_VARIABLES {n}
+#define N_ROWS {m}
+#define N_COUNTS {k}
+
+/* The answer after {self.counts[0]} to {self.counts[-1]} iterations. */
+void solve_problem(
+    const {self.real} phi[N_VARIABLES], const {self.real} gamma[N_ROWS], const {self.real} low[N_VARIABLES],
+    const {self.real} high[N_VARIABLES], const {self.real} guess[N_VARIABLES], {self.real} *guessed,
+    {self.real} points[N_COUNTS * N_VARIABLES], {self.real} costs[N_COUNTS], int32_t iterations[N_COUNTS]);
+
+/* Sum over the constants and the literals; SUM_OF_CONSTANTS is what it was when they were written. */
+uint32_t sum_of_constants(void);
+uint32_t sum_of_reals(uint32_t sum, const {self.real} *values, int32_t count);
+uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
+#define SUM_OF_CONSTANTS UINT32_C({self._sum_of_constants()})
+
+#endif
+"""
+
+    def _constants(self) -> dict[str, Array]:
+        """Return the constant arrays by name."""
+        real = self.problem.phi.dtype
+        flow = np.array([float(each) for each in self.method.flow], real)
+        return {"Phi": self.problem.Phi, "Gamma": self.problem.Gamma, "counts": self.counts,
+                **arrays_of("matrices", self.method.matrices), "flow": flow}  # fmt: skip
+
+    def _sum_of_constants(self) -> int:
+        real = self.problem.phi.dtype
+        literals = np.array([float(each.rstrip("f")) for each in self.printer.literals], real)
+        sum_ = crc(literals)
+        for array in self._constants().values():
+            sum_ = crc(array, sum_)
+        return sum_
+
+    def _problem(self) -> str:
+        constants = self._constants()
+        arrays = "\n".join(self._array(name, values) for name, values in constants.items())
+        sums = "\n".join(
+            f"    sum = sum_of_{'reals' if values.dtype.kind == 'f' else 'integers'}(sum, {name}, {values.size});"
+            for name, values in constants.items()
+        )
+        flow = [f"flow[{place}] != {self.printer.number(0.0)}" if isinstance(each, bool) else f"flow[{place}]"
+                for place, each in enumerate(self.method.flow)]  # fmt: skip
+        settings = "\n".join(
+            f"    method.flow.{identifier(name)} = {value};"
+            for name, value in zip(self.method.flow._fields, flow, strict=True)
+        )
+        matrices = "\n".join(
+            f"    method.{name.replace('_', '.', 2)} = {name};" for name in constants if name.startswith("matrices_")
+        )
+        none = "\n".join(f"    before.{name} = INFINITY;" for name in Costs._fields)
+        vectors = "\n".join(f"    qp.{identifier(name)} = {identifier(name)};" for name in PER_PROBLEM)
+        head = TEMPLATE.with_name("problem.c").read_text(encoding="ascii")
+        body = {"ARRAYS": arrays, "SUMS": sums, "METHOD": f"{matrices}\n{settings}", "BEFORE": none, "VECTORS": vectors}
+        return self._filled(head, body)
+
+    def _golden(self, vectors: list[GoldenVector]) -> dict[str, str]:
+        """Return the files of the golden vectors: inputs and results of all in a row."""
+        stacked = {
+            **{name: np.array([getattr(each.problem, name) for each in vectors]) for name in PER_PROBLEM},
+            "guess": np.array([each.guess for each in vectors]),
+            "guessed": np.array([each.answer.guessed for each in vectors], self.problem.phi.dtype),
+            "points": np.array([each.answer.points for each in vectors]),
+            "costs": np.array([each.answer.costs for each in vectors]),
+            "iterations": np.array([each.answer.iterations for each in vectors]),
+        }  # fmt: skip
+        declared = "".join(
+            f"extern const {self._scalar(values)} golden_{name}[{values.size}];\n" for name, values in stacked.items()
+        )
+        sum_ = 0
+        for values in stacked.values():
+            sum_ = crc(values, sum_)
+        header = (f"{GENERATED}#include <stdint.h>\n\n#define N_GOLDEN {len(vectors)}\n"
+                  f"#define SUM_OF_GOLDEN UINT32_C({sum_})\n{declared}")  # fmt: skip
+        arrays = "\n".join(self._array(f"golden_{name}", values, "") for name, values in stacked.items())
+        return {"golden.h": header, "golden.c": f'{GENERATED}#include <math.h>\n\n#include "golden.h"\n\n{arrays}'}
+
+    def _self_test(self) -> str:
+        return self._filled(TEMPLATE.read_text(encoding="ascii"), {})
+
+    def _filled(self, text: str, parts: Mapping[str, str]) -> str:
+        single = self.printer.single
+        parts = {"REAL": self.real, "BITS": "uint32_t" if single else "uint64_t", "BYTES": "4" if single else "8",
+                 "SMALLEST": "FLT_MIN" if single else "DBL_MIN", "GENERATED\n": GENERATED, **parts}  # fmt: skip
+        for name, value in parts.items():
+            text = text.replace(f"@{name}" if name.endswith("\n") else f"@{name}@", value)
+        return text
+
+    def _scalar(self, values: Array) -> str:
+        return self.real if values.dtype.kind == "f" else "int32_t"
+
+    def _array(self, name: str, values: Array, storage: str = "static ") -> str:
+        """Return the definition of a constant array."""
+        if values.dtype.kind == "f":
+            printed = [self.printer.number(each) for each in values.ravel()]
+        else:
+            printed = [str(int(each)) for each in values.ravel()]
+        rows = "".join(f"    {', '.join(printed[place : place + 6])},\n" for place in range(0, len(printed), 6))
+        return f"{storage}const {self._scalar(values)} {name}[{values.size}] = {{\n{rows}}};\n"
+
+
+GENERATED: Final = "/* Written by Coldloop from the kernels of its optimiser; changes belong there. */\n"
+
+
+def arrays_of(prefix: str, record: object) -> dict[str, Array]:
+    """Return the arrays of a record of records, by their names joined."""
+    if isinstance(record, np.ndarray):
+        return {prefix: record}
+    found: dict[str, Array] = {}
+    for name, part in zip(record._fields, record, strict=True):  # type: ignore[attr-defined, call-overload]
+        found |= arrays_of(f"{prefix}_{name}", part)
+    return found
+
+
+def crc(values: Array, before: int = 0) -> int:
+    """Return the CRC-32 of numbers, most significant byte first, as the self-test computes it."""
+    wide = values.astype(f">f{values.dtype.itemsize}" if values.dtype.kind == "f" else ">i4")
+    return zlib.crc32(wide.tobytes(), before)

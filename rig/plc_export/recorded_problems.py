@@ -1,0 +1,76 @@
+"""Problems of a run in single precision, and what the ODE-based solver's kernels make of each: golden vectors."""
+
+from typing import Final, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.config import load_configuration
+from coldloop.process.lti_model import load as load_model
+from coldloop.safety.sequence import InputSequence
+from optimizer_plc import scheme
+from optimizer_plc.computing_settings import Arithmetic
+from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.qp.arithmetic import real_of
+from optimizer_plc.qp.problem import QuadraticProblem
+from optimizer_plc.rules import UpdatingRule
+from optimizer_plc.solvers.interface import Answer, Costs
+from optimizer_plc.solvers.ode import OdeMethod, solve
+from plant.load import find_load
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario
+from rig.results.recording import Recorder
+from rig.settings import Settings
+
+Array = NDArray[np.float64]
+
+SINGLE: Final = (
+    "optimizer_plc.program.preset=paper",
+    "optimizer_plc.program.arithmetic=float32",
+    "optimizer_plc.program.solver=ode",
+)
+"""What the run is made with: the paper's configuration in the arithmetic of its PLC."""
+ITERATIONS: Final = 20
+"""Of the solver for each recorded problem; each one is compared."""
+
+
+class GoldenVector(NamedTuple):
+    """A problem, the guess it is begun from, and the kernels' answer after 1, 2, ... `ITERATIONS` iterations."""
+
+    problem: QuadraticProblem
+    guess: Array
+    answer: Answer
+
+
+class GoldenVectors(NamedTuple):
+    """Problems of one run, which have the same matrices, and the solver's constants."""
+
+    method: OdeMethod
+    vectors: list[GoldenVector]
+
+
+class _ListeningOptimizer(OptimizerProgram):
+    """Keeps every problem with its guess."""
+
+    def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
+        """Reset."""
+        self.heard: list[tuple[QuadraticProblem, Array]] = []
+        super().restart(updating_period_s, rule)
+
+    def solve(self) -> InputSequence:
+        """Keep what is solved, and solve it: posing a problem twice gives the same bits."""
+        qp, guess = scheme.pose(self.constants, self.state)
+        self.heard.append((qp, guess))
+        return super().solve()
+
+
+def record(ticks: int, load: str = "a") -> GoldenVectors:
+    """Return the problems of a run of so many ticks under a named load, adaptive updating period, with the answers."""
+    settings = load_configuration(Settings, environment={}, assignments=SINGLE).settings
+    model, rig = load_model(settings.model.file), OneProcessRig(settings, compiled=False)
+    optimizer = rig.optimizer = _ListeningOptimizer(model, settings.optimizer_plc.program, settings.limits)
+    rig.run(Scenario(ticks, find_load(load, model.w0), 0.0, seed=1), Recorder(ticks, []))
+    method, real = cast("OdeMethod", optimizer.method), real_of(Arithmetic.FLOAT32)
+    none, counts = Costs(real(np.inf), real(np.inf)), np.arange(1, ITERATIONS + 1)
+    return GoldenVectors(method, [GoldenVector(qp, guess, solve(method, qp, guess, counts, none))
+                                  for qp, guess in optimizer.heard])  # fmt: skip

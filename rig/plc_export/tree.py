@@ -1,0 +1,203 @@
+"""The typed tree between the kernels' Python and what is printed from it: functions of fixed shapes, no Python left."""
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TypeAlias
+
+
+class Kind(Enum):
+    """Types of scalars."""
+
+    REAL = "real"
+    """The on-line type, single or double precision."""
+    INT = "int"
+    UNSIGNED = "unsigned"
+    """An index that does not count from the end."""
+    BOOL = "bool"
+
+
+@dataclass(frozen=True)
+class ArrayType:
+    """An array whose shape is known when it is printed."""
+
+    kind: Kind
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        size = 1
+        for length in self.shape:
+            size *= length
+        return size
+
+
+@dataclass(frozen=True)
+class RecordType:
+    """A NamedTuple: constant, and so are its arrays."""
+
+    name: str
+    fields: tuple[tuple[str, "Type"], ...]
+
+
+Type: TypeAlias = Kind | ArrayType | RecordType
+
+# -- expressions -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Literal:
+    """A number of a stated type."""
+
+    type: Kind
+    value: float
+
+
+@dataclass(frozen=True)
+class Name:
+    """A parameter or a variable."""
+
+    type: Type
+    name: str
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of a record."""
+
+    type: Type
+    record: "Name | Field"
+    name: str
+
+
+@dataclass(frozen=True)
+class Element:
+    """An element of an array."""
+
+    type: Kind
+    array: "Name | Field"
+    indices: tuple["Expression", ...]
+
+
+@dataclass(frozen=True)
+class Operation:
+    """An operator with one or two operands, in Python's spelling; or sqrt, abs, min, max, power."""
+
+    type: Kind
+    operator: str
+    operands: tuple["Expression", ...]
+
+
+@dataclass(frozen=True)
+class Select:
+    """The one or the other; only that one is computed."""
+
+    type: Kind
+    condition: "Expression"
+    one: "Expression"
+    other: "Expression"
+
+
+@dataclass(frozen=True)
+class Convert:
+    """An integer as another type."""
+
+    type: Kind
+    operand: "Expression"
+
+
+@dataclass(frozen=True)
+class Invocation:
+    """The result of a function with one scalar result that writes to no argument."""
+
+    type: Kind
+    function: "Function"
+    arguments: tuple["Expression", ...]
+
+
+Expression: TypeAlias = Literal | Name | Field | Element | Operation | Select | Convert | Invocation
+Storage: TypeAlias = Name | Field
+
+# -- statements --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Declare:
+    """A new variable; without a value it is zero everywhere."""
+
+    variable: Name
+    value: Expression | None = None
+
+
+@dataclass(frozen=True)
+class Assign:
+    """A new value of a variable or an element."""
+
+    target: Name | Element
+    value: Expression
+
+
+@dataclass(frozen=True)
+class Invoke:
+    """A call for what it writes; results go to variables."""
+
+    function: "Function"
+    arguments: tuple[Expression, ...]
+    results: tuple[Name, ...]
+
+
+@dataclass(frozen=True)
+class For:
+    """A counted loop; bounds are computed once."""
+
+    variable: Name
+    start: Expression
+    stop: Expression
+    step: int
+    body: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class While:
+    """A loop."""
+
+    condition: Expression
+    body: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class If:
+    """A decision."""
+
+    condition: Expression
+    body: tuple["Statement", ...]
+    other: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class Return:
+    """The end of a function, with its value where it has one that is not a result parameter."""
+
+    value: Expression | None = None
+
+
+Statement: TypeAlias = Declare | Assign | Invoke | For | While | If | Return
+
+
+@dataclass
+class Function:
+    """A kernel for arguments of certain types.
+
+    One scalar result is returned by value; arrays, and results that are several, are parameters behind the others.
+    """
+
+    name: str
+    source: str
+    """File and line of the kernel."""
+    parameters: tuple[Name, ...]
+    written: set[str] = field(default_factory=set)
+    """Array parameters that it writes to."""
+    used: set[str] = field(default_factory=set)
+    results: tuple[Name, ...] = ()
+    value: Kind | None = None
+    body: tuple[Statement, ...] = ()

@@ -1,0 +1,151 @@
+"""The exported C99 gives the bits of the kernels, and its self-test finds what has been changed."""
+
+import ctypes
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from optimizer_plc.qp.costs import matrices_of
+from optimizer_plc.qp.problem import QuadraticProblem
+from optimizer_plc.solvers.interface import Costs
+from optimizer_plc.solvers.ode import Flow, OdeMethod, solve
+from rig.plc_export.folder import PER_PROBLEM, OdeExport
+from rig.plc_export.recorded_problems import ITERATIONS, GoldenVector, GoldenVectors, record
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off")
+COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
+MINUTE, HOUR = 240, 14400
+REAL = re.compile(r"(?<=[ {])-?\d\.\d{9}e[+-]\d\df")
+SOURCES = ("kernels.c", "problem.c", "golden.c", "self_test.c")
+
+pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler: neither gcc nor clang is installed")
+
+
+def export_of(recorded: GoldenVectors) -> OdeExport:
+    return OdeExport(recorded.method, recorded.vectors[0].problem, np.arange(1, ITERATIONS + 1))
+
+
+def compiled(folder: Path, compiler: str, *options: str, sources: tuple[str, ...] = SOURCES) -> Path:
+    made = folder / "-".join(("built", compiler, *options)).replace(" ", "")
+    command = [compiler, *STRICT, *options, *(str(folder / name) for name in sources), "-lm", "-o", str(made)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    return made
+
+
+def self_test(folder: Path, compiler: str, *options: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([compiled(folder, compiler, *options)], capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def minute() -> GoldenVectors:
+    """The problems of a minute of load a."""
+    return record(MINUTE)
+
+
+@pytest.fixture(scope="module")
+def folder(minute: GoldenVectors, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fresh export with the golden vectors of that minute."""
+    made = tmp_path_factory.mktemp("export")
+    export_of(minute).write(made, minute.vectors)
+    return made
+
+
+@pytest.mark.parametrize("level", ["-O0", "-O2", "-O3"])
+@pytest.mark.parametrize("compiler", COMPILERS)
+def test_the_self_test_finds_every_bit_as_the_kernels_have_it(
+    folder: Path, minute: GoldenVectors, compiler: str, level: str
+) -> None:
+    result = self_test(folder, compiler, level)
+    assert result.stdout == f"{len(minute.vectors)} golden vectors, 0 failures\n"
+    assert result.returncode == 0
+
+
+def in_double(recorded: GoldenVectors, most: int) -> GoldenVectors:
+    """Return the first problems with the kernels' answers in double precision."""
+    counts, none = np.arange(1, ITERATIONS + 1), Costs(np.inf, np.inf)
+    flow = Flow(*(each if isinstance(each, bool) else float(each) for each in recorded.method.flow))
+    first = recorded.vectors[0].problem
+    Phi, Gamma = first.Phi.astype(float), first.Gamma.astype(float)
+    vectors = []
+    for vector in recorded.vectors[:most]:
+        phi, gamma, low, high = (getattr(vector.problem, name).astype(float) for name in PER_PROBLEM)
+        qp = QuadraticProblem(Phi, phi, Gamma, gamma, low, high, 0.0)
+        method, guess = OdeMethod(matrices_of(qp), flow), vector.guess.astype(float)
+        vectors.append(GoldenVector(qp, guess, solve(method, qp, guess, counts, none)))
+    return GoldenVectors(method, vectors)
+
+
+def test_double_precision_has_the_same_bits_too(minute: GoldenVectors, tmp_path: Path) -> None:
+    double = in_double(minute, 5)
+    export_of(double).write(tmp_path, double.vectors)
+    assert self_test(tmp_path, COMPILERS[0], "-O2").stdout == "5 golden vectors, 0 failures\n"
+
+
+def changed(text: str, place: int) -> str:
+    """Change the last bit of a number in a C source."""
+    number = list(REAL.finditer(text))[place]
+    after = np.nextafter(np.float32(number[0].rstrip("f")), np.float32(np.inf))
+    return f"{text[: number.start()]}{after:.9e}f{text[number.end() :]}"
+
+
+def places(folder: Path, name: str, most: int) -> Iterator[int]:
+    count = len(REAL.findall((folder / name).read_text()))
+    assert count
+    yield from sorted({int(place) for place in np.random.default_rng(1).permutation(count)[:most]})
+
+
+def assert_found(folder: Path, copy: Path, name: str, most: int) -> None:
+    text = (folder / name).read_text()
+    for place in places(folder, name, most):
+        shutil.copytree(folder, copy, dirs_exist_ok=True)
+        (copy / name).write_text(changed(text, place))
+        result = self_test(copy, COMPILERS[0], "-O0")
+        assert result.returncode == 1, (name, place)
+        assert "is not what was written" in result.stdout
+
+
+@pytest.mark.parametrize("name", ["kernels.c", "problem.c", "golden.c"])
+def test_a_changed_bit_of_a_literal_a_matrix_or_a_golden_vector_is_found(
+    folder: Path, tmp_path: Path, name: str
+) -> None:
+    assert_found(folder, tmp_path / "copy", name, 1)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", ["kernels.c", "problem.c", "golden.c"])
+def test_many_changed_bits_are_found(folder: Path, tmp_path: Path, name: str) -> None:
+    assert_found(folder, tmp_path / "copy", name, 30)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("load", ["a", "e"])
+def test_an_hour_of_problems_has_the_same_bits_at_every_level_of_optimisation(tmp_path: Path, load: str) -> None:
+    recorded = record(HOUR, load)
+    export_of(recorded).write(tmp_path, recorded.vectors[:1])
+    for compiler in COMPILERS:
+        for level in ("-O0", "-O2", "-O3"):
+            made = compiled(tmp_path, compiler, level, "-shared", "-fPIC", sources=("kernels.c", "problem.c"))
+            assert differing(ctypes.CDLL(str(made)), recorded) == []
+
+
+def differing(library: ctypes.CDLL, recorded: GoldenVectors) -> list[int]:
+    """Return which vectors the library answers otherwise than the kernels."""
+    return [place for place, vector in enumerate(recorded.vectors)
+            if answer(library, [*(getattr(vector.problem, name) for name in PER_PROBLEM), vector.guess])
+            != [np.asarray(part, np.int32 if part is vector.answer.iterations else np.float32).tobytes()
+                for part in vector.answer[:4]]]  # fmt: skip
+
+
+def answer(library: ctypes.CDLL, given: list[NDArray[np.float32]]) -> list[bytes]:
+    n = len(given[0])
+    results = (np.empty(1, np.float32), np.empty((ITERATIONS, n), np.float32), np.empty(ITERATIONS, np.float32),
+               np.empty(ITERATIONS, np.int32))  # fmt: skip
+    library.solve_problem(*(each.ctypes.data_as(ctypes.c_void_p) for each in (*given, *results)))
+    return [each.tobytes() for each in results]
