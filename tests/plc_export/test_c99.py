@@ -82,6 +82,7 @@ def in_double(recorded: GoldenVectors, most: int) -> GoldenVectors:
     return GoldenVectors(method, vectors)
 
 
+@pytest.mark.exhaustive
 def test_double_precision_has_the_same_bits_too(minute: GoldenVectors, tmp_path: Path) -> None:
     double = in_double(minute, 5)
     export_of(double).write(tmp_path, double.vectors)
