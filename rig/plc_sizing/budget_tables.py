@@ -11,7 +11,7 @@ from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import check_detectability
 from optimizer_plc.qp.arithmetic import real_of
-from optimizer_plc.qp.design import trivial_design
+from optimizer_plc.qp.design import Target, trivial_design
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
@@ -106,6 +106,7 @@ def _operations(problem: PredictiveProblem, prediction: PredictionModel) -> str:
     sizes = operations.PreparationSizes(
         dense, m - 4 * len(problem.design.constraint_instants), problem.n_knots, prediction.n_states,
         prediction.D.shape[1], prediction.D.shape[0], segments=1, samples=1,
+        targets=problem.design.target is not Target.OPERATING_POINT,
     )  # fmt: skip
     once = operations.preparation(sizes, mean)
     rows.append(("preparation, once an updating period", f"{once.flops:,.0f}", "", f"{once.bytes / 1e3:.1f}", ""))

@@ -170,6 +170,8 @@ class PreparationSizes(NamedTuple):
     """Runs of equal inputs in the updating period."""
     samples: int
     """Sampling periods in a sequence."""
+    targets: bool
+    """Whether the cost is about a target that is sought."""
 
 
 def preparation(sizes: PreparationSizes, active: float) -> Operations:
@@ -182,7 +184,8 @@ def preparation(sizes: PreparationSizes, active: float) -> Operations:
     start = gradient(sizes.problem, active).plus(Operations(3 * n + 2))
     sequence = product(sizes.samples * sizes.inputs * sizes.knots).plus(Operations(4 * sizes.samples * sizes.inputs))
     costs = augmented_cost(sizes.problem, active).times(2)
-    return correct.plus(predict, instance(sizes).times(2), product(n * n), costs, start, sequence)
+    sought = target(sizes.inputs) if sizes.targets else Operations(0)
+    return correct.plus(predict, instance(sizes).times(2), product(n * n), costs, start, sequence, sought)
 
 
 def instance(sizes: PreparationSizes) -> Operations:
@@ -190,7 +193,19 @@ def instance(sizes: PreparationSizes) -> Operations:
     s = sizes.states + 1
     output_rows = sizes.problem.m - sizes.rate_rows
     maps = product(sizes.problem.n * s).plus(product(output_rows * s), product(s * s))
+    if sizes.targets:
+        about = Operations(4 * sizes.inputs * sizes.knots + sizes.inputs)
+        maps = maps.plus(product(sizes.inputs * s), product(sizes.inputs * sizes.problem.n), about)
     return maps.plus(product(sizes.rate_rows * sizes.inputs), Operations(sizes.rate_rows + 4 * sizes.inputs + 2 * s))
+
+
+def target(inputs: int) -> Operations:
+    """Return those of a target: all points of its plane where up to two bounds meet, of the inputs and of T5."""
+    rows = inputs + 1
+    bounds, corners = 2 * rows, 2 * rows * (rows - 1)
+    judged = 5 * rows + 3
+    plane = Operations(judged + bounds * (judged + 3) + 3 * rows + corners * (judged + 11))
+    return plane.plus(Operations(3 * rows + 15 * inputs + 3))
 
 
 def _response(results: int, sizes: PreparationSizes) -> Operations:

@@ -70,7 +70,8 @@ class _ListeningOptimizer(OptimizerProgram):
         sequence = super().solve()
         sent = self.state.sent
         w, ticks = float(sent.numbers[0]["w"]), int(sent.numbers[0]["ticks"])
-        self.heard.append(LoopProblem(QpParameters(sent.x.copy(), w, sent.u_before.copy(), ticks), sent.z.copy()))
+        parameters = QpParameters(sent.x.copy(), w, sent.u_before.copy(), ticks, self.state.target.copy())
+        self.heard.append(LoopProblem(parameters, sent.z.copy()))
         return sequence
 
 

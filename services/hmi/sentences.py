@@ -19,11 +19,11 @@ SURPRISING: Final = 3.0
 """A reading that is so many times further from its prediction than the filter expects is worth a word."""
 
 
-def deviation(found: ModelDeviation) -> str:
+def deviation(found: ModelDeviation, suspects: int = 0) -> str:
     """Return how the plant differs from its model, without the load, the most notable first; empty where it agrees.
 
-    Last comes the reading that is furthest from what is predicted, if it is surprising: the model, or its sensor, is
-    not what the filter takes it for.
+    Last come the reading that is furthest from what is predicted, if it is surprising: the model, or its sensor, is
+    not what the filter takes it for; and those that are not used for that reason (bit i is output i).
     """
     parts = [
         (value, unit, f"needs {abs(value):.3g} {unit} {'less' if value > 0 else 'more'} of {name}")
@@ -38,6 +38,9 @@ def deviation(found: ModelDeviation) -> str:
     surprise, name = max(zip(found.surprise, OUTPUT_NAMES, strict=True))
     if surprise >= SURPRISING:
         texts.append(f"{name} {surprise:.2g} times further from its prediction than expected")
+    texts += [
+        f"{name} is not used: it contradicts the others" for i, name in enumerate(OUTPUT_NAMES) if suspects >> i & 1
+    ]
     return ", ".join(texts)
 
 

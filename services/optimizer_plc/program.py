@@ -29,10 +29,12 @@ from coldloop.safety.sequence import InputSequence, with_checksum
 from optimizer_plc import scheme
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
-from optimizer_plc.estimator import estimator_of, rest_map
+from optimizer_plc.estimator import estimator_of
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
+from optimizer_plc.qp.rest import rest_map
+from optimizer_plc.qp.target import target_search
 from optimizer_plc.rules import UpdatingRule, make_rule
 from optimizer_plc.session_state import empty_state
 from optimizer_plc.settings import ProgramSettings
@@ -62,11 +64,14 @@ class OptimizerProgram:
             self.solver = make_solver(settings)
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
             self.state = empty_state(prediction.n_states, self.problem.size, self._real)
-            estimator = estimator_of(prediction, settings.estimator, self._real)
+            estimator = estimator_of(prediction, settings.estimator, self._real, settings.plausibility)
             self._rest_map = rest_map(prediction, self._real)
             at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
             self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
-            self.constants = scheme.constants_of(estimator, self.problem, self.solver.alpha, settings, self.budget)
+            target = target_search(prediction, settings.design, limits, self._real)
+            self.constants = scheme.constants_of(
+                estimator, self.problem, target, self.solver.alpha, settings, self.budget
+            )
             self._compile_kernels(model)
         self.restart(settings.updating_period_s)
 
@@ -93,7 +98,7 @@ class OptimizerProgram:
         self.solver.reset()
         for part in (self.state.numbers, self.state.playing.numbers, self.state.sent.numbers):
             part[:] = np.zeros(1, part.dtype)
-        for array in (*self.state.playing[1:], *self.state.sent[1:], self.state.u, self.state.rule):
+        for array in (*self.state.playing[1:], *self.state.sent[1:], self.state.u, self.state.target, self.state.rule):
             array[:] = 0
         self.state.belief.forget()
         self._now["guessed_before"] = self._now["delivered_before"] = np.inf
@@ -141,7 +146,9 @@ class OptimizerProgram:
         )  # fmt: skip
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
-        return Plan(update.update, update.tick + int(now["ticks"]), load_step, float(now["shortage"]))
+        return Plan(
+            update.update, update.tick + int(now["ticks"]), load_step, float(now["shortage"]), int(now["suspects"])
+        )
 
     def _knows_what_is_played(self, update: Update) -> bool:
         """Return whether the control PLC plays something of ours, or has not begun to."""

@@ -11,13 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import INPUT_NAMES, T1, T2, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.signals import T1, T2, TICK_S, TICKS_PER_SAMPLE
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
+from optimizer_plc.plausibility import suspects_of
 from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.qp.profile import inputs_of, shifted
+from optimizer_plc.qp.target import CV155, TargetSearch, find_target
 from optimizer_plc.rules.assessment import Observation, assessed
 from optimizer_plc.rules.interface import UpdatingRule, decide_by
 from optimizer_plc.session_state import Delivery, OptimizerState
@@ -27,7 +29,6 @@ from optimizer_plc.solvers.kernel_solver import solve_by
 
 Array = NDArray[np.float64]
 
-CV155: Final = INPUT_NAMES.index("CV155")
 BY_THE_RULE: Final = 0
 """The q that `plan` is given when the rule is to decide it."""
 
@@ -36,6 +37,7 @@ class Constants(NamedTuple):
     """What an optimiser computes with that does not change in a session, in the on-line floating-point type."""
 
     estimator: Estimator
+    target: TargetSearch
     Phi: Array
     Gamma: Array
     maps: Maps
@@ -77,6 +79,7 @@ class Constants(NamedTuple):
 def constants_of(
     estimator: Estimator,
     problem: PredictiveProblem,
+    target: TargetSearch,
     alpha: float,
     settings: ProgramSettings,
     budget: PlcBudget,
@@ -84,7 +87,7 @@ def constants_of(
     """Return the constants of a session with adaptive periods."""
     real = problem.Phi.dtype.type
     return Constants(
-        estimator=estimator,
+        estimator=estimator, target=target,
         Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps, shifts=problem.shifts,
         predicted=output_maps(problem),
         weights=problem.knots_to_samples, input_scale=problem.input_scale, rate=problem.rate,
@@ -110,12 +113,14 @@ def with_floor(cost: float, constant: float, floor: float) -> float:
 
 
 @kernel
-def problem_at(c: Constants, x: Array, w: float, u_before: Array, share: float, most_open: float) -> QuadraticProblem:
-    """Return the instance of the problem at a state, a load and the input before, and with a limit of CV155.
+def problem_at(
+    c: Constants, x: Array, w: float, u_before: Array, share: float, target: Array, most_open: float
+) -> QuadraticProblem:  # fmt: skip
+    """Return the instance of the problem at a state, a load and the input before, about a target.
 
-    All are deviations.
+    With a limit of CV155; all are deviations.
     """
-    phi, gamma, low, high, constant = instance(c.maps, x, w, u_before, share)
+    phi, gamma, low, high, constant = instance(c.maps, x, w, u_before, share, target)
     for i in range(CV155, c.n_inputs, u_before.shape[0]):
         high[i] = min(high[i], max(most_open, low[CV155]))  # the first knot's low is as far as the rate lets it close
     return QuadraticProblem(c.Phi, phi, c.Gamma, gamma, low, high, constant)
@@ -166,9 +171,8 @@ def pose(c: Constants, m: OptimizerState) -> tuple[QuadraticProblem, Array]:
     sent.x[:] = m.belief.predicted
     s = sent.numbers[0]
     s.w, s.share, s.ticks = m.belief.numbers[0].w, c.rate_shares[ticks], ticks
-    return problem_at(c, sent.x, s.w, sent.u_before, s.share, m.numbers[0].most_open), shifted(
-        c.shifts[ticks], m.playing.z
-    )
+    qp = problem_at(c, sent.x, s.w, sent.u_before, s.share, m.target, m.numbers[0].most_open)
+    return qp, shifted(c.shifts[ticks], m.playing.z)
 
 
 @kernel
@@ -271,9 +275,11 @@ def plan(
         now.solved = False
     correct(c.estimator, m.belief, u_before, load, y, x)
     w = m.belief.numbers[0].w
+    now.suspects = suspects_of(m.belief.readings)
     now.shortage = shortage(c, w, load, real(0.0))
     now.most_open = most_open(c, m.u, y)
-    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, now.most_open)
+    find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, m.target)
+    qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, m.target, now.most_open)
     effective = with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
     now.efficiency = now.mismatch = now.contraction = real(1.0)
     now.gamma = real(0.0)

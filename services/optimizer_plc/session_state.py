@@ -27,13 +27,14 @@ PERIOD: Final = (
     ("allowance", "i8"), ("planned", "?"), ("solved", "?"), ("load", "real"), ("effective", "real"),
     ("efficiency", "real"), ("mismatch", "real"), ("contraction", "real"), ("gamma", "real"),
     ("guessed_before", "real"), ("delivered_before", "real"), ("shortage", "real"), ("most_open", "real"),
+    ("suspects", "i8"),
 )  # fmt: skip
 """update, tick, load: of the update under way. q, iterations, ticks, effective: q(t_k), what fits, tau_u and J_k.
 efficiency, mismatch, contraction, gamma: what q was decided by. sequences: number of the last sequence. allowance:
 ticks that adaptive periods are longer than the budget says. planned, solved: whether there is a period, and an answer
 to it. guessed_before, delivered_before: J+ and Jhat of the problem before, infinite where there was none. shortage:
 what the load is above what can be held (W); negative: below what is needed. most_open: limit of CV155, a scaled
-deviation."""
+deviation. suspects: readings left out, bit i is output i."""
 
 
 class Delivery(NamedTuple):
@@ -63,6 +64,8 @@ class OptimizerState(NamedTuple):
     """The last answer. An answer may be computed again from the same state, with the same bits."""
     u: Array
     """Input applied at the update under way, as a deviation, shape (3,): played on where no sequence is."""
+    target: Array
+    """Inputs that the plant should come to rest at, scaled deviations, shape (3,)."""
     rule: Array
     """What the rule of the updating period remembers, shape (2,)."""
 
@@ -80,5 +83,5 @@ def empty_state(n_states: int, size: int, real: Real) -> OptimizerState:
 
     return OptimizerState(
         numbers(PERIOD), no_belief(n_states, real), delivery(), delivery(), np.zeros(N_INPUTS, real),
-        np.zeros(MEMORY, real),
+        np.zeros(N_INPUTS, real), np.zeros(MEMORY, real),
     )  # fmt: skip

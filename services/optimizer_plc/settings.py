@@ -28,6 +28,7 @@ from optimizer_plc.computing_settings import (
     InteriorPointSettings,
     OdeSettings,
     OsqpSettings,
+    PlausibilitySettings,
     QpoasesSettings,
 )
 from optimizer_plc.qp.design import ColdEndSettings, ControlDesign
@@ -132,10 +133,13 @@ class ProgramSettings(BaseModel):
     design: ControlDesign = ControlDesign()
     cold_end: ColdEndSettings = ColdEndSettings()
     preset: Preset = Preset.TUNED
-    """Solver, penalties, start of the ODE-based one, disturbances, limit of CV155, margin of the bands, if not set."""
+    """Solver, penalties, start of the ODE-based one, disturbances, limit of CV155, margin of the bands,
+    limit of residuals, if not set."""
     penalties: PenaltySettings = PenaltySettings()
     budget: BudgetSettings = BudgetSettings()
     estimator: EstimatorSettings = EstimatorSettings()
+    plausibility: PlausibilitySettings = PlausibilitySettings()
+    """Of readings; for the Kalman filter."""
     ode: OdeSettings = OdeSettings()
     qpoases: QpoasesSettings = QpoasesSettings()
     osqp: OsqpSettings = OsqpSettings()
@@ -159,7 +163,7 @@ class ProgramSettings(BaseModel):
         """Take what was not set from the preset, and alpha of the solvers from the penalties."""
         for name, values in PRESETS[self.preset].items():
             usual_filter = self.estimator.kind is EstimatorKind.KALMAN and self.estimator.load_known
-            if name == "estimator" and not usual_filter:
+            if name in ("estimator", "plausibility") and not usual_filter:
                 continue  # state feedback estimates nothing, and an unmeasured load needs a walk of its own
             if not name:
                 self.__dict__.update(self._not_set(values))

@@ -11,9 +11,10 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import L1
 from coldloop.registers.control_plc import Update
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
-from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict, rest_map
+from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
 from optimizer_plc.qp.linear_algebra import respond
 from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.rest import rest_map
 from optimizer_plc.settings import ProgramSettings
 
 Array = NDArray[np.float64]

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from coldloop.process.limits import LEVEL_BAND, T5_BAND, InputLimits
-from coldloop.process.signals import T5
 from optimizer_plc.settings import ProgramSettings
-from plant.cold_box.equilibrium import NoEquilibriumError, find_equilibrium
-from plant.cold_box.physics import REFERENCE
+from plant.cold_box.capacity import held_loads
+from plant.cold_box.physics import REFERENCE, derivative
 from plant.helium.properties import load_helium
 from rig import Simulation, simulate
 
@@ -69,19 +68,14 @@ def test_a_load_that_is_too_small_is_said_and_stays_so_though_the_estimate_is_hi
 @pytest.mark.exhaustive
 def test_the_loads_that_can_be_held_are_those_of_the_steady_states_of_the_plant() -> None:
     """Proof over a grid of the valves, with the heater at the end that helps."""
-    helium = load_helium()
-    loads = []
-    for heater in (LIMITS.low[1], LIMITS.high[1]):
-        for cv155 in (20.0, 24.0, 26.0, 50.0, 54.0, 56.0, 58.0, 60.0):
-            for cv156 in (20.0, 24.0, 50.0, 60.0):
-                try:
-                    rest = find_equilibrium(np.array([cv155, heater, cv156]), sum(LEVEL_BAND) / 2, REFERENCE, helium)
-                except NoEquilibriumError:
-                    continue
-                if T5_BAND[0] <= rest.y[T5] <= T5_BAND[1]:
-                    loads.append(rest.w)
-    assert min(loads) == pytest.approx(LEAST, abs=3.0)
-    assert max(loads) == pytest.approx(LARGEST, abs=3.0)
+    openings, turbine = (20.0, 24.0, 26.0, 50.0, 54.0, 56.0, 58.0, 60.0), (20.0, 24.0, 50.0, 60.0)
+    heater = LIMITS.low[1], LIMITS.high[1]
+    found = held_loads(REFERENCE, load_helium(), sum(LEVEL_BAND) / 2, openings, heater, turbine, T5_BAND)
+    assert found.least.w == pytest.approx(LEAST, abs=3.0)
+    assert found.largest.w == pytest.approx(LARGEST, abs=3.0)
+    assert (found.least.u[1], found.largest.u[1]) == (heater[1], heater[0])
+    for rest in found:
+        assert np.abs(derivative(rest.x, rest.u, rest.w, REFERENCE, load_helium())).max() < 1e-4
 
 
 def test_a_load_near_the_capacity_is_held_because_cv155_is_not_opened_too_far(tmp_path: Path) -> None:

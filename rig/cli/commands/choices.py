@@ -11,6 +11,7 @@ SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "
 PRESETS: Final = ("tuned", "paper", "as-printed")
 LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h", "pulses")
 SERVICES: Final = ("control_plc", "optimizer_plc", "plant")
+WITHOUT: Final = ("optimizer",)
 REGISTER_FORMATS: Final = ("csv", "json", "markdown", "table")
 TAG_FORMATS: Final = ("fuxa", "ignition", "node-red", "telegraf")
 FIGURE_FORMATS: Final = ("png", "pdf", "svg")

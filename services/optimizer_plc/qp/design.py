@@ -3,6 +3,7 @@
 The paper leaves weights and scaling open; `docs/science.md` says why these were chosen.
 """
 
+from enum import StrEnum
 from itertools import pairwise
 from typing import Annotated, Self
 
@@ -27,6 +28,16 @@ def _rising_instants(instants: tuple[int, ...]) -> tuple[int, ...]:
 Instants = Annotated[tuple[int, ...], AfterValidator(_rising_instants)]
 
 
+class Target(StrEnum):
+    """What the cost is about: where the plant should come to rest."""
+
+    OPERATING_POINT = "operating-point"
+    MISMATCH = "mismatch"
+    """Where the plant, as it is estimated to be, rests at the operating point's load."""
+    LOAD = "load"
+    """Where it rests at the present load."""
+
+
 class ControlDesign(BaseModel):
     """The constrained control problem. Inputs are in the order (CV155 %, NCR22_A W, CV156 %)."""
 
@@ -49,6 +60,7 @@ class ControlDesign(BaseModel):
     state_weight: PositiveFloat = 0.1
     violation_weight: tuple[PositiveFloat, PositiveFloat] = (100.0, 100.0)
     """rho, per %^2 of L1 and K^2 of T5 and sample."""
+    target: Target = Target.OPERATING_POINT
 
     @property
     def horizon(self) -> int:

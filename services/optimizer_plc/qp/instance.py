@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
+from optimizer_plc.qp.design import N_INPUTS, N_SLACKS
 from optimizer_plc.qp.linear_algebra import add_transposed_product
 
 Array = NDArray[np.float64]
@@ -31,6 +32,10 @@ class Maps(NamedTuple):
     first_rate: Array
     """Rates of the inputs, scaled, where they bound the first knot as a box; infinite where they do not."""
     input_scale: Array
+    rest: Array
+    """s at rest by the target, scaled inputs, shape (3, n_s); (0, n_s) where the target is the operating point."""
+    holding: Array
+    """2 Phi times a profile that holds an input, shape (3, n), or (0, n)."""
 
 
 @kernel
@@ -50,15 +55,24 @@ def keep_first_rate(maps: Maps, rate: Array, u_before: Array, share: float, z: A
 
 
 @kernel
-def instance(maps: Maps, x: Array, w: float, u_before: Array, share: float) -> tuple[Array, Array, Array, Array, float]:
-    """Return phi, gamma, low, high and the constant of the cost."""
-    zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
+def instance(
+    maps: Maps, x: Array, w: float, u_before: Array, share: float, target: Array
+) -> tuple[Array, Array, Array, Array, float]:  # fmt: skip
+    """Return phi, gamma, low, high and the constant of the cost, which is about a target (3,) of scaled inputs.
+
+    With its states at rest taken from s, and its inputs from z, the cost is as about the operating point.
+    """
+    zero, one, half = x.dtype.type(0.0), x.dtype.type(1.0), x.dtype.type(0.5)
     s = np.empty(x.shape[0] + 1, x.dtype)
     for i in range(x.shape[0]):
         s[i] = x[i]
     s[x.shape[0]] = w
+    deviation = s.copy()
+    add_transposed_product(maps.rest, -target, deviation)
     phi = np.zeros(maps.phi.shape[1], x.dtype)
-    add_transposed_product(maps.phi, s, phi)
+    add_transposed_product(maps.phi, deviation, phi)
+    about_rest = phi.copy()
+    add_transposed_product(maps.holding, -target, phi)
     outputs, rates = maps.output_bounds.shape[0], maps.rate_bounds.shape[0]
     gamma = np.empty(outputs + rates, x.dtype)
     for r in range(outputs):
@@ -71,8 +85,12 @@ def instance(maps: Maps, x: Array, w: float, u_before: Array, share: float) -> t
     for i in range(u_before.shape[0]):
         low[i], high[i] = first_knot_range(maps, maps.first_rate, u_before, share, i)
     weighted = np.zeros(s.shape[0], x.dtype)
-    add_transposed_product(maps.constant, s, weighted)
+    add_transposed_product(maps.constant, deviation, weighted)
     constant = zero
     for i in range(s.shape[0]):
-        constant += s[i] * weighted[i]
+        constant += deviation[i] * weighted[i]
+    inputs = phi.shape[0] * N_INPUTS // (N_INPUTS + N_SLACKS)
+    for i in range(maps.holding.shape[0]):
+        for j in range(i, inputs, N_INPUTS):
+            constant -= half * (about_rest[j] + phi[j]) * target[i]
     return phi, gamma, low, high, constant

@@ -63,6 +63,7 @@ PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
         "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
         "cold_end": {"approach_k": 0.3},
         "design": {"band_margin": (0.1, 0.1)},
+        "plausibility": {"sigmas": 6.0},
     },
     Preset.PAPER: {},
     Preset.AS_PRINTED: {

@@ -15,12 +15,13 @@ from coldloop.process.signals import TICKS_PER_SAMPLE
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.condensing import Condensed, condense, transposed
 from optimizer_plc.qp.constraints import OutputRows, RateRows, output_rows, rate_rows
-from optimizer_plc.qp.design import N_INPUTS, N_SLACKS, ControlDesign
+from optimizer_plc.qp.design import N_INPUTS, N_SLACKS, ControlDesign, Target
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.linear_algebra import add_transposed_product
 from optimizer_plc.qp.penalties import DEFAULT_PENALTIES, PenaltySettings
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.profile import inputs_of, interpolation, shift, shifted
+from optimizer_plc.qp.target import rest_of
 
 Array = NDArray[np.float64]
 
@@ -49,6 +50,8 @@ class QpParameters(NamedTuple):
     """Input applied just before the first knot takes effect."""
     elapsed_ticks: int = TICKS_PER_SAMPLE
     """Time since the update before; matters when the rate limit follows the elapsed time."""
+    target: Array | None = None
+    """Scaled inputs, shape (3,), that the cost is about; None is the operating point."""
 
 
 class PredictiveProblem:
@@ -85,7 +88,10 @@ class PredictiveProblem:
         scaled_rate = np.asarray(limits.rate) / np.asarray(design.input_scale)
         first_rate = scaled_rate if penalties.first_knot_in_box else np.full(N_INPUTS, np.inf)
         u0 = np.array(prediction.model.u0)
-        self.maps = Maps(*map(self._rounded, self._maps(condensed, outputs, rates, u0, first_rate)))
+        rest = np.zeros((0, n_states + 1))
+        if design.target is not Target.OPERATING_POINT:
+            rest = rest_of(prediction, design).states
+        self.maps = Maps(*map(self._rounded, self._maps(condensed, outputs, rates, u0, first_rate, rest)))
         self.scaled_rate = self._rounded(scaled_rate)
         self.knots_to_samples = self._rounded(weights)
         self.shifts = self._rounded(
@@ -106,11 +112,12 @@ class PredictiveProblem:
         return values.astype(self._real, copy=False)
 
     def _maps(
-        self, condensed: Condensed, outputs: OutputRows, rates: RateRows, u0: Array, first_rate: Array
+        self, condensed: Condensed, outputs: OutputRows, rates: RateRows, u0: Array, first_rate: Array, rest: Array
     ) -> Maps:  # fmt: skip
         scale = np.asarray(self.design.input_scale)
         low_u, high_u = (np.asarray(self.limits.low) - u0) / scale, (np.asarray(self.limits.high) - u0) / scale
         slacks = N_SLACKS * self.n_knots
+        held = np.tile(np.eye(len(rest), N_INPUTS), self.n_knots)  # profiles that hold an input of the target
         return Maps(
             phi=condensed.phi_map,
             constant=condensed.constant_map,
@@ -123,6 +130,8 @@ class PredictiveProblem:
             high=np.concatenate([np.tile(high_u, self.n_knots), np.full(slacks, np.inf)]),
             first_rate=first_rate,
             input_scale=scale,
+            rest=rest,
+            holding=np.ascontiguousarray(2.0 * held @ condensed.Phi[: self.n_inputs]),
         )
 
     # -- instances ---------------------------------------------------------------------------------------------------
@@ -135,7 +144,10 @@ class PredictiveProblem:
         """
         self._check(parameters)
         share = self._real(self.limits.rate_share(parameters.elapsed_ticks))
-        phi, gamma, low, high, constant = instance(self.maps, parameters.x, parameters.w, parameters.u_before, share)
+        target = np.zeros(N_INPUTS, self._real) if parameters.target is None else parameters.target
+        phi, gamma, low, high, constant = instance(
+            self.maps, parameters.x, parameters.w, parameters.u_before, share, target
+        )
         return QuadraticProblem(self.Phi, phi, self.Gamma, gamma, low, high, self._real(constant))
 
     def _check(self, parameters: QpParameters) -> None:

@@ -46,6 +46,15 @@ def find_equilibrium(u: RealArray, level: float, box: ColdBox, helium: Helium) -
         NoEquilibriumError: Newton's method does not converge, for instance beyond the capacity maximum.
     """
     x, w = _relaxed(u, level, box, helium)
+    return rest_near(x, w, u, box, helium)
+
+
+def rest_near(x: RealArray, w: float, u: RealArray, box: ColdBox, helium: Helium) -> Equilibrium:
+    """Return the state of rest under `u` that Newton's method finds from (x, w), with the level of x.
+
+    Raises:
+        NoEquilibriumError: It does not converge.
+    """
     scales = state_scales(box)
     for _ in range(MAX_NEWTON_STEPS):
         dx = derivative(x, u, w, box, helium)

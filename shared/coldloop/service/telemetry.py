@@ -59,7 +59,7 @@ class Telemetry:
         while True:
             try:
                 await self._publish()
-            except Exception as error:  # noqa: BLE001 - a service never ends because of its telemetry
+            except Exception as error:  # a service never ends because of its telemetry
                 if _is_cancelled():  # and the library has raised its own error instead
                     raise asyncio.CancelledError from error
                 reason = str(error) or "no answer in time"

@@ -1,0 +1,186 @@
+"""The target: where the plant, as it is estimated to be, should rest.
+
+Of the inputs at which the estimated plant rests with L1 at its operating point those are the target that cost least, as
+deviations from the operating point. They are within their bounds; within these they hold the load, or as much of it as
+they can; then they have T5 within its rows, or as near as they can.
+
+Inputs are deviations over `input_scale`, and those that act: with the estimated constants of inputs added.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.kernels.compiled import kernel
+from coldloop.process.limits import InputLimits
+from coldloop.process.signals import INPUT_NAMES, T5
+from optimizer_plc.qp.arithmetic import DOUBLE, Real
+from optimizer_plc.qp.design import N_INPUTS, ControlDesign, Target
+from optimizer_plc.qp.prediction import PredictionModel, state_weights
+from optimizer_plc.qp.rest import rest_map
+
+Array = NDArray[np.float64]
+
+CV155 = INPUT_NAMES.index("CV155")
+TOLERANCE = 1e-4
+"""What a bound may be missed by, scaled; in single precision a corner of bounds is met no better than within 1e-5."""
+
+
+class Rest(NamedTuple):
+    """What is at rest with L1 at its operating point, by the scaled inputs."""
+
+    states: Array
+    """States and load held: as a map of the inputs, shape (3, n_x + 1). Disturbances are none."""
+    temperature: Array
+    """T5, shape (3,)."""
+
+
+class TargetSearch(NamedTuple):
+    """What targets are found with, in the on-line floating-point type."""
+
+    followed: bool
+    """Whether there is a target other than the operating point."""
+    of_load: float
+    """1 where the load counts, 0 where only its mismatch does."""
+    held: Array
+    """Load that an input holds, W, shape (3,)."""
+    cheapest: Array
+    """Inputs that hold a W at the least cost, shape (3,)."""
+    plane: Array
+    """Inputs that hold nothing, orthonormal in what they cost, shape (3, 2)."""
+    rows: Array
+    """The inputs and T5 on that plane, shape (4, 2)."""
+    temperature: Array
+    """Shape (3,)."""
+    low: Array
+    """Of inputs and T5, shape (4,)."""
+    high: Array
+    constants: NDArray[np.int64]
+    """Which states are the constants of inputs and T5, shape (4,); -1 is none."""
+    scale: Array
+    """Of the constants: input_scale and 1, shape (4,)."""
+
+
+def rest_of(prediction: PredictionModel, design: ControlDesign) -> Rest:
+    """Return where the model rests."""
+    n, scale = len(prediction.model.x0), np.array(design.input_scale)
+    by_inputs = rest_map(prediction)[:, :N_INPUTS] * scale
+    states = np.zeros((N_INPUTS, prediction.n_states + 1))
+    states[:, :n], states[:, -1] = by_inputs[:n].T, by_inputs[n]
+    C, D, G = prediction.C[T5], prediction.D[T5], prediction.G[T5]
+    return Rest(states, states[:, :-1] @ C + D * scale + states[:, -1] * G)
+
+
+def target_search(
+    prediction: PredictionModel, design: ControlDesign, limits: InputLimits, real: Real = DOUBLE
+) -> TargetSearch:
+    """Return what targets of this problem are found with."""
+    rest, n, scale = rest_of(prediction, design), len(prediction.model.x0), np.array(design.input_scale)
+    held, states = rest.states[:, -1], rest.states[:, :n]
+    cost = states * state_weights(prediction.model, design) @ states.T + np.diag(scale**2 * design.input_weight)
+    inverse = np.linalg.inv(cost)
+    across = np.linalg.svd(held[None])[2][1:].T
+    root = np.linalg.cholesky(across.T @ cost @ across)
+    plane = np.ascontiguousarray(np.linalg.solve(root, across.T).T)
+    y0, margin, u0 = float(prediction.y0[T5]), design.band_margin[1], np.array(prediction.u0)
+    places = {signal: n + place for place, signal in enumerate(prediction.disturbances)}
+    signals = (*range(len(prediction.y0), len(prediction.y0) + N_INPUTS), T5)
+    arrays = {
+        "held": held,
+        "cheapest": inverse @ held / (held @ inverse @ held),
+        "plane": plane,
+        "rows": np.vstack([plane, rest.temperature @ plane]),
+        "temperature": rest.temperature,
+        "low": np.array([*(limits.low - u0) / scale, design.output_low[1] + margin - y0]),
+        "high": np.array([*(limits.high - u0) / scale, design.output_high[1] - margin - y0]),
+        "scale": np.array([*scale, 1.0]),
+    }
+    return TargetSearch(
+        followed=design.target is not Target.OPERATING_POINT,
+        of_load=real(design.target is Target.LOAD),
+        constants=np.array([places.get(signal, -1) for signal in signals]),
+        **{name: np.ascontiguousarray(array).astype(real, copy=False) for name, array in arrays.items()},
+    )
+
+
+@kernel
+def find_target(c: TargetSearch, x: Array, w: float, mismatch: float, most_open: float, target: Array) -> None:
+    """Write the target (3,) for estimated states (n_x,), load and its mismatch, and a limit of CV155."""
+    if not c.followed:
+        return
+    real = x.dtype.type
+    low, high = c.low.copy(), c.high.copy()
+    high[CV155] = max(min(high[CV155], most_open), low[CV155])
+    most, least = real(0.0), real(0.0)
+    for i in range(low.shape[0]):
+        if c.constants[i] >= 0:
+            constant = x[c.constants[i]] / c.scale[i]
+            sign = real(1.0) if i < target.shape[0] else real(-1.0)
+            low[i] += sign * constant
+            high[i] += sign * constant
+    for i in range(target.shape[0]):
+        one, other = c.held[i] * low[i], c.held[i] * high[i]
+        most += max(one, other)
+        least += min(one, other)
+    load = min(max(mismatch + c.of_load * (w - mismatch), least), most)
+    bounds, last = np.empty((low.shape[0], 2), x.dtype), target.shape[0]
+    for i in range(last):
+        target[i] = c.cheapest[i] * load
+        bounds[i, 0], bounds[i, 1] = low[i] - target[i], high[i] - target[i]
+        low[last] -= c.temperature[i] * target[i]
+        high[last] -= c.temperature[i] * target[i]
+    bounds[last, 0], bounds[last, 1] = low[last], high[last]
+    point = nearest_point(c.rows, bounds)
+    for i in range(last):
+        moved = target[i] + c.plane[i, 0] * point[0] + c.plane[i, 1] * point[1]
+        target[i] = min(max(moved, low[i]), high[i])
+
+
+@kernel
+def nearest_point(rows: Array, bounds: Array) -> Array:
+    """Return the point (2,) nearest to the origin with `rows` (4, 2) times it between `bounds` (4, 2).
+
+    Where there is none, the bounds of the first three rows come before those of the last. Of strips it is the origin,
+    its projection on a bound, or where two bounds meet.
+    """
+    best, missed = np.zeros(2, rows.dtype), np.empty(3, rows.dtype)
+    judge_point(rows, bounds, best, missed)
+    point, found = np.empty(2, rows.dtype), np.empty(3, rows.dtype)
+    for i in range(rows.shape[0]):
+        square = rows[i, 0] * rows[i, 0] + rows[i, 1] * rows[i, 1]
+        for at in range(2):
+            share = bounds[i, at] / square
+            point[0], point[1] = share * rows[i, 0], share * rows[i, 1]
+            take_better(rows, bounds, point, found, best, missed)
+            for j in range(i):
+                cross = rows[i, 0] * rows[j, 1] - rows[i, 1] * rows[j, 0]
+                for other in range(2):
+                    one, two = bounds[i, at] / cross, bounds[j, other] / cross
+                    point[0], point[1] = one * rows[j, 1] - two * rows[i, 1], two * rows[i, 0] - one * rows[j, 0]
+                    take_better(rows, bounds, point, found, best, missed)
+    return best
+
+
+@kernel
+def take_better(rows: Array, bounds: Array, point: Array, found: Array, best: Array, missed: Array) -> None:
+    """Copy a point to `best` if it is better than that; `found` and `missed` (3,) are as `judge_point` judges them."""
+    judge_point(rows, bounds, point, found)
+    for k in range(found.shape[0]):
+        if not found[k] <= missed[k]:
+            return
+        if found[k] < missed[k]:
+            best[:], missed[:] = point, found
+            return
+
+
+@kernel
+def judge_point(rows: Array, bounds: Array, point: Array, missed: Array) -> None:
+    """Write what a point misses the bounds (4, 2) of the first three rows by, those of the last, and its square."""
+    n, real = rows.shape[0], rows.dtype.type
+    missed[0] = missed[1] = real(TOLERANCE)
+    for i in range(n):
+        value = rows[i, 0] * point[0] + rows[i, 1] * point[1]
+        k = 1 if i == n - 1 else 0
+        missed[k] = max(missed[k], bounds[i, 0] - value, value - bounds[i, 1])
+    missed[2] = point[0] * point[0] + point[1] * point[1]
