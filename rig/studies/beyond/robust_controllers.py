@@ -24,7 +24,7 @@ CONTROLLERS: Final = {
     "paper, Algorithm 1": (ADAPTIVE, ()),
     "tuned, fixed 2.5 s": (2.5, (TUNED,)),
 }
-"""Updating period and settings; the solver is the ODE-based one."""
+"""Updating period and settings; each preset has its solver."""
 HELD_PCT: Final = 1.0
 """Mean share of the time outside a band up to which a controller holds it."""
 
