@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from optimizer_plc.program import OptimizerProgram
     from optimizer_plc.settings import ProgramSettings
     from plant.settings import PlantKind
 
@@ -76,13 +77,31 @@ def default_optimizer() -> None:
     _make_optimizer(ProgramSettings())
 
 
-def _make_optimizer(settings: "ProgramSettings") -> None:
+def default_solver() -> None:
+    """Compile what solves before what plans, which the program compiles first and another part meanwhile.
+
+    Kernels are the same whatever the estimator; this one takes no gains.
+    """
+    from optimizer_plc import scheme  # noqa: PLC0415
+    from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
+    from optimizer_plc.settings import ProgramSettings  # noqa: PLC0415
+
+    class SolvesFirst(OptimizerProgram):
+        def _compile_kernels(self, *_: object) -> None:
+            self.restart(0.0)
+            self.state.numbers["ticks"], self.state.numbers["iterations"] = 4, 2
+            scheme.solve(self.constants, self.method, self.state)
+
+    _make_optimizer(ProgramSettings.model_validate({"estimator": {"kind": "state-feedback"}}), SolvesFirst)
+
+
+def _make_optimizer(settings: "ProgramSettings", kind: "type[OptimizerProgram] | None" = None) -> None:
     from coldloop.process.limits import InputLimits  # noqa: PLC0415
     from coldloop.process.lti_model import load  # noqa: PLC0415
     from coldloop.process.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from optimizer_plc.program import OptimizerProgram  # noqa: PLC0415
 
-    OptimizerProgram(load(DEFAULT_MODEL_FILE), settings, InputLimits())
+    (kind or OptimizerProgram)(load(DEFAULT_MODEL_FILE), settings, InputLimits())
 
 
 def in_one_process(**changes: Any) -> Callable[[], None]:  # noqa: ANN401 as of `simulate`
@@ -136,12 +155,13 @@ PARTS: Final[dict[str, tuple[Callable[[], None], int]]] = {
     "optimizer_plc": (optimizer_plc, 25),
     "hmi": (nothing, 1),
     "default-plant": (default_plant, 9),
-    "default-optimizer": (default_optimizer, 13),
+    "default-solver": (default_solver, 13),
+    "default-optimizer": (default_optimizer, 10),
     "cold-box-in-one-process": (in_one_process(), 55),
     "refrigerator-in-one-process": (in_one_process(plant={"kind": "refrigerator"}), 27),
     "single-precision-in-one-process": (in_one_process(optimizer_plc={"program": {"arithmetic": "float32"}}), 25),
     "interior-point-in-one-process": (in_one_process(solver="interior-point"), 25),
-    "hybrid-in-one-process": (in_one_process(solver="hybrid"), 25),
+    "ode-in-one-process": (in_one_process(solver="ode"), 25),
     "fast-gradient-in-one-process": (in_one_process(solver="fast-gradient"), 25),
     "linear-models": (linear_models, 20),
     "run-modules": (run_modules, 4),
@@ -183,6 +203,8 @@ def _show(line: str) -> None:
 
 
 if __name__ == "__main__":
+    for number in (signal.SIGINT, signal.SIGTERM):  # a script's shell has SIGINT ignored in the background
+        signal.signal(number, signal.default_int_handler)
     if len(sys.argv) == 2:
         PARTS[sys.argv[1]][0]()
         sys.exit()

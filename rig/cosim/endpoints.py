@@ -1,8 +1,11 @@
 """Where the three servers of a rig are."""
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from coldloop.modbus.endpoints import Endpoint
+
+REQUIRED: Final = ("plant", "control_plc")
+"""Services of every rig; an optimiser may be somebody else's (`up --without optimizer`)."""
 
 
 class RigEndpoints(NamedTuple):

@@ -1,6 +1,6 @@
 """A loop without a PLC's limits: at each instant the exact optimum of the state that is there, applied at once.
 
-It is the infinitely fast PLC that rules are measured against: a reference, and no bound that could be proved. Its
+It is the loop of an infinitely fast PLC, with the problems that certified iterations are sampled from. Its
 horizon is finite and its model linear, and with the rate limit in full at each instant a loop may be faster than is
 good for its plant.
 """

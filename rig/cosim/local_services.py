@@ -1,4 +1,4 @@
-"""The three services as processes on localhost."""
+"""The services as processes on localhost."""
 
 import asyncio
 import contextlib
@@ -26,13 +26,14 @@ STOP_GRACE_S = 5.0
 
 
 class LocalServices:
-    """Processes of the three services; an async context in which they live.
+    """Processes of the services; an async context in which they live.
 
     Args:
         settings: Their configuration.
         log_folder: Their logs go to `<folder>/<service>.log`.
         detours: Where something is between clients and servers.
         ports: Where they listen; by default on free ports.
+        services: Which ones are started; the others are somebody else's.
     """
 
     def __init__(
@@ -42,11 +43,13 @@ class LocalServices:
         *,
         detours: Detours | None = None,
         ports: Sequence[int] | None = None,
+        services: Sequence[str] = SERVICES,
     ) -> None:
         self._ports = ReservedPorts(len(SERVICES) if ports is None else 0)
         self.endpoints = endpoints_on(ports or self._ports.numbers, settings)
         self._environment = to_environment(wired(settings, self.endpoints, detours))
         self._logs = log_folder
+        self.services = tuple(services)
         self._processes: dict[str, asyncio.subprocess.Process] = {}
         self._watchers: set[asyncio.Task[None]] = set()
         self._ended: asyncio.Queue[str] = asyncio.Queue()
@@ -55,10 +58,10 @@ class LocalServices:
     async def __aenter__(self) -> Self:
         """Start them."""
         self._logs.mkdir(parents=True, exist_ok=True)
-        for service in SERVICES:
+        for service in self.services:
             self.log(service).unlink(missing_ok=True)
             await self.start(service)
-        logs = [self.log(service) for service in SERVICES]
+        logs = [self.log(service) for service in self.services]
         self._showing = asyncio.create_task(show_compiling(logs), name="show compiling")
         return self
 

@@ -104,15 +104,18 @@ class OneProcessRig:
         plant, solver = self._settings.plant.kind.replace("-", " "), self._settings.optimizer_plc.program.solver
         return kernels_of(f"the {plant} and the {solver} solver in one process", about_s=50)
 
+    def _plant(self, load: LoadProfile, seed: int) -> PlantProgram:
+        return plant_maker(self._header, self._settings.plant)(load, seed)
+
     def _run(self, scenario: Scenario, recorder: Recorder) -> None:
         load = load_table(scenario.load)
-        plant = plant_maker(self._header, self._settings.plant)(load, scenario.seed)
+        plant = self._plant(load, scenario.seed)
         programs = Programs(plant, self.control, self.optimizer)
         self.optimizer.restart(scenario.updating_period_s)
         noted = self.control.journal.count
         self.control.restart(session=1)
         stretches = None
-        if self._compiled:
+        if self._compiled and not self._settings.plant.mismatch.beside_the_box:
             stretches = CompiledStretches(plant, self.control, self.optimizer, load)
         recorder.begin()
         while self.control.tick < scenario.ticks:

@@ -22,6 +22,7 @@ from rig.cosim.endpoints import RigEndpoints
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_events import SessionEvents
 from rig.cosim.session_reader import BATCH, SampleReader, UpdateReader
+from rig.cosim.wiring import SERVICES
 from rig.results.driving import CONTROL, PLANT
 from rig.results.recording import LinkStatistics, Recorder
 from rig.settings import Settings
@@ -53,22 +54,31 @@ def next_session(present: Sequence[int]) -> int:
 
 
 class SessionClient:
-    """Client of all three services.
+    """Client of the services of a rig.
 
     Args:
         endpoints: Where they are.
         settings: What they are expected to run.
         tolerant: For a rig whose parts come and go: a service that does not answer is asked again later, ticks that it
             does not keep any more are left out. Otherwise either ends the run.
+        services: Which ones there are; without the optimiser, sessions can be started and held, and not recorded.
     """
 
-    def __init__(self, endpoints: RigEndpoints, settings: Settings, *, tolerant: bool = False) -> None:
+    def __init__(
+        self,
+        endpoints: RigEndpoints,
+        settings: Settings,
+        *,
+        tolerant: bool = False,
+        services: Sequence[str] = SERVICES,
+    ) -> None:
         self._settings = settings
         self._tolerant = tolerant
         self.plant = RegisterClient.at(PLANT_MAP, endpoints.plant)
         self.control = RegisterClient.at(CONTROL_MAP, endpoints.control_plc)
         self.optimizer = RegisterClient.at(OPTIMIZER_MAP, endpoints.optimizer_plc)
-        self.clients = {"plant": self.plant, "control_plc": self.control, "optimizer_plc": self.optimizer}
+        every = {"plant": self.plant, "control_plc": self.control, "optimizer_plc": self.optimizer}
+        self.clients = {service: every[service] for service in services}
         self.session = 0
         """The session that was started last; 0 is none."""
         self.load: LoadStream | None = None
@@ -79,7 +89,7 @@ class SessionClient:
         self._background: asyncio.Task[None] | None = None
 
     async def connect(self, patience_s: float) -> None:
-        """Connect to all three, and make sure that all run the model of our configuration.
+        """Connect to all of them, and make sure that they run the model of our configuration.
 
         Raises:
             PeerUnreachableError: One is not there.
@@ -129,7 +139,7 @@ class SessionClient:
         recorder.begin()
 
     async def start(self, scenario: Scenario) -> int:
-        """Write the load and the settings of a new session to all three; return its number.
+        """Write the load and the settings of a new session to all of them; return its number.
 
         Raises:
             LinkError: A service does not answer or refuses.
@@ -137,9 +147,10 @@ class SessionClient:
         session = next_session([(await client.read(Identity)).session for client in self.clients.values()])
         self.session = session
         realtime = int(scenario.realtime)
-        await self.optimizer.write(
-            OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / TICK_S))
-        )
+        if "optimizer_plc" in self.clients:
+            await self.optimizer.write(
+                OptimizerSession(session, realtime, scenario.factor, round(scenario.updating_period_s / TICK_S))
+            )
         rows = await write_table(self.plant, scenario.load)
         await self.plant.write(PlantSession(session, realtime, scenario.factor, scenario.seed, rows))
         self.load = LoadStream(self.plant, session, scenario.load, sent=rows)

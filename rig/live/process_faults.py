@@ -14,12 +14,14 @@ def process_of(first_port: int | None, service: str) -> ServiceProcess:
     """Return the process of a service of the rig on these ports, or of the only one.
 
     Raises:
-        UsageError: No rig was started here, or the service does not run at present.
+        UsageError: No rig was started here, it has no such service, or that does not run at present.
     """
     rig = find_rig(first_port)
     if rig is None:
         raise no_rig(first_port)
-    process = rig.services[service]
+    process = rig.services.get(service)
+    if process is None:
+        raise UsageError(f"the rig was started without an {service} service")
     if not _runs(process):
         raise UsageError(f"the {service} service does not run: `coldloop up` starts it again, or has given it up")
     return process

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple, Self
 
 from coldloop.errors import ColdloopError, UsageError
 from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
-from rig.cosim.endpoints import RigEndpoints
+from rig.cosim.endpoints import REQUIRED, RigEndpoints
 from rig.interpreter import PYTHON
 from rig.interruption import INTERRUPTION
 from rig.live.private_folder import base_folder, is_private, make_own_folder, new_own, read_own, write_own
@@ -67,6 +67,7 @@ class RunningRig(NamedTuple):
     tls: str
     """Folder of certificates that it was started with; empty when none."""
     services: dict[str, ServiceProcess]
+    """Those that were started: an optimiser may be somebody else's."""
     cuttable: bool
     """Whether its links can be cut; see `rig.live.link_cuts`."""
 
@@ -91,7 +92,9 @@ class RunningRig(NamedTuple):
             content: dict[str, Any] = json.loads(text)
             own = ServiceProcess.parsed([content["pid"], content["identity"]])
             services = {
-                service: ServiceProcess.parsed(content["services"][service]) for service in RigEndpoints._fields
+                service: ServiceProcess.parsed(content["services"][service])
+                for service in RigEndpoints._fields
+                if service in REQUIRED or service in content["services"]
             }
             rig = cls(*own, tuple(content["ports"]), content["tls"], services, content["cuttable"] is True)
         except (ValueError, KeyError, TypeError, RecursionError):

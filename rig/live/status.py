@@ -2,7 +2,7 @@
 
 from typing import Final, NamedTuple
 
-from coldloop.operating.execution import ALL_SERVICES, Clients
+from coldloop.operating.execution import Clients
 from coldloop.operating.rings import last_update
 from coldloop.process.signals import L1, T5, TICK_S
 from coldloop.registers.common import Identity, SessionPace
@@ -16,7 +16,7 @@ QUIET: Final = (AlarmState.NORMAL, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE
 
 
 class RigStatus(NamedTuple):
-    """One look at all three services."""
+    """One look at the services of a rig."""
 
     plant: Identity
     pace: SessionPace
@@ -25,7 +25,7 @@ class RigStatus(NamedTuple):
     process: Process
     load: LoadStatus
     update: Optimization | None
-    """The last one that was done; None before the first."""
+    """The last one that was done; None before the first, and of an optimiser that is not ours."""
     alarms: tuple[str, ...]
 
 
@@ -35,8 +35,8 @@ async def read_status(clients: Clients) -> RigStatus:
     Raises:
         LinkError: A service does not answer.
     """
-    plant, control, optimizer = (clients[service] for service in ALL_SERVICES)
-    update = await last_update(optimizer, await optimizer.read(Identity))
+    plant, control, optimizer = clients["plant"], clients["control_plc"], clients.get("optimizer_plc")
+    update = None if optimizer is None else await last_update(optimizer, await optimizer.read(Identity))
     rows = await control.read_rows(Alarm, 0, len(AlarmKind))
     alarms = tuple(_alarm(kind, row) for kind, row in zip(AlarmKind, rows, strict=True) if row.state not in QUIET)
     return RigStatus(

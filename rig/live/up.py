@@ -1,4 +1,4 @@
-"""A rig that stays up: three services on fixed ports, in real time, until they are ended."""
+"""A rig that stays up: services on fixed ports, in real time, until they are ended."""
 
 import asyncio
 import sys
@@ -31,15 +31,24 @@ class UpRig:
     """Starts the services, begins a session in real time, and keeps both up until it is cancelled.
 
     A service or page that ends is started again (`rig.cosim.kept_up`), and resumes from its retained state.
+    `services` are those that are started; where the optimiser is not one of them, another client takes its place.
     """
 
     def __init__(
-        self, settings: Settings, ports: Sequence[int], tls: Path | None, *, page: bool = False, cuttable: bool = False
+        self,
+        settings: Settings,
+        ports: Sequence[int],
+        tls: Path | None,
+        *,
+        page: bool = False,
+        cuttable: bool = False,
+        services: Sequence[str] = SERVICES,
     ) -> None:
         self.folder = make_own_folder(str(ports[0]))
         self._settings = retaining(settings, self.folder, always=False)
         self._scenario = make_scenario(settings)
         self._page = page
+        self._services = tuple(services)
         self._ports = tuple(ports)
         self._tls = tls
         self._links = CuttableLinks(self.folder) if cuttable else None
@@ -58,12 +67,13 @@ class UpRig:
             make_private(self.folder / "logs"),
             ports=self._ports,
             detours=None if links is None else links.detours,
+            services=self._services,
         )
         async with links or nullcontext(), services:
             if links is not None:
                 links.put_before(services.endpoints)
                 await links.connect()
-            rig = SessionClient(services.endpoints, self._settings)
+            rig = SessionClient(services.endpoints, self._settings, services=self._services)
             page = PageProcess(self._settings.hmi, services.endpoints, self.folder) if self._page else None
             try:
                 async with page or nullcontext():
@@ -81,7 +91,7 @@ class UpRig:
         if page is not None:
             await page.is_served()
         if announce:
-            sys.stdout.write(addresses(self._settings, self._ports, self.folder))
+            sys.stdout.write(addresses(self._settings, self._ports, self.folder, self._services))
             sys.stdout.write(page.addresses if page is not None else "")
             sys.stdout.flush()
         self._write_state(services)
@@ -93,7 +103,7 @@ class UpRig:
         RunningRig.of_this_process(self._ports, tls, pids, cuttable=self._links is not None).write()
 
     async def _keep(self, services: LocalServices, rig: SessionClient, page: PageProcess | None) -> None:
-        work = [self._hold(rig), *(self._keep_service(services, service, rig) for service in SERVICES)]
+        work = [self._hold(rig), *(self._keep_service(services, service, rig) for service in self._services)]
         if page is not None:
             work.append(_keep_page(page))
         if self._links is not None:
@@ -156,13 +166,17 @@ async def _keep_page(page: PageProcess) -> None:
         say(str(error))
 
 
-def addresses(settings: Settings, ports: Sequence[int], folder: Path) -> str:
+def addresses(settings: Settings, ports: Sequence[int], folder: Path, services: Sequence[str]) -> str:
     """Return where everything is, with a line to paste."""
     base = "" if tuple(ports) == DEFAULT_PORTS else f" --port-base {ports[0]}"
-    tls = any(getattr(settings, service).server.tls for service in SERVICES)
+    tls = any(getattr(settings, service).server.tls for service in services)
+    places = {
+        service: f"127.0.0.1:{port}" if service in services else "yours: a client of the control PLC"
+        for service, port in zip(SERVICES, ports, strict=True)
+    }
     lines = [
         f"the rig is up: load {settings.plant.load}, {settings.session.factor:g} x real time",
-        *(f"  {service:14} 127.0.0.1:{port}" for service, port in zip(SERVICES, ports, strict=True)),
+        *(f"  {service:14} {place}" for service, place in places.items()),
         f"  logs           {folder / 'logs'}",
     ]
     if tls:

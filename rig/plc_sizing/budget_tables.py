@@ -116,20 +116,21 @@ def _operations(problem: PredictiveProblem, prediction: PredictionModel) -> str:
 def solver_table(
     program: ProgramSettings, problem: PredictiveProblem, periods_s: Sequence[float]
 ) -> list[tuple[str, ...]]:  # fmt: skip
-    """Return, solver by solver, the times of an iteration at P = 1, the iterations done in periods, and the memory.
+    """Return, solver by solver, times of an iteration at P = 1, periods of the ladder, iterations in some, and memory.
 
     The first row is the header.
     """
     sizes, speed = counted_sizes(problem), fitted(cholesky_times()).flops_per_s(problem.size)
     memory = workspaces(problem.size, len(problem.Gamma))
-    rows: list[tuple[str, ...]] = [(*SOLVER_COLUMNS, *(f"in {period:g} s" for period in periods_s), "kB")]
+    rows: list[tuple[str, ...]] = [(*SOLVER_COLUMNS, "periods", *(f"in {period:g} s" for period in periods_s), "kB")]
     for name, solver in SOLVERS.items():
         tau_1_s = solver.tau_1_s(program)
         plc = PlcBudget(program.budget, tau_1_s)
         rows.append((
             name, "" if solver.paper_s is None else f"{solver.paper_s:.2f}",
             *(f"{solver.operations(one).flops / speed:.3f}" for one in sizes), f"{tau_1_s:g}", solver.default,
-            *(str(plc.iterations(round(period / TICK_S))) for period in periods_s), f"{memory[name] / 1e3:.1f}",
+            str(len(plc.ladder)), *(str(plc.iterations(round(period / TICK_S))) for period in periods_s),
+            f"{memory[name] / 1e3:.1f}",
         ))  # fmt: skip
     return rows
 

@@ -100,18 +100,3 @@ def interval_of_mean(values: Sequence[float], above: float = -np.inf) -> Interva
     if not len(known):
         return Interval(np.nan, np.nan, np.nan)
     return jackknife(lambda which: float(known[which].mean()), len(known), above)
-
-
-def gap_closed(costs: Series, reference: Series, best: Series) -> Interval:
-    """Return the share of the gap between a reference and the best that a rule closes.
-
-    It is sum ln(reference / costs) over sum ln(reference / best), over the hours: 0 for the reference itself, 1 for the
-    best, below 0 for what is worse than the reference. All have shape (n,). NaN where there is no gap.
-    """
-    won, gap = np.log(reference / costs), np.log(reference / best)
-
-    def closed(which: list[int]) -> float:
-        total = float(gap[which].sum())
-        return float(won[which].sum()) / total if total > 0 else np.nan
-
-    return jackknife(closed, len(costs))

@@ -20,7 +20,7 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import L1, OUTPUT_NAMES, STATION_SIGNAL_NAMES, T5, TICK_S
 from optimizer_plc.solvers import make_solver
-from rig.cosim.ideal_loop import run_ideal_loop
+from rig.cosim.linear_plant import LinearRig
 from rig.cosim.local_services import run_on_localhost
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
@@ -28,7 +28,6 @@ from rig.results.folders import installed_version
 from rig.results.indicators import Indicators, StageCost, evaluate
 from rig.results.recording import Recorder, Recording
 from rig.settings import Settings
-from rig.studies.hindsight import Objective, run_best_in_hindsight
 from rig.studies.paired_run import harsh_run, paired_indicators, paired_run
 from rig.studies.problem_sequence import problem_sequence
 from rig.studies.settings import settings_of
@@ -49,8 +48,7 @@ RIG_MODULES = (
     "rig.cosim.one_process",
     "rig.results.recorded",
     "rig.results.recording",
-    "rig.studies.hindsight",
-    "rig.cosim.ideal_loop",
+    "rig.cosim.linear_plant",
     "rig.studies.paired_run",
     "rig.studies.played_profiles",
     "rig.studies.problem_sequence",
@@ -76,12 +74,8 @@ class Procedure(StrEnum):
     """No loop: the configured solver solves the problems of a converged loop (`rig.studies.paired_run`)."""
     HARSH_PROBLEMS = "harsh problems"
     """The same, and only those count whose guess is far from the optimum, each solver beginning at the same one."""
-    INFINITELY_FAST = "infinitely fast"
-    """The exact optimum at once, every updating period (`rig.cosim.ideal_loop`)."""
-    BEST_CLOSED_LOOP = "best closed loop"
-    """The sequence of updating periods that is best for J_BF (`rig.studies.hindsight`)."""
-    BEST_OPEN_LOOP = "best open loop"
-    """That which is best for J_open_mean."""
+    LINEAR_PLANT = "linear plant"
+    """The optimiser and the control PLC with the linear model for a plant (`rig.cosim.linear_plant`)."""
 
 
 @dataclass(frozen=True)
@@ -220,12 +214,8 @@ def perform(request: RunRequest) -> str:
     match request.procedure:
         case Procedure.PAIRED_PROBLEMS | Procedure.HARSH_PROBLEMS:
             return _of_problems(request, settings, scenario).to_json()
-        case Procedure.INFINITELY_FAST:
-            run_ideal_loop(settings, scenario, recorder, round(request.updating_period_s / TICK_S))
-        case Procedure.BEST_CLOSED_LOOP:
-            run_best_in_hindsight(settings, scenario, recorder, Objective.CLOSED_LOOP)
-        case Procedure.BEST_OPEN_LOOP:
-            run_best_in_hindsight(settings, scenario, recorder, Objective.OPEN_LOOP)
+        case Procedure.LINEAR_PLANT:
+            LinearRig(settings).run(scenario, recorder)
         case Procedure.CONFIGURED if request.networked:
             with tempfile.TemporaryDirectory(prefix="coldloop-logs-") as logs:
                 asyncio.run(run_on_localhost(settings, scenario, recorder, Path(logs)))
@@ -250,8 +240,10 @@ def _of_problems(request: RunRequest, settings: Settings, scenario: Scenario) ->
 def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outcome:
     model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
     trace_sha256 = recording.trace_sha256
-    if any(settings.plant.sensors.biases):  # costs are those of what was reached, not of what was shown
-        true_y = recording.y - np.array(settings.plant.sensors.biases, dtype=np.float32)
+    sensors, gauge = settings.plant.sensors, settings.plant.mismatch.level_gauge
+    if any(sensors.biases) or gauge != 1.0:  # costs are those of what was reached, not of what was shown
+        true_y = recording.y - np.array(sensors.biases, dtype=np.float32)
+        true_y[:, L1] /= gauge
         recording = recording._replace(y=true_y)
     return Outcome(
         programs=programs_digest(),

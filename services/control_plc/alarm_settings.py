@@ -14,8 +14,8 @@ from coldloop.registers.safety import AlarmKind, AlarmPriority
 PASSING: Final = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED, AlarmKind.SECOND_WRITER)
 """Alarms for something that happens at an instant: their off-delay is how long ago the last time must be."""
 BANDS: Final = (AlarmKind.LEVEL_BAND, AlarmKind.T5_BAND)
-OF_THE_PROCESS: Final = (*BANDS, AlarmKind.CAPACITY)
-"""Alarms that say nothing against PLCs, links and sensors."""
+OF_THE_PROCESS: Final = (*BANDS, AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT)
+"""Alarms that say nothing against PLCs, links and what the control PLC works with."""
 
 LOW, MEDIUM, HIGH, CRITICAL = AlarmPriority
 
@@ -56,6 +56,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     AlarmKind.SEQUENCE_EXHAUSTED: AlarmRule(MEDIUM),  # outputs are held, then the classical loops control
     AlarmKind.OPTIMIZER_LOST: AlarmRule(MEDIUM),  # no new sequence will come by itself
     AlarmKind.SENSOR_BAD: AlarmRule(MEDIUM),  # substituted; the ladder reacts to those that matter
+    AlarmKind.SENSOR_SUSPECT: AlarmRule(MEDIUM),  # the optimiser does without it
     AlarmKind.MODEL_MISMATCH: AlarmRule(MEDIUM),  # no sequence is accepted until a configuration is changed
     AlarmKind.SECOND_WRITER: AlarmRule(MEDIUM, off_delay_s=60.0),  # refused, but wired or configured wrongly
     AlarmKind.CERTIFICATE: AlarmRule(MEDIUM),  # clients will not connect once it has expired

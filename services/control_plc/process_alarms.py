@@ -1,6 +1,7 @@
 """The alarms that depend on the process and on the ladder, watched once a scan."""
 
 from collections.abc import Collection, Sequence
+from typing import Final
 
 from coldloop.process.signals import L1, T5
 from coldloop.registers.audit import EventKind
@@ -10,6 +11,11 @@ from coldloop.service.journal import Journal
 from control_plc.alarm_settings import AlarmSettings
 from control_plc.alarms import AlarmPanel
 from control_plc.ladder import Ladder
+
+SENSORS: Final = {AlarmKind.SENSOR_BAD: 1, AlarmKind.SENSOR_SUSPECT: 2}
+"""Alarms of sensors, and the cause of their events."""
+OPTIMIZER_DRIVES: Final = (Mode.MPC, Mode.REST)
+"""Modes in which the optimiser's sequences are played."""
 
 
 class ProcessAlarms:
@@ -25,7 +31,7 @@ class ProcessAlarms:
         self._panel = panel
         self._journal = journal
         self._bands = bands
-        self._bad_before: frozenset[int] = frozenset()
+        self._before: dict[AlarmKind, frozenset[int]] = dict.fromkeys(SENSORS, frozenset())
 
     def watch(
         self,
@@ -37,6 +43,7 @@ class ProcessAlarms:
         optimizer: bool,
         shortage: float,
         bad: Collection[int],
+        suspects: int,
     ) -> None:
         """Look at everything after a scan.
 
@@ -48,6 +55,7 @@ class ProcessAlarms:
             optimizer: Its heartbeat is present.
             shortage: What the load is above what can be held, in W; negative: below what is needed.
             bad: Outputs that are substituted.
+            suspects: Outputs that the optimiser does without: bit i is output i.
         """
         report = self._panel.report
         for kind, value, (low, high) in (
@@ -64,14 +72,20 @@ class ProcessAlarms:
         report(AlarmKind.OPTIMIZER_LOST, condition=not optimizer)
         short = CapacityCause.of(shortage if mode is Mode.MPC else 0.0)
         report(AlarmKind.CAPACITY, condition=bool(short), cause=short, value=abs(shortage))
-        self._watch_sensors(tick, frozenset(bad))
+        self._watch_sensors(tick, AlarmKind.SENSOR_BAD, frozenset(bad))
+        suspected = (output for output in range(len(y)) if mode in OPTIMIZER_DRIVES and suspects >> output & 1)
+        self._watch_sensors(tick, AlarmKind.SENSOR_SUSPECT, frozenset(suspected))
 
-    def _watch_sensors(self, tick: int, bad: frozenset[int]) -> None:
-        """Note each sensor that became bad or good, and raise the alarm; its cause is the newest one's output."""
-        for output in sorted(bad ^ self._bad_before):
-            self._journal.note(tick, EventKind.SENSOR, output, int(output in bad))
-        for output in sorted(bad - self._bad_before):
-            self._panel.raised(AlarmKind.SENSOR_BAD, output)
-        if not bad:
-            self._panel.returned(AlarmKind.SENSOR_BAD)
-        self._bad_before = bad
+    def _watch_sensors(self, tick: int, kind: AlarmKind, found: frozenset[int]) -> None:
+        """Note each sensor that became bad, suspect or good, and raise the alarm; its cause is the newest one."""
+        before, self._before[kind] = self._before[kind], found
+        for output in sorted(found ^ before):
+            self._journal.note(tick, EventKind.SENSOR, output, SENSORS[kind] if output in found else 0)
+        for output in sorted(found - before):
+            self._panel.raised(kind, output)
+        if not found:
+            self._panel.returned(kind)
+
+    def has_noted(self, suspects: int) -> bool:
+        """Return whether these suspects (bit i is output i) are those of the last scan, in a mode of the optimiser."""
+        return suspects == sum(1 << output for output in self._before[AlarmKind.SENSOR_SUSPECT])

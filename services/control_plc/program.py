@@ -39,7 +39,7 @@ from control_plc.classical import ClassicalLoops
 from control_plc.guard import OutputGuard
 from control_plc.ladder import Ladder, LadderInputs
 from control_plc.player import SequencePlayer
-from control_plc.process_alarms import ProcessAlarms
+from control_plc.process_alarms import OPTIMIZER_DRIVES, ProcessAlarms
 from control_plc.sensors import SensorMonitor
 from control_plc.settings import ControlSection, ControlStrategy
 
@@ -149,7 +149,8 @@ class ControlProgram:
         self.process: Process | None = None
         self.optimizer_present = True
         self.shortage = 0.0
-        """Of the last plan."""
+        """Of the last plan, as the next."""
+        self.suspects = 0
         self.guard = OutputGuard(self._limits, self._initial)
         if applied != self._initial:
             self.guard.begin_at(tick, applied)
@@ -184,6 +185,11 @@ class ControlProgram:
         return self.sensors.mask
 
     @property
+    def has_noted_suspects(self) -> bool:
+        """Whether alarm and journal have what the last plan says of suspects."""
+        return self._process_alarms.has_noted(self.suspects)
+
+    @property
     def applied(self) -> SequenceRow:
         """The inputs being applied."""
         return self.guard.applied
@@ -205,8 +211,9 @@ class ControlProgram:
 
     @property
     def _usable(self) -> bool:
-        """MPC can work with what is measured."""
-        return not (self._unknown or self.sensors.unusable)
+        """MPC can work with what is measured: it continues without L1 or T5, and does not begin without them."""
+        drives = self.ladder.mode in OPTIMIZER_DRIVES
+        return not (self._unknown or (self.sensors.unestimated if drives else self.sensors.unusable))
 
     @property
     def _earliest(self) -> int:
@@ -300,7 +307,7 @@ class ControlProgram:
             )  # fmt: skip
         self._process_alarms.watch(
             self.tick, y, self.ladder, late=self.player.late, optimizer=self.optimizer_present,
-            shortage=self.shortage, bad=self.sensors.bad,
+            shortage=self.shortage, bad=self.sensors.bad, suspects=self.suspects,
         )  # fmt: skip
         self.tick += 1
         self._in_scan = False
@@ -367,7 +374,7 @@ class ControlProgram:
         self.optimizer_seen()
         accepted = self.player.accept_plan(plan, self._earliest)
         if accepted:
-            self.shortage = plan.shortage
+            self.shortage, self.suspects = plan.shortage, plan.suspects
         return accepted
 
     def abandon(self) -> None:

@@ -1,8 +1,8 @@
 """Measurements that cannot be right: found, replaced by the last good value, and reported.
 
-A measurement is bad when it is no number, outside its sensor's range, or, for the outputs that are controlled, frozen:
-it does not change by a bit for a while in which most of the others move. When nothing at all changes, load and states
-included, the image is an old one: a plant that rests is known by its inputs, which rest too.
+A measurement is bad when it is no number, outside its sensor's range, or frozen: it does not change by a bit for a
+while in which most of the others move. When nothing at all changes, load and states included, the image is an old one:
+a plant that rests is known by its inputs, which rest too.
 """
 
 from collections.abc import Collection, MutableSequence, Sequence
@@ -10,11 +10,15 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process.signals import L1, T5, TICK_S
+from coldloop.process.signals import L1, OUTPUT_NAMES, T5, TICK_S
 from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
 CONTROLLED = (L1, T5)
+TEMPERATURES, PRESSURES = range(2, 12), range(12, 22)
+MOVES = 240
+"""Ticks in which an output that is not controlled must have moved before it can be frozen."""
+FIRST_RESTS = [0 if output in CONTROLLED else -MOVES for output in range(len(OUTPUT_NAMES))]
 RECOVERY_TICKS = 8
 """A sensor is good again when its measurements have been good for so long."""
 
@@ -34,11 +38,18 @@ class SensorCheckSettings(BaseModel):
     """bar."""
     frozen_s: Annotated[float, Field(gt=0)] = 20.0
     """A controlled output that does not change for so long, while others move, is frozen."""
+    resting_s: Annotated[float, Field(gt=0)] = 60.0
+    """Another one, that has moved for a minute before, is if it rests for so long and for twice as long as ever before:
+    what is constant in a plant with exact sensors is not taken for frozen."""
     may_rest: bool = True
     """While its inputs do not move a plant may stand still bit for bit, as a simulated one with exact sensors does.
     False for sensors that are always noisy: an image unchanged for `frozen_s` is then stale in any case."""
     bridged_s: Annotated[float, Field(ge=0)] = 10.0
-    """How long the last good value of a controlled output is worked with; then what needs it is left."""
+    """How long the classical loops work with the last good value of a controlled output; then that loop is left."""
+    estimated_s: Annotated[float, Field(ge=0)] = 1800.0
+    """How long MPC works without one, by its estimate from the others."""
+    estimated_most: Annotated[int, Field(ge=0, le=22)] = 5
+    """Bad sensors at most for that; with more, MPC is left after `bridged_s`, too."""
 
     @property
     def ranges(self) -> tuple[Range, ...]:
@@ -60,23 +71,47 @@ def are_inside(y: Numbers, low: Numbers, high: Numbers) -> bool:
     return inside
 
 
-def count_unchanged(unchanged: MutableSequence[int], before: MutableSequence[float], y: Numbers, elapsed: int) -> None:
-    """Count for how many ticks each controlled output is unchanged while most of the others moved.
+def count_unchanged(
+    unchanged: MutableSequence[int],
+    rests: MutableSequence[int],
+    before: MutableSequence[float],
+    y: Numbers,
+    elapsed: int,
+    least: Numbers,
+) -> None:
+    """Count for how many ticks each output is unchanged while most of the others moved.
 
-    `before` (22) becomes `y`, the measurements `elapsed` ticks later.
+    For those that are not controlled these are most temperatures and most pressures: exact sensors of one kind rest
+    with the plant while noisy ones of the other kind do not.
+
+    `before` (22) becomes `y`, the measurements `elapsed` ticks later. `rests` (22), first `FIRST_RESTS`, are the
+    longest such times of those that are not controlled, without the times for which they were frozen; below 0: the
+    moves that are missing until they count.
     """
-    for place in range(len(CONTROLLED)):
-        if y[CONTROLLED[place]] != before[CONTROLLED[place]]:
-            unchanged[place] = 0
-        elif 2 * moved(before, y) > len(y):
-            unchanged[place] += elapsed
+    most = 2 * moved(before, y, range(len(y))) > len(y)
+    half = len(PRESSURES) // 2
+    most_of_each = moved(before, y, TEMPERATURES) > half and moved(before, y, PRESSURES) > half
+    for output in range(len(y)):
+        if y[output] == before[output]:
+            unchanged[output] += elapsed * (most if output in CONTROLLED else most_of_each)
+            continue
+        if rests[output] < 0:
+            rests[output] += 1
+        elif output not in CONTROLLED and not is_frozen(unchanged[output], rests[output], least[output]):
+            rests[output] = max(unchanged[output], rests[output])
+        unchanged[output] = 0
     before[:] = y
 
 
-def moved(before: Numbers, y: Numbers) -> int:
-    """Return how many measurements are others than before."""
+def is_frozen(unchanged: float, rest: float, least: float) -> bool:
+    """Return whether an output is unchanged for at least so many ticks, and for twice its longest rest."""
+    return rest >= 0 and unchanged >= least and unchanged >= 2 * rest
+
+
+def moved(before: Numbers, y: Numbers, outputs: range) -> int:
+    """Return how many of these outputs are others than before."""
     count = 0
-    for output in range(len(y)):
+    for output in outputs:
         count += y[output] != before[output]
     return count
 
@@ -128,12 +163,18 @@ class SensorMonitor:
     def __init__(self, settings: SensorCheckSettings, initial: Sequence[float], moves: Sequence[float] = ()) -> None:
         self.low, self.high = zip(*settings.ranges, strict=True)
         self.frozen_ticks = round(settings.frozen_s / TICK_S)
+        resting_ticks = round(settings.resting_s / TICK_S)
+        self.least = [self.frozen_ticks if output in CONTROLLED else resting_ticks for output in range(len(initial))]
+        """Ticks for which each output is at least unchanged before it is frozen."""
         self._bridged_ticks = round(settings.bridged_s / TICK_S)
+        self._estimated_ticks = round(settings.estimated_s / TICK_S)
+        self._estimated_most = settings.estimated_most
         self._good = list(initial)
         self.before = list(initial)
         self._tick: int | None = None
         self._now = 0
-        self.unchanged = [0] * len(CONTROLLED)
+        self.unchanged = [0] * len(initial)
+        self.rests = FIRST_RESTS.copy()
         self._image = ImageWatch(moves, may_rest=settings.may_rest)
         self._recovering: dict[int, int] = {}
         """Output, and since which tick its measurements have been good again."""
@@ -151,11 +192,10 @@ class SensorMonitor:
             others: What else was measured.
         """
         elapsed = 1 if self._tick is None else max(0, tick - self._tick)
-        count_unchanged(self.unchanged, self.before, y, elapsed)
+        count_unchanged(self.unchanged, self.rests, self.before, y, elapsed, self.least)
         self._tick = self._now = tick
-        frozen: Collection[int] = [
-            output for output, ticks in zip(CONTROLLED, self.unchanged, strict=True) if ticks >= self.frozen_ticks
-        ]
+        history = zip(self.unchanged, self.rests, self.least, strict=True)
+        frozen: Collection[int] = [output for output, each in enumerate(history) if is_frozen(*each)]
         if self._image.unchanged(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
             frozen = range(len(y))
         if not self.bad and not frozen and are_inside(y, self.low, self.high):
@@ -190,12 +230,16 @@ class SensorMonitor:
 
     @property
     def unusable(self) -> list[int]:
-        """Controlled outputs that have been bad for longer than they are bridged."""
-        return [
-            output
-            for output in CONTROLLED
-            if output in self.bad and self._now - self.bad[output] + 1 > self._bridged_ticks
-        ]
+        """Controlled outputs that have been bad for longer than they are bridged: their loops are left."""
+        return self._bad_for(self._bridged_ticks)
+
+    @property
+    def unestimated(self) -> list[int]:
+        """Controlled outputs that have been bad for longer than an estimate of them is believed: MPC is left."""
+        return self._bad_for(self._bridged_ticks if len(self.bad) > self._estimated_most else self._estimated_ticks)
+
+    def _bad_for(self, ticks: int) -> list[int]:
+        return [output for output in CONTROLLED if output in self.bad and self._now - self.bad[output] + 1 > ticks]
 
     @property
     def mask(self) -> int:

@@ -11,7 +11,7 @@ from typing import Any, Final
 from coldloop import __version__
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.audit import EventKind
-from coldloop.registers.control_plc import Mode, OperatorMode
+from coldloop.registers.control_plc import Mode, OperatorMode, Plan
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import (
     BANDED_OUTPUTS,
@@ -156,13 +156,16 @@ def services_document(model: Model) -> Document:
 def state_document(model: Model, changed: Iterable[str] | None = None) -> Document:
     """Return the state of everything that is shown; of signals only those that have changed, if these are named."""
     names = model.values if changed is None else [name for name in changed if name in model.values]
+    plan = model.record("control_plc", Plan) if model.mode == Mode.MPC else None
     document: Document = {
         "whole": changed is None,
         "tick": model.tick,
         "time_s": model.tick * TICK_S,
         "services": services_document(model),
         "plant": plant_document(model),
-        "deviation": deviation(model.record("optimizer_plc", ModelDeviation) or ModelDeviation()),
+        "deviation": deviation(
+            model.record("optimizer_plc", ModelDeviation) or ModelDeviation(), plan.suspects if plan else 0
+        ),
         "stale": model.stale_prefixes(),
         "values": {name: finite(model.values[name]) for name in names},
     }
@@ -230,7 +233,7 @@ def trend_document(model: Model, names: Sequence[str], start: int, end: int, poi
         [update.tick * TICK_S for update in updates],
         {
             "tau_u": [update.tau_u * TICK_S for update in updates],
-            "q": [float(update.iterations) for update in updates],
+            "q": [float(update.q) for update in updates],
             "J": [update.j_effective for update in updates],
             "J_predicted": [update.j_delivered for update in updates],
         },

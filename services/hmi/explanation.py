@@ -9,20 +9,19 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.signals import TICK_S
+from coldloop.process.updating_periods import ComputingTimes
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization, UpdatingRuleKind, UpdatingRuleStatus
 
-ROUNDING: Final = 1e-6
 RESOLUTION: Final = 2.0**-22
 """A change of E that is smaller is lost in the single precision of the registers."""
 STEEPEST: Final = 0.1
 """Slope of K, 1/iteration, that is not reached where K is 1."""
-LONGEST_TICKS: Final = TICKS_PER_SAMPLE
 
 
 class Branch(StrEnum):
-    """Branch that decided the number of iterations."""
+    """Branch that decided q."""
 
     FIXED = "fixed"
     """The period is fixed."""
@@ -37,9 +36,9 @@ class Branch(StrEnum):
     UNKNOWN = "unknown"
     """The update before is not recorded."""
     DOWN = "down"
-    """Gamma > 0: fewer iterations."""
+    """Gamma > 0: a shorter period."""
     UP = "up"
-    """Gamma < 0: more iterations."""
+    """Gamma < 0: a longer period."""
     LEVEL = "level"
     """Gamma = 0: as before."""
     CONTRACTION = "contraction"
@@ -54,18 +53,20 @@ class Increments(NamedTuple):
     """The quantities per iteration that Gamma is made of."""
 
     mismatch: float
-    """Delta D / Delta q."""
+    """Delta D / Delta n."""
     efficiency: float
-    """Delta E / Delta q."""
+    """Delta E / Delta n."""
     contraction: float
-    """Delta K / Delta q."""
+    """Delta K / Delta n."""
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """What another number of iterations would have meant, to first order."""
+    """What another q would have meant, to first order."""
 
+    q: int
     iterations: int
+    """That fit into its period."""
     period_s: float
     contraction: float
     response_s: float | None
@@ -99,10 +100,10 @@ class Explanation:
     before: Optimization | None
     """The update right before it; None when it is not recorded."""
     branch: Branch
-    iterations_before: int | None
-    iterations: int
+    q_before: int | None
+    q: int
     spare_s: float
-    """How much longer the period is than its iterations need: answers have been late, or more would change nothing."""
+    """How much longer the period is than that of q: answers have been late."""
     period_before_s: float | None
     period_s: float
     increments: Increments | None
@@ -128,29 +129,25 @@ def explain(
     if before is not None and before.update + 1 != update.update:
         before = None
     branch = _branch(update, before, rule)
-    q_before = before.iterations if before is not None else None
-    increments = increments_of(update, q_before) if branch in DECIDED and q_before else None
+    times = ComputingTimes(rule.slots, rule.preparation, rule.iteration)
+    n_before = times.iterations(times.period(before.q)) if before is not None else 0
+    increments = increments_of(update, n_before) if branch in DECIDED and before is not None else None
+    needed = update.tau_u if branch is Branch.FIXED else times.period(update.q)
     return Explanation(
         update=update,
         before=before,
         branch=branch,
-        iterations_before=q_before,
-        iterations=update.iterations,
-        spare_s=max(0, update.tau_u - period_ticks(update.iterations, rule)) * TICK_S,
+        q_before=before.q if before is not None else None,
+        q=update.q,
+        spare_s=(update.tau_u - needed) * TICK_S,
         period_before_s=before.tau_u * TICK_S if before is not None else None,
         period_s=update.tau_u * TICK_S,
         increments=increments,
-        alternatives=_alternatives(update, q_before, increments, rule) if increments and q_before else (),
+        alternatives=_alternatives(update, before.q, increments, rule.delta, times) if increments and before else (),
         budget=budget_of(update, rule),
         predicted=update.j_delivered,
         came=after.j_effective if after is not None and after.update == update.update + 1 else None,
     )
-
-
-def period_ticks(iterations: int, rule: UpdatingRuleStatus) -> int:
-    """Return the updating period that holds so many iterations, in ticks."""
-    needed = (rule.slots + iterations * rule.iteration) / TICK_S
-    return min(LONGEST_TICKS, math.ceil(needed - ROUNDING))
 
 
 def is_rounded_to_one(update: Optimization) -> bool:
@@ -159,7 +156,7 @@ def is_rounded_to_one(update: Optimization) -> bool:
 
 
 def increments_of(update: Optimization, iterations_before: int) -> Increments | None:
-    """Return the increments that Gamma was made of: they follow from E, D, K, Gamma and q; None where they do not."""
+    """Return what Gamma was made of: it follows from E, D, K, Gamma and the iterations; None where it does not."""
     if is_rounded_to_one(update):
         return None
     E, D, K = update.efficiency, update.mismatch, update.contraction
@@ -210,20 +207,22 @@ def _why_not_played(update: Optimization, before: Optimization | None, rule: Upd
     elapsed = update.tick - before.tick
     if elapsed < before.tau_u and before.verdict in {Verdict.NONE, Verdict.WRONG_UPDATE}:
         return Branch.INTERRUPTED
-    if elapsed != before.tau_u and update.iterations == rule.q_first != before.iterations:
+    if elapsed != before.tau_u and update.q == rule.q_first != before.q:
         return Branch.BEGUN_AGAIN
     return Branch.LATE
 
 
 def _alternatives(
-    update: Optimization, q_before: int, increments: Increments, rule: UpdatingRuleStatus
+    update: Optimization, q_before: int, increments: Increments, delta: int, times: ComputingTimes
 ) -> tuple[Alternative, ...]:
     found = []
-    for step in (-rule.delta, 0, rule.delta):
-        q = q_before + step
+    n_before = times.iterations(times.period(q_before))
+    for q in (q_before - delta, q_before, q_before + delta):
         if q < 1:
             continue
-        K = update.contraction + step * increments.contraction
-        response = -q * rule.iteration / math.log(K) if 0.0 < K < 1.0 else None
-        found.append(Alternative(q, period_ticks(q, rule) * TICK_S, K, response))
+        period = times.period(q)
+        n = times.iterations(period)
+        K = update.contraction + (n - n_before) * increments.contraction
+        response = -n * times.iteration / math.log(K) if 0.0 < K < 1.0 else None
+        found.append(Alternative(q, n, period * TICK_S, K, response))
     return tuple(found)

@@ -19,11 +19,11 @@ SURPRISING: Final = 3.0
 """A reading that is so many times further from its prediction than the filter expects is worth a word."""
 
 
-def deviation(found: ModelDeviation) -> str:
+def deviation(found: ModelDeviation, suspects: int = 0) -> str:
     """Return how the plant differs from its model, without the load, the most notable first; empty where it agrees.
 
-    Last comes the reading that is furthest from what is predicted, if it is surprising: the model, or its sensor, is
-    not what the filter takes it for.
+    Last come the reading that is furthest from what is predicted, if it is surprising: the model, or its sensor, is
+    not what the filter takes it for; and those that are not used for that reason (bit i is output i).
     """
     parts = [
         (value, unit, f"needs {abs(value):.3g} {unit} {'less' if value > 0 else 'more'} of {name}")
@@ -38,17 +38,17 @@ def deviation(found: ModelDeviation) -> str:
     surprise, name = max(zip(found.surprise, OUTPUT_NAMES, strict=True))
     if surprise >= SURPRISING:
         texts.append(f"{name} {surprise:.2g} times further from its prediction than expected")
+    texts += [
+        f"{name} is not used: it contradicts the others" for i, name in enumerate(OUTPUT_NAMES) if suspects >> i & 1
+    ]
     return ", ".join(texts)
 
 
 def sentence(found: Explanation, rule: UpdatingRuleStatus) -> str:
     """Return the explanation of the period in one or two sentences."""
     text = _WORDS[found.branch](found, rule)
-    if found.spare_s and found.branch is not Branch.FIXED:
-        text += (
-            f" The period is {found.spare_s:g} s longer than q = {found.iterations} needs: answers have been late, or "
-            "more iterations would have changed nothing."
-        )
+    if found.spare_s:
+        text += f" The period is {found.spare_s:g} s longer than that of q = {found.q}, as answers have been late."
     return text
 
 
@@ -63,8 +63,8 @@ def _change(found: Explanation) -> str:
 
 def _fixed(found: Explanation, _rule: UpdatingRuleStatus) -> str:
     return (
-        f"tau_u is {found.period_s:g} s because the session has a fixed updating period; q = {found.iterations} "
-        "iterations fit into it."
+        f"tau_u is {found.period_s:g} s because the session has a fixed updating period; "
+        f"{found.update.iterations} iterations were done in it."
     )
 
 
@@ -99,7 +99,7 @@ def _late(found: Explanation, _rule: UpdatingRuleStatus) -> str:
     text = word(Verdict(verdict)) if verdict in Verdict.__members__.values() else str(verdict)
     return (
         f"{_change(found)} because the sequence before did not take effect at its instant (verdict: {text}): there was "
-        f"nothing to learn from, and q stays at {found.iterations}."
+        f"nothing to learn from, and q stays at {found.q}."
     )
 
 
@@ -108,28 +108,28 @@ def _algorithm_1(found: Explanation, _rule: UpdatingRuleStatus) -> str:
     if is_rounded_to_one(found.update):
         looks = "K is 1 to the precision of the registers (the cost does not change), and Gamma"
     elif K >= 1.0:
-        looks = f"K = {K:.6g} is not below 1 (the cost does not fall), so K itself is to fall: dK/dq"
+        looks = f"K = {K:.6g} is not below 1 (the cost does not fall), so K itself is to fall: dK/dn"
     else:
-        looks = f"K = {K:.6g} is below 1 (the cost falls), so the response time is to fall: dt_r/dq"
+        looks = f"K = {K:.6g} is below 1 (the cost falls), so the response time is to fall: dt_r/dn"
     if found.branch is Branch.LEVEL:
-        return f"{_change(found)} because {looks} = 0 says that q makes no difference."
-    fewer = found.branch is Branch.DOWN
-    asks = f"{looks} = {gamma:.3g} {'>' if fewer else '<'} 0 asks for {'fewer' if fewer else 'more'} iterations"
+        return f"{_change(found)} because {looks} = 0 says that the number of iterations makes no difference."
+    shorter = found.branch is Branch.DOWN
+    asks = f"{looks} = {gamma:.3g} {'>' if shorter else '<'} 0 asks for a {'shorter' if shorter else 'longer'} period"
     rest = " (at rest: the cost is at its floor, and rounding decides)" if abs(gamma) < AT_REST else ""
-    return f"{_change(found)} because {asks}{rest}; {_step(found, fewer=fewer)}."
+    return f"{_change(found)} because {asks}{rest}; {_step(found, shorter=shorter)}."
 
 
-def _step(found: Explanation, *, fewer: bool) -> str:
-    q = found.iterations
-    if found.iterations_before is None:
+def _step(found: Explanation, *, shorter: bool) -> str:
+    q = found.q
+    if found.q_before is None:
         return f"q becomes {q}"
-    if q != found.iterations_before:
-        return f"q goes from {found.iterations_before} to {q}"
-    return f"q stays at {q}, as q_{'min' if fewer else 'max'} allows no {'fewer' if fewer else 'more'}"
+    if q != found.q_before:
+        return f"q goes from {found.q_before} to {q}"
+    return f"q stays at {q}, as q_{'min' if shorter else 'max'} allows no {'less' if shorter else 'more'}"
 
 
 def _contraction(found: Explanation, rule: UpdatingRuleStatus) -> str:
-    q, before = found.iterations, found.before
+    q, before = found.q, found.before
     if q == rule.q_max and before is not None and found.update.j_effective > before.j_delivered:
         ratio = found.update.j_effective / before.j_delivered
         return (

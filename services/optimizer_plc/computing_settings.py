@@ -104,6 +104,38 @@ class EstimatorSettings(BaseModel):
         return self
 
 
+class PlausibilitySettings(BaseModel):
+    """When the Kalman filter does without a reading, because prediction and other readings contradict it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    sigmas: Annotated[float, Field(ge=0)] = 0.0
+    """Largest residual over its standard deviation; 0: any is plausible. With 6 a good sensor is suspected by noise
+    alone once in 5e8 updates, which is one of the 22 in two years at updates every 2.5 s."""
+    level_allowance: Annotated[float, Field(ge=0)] = 0.05
+    """What a plant that is not its model adds to a residual, %, Hz, K and bar: from the hours a to f of plants that are
+    20 % off, whose residuals are below 5 sigmas and 0.02 %, 0 Hz, 0 K, 0.009 bar (`docs/fail-safe.md`)."""
+    speed_allowance: Annotated[float, Field(ge=0)] = 5.0
+    temperature_allowance: Annotated[float, Field(ge=0)] = 0.0
+    pressure_allowance: Annotated[float, Field(ge=0)] = 0.01
+    settled_s: Annotated[float, Field(ge=0)] = 60.0
+    """A reading is judged when it has been used for so long: until then the filter learns how the plant differs."""
+    agreeing_s: Annotated[float, Field(ge=0)] = 60.0
+    """A suspect that agrees with the others for so long is taken back."""
+    longest_s: Annotated[float, Field(ge=0)] = 1800.0
+    """It is taken back after so long in any case: what the others say of it is then no better."""
+    most: Annotated[int, Field(ge=0, le=len(OUTPUT_NAMES) - 1)] = 5
+    """Readings that may be missing or suspected at once; when more contradict the prediction it is the plant."""
+
+    @property
+    def allowances(self) -> tuple[float, ...]:
+        """Of each output."""
+        return (
+            self.level_allowance, self.speed_allowance, *[self.temperature_allowance] * 10,
+            *[self.pressure_allowance] * 10,
+        )  # fmt: skip
+
+
 def _members(names: tuple[str, ...]) -> list[str]:
     return [member for name in names for member in GROUPS.get(name, (name,))]
 

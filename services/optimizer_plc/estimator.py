@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
 from coldloop.process.signals import OUTPUT_NAMES, SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
-from optimizer_plc.computing_settings import SIGNALS, EstimatorKind, EstimatorSettings, NoiseReference
+from optimizer_plc.computing_settings import (
+    SIGNALS,
+    EstimatorKind,
+    EstimatorSettings,
+    NoiseReference,
+    PlausibilitySettings,
+)
+from optimizer_plc.plausibility import Plausibility, imputed, judge, new_readings, note_surprise, plausibility_of
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.linear_algebra import add_transposed_product, cholesky, cholesky_solve, multiply, respond
 from optimizer_plc.qp.prediction import PredictionModel, Transition
@@ -17,6 +24,7 @@ Array = NDArray[np.float64]
 
 
 MINUTE_S: Final = 60.0
+ANY_PLAUSIBLE: Final = PlausibilitySettings()
 UNDETECTABLE: Final = 1e-9
 """Relative size of a direction that no measurement sees."""
 
@@ -50,6 +58,7 @@ class Estimator(NamedTuple):
     load_known: bool
     stationary: StationaryGains
     """Of the Kalman filter."""
+    plausible: Plausibility
 
 
 class Belief(NamedTuple):
@@ -65,11 +74,14 @@ class Belief(NamedTuple):
     surprise: Array
     """How far each output was from what the prediction and the other outputs say, over the standard deviation that the
     filter expects: mean square over about `MINUTE_S`, shape (n_y,)."""
+    readings: Any
+    """Records, shape (n_y,): which of them are believed, and since when."""
 
     def forget(self) -> None:
         """Begin at the operating point."""
         self.x[:] = self.predicted[:] = self.surprise[:] = 0.0
         self.numbers[0] = (0.0, 0.0, 1)
+        self.readings[:] = np.zeros(1, self.readings.dtype)
 
     def begin_at_rest(self, rest: Array, u: Array, load: float | None, level: float) -> None:
         """Begin where the plant would rest with the inputs u (3,), load and L1, deviations; `rest` is `rest_map`'s.
@@ -84,7 +96,12 @@ class Belief(NamedTuple):
             self.numbers["mismatch"] = found[-1]
 
 
-def estimator_of(prediction: PredictionModel, settings: EstimatorSettings, real: Real = DOUBLE) -> Estimator:
+def estimator_of(
+    prediction: PredictionModel,
+    settings: EstimatorSettings,
+    real: Real = DOUBLE,
+    plausibility: PlausibilitySettings = ANY_PLAUSIBLE,
+) -> Estimator:
     """Return the estimator that the settings name.
 
     Raises:
@@ -103,13 +120,17 @@ def estimator_of(prediction: PredictionModel, settings: EstimatorSettings, real:
         Transition(*(np.array(M) for M in zip(*m.transitions.values(), strict=True))),
         m.outputs, np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, kalman, settings.load_known,
         StationaryGains(*(array.astype(real, copy=False) for array in stationary)),
+        plausibility_of(plausibility, prediction, len(prediction.transitions) * TICK_S, real),
     )  # fmt: skip
 
 
 def no_belief(n_states: int, real: Real = DOUBLE) -> Belief:
     """Return the belief of an estimator that begins at the operating point."""
     numbers = np.zeros(1, [("w", real), ("mismatch", real), ("since", "i8")])
-    belief = Belief(numbers, np.zeros(n_states, real), np.zeros(n_states, real), np.zeros(len(OUTPUT_NAMES), real))
+    belief = Belief(
+        numbers, np.zeros(n_states, real), np.zeros(n_states, real), np.zeros(len(OUTPUT_NAMES), real),
+        new_readings(real),
+    )  # fmt: skip
     belief.forget()
     return belief
 
@@ -118,7 +139,7 @@ def no_belief(n_states: int, real: Real = DOUBLE) -> Belief:
 def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array, x: Array) -> None:
     """Take a measurement (u_before (3,), load, y (22,), x (28,), in physical units and the on-line type).
 
-    The Kalman filter corrects by the outputs that are finite.
+    The Kalman filter corrects by the outputs that are finite and plausible.
     """
     b = belief.numbers[0]
     known = load - c.w0 if c.load_known else belief.x.dtype.type(0.0)
@@ -126,13 +147,14 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
         belief.x[:] = x - c.x0
         b.w, b.mismatch = known, belief.x.dtype.type(0.0)
         return
-    period, maps = min(b.since, c.stationary.gains.shape[0]) - 1, c.outputs
+    real, period, maps = belief.x.dtype.type, min(b.since, c.stationary.gains.shape[0]) - 1, c.outputs
     expected = respond(maps.A, maps.B, maps.F, belief.predicted, u_before - c.u0, known + b.mismatch)
     innovation = y - c.y0 - expected
     J = c.stationary.inverse_covariances[period]
+    if c.plausible.sigmas > 0.0:
+        innovation = judge(c.plausible, belief.readings, belief.predicted, innovation, J, real(b.since) * real(TICK_S))
     if not np.isfinite(innovation).all():
         innovation = imputed(innovation, J)
-    real = belief.x.dtype.type
     note_surprise(belief.surprise, innovation, J, real(b.since) * real(TICK_S / MINUTE_S))
     correction = np.zeros(belief.x.size + 1, belief.x.dtype)
     add_transposed_product(c.stationary.gains[period], innovation, correction)
@@ -140,42 +162,6 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     belief.predicted[:] = belief.x
     b.mismatch += correction[-1]
     b.w = known + b.mismatch
-
-
-@kernel
-def note_surprise(surprise: Array, innovation: Array, J: Array, share: float) -> None:
-    """Let an innovation (n_y,), whose inverse covariance is J, count with a share of up to 1 in the mean squares.
-
-    (J e)_i / sqrt(J_ii) is the residual of output i given all others, over its standard deviation.
-    """
-    for i in range(surprise.shape[0]):
-        residual = surprise.dtype.type(0.0)
-        for j in range(surprise.shape[0]):
-            residual += J[i, j] * innovation[j]
-        surprise[i] += min(share, surprise.dtype.type(1.0)) * (residual * residual / J[i, i] - surprise[i])
-
-
-@kernel
-def imputed(innovation: Array, inverse_covariance: Array) -> Array:
-    """Return the innovation (n_y,), its elements that are not finite replaced by their mean given the others.
-
-    J_MM e_M = -J_MO e_O, with the inverse covariance J (n_y, n_y): the gain for all outputs then corrects as that for
-    the others alone. Without any it is zero.
-    """
-    n, real = innovation.size, innovation.dtype.type
-    M, mean = np.zeros((n, n), innovation.dtype), np.zeros(n, innovation.dtype)
-    finite = np.isfinite(innovation)
-    for i in range(n):
-        if finite[i]:
-            M[i, i], mean[i] = real(1.0), innovation[i]
-            continue
-        for j in range(n):
-            if finite[j]:
-                mean[i] -= inverse_covariance[i, j] * innovation[j]
-            else:
-                M[i, j] = inverse_covariance[i, j]
-    cholesky_solve(M, cholesky(M), mean)
-    return mean
 
 
 @kernel

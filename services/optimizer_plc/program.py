@@ -64,7 +64,7 @@ class OptimizerProgram:
             self.solver = make_solver(settings)
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
             self.state = empty_state(prediction.n_states, self.problem.size, self._real)
-            estimator = estimator_of(prediction, settings.estimator, self._real)
+            estimator = estimator_of(prediction, settings.estimator, self._real, settings.plausibility)
             self._rest_map = rest_map(prediction, self._real)
             at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
             self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
@@ -146,7 +146,9 @@ class OptimizerProgram:
         )  # fmt: skip
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
-        return Plan(update.update, update.tick + int(now["ticks"]), load_step, float(now["shortage"]))
+        return Plan(
+            update.update, update.tick + int(now["ticks"]), load_step, float(now["shortage"]), int(now["suspects"])
+        )
 
     def _knows_what_is_played(self, update: Update) -> bool:
         """Return whether the control PLC plays something of ours, or has not begun to."""
@@ -191,12 +193,12 @@ class OptimizerProgram:
         return begun and late == 0
 
     def _wanted(self, *, interrupted: bool, in_time: bool) -> int:
-        """Return the iterations of the period, which the rule decides unless the last sequence never took effect."""
+        """Return the q of the period, which the rule decides unless the last sequence never took effect."""
         if not self._now["planned"]:
             return self.rule.first
         if interrupted:
             return self.rule.after_interruption(self.state.rule)
-        return scheme.BY_THE_RULE if in_time else int(self._now["iterations"])
+        return scheme.BY_THE_RULE if in_time else int(self._now["q"])
 
     # -- step (3): during the updating period -------------------------------------------------------------------------
 
@@ -211,13 +213,13 @@ class OptimizerProgram:
         return int(self._now["iterations"])
 
     def solve(self) -> InputSequence:
-        """Predict the state at t_{i+1}, shift the profile, do q iterations; return the sequence to play from there."""
-        q = self._iterations
+        """Predict the state at t_{i+1}, shift the profile, iterate; return the sequence to play from there."""
+        n = self._iterations
         if isinstance(self.solver, KernelSolver):
             scheme.solve(self.constants, self.method, self.state)
         else:
             qp, guess = scheme.pose(self.constants, self.state)
-            scheme.deliver(self.constants, self.state, qp, self.solver.solve(qp, guess, (q - 1, q)))
+            scheme.deliver(self.constants, self.state, qp, self.solver.solve(qp, guess, (n - 1, n)))
         return self._sequence()
 
     def _sequence(self) -> InputSequence:
@@ -288,7 +290,7 @@ class OptimizerProgram:
             raise RuntimeError("call solve before report")
         now, sent = self._now, self._sent
         return Optimization(
-            update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]),
+            update=int(now["update"]), tick=int(now["tick"]), tau_u=int(now["ticks"]), q=int(now["q"]),
             iterations=int(sent["iterations"]), verdict=verdict, j_effective=float(now["effective"]),
             j_hot_start=float(sent["hot_start"]), j_delivered=float(sent["delivered"]), j_dev=float(sent["j_dev"]),
             j_cst=float(sent["j_cst"]), violation=float(sent["violation"]), efficiency=float(now["efficiency"]),

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from coldloop.process.signals import TICK_S
+from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.audit import EventKind, JournalQuery
 from coldloop.registers.bank import Caller, IllegalValueError, RegisterBank
 from coldloop.registers.codec import WordOrder
@@ -23,7 +24,6 @@ from coldloop.session.time_base import TimeBase
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.control_link import ControlLink
 
-SHORTEST_PERIOD_TICKS: Final = 2
 NO_UPDATE: Final = Optimization(*(0,) * len(Optimization._fields))
 
 
@@ -65,9 +65,9 @@ class OptimizerPublication:
     def _judge(self, asked: OptimizerSession, _row: int, _caller: Caller) -> None:
         """Refuse an updating period that there is not, or whose answers would never be there in time."""
         ticks = asked.updating_period
-        if 0 < ticks < SHORTEST_PERIOD_TICKS:
+        if 0 < ticks < SHORTEST_TICKS:
             raise IllegalValueError(
-                f"session.updating_period = {ticks}: give {SHORTEST_PERIOD_TICKS} or more, or 0 (adaptive)"
+                f"session.updating_period = {ticks}: give {SHORTEST_TICKS} or more, or 0 (adaptive)"
             )
         if ticks and asked.realtime and not self._budget.is_enough(ticks):
             raise IllegalValueError(

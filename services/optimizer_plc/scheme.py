@@ -14,6 +14,7 @@ from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import T1, T2, TICK_S, TICKS_PER_SAMPLE
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
+from optimizer_plc.plausibility import suspects_of
 from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
@@ -29,7 +30,7 @@ from optimizer_plc.solvers.kernel_solver import solve_by
 Array = NDArray[np.float64]
 
 BY_THE_RULE: Final = 0
-"""Iterations that `plan` is given when the rule is to decide them."""
+"""The q that `plan` is given when the rule is to decide it."""
 
 
 class Constants(NamedTuple):
@@ -68,9 +69,11 @@ class Constants(NamedTuple):
     fixed_ticks: int
     """Fixed updating period; 0 is adaptive."""
     most: int
-    """Iterations that fit into the longest period."""
+    """Largest q, that of the longest period."""
     periods: NDArray[np.int64]
-    """Updating period in ticks for each number of iterations, shape (most + 1,)."""
+    """Updating period in ticks for each q, shape (most + 1,); there is no q = 0."""
+    fitting: NDArray[np.int64]
+    """Iterations that fit into each number of ticks, shape (ticks + 1,)."""
 
 
 def constants_of(
@@ -83,7 +86,6 @@ def constants_of(
 ) -> Constants:  # fmt: skip
     """Return the constants of a session with adaptive periods."""
     real = problem.Phi.dtype.type
-    most = budget.iterations(MAX_PERIOD_TICKS)
     return Constants(
         estimator=estimator, target=target,
         Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps, shifts=problem.shifts,
@@ -99,8 +101,8 @@ def constants_of(
         opening_per_k=real(settings.cold_end.opening_per_k),
         opening_from=real(settings.cold_end.opening_from - estimator.u0[CV155]),
         sequence_ticks=settings.sequence_ticks,
-        fixed_ticks=0, most=most,
-        periods=np.array([budget.period(iterations) for iterations in range(most + 1)]),
+        fixed_ticks=0, most=len(budget.ladder), periods=np.array([0, *budget.ladder]),
+        fitting=np.array([budget.iterations(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)]),
     )  # fmt: skip
 
 
@@ -264,7 +266,7 @@ def plan(
 ) -> None:
     """Take the update latched at `tick`, in physical units and the on-line type; decide the updating period.
 
-    `wanted` are its iterations, or BY_THE_RULE where what is played is the answer to the update before, in time.
+    `wanted` is its q, or BY_THE_RULE where what is played is the answer to the update before, in time.
     """
     now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
     if now.solved:
@@ -273,6 +275,7 @@ def plan(
         now.solved = False
     correct(c.estimator, m.belief, u_before, load, y, x)
     w = m.belief.numbers[0].w
+    now.suspects = suspects_of(m.belief.readings)
     now.shortage = shortage(c, w, load, real(0.0))
     now.most_open = most_open(c, m.u, y)
     find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, m.target)
@@ -282,12 +285,15 @@ def plan(
     now.gamma = real(0.0)
     if wanted == BY_THE_RULE:  # step (4): q(t_{k+1}) from the costs
         o = Observation(
-            now.iterations, real(now.ticks) * real(TICK_S), now.effective, played.hot_start, played.last_but_one,
+            now.q, now.iterations, real(now.ticks) * real(TICK_S), now.effective, played.hot_start, played.last_but_one,
             played.delivered, effective,
         )  # fmt: skip
         a = assessed(o)
         wanted = decide_by(rule, m.rule, o, a)
         now.efficiency, now.mismatch, now.contraction, now.gamma = a.efficiency, a.mismatch, a.contraction, a.gamma
-    now.iterations = min(wanted, c.most)  # step (5): the period that holds them; then step (2), what was sent is played
-    now.ticks = c.fixed_ticks or min(c.periods[now.iterations] + now.allowance, MAX_PERIOD_TICKS)
+    now.q = min(wanted, c.most)  # step (5): its period, and what fits; then step (2), what was sent is played
+    now.ticks = c.fixed_ticks or c.periods[now.q]
+    now.iterations = c.fitting[now.ticks]
+    if not c.fixed_ticks:
+        now.ticks = min(now.ticks + now.allowance, MAX_PERIOD_TICKS)
     now.update, now.tick, now.load, now.effective, now.planned = update, tick, load, effective, True

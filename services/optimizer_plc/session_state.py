@@ -23,16 +23,18 @@ the first tick, load (W, a deviation), share of the rate limit. iterations: done
 costs of the guess, after q - 1 and after q iterations. j_dev, j_cst, violation: indicators of the profile."""
 
 PERIOD: Final = (
-    ("update", "i8"), ("tick", "i8"), ("iterations", "i8"), ("ticks", "i8"), ("sequences", "i8"), ("allowance", "i8"),
-    ("planned", "?"), ("solved", "?"), ("load", "real"), ("effective", "real"), ("efficiency", "real"),
-    ("mismatch", "real"), ("contraction", "real"), ("gamma", "real"), ("guessed_before", "real"),
-    ("delivered_before", "real"), ("shortage", "real"), ("most_open", "real"),
+    ("update", "i8"), ("tick", "i8"), ("q", "i8"), ("iterations", "i8"), ("ticks", "i8"), ("sequences", "i8"),
+    ("allowance", "i8"), ("planned", "?"), ("solved", "?"), ("load", "real"), ("effective", "real"),
+    ("efficiency", "real"), ("mismatch", "real"), ("contraction", "real"), ("gamma", "real"),
+    ("guessed_before", "real"), ("delivered_before", "real"), ("shortage", "real"), ("most_open", "real"),
+    ("suspects", "i8"),
 )  # fmt: skip
-"""update, tick, load: of the update under way. iterations, ticks, effective: q(t_k), tau_u and J_k. efficiency,
-mismatch, contraction, gamma: what they were decided by. sequences: number of the last sequence. allowance: ticks that
-adaptive periods are longer than the budget says. planned, solved: whether there is a period, and an answer to it.
-guessed_before, delivered_before: J+ and Jhat of the problem before, infinite where there was none. shortage: what the
-load is above what can be held (W); negative: below what is needed. most_open: limit of CV155, a scaled deviation."""
+"""update, tick, load: of the update under way. q, iterations, ticks, effective: q(t_k), what fits, tau_u and J_k.
+efficiency, mismatch, contraction, gamma: what q was decided by. sequences: number of the last sequence. allowance:
+ticks that adaptive periods are longer than the budget says. planned, solved: whether there is a period, and an answer
+to it. guessed_before, delivered_before: J+ and Jhat of the problem before, infinite where there was none. shortage:
+what the load is above what can be held (W); negative: below what is needed. most_open: limit of CV155, a scaled
+deviation. suspects: readings left out, bit i is output i."""
 
 
 class Delivery(NamedTuple):

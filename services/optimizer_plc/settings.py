@@ -11,6 +11,7 @@ from coldloop.modbus.settings import ServerSettings
 from coldloop.process.limits import InputLimits
 from coldloop.process.model_settings import ModelSettings
 from coldloop.process.signals import TICK_S
+from coldloop.process.updating_periods import SHORTEST_TICKS
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.service.metrics_settings import MetricsSettings
@@ -27,6 +28,7 @@ from optimizer_plc.computing_settings import (
     InteriorPointSettings,
     OdeSettings,
     OsqpSettings,
+    PlausibilitySettings,
     QpoasesSettings,
 )
 from optimizer_plc.qp.design import ColdEndSettings, ControlDesign
@@ -93,7 +95,8 @@ class AdaptiveSettings(BaseModel):
     contraction: ContractionSettings = ContractionSettings()
 
     q_first: Annotated[int, Field(ge=1)] = 9
-    """q(t_0); 9 iterations are an updating period of 2.5 s."""
+    """q(t_0), the number of a period in the ladder: 1 is 0.5 s, 9 is 2.5 s at P = 1 and with an iteration of 0.25 s or
+    less. The ladder has each period that holds more iterations than the one before (`coldloop budget`)."""
     q_min: Annotated[int, Field(ge=1)] = 2
     q_max: Annotated[int, Field(ge=1)] = 19
     delta: Annotated[int, Field(ge=1)] = 2
@@ -113,6 +116,7 @@ class ProgramSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     solver: SolverName = SolverName.ODE
+    """If not set, that of the preset; the ODE-based one where that names none."""
     arithmetic: Arithmetic = Arithmetic.FLOAT64
     """Floating-point type of all that is computed on line; the PLC of the paper has float32 only."""
     updating_period_s: Annotated[float, Field(ge=0, le=MAX_PERIOD_TICKS * TICK_S)] = ADAPTIVE
@@ -129,10 +133,13 @@ class ProgramSettings(BaseModel):
     design: ControlDesign = ControlDesign()
     cold_end: ColdEndSettings = ColdEndSettings()
     preset: Preset = Preset.TUNED
-    """Penalties, start of the ODE-based solver, disturbances, limit of CV155, margin of the bands, if not set."""
+    """Solver, penalties, start of the ODE-based one, disturbances, limit of CV155, margin of the bands,
+    limit of residuals, if not set."""
     penalties: PenaltySettings = PenaltySettings()
     budget: BudgetSettings = BudgetSettings()
     estimator: EstimatorSettings = EstimatorSettings()
+    plausibility: PlausibilitySettings = PlausibilitySettings()
+    """Of readings; for the Kalman filter."""
     ode: OdeSettings = OdeSettings()
     qpoases: QpoasesSettings = QpoasesSettings()
     osqp: OsqpSettings = OsqpSettings()
@@ -147,7 +154,7 @@ class ProgramSettings(BaseModel):
     @field_validator("updating_period_s")
     @classmethod
     def _whole_ticks(cls, value: float) -> float:
-        if value % TICK_S or 0 < value < 2 * TICK_S:
+        if value % TICK_S or 0 < value < SHORTEST_TICKS * TICK_S:
             raise ValueError("an updating period is a multiple of 0.25 s from 0.5 s on, or 0 for adaptive")
         return value
 
@@ -156,14 +163,22 @@ class ProgramSettings(BaseModel):
         """Take what was not set from the preset, and alpha of the solvers from the penalties."""
         for name, values in PRESETS[self.preset].items():
             usual_filter = self.estimator.kind is EstimatorKind.KALMAN and self.estimator.load_known
-            if name == "estimator" and not usual_filter:
+            if name in ("estimator", "plausibility") and not usual_filter:
                 continue  # state feedback estimates nothing, and an unmeasured load needs a walk of its own
+            if not name:
+                self.__dict__.update(self._not_set(values))
+                continue
             self.__dict__[name] = completed(getattr(self, name), values)  # before it is used: it is frozen then
         alpha = alpha_of(self.penalties, self.design)
         for key in ALPHAS:
             name = key.partition(".")[0]
             self.__dict__[name] = completed(getattr(self, name), {"alpha": alpha})
         return self
+
+    def _not_set(self, values: Mapping[str, str]) -> dict[str, object]:
+        """Return those of a preset's values of this section's own keys that were not set."""
+        kinds = {"solver": SolverName}
+        return {key: kinds[key](value) for key, value in values.items() if key not in self.model_fields_set}
 
     @model_validator(mode="after")
     def _load_steps_are_seen(self) -> Self:

@@ -8,6 +8,7 @@ from coldloop.kernels.first_use import kernels_of
 from coldloop.process.model_file import COLD_BOX, ModelHeader
 from plant.cold_box.physics import REFERENCE, ColdBox
 from plant.components.valve import Valve
+from plant.mismatched import MismatchedPlant
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.rack.rack import MakePlant
 from plant.refrigerator.events import EventSchedule
@@ -54,7 +55,10 @@ def make_program(
 ) -> PlantProgram:
     """Return the cold box at the operating point of its model file."""
     with kernels_of("the cold box", about_s=10):
-        return PlantProgram(box=_box(mismatch), x0=header.x0, u0=header.u0, load=load, noise=_noise(sensors, seed))
+        box, noise = _box(mismatch), noise_of(sensors, seed)
+        if mismatch.beside_the_box:
+            return MismatchedPlant(box=box, x0=header.x0, u0=header.u0, load=load, noise=noise, mismatch=mismatch)
+        return PlantProgram(box=box, x0=header.x0, u0=header.u0, load=load, noise=noise)
 
 
 def _box(mismatch: MismatchSettings) -> ColdBox:
@@ -85,10 +89,11 @@ def _make_refrigerator(
             load=load,
             station=section.station,
             events=EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k),
-            noise=_noise(section.sensors, seed),
+            noise=noise_of(section.sensors, seed),
         )
 
 
-def _noise(sensors: SensorSettings, seed: int) -> MeasurementNoise | None:
+def noise_of(sensors: SensorSettings, seed: int) -> MeasurementNoise | None:
+    """Return the noise of the sensors; None where they are exact."""
     exact = not any(sensors.deviations + sensors.biases)
     return None if exact else MeasurementNoise(sensors.deviations, seed, sensors.biases)

@@ -34,7 +34,7 @@ Factor = Annotated[float, Field(ge=0.5, le=1.4)]
 
 
 class MismatchSettings(BaseModel):
-    """What of the cold box is not as in its model: factors on parameters. It begins at the model's point of rest."""
+    """What of the cold box is not as in its model: most are factors. It begins at the model's point of rest."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -45,6 +45,19 @@ class MismatchSettings(BaseModel):
     """Flow area of CV155."""
     turbine_valve: Factor = 1.0
     """Flow area of CV156."""
+    heater: Factor = 1.0
+    """Power of NCR22_A, as the next three in a loop that is not compiled."""
+    load: Factor = 1.0
+    """Heat load over what is announced."""
+    level_gauge: Factor = 1.0
+    """What is shown of L1."""
+    delay_ticks: Annotated[int, Field(ge=0, le=20)] = 0
+    """Ticks by which inputs act later."""
+
+    @property
+    def beside_the_box(self) -> bool:
+        """Whether something is off that is no parameter of the cold box."""
+        return (self.heater, self.load, self.level_gauge, self.delay_ticks) != (1.0, 1.0, 1.0, 0)
 
 
 class SensorSettings(BaseModel):

@@ -75,6 +75,7 @@ def test_one_process_and_three_leave_one_trace_in_the_speed_benchmark(printed_by
     assert text.count("one trace: True") == 2, text
 
 
+@pytest.mark.exhaustive
 def test_lock_step_is_compared_with_bare_exchanges(printed_by: Benchmark) -> None:
     text = printed_by("lockstep.py", "--ticks", "200")
     (ratio,) = numbers(r"ratio ([0-9.]+)", text)
@@ -89,6 +90,7 @@ def test_the_start_of_each_program_is_timed(printed_by: Benchmark) -> None:
     assert all(map(is_time, seconds)), text
 
 
+@pytest.mark.exhaustive
 def test_the_problem_for_peers_costs_less_where_every_sample_is_free(printed_by: Benchmark) -> None:
     told = json.loads(printed_by("peer_problem.py"))
     assert len(told["problem"]["A"]) == 28

@@ -31,6 +31,7 @@ class Bench:
         self.load = 384.0
         self.shortage = 0.0
         """What the optimiser says of it."""
+        self.suspects = 0
         self.steady = False
         """The process stands at its setpoints, moved by `level` and `temperature`; else the outputs count the ticks."""
         self.level = self.temperature = 0.0
@@ -68,7 +69,8 @@ class Bench:
         """Plan the next updating instant so many ticks after the last one, or at a load step."""
         update = self.program.player.update
         assert update is not None
-        return self.program.accept_plan(Plan(update.update, update.tick + ticks, load_step, self.shortage))
+        plan = Plan(update.update, update.tick + ticks, load_step, self.shortage, self.suspects)
+        return self.program.accept_plan(plan)
 
     def sequence(self, rows: Sequence[SequenceRow], **changed: int) -> InputSequence:
         """Return an answer to the last update, with header fields changed before its checksum is taken."""

@@ -247,8 +247,11 @@ def test_an_update_has_no_number_for_a_bad_measurement(rig: "Bench", at: At) -> 
 
 @pytest.mark.parametrize(("output", "stands", "moves"), [(L1, 1, 2), (T5, 2, 1)], ids=["L1", "T5"])
 def test_a_controlled_output_that_stays_bad_ends_mpc_and_only_the_loop_that_needs_it(
-    rig: "Bench", at: At, output: int, stands: int, moves: int
+    new_bench: NewBench, at: At, output: int, stands: int, moves: int
 ) -> None:
+    rig = new_bench(InputLimits(), section(sensors={"estimated_s": 10.0}))
+    rig.steady = True
+    rig.scan()
     rig.play([at()] * 200, ticks=2)
     stale = rig.sequence([at()] * 20)
     rig.level, rig.temperature = 1.0, 1.0
@@ -265,6 +268,83 @@ def test_a_controlled_output_that_stays_bad_ends_mpc_and_only_the_loop_that_need
     del rig.readings[output]
     latched = [rig.scan()[1] for _ in range(10)]
     assert any(latched), "MPC is invited again"
+
+
+@pytest.mark.parametrize(
+    ("others", "lasts_s"), [(4, 60.0), (5, 10.0)], ids=["some others too", "more than an estimate can do without"]
+)
+def test_mpc_goes_on_without_the_level_for_as_long_as_an_estimate_is_believed(
+    new_bench: NewBench, at: At, others: int, lasts_s: float
+) -> None:
+    bench = new_bench(InputLimits(), section(sensors={"estimated_s": 60.0}))
+    bench.steady = bench.moving = True
+    bench.scan()
+    bench.play([at()] * 20, ticks=10)
+    for output in (L1, *range(12, 12 + others)):
+        bench.readings[output] = math.nan
+    bench.scan()
+    began = bench.program.tick
+    while bench.program.mode in (Mode.MPC, Mode.REST) and bench.program.tick < began + 400:
+        if bench.program.player.invited:
+            bench.play([at()] * 20, ticks=10)
+        bench.scan()
+    assert (bench.program.tick - began) / 4 == pytest.approx(lasts_s, abs=3.0)
+    assert (bench.program.mode, bench.program.ladder.cause) == (Mode.CLASSICAL, Cause.SENSOR_BAD)
+    bench.scans(400)
+    assert bench.program.mode is Mode.CLASSICAL, "it does not begin without it"
+
+
+def test_another_sensor_that_stands_still_is_found_if_it_has_not_stood_so_long_before(new_bench: NewBench) -> None:
+    """What is constant in a plant with exact sensors moves once or never; what rests at times has moved before."""
+    p4, t1, constant = (OUTPUT_NAMES.index(name) for name in ("P4", "T1", "P2"))
+    bench = new_bench(InputLimits(), section())
+    bench.steady = bench.moving = True
+    bench.scans(2)
+    bench.readings[constant] = 16.0
+    bench.scans(300)
+    bench.readings[t1] = 4.5
+    bench.scans(200)
+    del bench.readings[t1]
+    bench.scans(8)
+    bench.readings[p4], bench.readings[t1] = 1.2, 4.5
+    bench.scans(239)
+    assert bench.program.bad_sensors == 0
+    bench.scans(3)
+    assert bench.program.bad_sensors == 1 << p4
+    bench.scans(160)
+    assert bench.program.bad_sensors == 1 << p4 | 1 << t1
+    del bench.readings[p4]
+    bench.scans(10)
+    assert bench.program.bad_sensors == 1 << t1
+
+
+def test_exact_sensors_of_one_kind_may_rest_while_noisy_ones_of_the_other_move(new_bench: NewBench) -> None:
+    bench = new_bench(InputLimits(), section())
+    bench.steady = bench.moving = True
+    bench.scans(300)
+    bench.readings = dict.fromkeys(range(12, 22), 1.5)
+    bench.scans(400)
+    assert bench.program.bad_sensors == 0
+
+
+def test_what_the_optimiser_does_without_is_an_alarm_while_it_drives(rig: "Bench", at: At) -> None:
+    program = rig.program
+    rig.suspects = 1 << T5
+    rig.play([at()] * 20, ticks=2)
+    rig.scan()
+    row = program.alarms.rows[AlarmKind.SENSOR_SUSPECT]
+    assert (row.active, row.cause, row.times) == (1, T5, 1)
+    assert program.bad_sensors == 0, "the loops still work with it"
+    rig.suspects |= 1 << L1
+    rig.play([at()] * 20, ticks=2)
+    rig.scan()
+    row = program.alarms.rows[AlarmKind.SENSOR_SUSPECT]
+    assert (row.active, row.cause, row.times) == (1, L1, 2)
+    program.operate(Operator(OperatorMode.CLASSICAL, *AT_REST))
+    rig.scans(2)
+    assert alarm(rig, AlarmKind.SENSOR_SUSPECT) is AlarmState.RETURNED
+    events = [(each.subject, each.cause) for each in program.journal.since(0) if each.kind == EventKind.SENSOR]
+    assert events == [(T5, 2), (L1, 2), (L1, 0), (T5, 0)]
 
 
 def test_a_frozen_level_is_found_while_others_move_and_a_process_at_rest_is_not_taken_for_it(

@@ -50,6 +50,8 @@ IN_ORDER = {"tutorial.md"}
 
 NEEDS_A_RIG = re.compile(r"127\.0\.0\.1:502|coldloop (status|set|events|fault|record)|mbpoll")
 STARTS_A_RIG = re.compile(r"^(coldloop |scripts/)up\b", re.MULTILINE)
+READ_FIRST = {"README.md", "tutorial.md"}
+STARTS_MUCH = re.compile(r"^(scripts/|coldloop chaos)|refrigerator", re.MULTILINE)
 BY_THE_CLOCK = re.compile(r"realtime|(coldloop |scripts/)up\b")
 
 FOLLOWS = "--follow"
@@ -266,13 +268,15 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
-def page_rig(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) -> int:
+@pytest.fixture(scope="module")
+def page_rig(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) -> Iterator[int]:
     """The first port of a rig that is up for all pages."""
     base, files = shared_processes.three_ports(), {"XDG_RUNTIME_DIR": str(tmp_path_factory.mktemp("runtime"))}
     words = ("up", "--load", "e", "--factor", "5", "--port-base", base)
-    wait_until_up(shared_processes.coldloop(*words, stdout=subprocess.PIPE, more=files), base)
-    return base
+    rig = shared_processes.coldloop(*words, stdout=subprocess.PIPE, more=files)
+    wait_until_up(rig, base)
+    yield base
+    assert rig.interrupt() in {0, 130}
 
 
 @pytest.fixture
@@ -289,11 +293,16 @@ def reader(
     return Reader(tmp_path, coldloop, processes, whole=whole)
 
 
+def marks(lesson: Lesson) -> list[pytest.MarkDecorator]:
+    """Return the marks of a lesson; of pages that are read later, only short ones are executed without `--all`."""
+    by_the_clock = lesson.needs_a_rig or lesson.says(BY_THE_CLOCK)
+    long = by_the_clock or lesson.says(STARTS_MUCH) or lesson.blocks[0].marker == TEST_SUITE
+    found = [pytest.mark.realtime] if by_the_clock else []
+    return [*found, pytest.mark.exhaustive] if long and lesson.page.name not in READ_FIRST else found
+
+
 LESSONS = [
-    pytest.param(
-        lesson, id=f"{lesson.page.name}:{lesson.blocks[0].line}",
-        marks=[pytest.mark.realtime] if lesson.says(BY_THE_CLOCK) or lesson.needs_a_rig else [],
-    )
+    pytest.param(lesson, id=f"{lesson.page.name}:{lesson.blocks[0].line}", marks=marks(lesson))
     for page in PAGES for lesson in lessons(page)
 ]  # fmt: skip
 ALONE = [each for each in LESSONS if not each.values[0].needs_a_rig]

@@ -17,7 +17,7 @@ from coldloop.process.signals import OUTPUT_NAMES, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, UpdatingRuleKind, UpdatingRuleStatus
-from hmi.explanation import Branch, Explanation, explain, increments_of, period_ticks
+from hmi.explanation import Branch, Explanation, explain, increments_of
 from hmi.sentences import deviation, sentence
 from optimizer_plc.rules import Algorithm1, Observation, algorithm_1, assess
 
@@ -79,7 +79,7 @@ def optimization(number: int, tick: int, q: int, **values: float) -> Optimizatio
         "load_mismatch": 0.0, **UNDECIDED, **values,
     }  # fmt: skip
     verdict = int(numbers.pop("verdict", Verdict.ACCEPTED))
-    return as_transmitted(Optimization(number, tick, tau_u=1 + q, iterations=q, verdict=verdict, **numbers))
+    return as_transmitted(Optimization(number, tick, tau_u=1 + q, q=q, iterations=q, verdict=verdict, **numbers))
 
 
 def decided_cases(wanted: int) -> list[Case]:
@@ -94,7 +94,7 @@ def decided_cases(wanted: int) -> list[Case]:
         reference = by_hand(q, J_k, J_hot, J_last, J_hat, J_next)
         if (reference.gamma > 0) - (reference.gamma < 0) != wanted or abs(reference.contraction - 1) < Decimal("0.01"):
             continue
-        observed = Observation(q, 0.25 * (1 + q), J_k, J_hot, J_last, J_hat, J_next)
+        observed = Observation(q, q, 0.25 * (1 + q), J_k, J_hot, J_last, J_hat, J_next)
         a = assess(observed)
         decided = algorithm_1.decide(Algorithm1(9, 2, 19, 2), np.zeros(2), observed, a)
         assert decided == reference.q, "the program agrees with the reference"
@@ -112,11 +112,11 @@ def test_periods_that_algorithm_1_made_shorter_or_longer(wanted: int, branch: Br
     for before, update, q, reference in decided_cases(wanted):
         found = explain(update, before, None, RULE)
         assert found.branch is branch
-        assert (found.iterations_before, found.iterations) == (q, reference.q)
+        assert (found.q_before, found.q) == (q, reference.q)
         assert found.increments is not None
         assert found.increments.contraction == pytest.approx(float(reference.slope), rel=2e-3, abs=1e-6)
         text = sentence(found, RULE)
-        assert ("fewer iterations" in text) is (wanted > 0)
+        assert ("asks for a shorter period" in text) is (wanted > 0)
         assert ("is not below 1" in text) is (reference.contraction >= 1)
         assert f"{float(reference.contraction):.4g}"[:4] in text
         says = f"q goes from {q} to {reference.q}" if q != reference.q else f"q stays at {q}"
@@ -130,7 +130,7 @@ def test_what_other_numbers_of_iterations_would_have_meant() -> None:
     """K +- 2 dK; the response time is q tau_1 / -ln K, and there is none where K is not below 1."""
     for before, update, q, reference in decided_cases(1) + decided_cases(-1):
         found = explain(update, before, None, RULE)
-        steps = [one.iterations - q for one in found.alternatives]
+        steps = [one.q - q for one in found.alternatives]
         assert steps == [step for step in (-2, 0, 2) if q + step >= 1]
         for one in found.alternatives:
             K = reference.contraction + (one.iterations - q) * reference.slope
@@ -139,6 +139,20 @@ def test_what_other_numbers_of_iterations_would_have_meant() -> None:
             if one.response_s is not None and 0.05 < K < Decimal("0.95"):
                 assert one.response_s == pytest.approx(-one.iterations * 0.25 / math.log(K), rel=2e-2)
             assert (one.response_s is None) is not (0 < one.contraction < 1)
+
+
+def test_a_faster_solver_takes_the_same_steps_and_does_more_in_each() -> None:
+    """0.03 s an iteration: q = 4 is 1.25 s with 33 iterations, q = 6 is 1.75 s with 50, and K moves by 17 of them."""
+    fast = RULE._replace(iteration=0.03)
+    a = assess(Observation(4, 33, 1.25, 160.0, 200.0, 104.0, 100.0, 90.0))
+    values = {"efficiency": a.efficiency, "mismatch": a.mismatch, "contraction": a.contraction, "gamma": a.gamma}
+    before = optimization(7, 100, 4)._replace(iterations=33)
+    found = explain(optimization(8, 105, 2, **values), before, None, fast)
+    assert [(one.q, one.period_s, one.iterations) for one in found.alternatives] == [
+        (2, 0.75, 16), (4, 1.25, 33), (6, 1.75, 50)
+    ]  # fmt: skip
+    slope = (found.alternatives[2].contraction - found.alternatives[1].contraction) / 17
+    assert slope == pytest.approx(a.contraction_increment, rel=1e-3)
 
 
 def assert_all(cases: Sequence[Explanation], branch: Branch, rule: UpdatingRuleStatus, *parts: str) -> None:
@@ -178,7 +192,9 @@ def test_periods_that_are_fixed() -> None:
         explain(optimization(number + 1, 10 * number + 10, 9), optimization(number, 10 * number, 9), None, FIXED)
         for number in range(OF_EACH_KIND)
     ]
-    assert_all(cases, Branch.FIXED, FIXED, "tau_u is 2.5 s because the session has a fixed updating period", "q = 9")
+    assert_all(
+        cases, Branch.FIXED, FIXED, "tau_u is 2.5 s because the session has a fixed updating period", "9 iterations"
+    )
 
 
 def test_the_first_update_one_after_a_restart_and_one_whose_predecessor_is_unknown() -> None:
@@ -188,7 +204,7 @@ def test_the_first_update_one_after_a_restart_and_one_whose_predecessor_is_unkno
     assert "had to start over" in sentence(again, RULE)
     unknown = explain(optimization(5, 300, 9), optimization(3, 100, 3), None, RULE)
     assert unknown.branch is Branch.UNKNOWN
-    assert unknown.iterations_before is None
+    assert unknown.q_before is None
 
 
 def test_the_time_line_of_the_plc_and_what_was_predicted_and_came() -> None:
@@ -201,9 +217,9 @@ def test_the_time_line_of_the_plc_and_what_was_predicted_and_came() -> None:
     assert explain(update, None, optimization(5, 50, 9), RULE).came is None
 
 
-def test_a_period_that_is_longer_than_its_iterations_need_says_so() -> None:
+def test_a_period_that_is_longer_than_that_of_its_q_says_so() -> None:
     case = decided_cases(1)[0]
-    late = case.update._replace(tau_u=period_ticks(case.update.iterations, RULE) + 3)
+    late = case.update._replace(tau_u=case.update.tau_u + 3)
     found = explain(late, case.before, None, RULE)
     assert found.spare_s == 0.75
     assert "0.75 s longer" in sentence(found, RULE)
@@ -213,7 +229,7 @@ def test_a_period_that_is_longer_than_its_iterations_need_says_so() -> None:
 
 def test_increments_are_found_again_on_both_sides_of_one() -> None:
     for effective in (80.0, 300.0):
-        a = assess(Observation(4, 1.25, 160.0, 200.0, 104.0, 100.0, effective))
+        a = assess(Observation(4, 4, 1.25, 160.0, 200.0, 104.0, 100.0, effective))
         values = {"efficiency": a.efficiency, "mismatch": a.mismatch, "contraction": a.contraction, "gamma": a.gamma}
         found = increments_of(optimization(1, 5, 4, **values), 4)
         assert found is not None
@@ -223,8 +239,8 @@ def test_increments_are_found_again_on_both_sides_of_one() -> None:
 
 
 def test_a_slope_where_k_rounds_to_one_is_not_told_as_the_slope_of_k() -> None:
-    """K = 1 - 1e-9 in the program, 1 in the registers: Gamma is dt_r/dq, of the size of 1 / ln(K)^2."""
-    observed = Observation(4, 1.25, 1.0, 1.0, 1.0, 1.0 - 2e-10, 1.0 - 1e-9)
+    """K = 1 - 1e-9 in the program, 1 in the registers: Gamma is dt_r/dn, of the size of 1 / ln(K)^2."""
+    observed = Observation(4, 4, 1.25, 1.0, 1.0, 1.0, 1.0 - 2e-10, 1.0 - 1e-9)
     a = assess(observed)
     assert a.contraction < 1.0
     assert abs(a.gamma) > 1e6
@@ -235,7 +251,7 @@ def test_a_slope_where_k_rounds_to_one_is_not_told_as_the_slope_of_k() -> None:
     assert (found.increments, found.alternatives) == (None, ())
     text = sentence(found, RULE)
     assert "K is 1 to the precision of the registers" in text
-    assert "dK/dq" not in text
+    assert "dK/dn" not in text
 
 
 def test_a_plant_that_differs_from_its_model_is_described_the_most_notable_first() -> None:

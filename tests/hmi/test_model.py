@@ -297,7 +297,7 @@ def test_a_measurement_that_is_substituted_is_stale_and_no_other(model: Model) -
 def test_what_is_sent_is_json_even_when_numbers_or_words_are_none(model: Model) -> None:
     model.put("control_plc", process(2, level=float("nan")))
     model.put("plant", SessionPace(1, 1, 0.0, 0))
-    model.put_updates([Optimization(1, 2, 4, 3, 0, *(float("inf"),) * 11)])
+    model.put_updates([Optimization(1, 2, 4, 3, 3, 0, *(float("inf"),) * 11)])
     model.put_alarms([Alarm(state=99, priority=77) for _ in AlarmKind])
     trend = json.loads(encoded(trend_document(model, ["L1"], 0, 10, 100)), parse_constant=pytest.fail)
     assert trend["series"]["L1"] == [60.0, None]

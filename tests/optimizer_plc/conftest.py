@@ -130,7 +130,7 @@ class Recorder:
 
 def recorded_jumps(model: LtiModel, hour: str, minutes: float) -> list[Jump]:
     """Run the closed loop at an updating period of 5 s; return what followed each load jump of more than 40 W."""
-    recorder = Recorder(make_solver(ProgramSettings()))
+    recorder = Recorder(make_solver(ProgramSettings(preset=Preset.PAPER)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(optimizer_plc.program, "make_solver", lambda _settings: recorder)
         settings = ProgramSettings(preset=Preset.PAPER, updating_period_s=5.0)

@@ -109,7 +109,7 @@ def loss(qp: QuadraticProblem, guess: Array, iterations: int, best: float) -> tu
     return (ends[0] - best) / best, (ends[1] - best) / best
 
 
-@pytest.mark.parametrize("iterations", [4, 19, 200])
+@pytest.mark.parametrize("iterations", [19, *(pytest.param(n, marks=pytest.mark.exhaustive) for n in (4, 200))])
 def test_after_harsh_load_jumps_single_precision_loses_little(
     harsh_jumps: "list[Jump]", penalised_optimum: "PenalisedOptimum", iterations: int
 ) -> None:

@@ -18,11 +18,10 @@ from optimizer_plc.estimator import (
     Estimator,
     correct,
     estimator_of,
-    imputed,
     no_belief,
-    note_surprise,
     stationary_gains,
 )
+from optimizer_plc.plausibility import imputed, note_surprise
 from optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
 from optimizer_plc.qp.linear_algebra import add_transposed_product, respond
 from optimizer_plc.qp.prediction import PredictionModel

@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
+from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.qp.problem import PredictiveProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
-from optimizer_plc.solvers import Answer, hybrid, make_solver
+from optimizer_plc.solvers import Answer, Solver, hybrid, make_solver
 from optimizer_plc.solvers.hybrid import (
     HybridMethod,
     allowed_in,
@@ -47,11 +48,16 @@ def choices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, Costs]]:
     return made
 
 
+def made(name: SolverName) -> Solver:
+    """With the penalties of the fixtures' problems."""
+    return make_solver(ProgramSettings(preset=Preset.PAPER, solver=name))
+
+
 def test_a_problem_is_chosen_for_by_the_costs_of_the_one_before(
     choices: list[tuple[float, Costs]], harsh_jumps: "list[Jump]"
 ) -> None:
     """J+ and Jhat, both with constant and floor, are those of the problem before, whoever solved it."""
-    solver = make_solver(ProgramSettings(solver=SolverName.HYBRID))
+    solver = made(SolverName.HYBRID)
     answers = [solver.solve(qp, guess, (4, 5)) for qp, guess in harsh_jumps[:6]]
     rest = [qp.constant + 1.0 for qp, _ in harsh_jumps[:6]]
     whole = [Costs(a.guessed + more, a.cost + more) for a, more in zip(answers, rest, strict=True)]
@@ -119,7 +125,9 @@ def test_what_is_left_of_a_slot_counts_for_the_next_one() -> None:
 def test_on_harsh_problems_it_is_the_interior_point_in_the_time_of_its_slots(
     problem: PredictiveProblem, situations: "Situations", harsh_jumps: "list[Jump]"
 ) -> None:
-    solver, interior = (make_solver(ProgramSettings(solver=name)) for name in (SolverName.HYBRID, "interior-point"))
+    solver, interior = (
+        make_solver(ProgramSettings(preset=Preset.PAPER, solver=name)) for name in (SolverName.HYBRID, "interior-point")
+    )
     solver.solve(problem.at(situations(np.random.default_rng(30))), np.zeros(49), (19,))
     qp, guess = harsh_jumps[0]
     slots = solver.solve(qp, guess, (3,))
@@ -128,7 +136,9 @@ def test_on_harsh_problems_it_is_the_interior_point_in_the_time_of_its_slots(
 
 
 def test_in_quiet_it_is_the_ode_based_solver(problem: PredictiveProblem, situations: "Situations") -> None:
-    solver, ode = (make_solver(ProgramSettings(solver=name)) for name in (SolverName.HYBRID, SolverName.ODE))
+    solver, ode = (
+        make_solver(ProgramSettings(preset=Preset.PAPER, solver=name)) for name in (SolverName.HYBRID, SolverName.ODE)
+    )
     qp = problem.at(situations(np.random.default_rng(31)))
     first = solver.solve(qp, np.zeros(49), (5, 400))
     solver.solve(qp, first.z, (40,))  # the guess before was bad: the interior point has it

@@ -23,6 +23,7 @@ from coldloop.safety.sequence import InputSequence
 from optimizer_plc import solvers
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from optimizer_plc.rules import Assessment, Observation
 from optimizer_plc.rules.interface import decides_by
@@ -69,7 +70,7 @@ class NotingRule(NamedTuple):
     @property
     def told(self) -> list[Observation]:
         rows = self.notes[: self.count[0]].tolist()
-        return [Observation(int(iterations), *others) for iterations, *others in rows]
+        return [Observation(int(q), int(iterations), *others) for q, iterations, *others in rows]
 
     @property
     def first(self) -> int:
@@ -88,8 +89,8 @@ class NotingRule(NamedTuple):
 @numba.njit
 def decide(rule: NotingRule, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001 a kernel
     note = rule.notes[rule.count[0]]
-    note[0], note[1], note[2], note[3] = o.iterations, o.period_s, o.effective_before, o.hot_start
-    note[4], note[5], note[6] = o.last_but_one, o.delivered, o.effective
+    note[0], note[1], note[2], note[3] = o.q, o.iterations, o.period_s, o.effective_before
+    note[4], note[5], note[6], note[7] = o.hot_start, o.last_but_one, o.delivered, o.effective
     rule.count[0] += 1
     return NEXT
 
@@ -98,13 +99,14 @@ class Bench:
     """The program, and beside it all that it should know."""
 
     def __init__(self, model: LtiModel, problem: PredictiveProblem, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.rule = NotingRule(np.zeros(1, np.int64), np.zeros((20, 7)))
+        self.rule = NotingRule(np.zeros(1, np.int64), np.zeros((20, 8)))
         self.model, self.problem = model, problem
         monkeypatch.setattr(optimizer_plc.program, "make_rule", lambda *_: self.rule)
         monkeypatch.setattr(optimizer_plc.program, "make_solver", lambda _: KnownSolver())
         settings = ProgramSettings(
-            interrupting_load_step_w=10.0, estimator=EstimatorSettings(kind=EstimatorKind.STATE_FEEDBACK)
-        )
+            preset=Preset.PAPER, interrupting_load_step_w=10.0,
+            estimator=EstimatorSettings(kind=EstimatorKind.STATE_FEEDBACK),
+        )  # fmt: skip
         self.program = OptimizerProgram(model, settings, InputLimits())
         self.program.restart(0.0)
         self.rule.count[0] = 0

@@ -15,6 +15,7 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.registers.control_plc import Verdict
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import FastGradientSettings, InteriorPointSettings, QpoasesSettings
+from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.settings import OptimizerSection, ProgramSettings, SolverName
 from optimizer_plc.solvers import Solver, judged, make_solver, qpoases
@@ -51,7 +52,7 @@ CONVERGED = {
 
 
 def solver_named(name: str) -> Solver:
-    return make_solver(ProgramSettings(solver=SolverName(name)))
+    return make_solver(ProgramSettings(preset=Preset.PAPER, solver=SolverName(name)))
 
 
 def convex_problem(rng: np.random.Generator, n: int, m: int) -> QuadraticProblem:
@@ -334,6 +335,7 @@ def test_without_momentum_a_step_never_raises_the_cost(harsh_jumps: "list[Jump]"
         assert first.cost <= first.guessed
 
 
+@pytest.mark.exhaustive  # compiles each solver for it; test_arithmetic.py has the default's
 @pytest.mark.parametrize(
     "make",
     [

@@ -223,7 +223,7 @@ def test_l1_comes_to_rest_nearer_to_its_operating_point_with_valves_that_pass_le
     off = []
     for target in (Target.OPERATING_POINT, Target.MISMATCH):
         run = simulate(
-            load="a", duration_s=1200, plant={"mismatch": {"jt_valve": 0.9, "turbine_valve": 0.9}},
+            load="a", solver="ode", duration_s=1200, plant={"mismatch": {"jt_valve": 0.9, "turbine_valve": 0.9}},
             optimizer_plc={"program": {"design": {"target": target.value}}},
         )  # fmt: skip
         off.append(abs(np.mean(run.trace.to_dict()["L1"][2400:]) - 60.0))

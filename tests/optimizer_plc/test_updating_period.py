@@ -47,7 +47,8 @@ rules = st.builds(
 )
 observations = st.builds(
     Observation,
-    iterations=st.integers(1, 20),
+    q=st.integers(1, 20),
+    iterations=st.integers(1, 200),
     period_s=st.floats(0.5, 5.0),
     effective_before=costs,
     hot_start=costs,
@@ -60,6 +61,7 @@ observations = st.builds(
 def contracting(**changed: float) -> Observation:
     """K = 0.45: from J+ = 200 over 104 to 100 in 4 iterations at the predicted state; 90 where the plant really is."""
     base = Observation(
+        q=4,
         iterations=4,
         period_s=1.25,
         effective_before=200.0,
@@ -115,9 +117,25 @@ def test_a_contraction_of_exactly_1_counts_as_none() -> None:
     assert Deciding(RULE).next(at_one._replace(last_but_one=180.0))[0] == 6
 
 
+def test_increments_are_per_iteration_and_the_step_is_in_periods() -> None:
+    """The same costs after 32 iterations in the period of q = 4: D changes by an eighth as much for each."""
+    q, a = Deciding(RULE).next(contracting(effective_before=160.0, iterations=32))
+    assert a.mismatch_increment == pytest.approx(0.03125 / 8)
+    assert a.efficiency_increment == pytest.approx(-0.02)
+    assert q == 6
+    assert a.gamma < 0, "32 iterations at -0.02 each outweigh the mismatch"
+
+
 def test_a_zero_gradient_changes_nothing() -> None:
     still = Observation(
-        iterations=7, period_s=2.0, effective_before=5.0, hot_start=5.0, last_but_one=5.0, delivered=5.0, effective=5.0
+        q=7,
+        iterations=7,
+        period_s=2.0,
+        effective_before=5.0,
+        hot_start=5.0,
+        last_but_one=5.0,
+        delivered=5.0,
+        effective=5.0,
     )
     q, a = Deciding(RULE).next(still)
     assert (q, a.gamma) == (7, 0.0)
@@ -128,7 +146,7 @@ def test_q_moves_by_delta_against_the_gradient_or_is_clipped(rule: Algorithm1, o
     q, a = Deciding(rule).next(observation)
     assert rule.q_min <= q <= rule.q_max
     sign = (a.gamma > 0) - (a.gamma < 0)
-    wanted = observation.iterations - rule.delta * sign
+    wanted = observation.q - rule.delta * sign
     assert q == min(rule.q_max, max(rule.q_min, wanted))
     assert not math.isnan(a.gamma)
 
@@ -144,6 +162,7 @@ def test_the_branch_depends_on_whether_the_cost_contracts(observation: Observati
 def test_multiplying_all_costs_by_a_constant_changes_nothing(observation: Observation, exponent: int) -> None:
     factor = 2.0**exponent  # exact in binary, so that rounding cannot change the decision
     scaled = Observation(
+        q=observation.q,
         iterations=observation.iterations,
         period_s=observation.period_s,
         effective_before=observation.effective_before * factor,
@@ -171,13 +190,11 @@ def test_the_response_increment_is_the_derivative_of_the_response_time(observati
     assert a.response_increment == pytest.approx(numerical, rel=1e-3, abs=1e-3 * scale + 1e-6)
 
 
-@given(observation=observations, iterations=st.integers(1, 19))
-def test_a_fixed_period_is_fixed_but_tells_the_quantities_all_the_same(
-    observation: Observation, iterations: int
-) -> None:
-    rule = FixedPeriod(iterations)
-    assert rule.first == iterations
-    assert Deciding(rule).next(observation) == (iterations, assess(observation))
+@given(observation=observations, q=st.integers(1, 19))
+def test_a_fixed_period_is_fixed_but_tells_the_quantities_all_the_same(observation: Observation, q: int) -> None:
+    rule = FixedPeriod(q)
+    assert rule.first == q
+    assert Deciding(rule).next(observation) == (q, assess(observation))
 
 
 def test_the_first_period_is_the_one_configured() -> None:
@@ -232,8 +249,8 @@ def test_after_a_load_step_nothing_contracts_at_first() -> None:
 def test_compiled_and_plain_a_rule_is_assessed_the_same(rule: Algorithm1, observation: Observation) -> None:
     """To the bit, and in single precision to its rounding."""
     assert assessed(observation) == assess(observation)
-    single = Observation(observation.iterations, *map(np.float32, observation[1:]))
-    rough, exact = assessed(single), assess(Observation(single.iterations, *map(float, single[1:])))
+    single = Observation(*observation[:2], *map(np.float32, observation[2:]))
+    rough, exact = assessed(single), assess(Observation(*single[:2], *map(float, single[2:])))
     assert rough.contraction == pytest.approx(exact.contraction, rel=1e-6)
     assert rule.q_min <= decide_by(rule, np.zeros(MEMORY, np.float32), single, rough) <= rule.q_max
 
@@ -252,4 +269,4 @@ def test_one_compilation_serves_fixed_and_adaptive_periods() -> None:
     """Else the first update of a session with the other one would wait for the compiler."""
     budget = PlcBudget(BudgetSettings(), 0.25)
     adaptive, fixed = (make_rule(ProgramSettings(), budget, ticks) for ticks in (0, 8))
-    assert numba.typeof(adaptive) == numba.typeof(fixed) == numba.typeof(adaptive.fixed(3))
+    assert numba.typeof(adaptive) == numba.typeof(fixed)

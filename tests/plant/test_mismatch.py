@@ -44,6 +44,36 @@ def test_wider_valves_pass_more_gas() -> None:
     assert level_after(5, jt_valve=1.2) != pytest.approx(60.0, abs=0.1)
 
 
+def test_a_heater_and_a_load_that_are_more_than_they_are_believed_to_be_empty_the_bath() -> None:
+    assert level_after(5, heater=1.2) < 59.9
+    assert level_after(5, load=1.05) < 59.9
+    loaded = made(mismatch=MismatchSettings(load=1.05))
+    assert loaded.load == HEADER.w0, "what is announced"
+
+
+def test_a_gauge_shows_another_level_and_changes_nothing_else() -> None:
+    exact, wrong = made(), made(mismatch=MismatchSettings(level_gauge=1.01))
+    for plant in (exact, wrong):
+        plant.apply([50.0, 75.0, 36.0])
+        for _ in range(20):
+            plant.advance()
+    assert wrong.measure()[LEVEL] == pytest.approx(1.01 * exact.measure()[LEVEL])
+    np.testing.assert_array_equal(wrong.measure()[1:], exact.measure()[1:])
+
+
+def test_inputs_act_as_many_ticks_later() -> None:
+    """In one tick the delayed plant has moved as far as the other had two ticks ago; before that it rests."""
+    prompt, late = made(), made(mismatch=MismatchSettings(delay_ticks=2))
+    states = [prompt.state]
+    for tick in range(12):
+        for plant in (prompt, late):
+            plant.apply([45.0 + tick, 75.0, 36.0])
+            plant.advance()
+        states.append(prompt.state)
+        expected = states[max(0, len(states) - 3)]
+        np.testing.assert_allclose(late.state, expected, rtol=1e-6)
+
+
 def test_a_bias_is_shown_and_changes_nothing_else() -> None:
     exact, biased = made(), made(sensors=SensorSettings(level_bias=0.2, temperature_bias=-0.1, pressure_bias=0.005))
     for _ in range(10):

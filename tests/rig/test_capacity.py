@@ -65,6 +65,7 @@ def test_a_load_that_is_too_small_is_said_and_stays_so_though_the_estimate_is_hi
     ]
 
 
+@pytest.mark.exhaustive
 def test_the_loads_that_can_be_held_are_those_of_the_steady_states_of_the_plant() -> None:
     """Proof over a grid of the valves, with the heater at the end that helps."""
     openings, turbine = (20.0, 24.0, 26.0, 50.0, 54.0, 56.0, 58.0, 60.0), (20.0, 24.0, 50.0, 60.0)

@@ -145,7 +145,10 @@ def test_a_line_is_completed(line: str, offered: str, tmp_path: Path, python: Py
     assert offered in answer.read_text().split()
 
 
-@pytest.mark.parametrize("environment", [{}, {"NO_COLOR": "1", "COLUMNS": "20", "TERM": "dumb"}])
+DUMB = pytest.param({"NO_COLOR": "1", "COLUMNS": "20", "TERM": "dumb"}, marks=pytest.mark.exhaustive)
+
+
+@pytest.mark.parametrize("environment", [{}, DUMB])
 def test_a_run_that_is_piped_writes_no_control_sequences(
     environment: dict[str, str], tmp_path: Path, python: Python
 ) -> None:

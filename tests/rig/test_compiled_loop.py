@@ -14,6 +14,7 @@ from coldloop.config import load_configuration
 from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.limits import InputLimits, RateReference
 from coldloop.process.load_profile import LoadProfile
+from coldloop.registers.audit import EventKind
 from control_plc.output_limits import admit, beginning, plain
 from plant.load import find_load
 from rig.cosim.compiled.control import guard_records
@@ -25,6 +26,7 @@ from rig.settings import Settings
 
 PROGRAM = "optimizer_plc.program."
 NOISE = ("plant.sensors.level=0.02", "plant.sensors.speed=0.5", "plant.sensors.temperature=0.02")
+SUSPECTS = tuple(f"{PROGRAM}plausibility.{each}" for each in ("sigmas=2", "settled_s=5", "agreeing_s=5", "longest_s=9"))
 REFRIGERATOR = "plant.kind=refrigerator"
 SINGLE = f'{PROGRAM}arithmetic="float32"'
 TRIP = (
@@ -49,6 +51,8 @@ COMPILED = {
         f"{PROGRAM}holdable_load_w=[330,345]",
         "control_plc.alarms.rules.capacity.on_delay_s=2",
     ),
+    "suspects": (*SUSPECTS, *NOISE),
+    "suspects in single precision": (SINGLE, *SUSPECTS, *NOISE),
     "load steps that interrupt": (f"{PROGRAM}updating_period_s=5", f"{PROGRAM}interrupting_load_step_w=10"),
     "load steps that interrupt a rule": (
         f'{PROGRAM}adaptive.rule="contraction"',
@@ -132,7 +136,7 @@ def left_by(assignments: tuple[str, ...], load: LoadProfile, ticks: int, *, comp
 USUALLY = {
     "adaptive", "noise", "interior point, cut off", "hybrid", "fast gradient", "load steps that interrupt",
     "refrigerator", "as printed", "single precision", "osqp", "sequences that are refused", "an impatient watchdog",
-    "the classical loops", "loads that cannot be held",
+    "the classical loops", "loads that cannot be held", "suspects",
 }  # fmt: skip
 """One of each kind; the others differ from one of them in a part of the configuration."""
 
@@ -147,6 +151,13 @@ USUALLY = {
 def test_the_compiled_loop_leaves_what_the_programs_leave(name: str, lively: LoadProfile) -> None:
     assignments = (COMPILED | LEFT_TO_PROGRAMS | UNUSUAL)[name]
     assert left_by(assignments, lively, 1500, compiled=True) == left_by(assignments, lively, 1500, compiled=False)
+
+
+def test_suspects_come_and_go(lively: LoadProfile) -> None:
+    """What the comparison above is about."""
+    events = left_by(COMPILED["suspects"], lively, 1500, compiled=True).events
+    assert {cause for _, _, kind, _, cause in events if kind == EventKind.SENSOR} == {0, 2}, "none stands still"
+    assert sum(kind == EventKind.SENSOR for _, _, kind, _, _ in events) > 20
 
 
 def done_by_the_loop(monkeypatch: pytest.MonkeyPatch, assignments: tuple[str, ...], load: LoadProfile) -> int:

@@ -69,6 +69,7 @@ def outside(load_a: LoadProfile, monkeypatch: pytest.MonkeyPatch) -> Outside:
     return run
 
 
+@pytest.mark.exhaustive
 def test_the_estimate_does_without_a_dead_sensor_whose_last_value_would_mislead_it(outside: Outside) -> None:
     """With the preset `paper` all that a stale pressure shows is taken for state and load; `tuned` adds a constant."""
     assert outside(["P1"], HALF_HOUR, Preset.PAPER, stale=True)[:, 0].any()

@@ -10,6 +10,7 @@ import pytest
 from coldloop.process.load_profile import LoadProfile
 from coldloop.registers.codec import WordOrder
 from control_plc.settings import ControlSection, ControlStrategy
+from optimizer_plc.computing_settings import PlausibilitySettings
 from optimizer_plc.settings import AdaptiveSettings, OptimizerSection, ProgramSettings, RuleName
 from plant.load import find_load
 from plant.settings import PlantSection, SensorSettings
@@ -73,13 +74,17 @@ async def test_load_steps_that_interrupt_change_nothing_about_the_equality(
     assert steps
 
 
-async def test_noise_and_the_low_word_first_change_nothing_about_the_equality(
+async def test_noise_suspects_and_the_low_word_first_change_nothing_about_the_equality(
     lively: LoadProfile, simulate: "Simulate", on_the_bus: "OnTheBus"
 ) -> None:
     scenario = three_minutes(lively, seed=20)
-    async with on_the_bus(Settings(plant=NOISY), order=WordOrder.LOW_FIRST) as bus:
+    limits = PlausibilitySettings(sigmas=2.0, settled_s=5.0, agreeing_s=5.0)
+    suspicious = OptimizerSection(program=ProgramSettings(plausibility=limits))
+    async with on_the_bus(Settings(plant=NOISY, optimizer_plc=suspicious), order=WordOrder.LOW_FIRST) as bus:
         networked = await bus.record(scenario)
-    assert_same(simulate(scenario, plant=NOISY), networked)
+    alone = simulate(scenario, plant=NOISY, optimizer_plc=suspicious)
+    assert_same(alone, networked)
+    assert alone.trace_sha256 != simulate(scenario, plant=NOISY).trace_sha256, "some readings were left out"
 
 
 def test_the_seed_decides_the_noise_and_so_the_trace(lively: LoadProfile, simulate: "Simulate") -> None:
@@ -122,6 +127,7 @@ def test_the_command_starts_three_services_and_gets_the_trace_of_one_process(
     }  # fmt: skip
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("undrawn", "processes")
 def test_tls_on_every_connection_changes_nothing_about_the_trace(coldloop: "Coldloop", tmp_path: Path) -> None:
     assert coldloop("certificates", "--out", tmp_path / "site").code == 0

@@ -41,7 +41,7 @@ def update(tick: int, tau_u: int, j_dev: float, j_cst: float = 0.0, violation: f
         ("j_effective", "j_hot_start", "j_delivered", "efficiency", "mismatch", "contraction", "gamma"), math.nan
     )
     return Optimization(
-        update=tick, tick=tick, tau_u=tau_u, iterations=5, verdict=Verdict.ACCEPTED, j_dev=j_dev, j_cst=j_cst,
+        update=tick, tick=tick, tau_u=tau_u, q=5, iterations=5, verdict=Verdict.ACCEPTED, j_dev=j_dev, j_cst=j_cst,
         violation=violation, load_mismatch=0.0, **costs,
     )  # fmt: skip
 

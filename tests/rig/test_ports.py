@@ -8,6 +8,7 @@ import pytest
 import uvloop
 
 from rig.cosim.ports import HOST, ReservedPorts
+from tests.harness.processes import Processes
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="two sockets share a port in this way on Linux alone")
 
@@ -45,5 +46,12 @@ def test_ports_in_a_row_are_refused_where_one_is_taken() -> None:
         (port,) = taken.numbers
         with pytest.raises(OSError, match="in use"):
             ReservedPorts(2, port - 1)
-    with ReservedPorts(2, port - 1) as reserved:
-        assert reserved.numbers == [port - 1, port]
+
+
+def test_ports_in_a_row_are_reserved_where_none_is_taken(processes: Processes) -> None:
+    first = processes.three_ports()
+    for port in range(first, first + 3):
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection((HOST, port)).close()
+        with pytest.raises(OSError, match="in use"):
+            ReservedPorts(1, port)

@@ -111,6 +111,26 @@ async def test_a_service_can_be_stopped_while_its_broker_is_frozen(
         assert done
 
 
+async def test_a_service_can_be_stopped_though_its_connection_fails_as_it_is_closed(
+    free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connected = asyncio.Event()
+
+    async def publish(_: Telemetry) -> None:
+        connected.set()
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            raise OSError("disconnected unexpectedly") from None
+
+    monkeypatch.setattr(Telemetry, "_publish", publish)
+    async with publishing(free_port, lambda: {"tick": 1}) as task:
+        await connected.wait()
+        task.cancel()
+        done, _ = await asyncio.wait({task}, timeout=PATIENCE_S)
+        assert done
+
+
 async def test_what_is_published_is_json_whatever_the_numbers(broker: "Serve", free_port: int) -> None:
     async with broker(free_port) as known, publishing(free_port, lambda: {"gamma": math.inf}):
         await until(lambda: known.retained("coldloop/plant/telemetry"), lambda now: now is not None)

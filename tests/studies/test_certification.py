@@ -22,7 +22,7 @@ from rig.plc_sizing.certification import (
     scenario_needs,
     scenario_problems,
 )
-from rig.settings import Settings
+from rig.studies.settings import settings_of
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -106,7 +106,7 @@ def test_a_certificate_counts_scenarios() -> None:
 
 
 def test_scenarios_repeat_and_differ() -> None:
-    settings = Settings()
+    settings = settings_of(())
     one, again, other = (scenario_problems(settings, number) for number in (3, 3, 4))
     assert len(one) == 179
     assert all((a.qp.phi == b.qp.phi).all() for a, b in zip(one, again, strict=True))
@@ -114,7 +114,7 @@ def test_scenarios_repeat_and_differ() -> None:
 
 
 def test_an_exact_solver_needs_one_iteration_and_a_truncated_one_more() -> None:
-    settings = Settings()
+    settings = settings_of(())
     problems = scenario_problems(settings, 1)[:60]
     program = settings.optimizer_plc.program
     needs = {

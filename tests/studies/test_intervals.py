@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from rig.studies.intervals import (
     Interval,
-    gap_closed,
     geometric_mean,
     interval_of_mean,
     interval_of_share,
@@ -129,25 +128,6 @@ def test_intervals_cover_what_they_should(statistic: str, hours: int) -> None:
     rng = np.random.default_rng(20)
     found = [interval(*draw(rng, hours)) for _ in range(1000)]
     assert 0.93 <= np.mean([low <= truth <= high for _, low, high in found]) <= 0.97
-
-
-@pytest.mark.parametrize(
-    ("costs", "share"),
-    [
-        ([16.0, 4.0], 0.0),  # the reference itself
-        ([1.0, 1.0], 1.0),  # the best
-        ([4.0, 2.0], 0.5),  # (ln 4 + ln 2) of (ln 16 + ln 4)
-        ([32.0, 8.0], -1.0 / 3.0),  # worse: -(ln 2 + ln 2) of ln 64
-        ([0.5, 1.0], 7.0 / 6.0),  # better than the best that was found
-    ],
-)
-def test_shares_of_a_gap_of_two_hours(costs: list[float], share: float) -> None:
-    found = gap_closed(np.array(costs), np.array([16.0, 4.0]), np.array([1.0, 1.0]))
-    assert found.value == pytest.approx(share)
-
-
-def test_where_there_is_no_gap_there_is_no_share() -> None:
-    assert math.isnan(gap_closed(np.array([2.0]), np.array([1.0]), np.array([1.0])).value)
 
 
 def test_where_one_draw_has_nearly_all_of_the_excess_the_interval_stays_of_its_size() -> None:

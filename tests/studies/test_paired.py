@@ -14,6 +14,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from optimizer_plc.computing_settings import QpoasesSettings
 from optimizer_plc.qp.design import ControlDesign
+from optimizer_plc.qp.penalties import Preset
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
@@ -38,6 +39,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 UNBOUNDED = 1e30
+
+
+def with_solver(name: str) -> ProgramSettings:
+    return ProgramSettings(preset=Preset.PAPER, solver=SolverName(name))
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +160,7 @@ def test_no_profile_that_can_be_played_costs_less(problem: PredictiveProblem, pr
 @pytest.mark.parametrize("name", [name.value for name in SolverName])
 @pytest.mark.parametrize("power", [0.2, 1.0, 10.0])
 def test_no_solver_at_any_power_gets_below_the_lowest_cost(name: str, power: float, sequence: ProblemSequence) -> None:
-    program = ProgramSettings(solver=SolverName(name))
+    program = with_solver(name)
     budget = program.budget.model_copy(update={"power": power, "preparation_slots": 0})
     columns = paired_run(sequence, program.model_copy(update={"budget": budget}))
     total, lowest = np.array(columns["j_dev"]) + np.array(columns["j_cst"]), np.array(columns["lowest"])
@@ -171,6 +176,7 @@ def test_no_solver_at_any_power_gets_below_the_lowest_cost(name: str, power: flo
 def test_a_solver_starts_each_problem_from_its_own_last_profile(sequence: ProblemSequence) -> None:
     """Replayed here, solver, shifts and costs by hand."""
     program = ProgramSettings(
+        preset=Preset.PAPER,
         solver=SolverName.INTERIOR_POINT,
         budget=ProgramSettings().budget.model_copy(update={"power": 0.2, "preparation_slots": 0}),
     )
@@ -187,9 +193,7 @@ def test_a_solver_starts_each_problem_from_its_own_last_profile(sequence: Proble
 
 def test_equal_plc_times_hold_these_iterations() -> None:
     program = ProgramSettings()
-    counts = {
-        name: tuple(equal_counts(program, make_solver(ProgramSettings(solver=name))).values()) for name in SolverName
-    }
+    counts = {name: tuple(equal_counts(program, make_solver(with_solver(name))).values()) for name in SolverName}
     # 0.34, 0.68, 1.02 and 1.36 s over 0.25, 0.475, 0.05, 0.03, 0.17 and 4.75 s
     assert counts == {
         "ode": (1, 2, 4, 5), "qpoases": (0, 1, 2, 2), "osqp": (6, 13, 20, 27), "fast-gradient": (11, 22, 34, 45),
@@ -199,7 +203,7 @@ def test_equal_plc_times_hold_these_iterations() -> None:
 
 
 def test_on_harsh_problems_all_begin_at_the_same_guess(sequence: ProblemSequence) -> None:
-    found = {name: harsh_run(sequence, ProgramSettings(solver=SolverName(name))) for name in ("ode", "qpoases", "daqp")}
+    found = {name: harsh_run(sequence, with_solver(name)) for name in ("ode", "qpoases", "daqp")}
     assert len(found["ode"]["guess"]) >= 2, "the first load steps"
     assert found["ode"]["guess"] == found["qpoases"]["guess"] == found["daqp"]["guess"]
     assert found["daqp"]["after_8"] == found["daqp"]["guess"], "no solve of DAQP is as short"

@@ -66,6 +66,7 @@ def test_seven_shards_merged_are_the_study_byte_for_byte(whole: Path, parts: lis
     assert theirs == {path.name: path.read_bytes() for path in (whole / RUNS).iterdir()}
 
 
+@pytest.mark.exhaustive
 def test_shards_may_share_a_folder_and_be_done_at_once(whole: Path, client: "Client", tmp_path: Path) -> None:
     """Two of the three are the same one: both do its runs, or find them done."""
     workers = Workers(1, scheduler=client.scheduler.address)

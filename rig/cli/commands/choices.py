@@ -11,13 +11,14 @@ SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "
 PRESETS: Final = ("tuned", "paper", "as-printed")
 LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h", "pulses")
 SERVICES: Final = ("control_plc", "optimizer_plc", "plant")
+WITHOUT: Final = ("optimizer",)
 REGISTER_FORMATS: Final = ("csv", "json", "markdown", "table")
 TAG_FORMATS: Final = ("fuxa", "ignition", "node-red", "telegraf")
 FIGURE_FORMATS: Final = ("png", "pdf", "svg")
 STUDIES: Final = (
     "cholesky", "unlimited", "limited", "solver-comparison", "trajectories", "updating-period", "plc-2h", "adaptive-2h",
     "trade-off", "classical", "single-precision", "coupling", "disturbances",
-    "oracles", "robustness", "contest", "penalties",
+    "robustness", "contest", "penalties",
 )  # fmt: skip
 
 

@@ -163,6 +163,19 @@ def rig_endpoints(options: argparse.Namespace, settings: "OperatorSettings | Set
     ))  # fmt: skip
 
 
+def rig_services(options: argparse.Namespace) -> tuple[str, ...]:
+    """Return the services of the rig that `add_rig_options` names; one that was started here may be without optimiser.
+
+    Raises:
+        UsageError: Several are up, or its record is damaged.
+    """
+    from rig.cosim.endpoints import RigEndpoints
+    from rig.live.started_rigs import find_rig
+
+    known = None if options.rig else find_rig(options.port_base)
+    return RigEndpoints._fields if known is None else tuple(known.services)
+
+
 def first_port_here(options: argparse.Namespace) -> int | None:
     """Return the first port of the rig on this machine that `add_rig_options` names, None for the only one.
 

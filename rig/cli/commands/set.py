@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
 from coldloop.process.signals import TICK_S
-from rig.cli.commands.options import add_rig_options, add_to_subcommands, operator_settings, rig_endpoints, tell
+from rig.cli.commands.options import (
+    add_rig_options,
+    add_to_subcommands,
+    operator_settings,
+    rig_endpoints,
+    rig_services,
+    tell,
+)
 from rig.durations import LONGEST_TICKS
 
 if TYPE_CHECKING:
@@ -73,7 +80,9 @@ async def _do(options: argparse.Namespace) -> None:
 
     settings = operator_settings(options)
     services, work = _stream(options) if _is_stream(options) else _command(options, settings.limits)
-    text = await ask(rig_endpoints(options, settings), services, work, limited=not _is_stream(options))
+    there = rig_services(options)
+    concerned = [service for service in services if service in there]
+    text = await ask(rig_endpoints(options, settings), concerned, work, limited=not _is_stream(options))
     sys.stdout.write(f"{text}\n")
 
 

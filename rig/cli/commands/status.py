@@ -6,7 +6,7 @@ import sys
 from contextlib import AsyncExitStack
 from typing import Final
 
-from rig.cli.commands.options import add_rig_options, operator_settings, rig_endpoints
+from rig.cli.commands.options import add_rig_options, operator_settings, rig_endpoints, rig_services
 
 LOOK_S: Final = 1.0
 
@@ -30,7 +30,8 @@ async def _show(options: argparse.Namespace) -> None:
     from rig.cosim.answer_time import answered_in_time
     from rig.live.status import line, page, read_status
 
-    clients = clients_of(rig_endpoints(options, operator_settings(options))._asdict())
+    endpoints = rig_endpoints(options, operator_settings(options))
+    clients = clients_of({service: getattr(endpoints, service) for service in rig_services(options)})
     async with AsyncExitStack() as stack:
         async with answered_in_time("to read the status"):
             await stack.enter_async_context(connected(clients))

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from coldloop.service.command_line import add_configuration_options
+from rig.cli.commands.choices import WITHOUT
 from rig.cli.commands.options import PLACES, add_loop_options, check_load, port_base, refuse_ineffective
 
 
@@ -18,6 +19,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         help="first of three consecutive ports (default: 5020)")  # fmt: skip
     parser.add_argument("--page", action="store_true", help="serve the operator's page, too")
     parser.add_argument("--page-port", type=int, metavar="PORT", help="its port (default: 8020); implies --page")
+    parser.add_argument("--without", choices=WITHOUT, metavar="|".join(WITHOUT),
+                        help="leave its place to a client of your own (docs/your-optimiser.md)")  # fmt: skip
     parser.add_argument("--cuttable", action="store_true",
                         help="put a proxy into each link, for `coldloop fault cut`")  # fmt: skip
     parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")
@@ -48,9 +51,12 @@ def execute(options: argparse.Namespace) -> int:
         check_page(effective.settings.hmi)
     if options.detach and options.locked is None:
         return detached(ports, lock)
+    from rig.cosim.endpoints import REQUIRED
+    from rig.cosim.wiring import SERVICES
     from rig.live.up import UpRig
     from rig.until_interrupted import run_until_interrupted
 
-    rig = UpRig(effective.settings, ports, options.tls, page=page, cuttable=options.cuttable)
+    services = REQUIRED if options.without else SERVICES
+    rig = UpRig(effective.settings, ports, options.tls, page=page, cuttable=options.cuttable, services=services)
     run_until_interrupted(lambda: rig.run(announce=not options.quiet))
     return 0

@@ -12,6 +12,8 @@ from control_plc.program import ControlProgram
 from rig.cosim.compiled.records import GUARD, NOT, SCAN, Alarms, Array, Trace, empty_rows, record
 
 BANDS = (AlarmKind.LEVEL_BAND, AlarmKind.T5_BAND)
+OF_PLANS = (AlarmKind.CAPACITY, AlarmKind.SENSOR_SUSPECT)
+"""Alarms of what plans say."""
 LONGEST_SILENCE = 22
 """Ticks between two signs of life of an optimiser that answers every update."""
 
@@ -27,10 +29,16 @@ def is_ordinary(program: ControlProgram) -> bool:
         and not program.guard.state.out_of_bounds
         and program.alarms.are_quiet
         and program.alarms.reported(AlarmKind.CAPACITY) == CapacityCause.of(program.shortage)
-        and program.alarms.due(AlarmKind.CAPACITY) > program.tick
+        and program.has_noted_suspects
+        and due(program) > program.tick
         and not program.watchdog.expired
         and (not program.watchdog.time or program.watchdog.time > LONGEST_SILENCE)
     )
+
+
+def due(program: ControlProgram) -> float:
+    """Return the tick at which an alarm of what plans say follows its condition; infinite where none is about to."""
+    return min(map(program.alarms.due, OF_PLANS))
 
 
 def alarms_of(program: ControlProgram) -> Alarms:
@@ -56,7 +64,8 @@ def scan_record(program: ControlProgram) -> Any:  # noqa: ANN401 a record
     s["triggered"], s["lowest"] = program.watchdog.triggered, program.watchdog.lowest
     s["level_since"], s["t5_since"] = (NOT if since is None else since for since in program.alarms.pending(*BANDS))
     s["unchanged"], s["seen"] = program.sensors.unchanged, program.sensors.before
-    s["short"] = np.sign(program.shortage)
+    s["rests"] = program.sensors.rests
+    s["short"], s["suspects"] = np.sign(program.shortage), program.suspects
     return scans
 
 
@@ -87,7 +96,7 @@ def restore_scan(program: ControlProgram, s: Any, trace: Trace) -> None:  # noqa
     y = tuple(trace.y[row].tolist())
     program.tick, program.alarms.now = last + 1, last
     program.process = Process(last, float(trace.load[row]), tuple(trace.u[row].tolist()), y)
-    program.sensors.unchanged[:] = s["unchanged"].tolist()
+    program.sensors.unchanged[:], program.sensors.rests[:] = s["unchanged"].tolist(), s["rests"].tolist()
     program.sensors.seen(last, y)
     program.watchdog.triggered, program.watchdog.lowest = int(s["triggered"]), int(s["lowest"])
     for kind, since in zip(BANDS, (int(s["level_since"]), int(s["t5_since"])), strict=True):

@@ -13,7 +13,7 @@ import rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is pl
 from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import L1, T5
 from control_plc.output_limits import admit, admits, copy_state, in_range
-from control_plc.sensors import CONTROLLED, are_inside, count_unchanged
+from control_plc.sensors import are_inside, count_unchanged, is_frozen
 from optimizer_plc import scheme
 from optimizer_plc.scheme import BY_THE_RULE
 from optimizer_plc.session_state import OptimizerState
@@ -40,9 +40,8 @@ def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> b
         known = known and np.isfinite(x[i])
     interrupted = s.load_step > 0.0 and abs(load - s.update_load) > s.load_step
     frozen = False
-    for place in range(len(CONTROLLED)):
-        unchanged = y[CONTROLLED[place]] == s.seen[CONTROLLED[place]]
-        frozen = frozen or (unchanged and s.unchanged[place] + 1 >= w.frozen_ticks)
+    for i in range(y.shape[0]):
+        frozen = frozen or (y[i] == s.seen[i] and is_frozen(s.unchanged[i] + 1, s.rests[i], w.least[i]))
     changes = is_due(alarms.level_band, alarms.level_active, alarms.level_delay, s.level_since, s.tick, y[L1])
     changes = changes or is_due(alarms.t5_band, alarms.t5_active, alarms.t5_delay, s.t5_since, s.tick, y[T5])
     return known and not (interrupted or frozen or changes) and are_inside(y, w.low, w.high)
@@ -78,7 +77,7 @@ def scan(
         for i in range(plant.y.shape[0]):
             plant.y[i] = plant.y[i] + w.biases[i] + w.deviations[i] * plant.noise[row, i]
     y = trace.y[row]
-    count_unchanged(s.unchanged, s.seen, y, 1)
+    count_unchanged(s.unchanged, s.rests, s.seen, y, 1, w.least)
     s.level_since = pending(alarms.level_band, alarms.level_active, s.level_since, tick, y[L1])
     s.t5_since = pending(alarms.t5_band, alarms.t5_active, s.t5_since, tick, y[T5])
     s.tick = tick + 1
@@ -112,7 +111,7 @@ def run_block(
     reports: Reports,
     until: int,
 ) -> int:
-    """Do ticks and updates; return DONE at the tick `until` or where a shortage begins or ends, or UNUSUAL.
+    """Do ticks and updates; return DONE at the tick `until` or where a shortage or the suspects change, or UNUSUAL.
 
     An answer is computed when the programs would deliver it: at its instant, or at once where a load step may cut it
     off. One that has not begun when something unusual happens is not reported: it is computed again, with the same
@@ -140,7 +139,8 @@ def run_block(
         outcome = DONE
         if instant:
             latch(w, o, s, trace, tick, u_before)
-            if np.sign(o.memory.numbers[0].shortage) != s.short:
+            now = o.memory.numbers[0]
+            if np.sign(now.shortage) != s.short or now.suspects != s.suspects:
                 break
     if answered:
         s.solved -= 1
@@ -219,7 +219,7 @@ def report(s: Any, m: OptimizerState, reports: Reports) -> None:  # noqa: ANN401
     """Write what was done with the update under way."""
     now, sent = m.numbers[0], m.sent.numbers[0]
     counts, values = reports.counts[s.solved], reports.values[s.solved]
-    counts[0], counts[1], counts[2], counts[3] = now.update, now.tick, now.ticks, sent.iterations
+    counts[0], counts[1], counts[2], counts[3], counts[4] = now.update, now.tick, now.ticks, now.q, sent.iterations
     values[0], values[1], values[2], values[3] = now.effective, sent.hot_start, sent.delivered, sent.j_dev
     values[4], values[5] = sent.j_cst, sent.violation
     values[6], values[7], values[8], values[9] = now.efficiency, now.mismatch, now.contraction, now.gamma

@@ -22,6 +22,7 @@ PORTABLE: Final[tuple[Callable[..., Any], ...]] = (
     output_limits.nearest,
     output_limits.rate_share,
     sensors.are_inside,
+    sensors.is_frozen,
     sensors.moved,
     sensors.count_unchanged,
 )

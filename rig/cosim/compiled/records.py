@@ -35,8 +35,9 @@ SCAN: Final = np.dtype([
     ("first", "i8"), ("tick", "i8"), ("next_update", "i8"), ("updates", "i8"), ("update_tick", "i8"),
     ("update_load", "f8"), ("load_step", "f8"), ("u_before", "f8", 3), ("number", "i8"), ("first_tick", "i8"),
     ("length", "i8"), ("tau_u", "i8"), ("accepted", "i8"), ("triggered", "i8"), ("lowest", "i8"),
-    ("level_since", "i8"), ("t5_since", "i8"), ("unchanged", "i8", 2), ("seen", "f8", len(OUTPUT_NAMES)),
-    ("load_index", "i8"), ("solved", "i8"), ("short", "f8"),
+    ("level_since", "i8"), ("t5_since", "i8"), ("unchanged", "i8", len(OUTPUT_NAMES)),
+    ("rests", "i8", len(OUTPUT_NAMES)), ("seen", "f8", len(OUTPUT_NAMES)), ("load_index", "i8"), ("solved", "i8"),
+    ("short", "f8"), ("suspects", "i8"),
 ])  # fmt: skip
 """The control PLC and the load.
 
@@ -44,8 +45,8 @@ first: tick of the trace's first row. tick: the next scan. next_update, updates:
 update_tick, update_load, u_before: the one under way, and what was applied before it. load_step: change of the load (W)
 that interrupts it, or 0. number, first_tick, length, tau_u: the sequence being played. accepted: sequences accepted.
 triggered, lowest: the optimiser's watchdog. level_since, t5_since: since when a band alarm is about to change.
-unchanged, seen: of the sensor check. load_index: step of the load that holds. solved: reports made. short: sign of
-the shortage of the last plan."""
+unchanged, rests, seen: of the sensor check. load_index: step of the load that holds. solved: reports made. short,
+suspects: sign of the shortage, and suspects, of the last plan."""
 
 
 class BoxConstants(NamedTuple):
@@ -115,7 +116,8 @@ class World(NamedTuple):
     low: Array
     """Lowest value in the range of a sensor, shape (22,)."""
     high: Array
-    frozen_ticks: int
+    least: NDArray[np.int64]
+    """Ticks for which each output is at least unchanged before it is frozen, shape (22,)."""
     largest_load: float
     watchdog: int
     """Time-out, ticks; 0 is off."""
@@ -161,7 +163,7 @@ class Reports(NamedTuple):
     """What the optimiser did, a row an update."""
 
     counts: NDArray[np.int64]
-    """Update, tick, tau_u, iterations."""
+    """Update, tick, tau_u, q, iterations."""
     values: NDArray[np.float32]
     """The numbers of `Optimization` from `j_effective` on."""
 
@@ -174,7 +176,7 @@ def empty_trace(station: int) -> Trace:
 
 def empty_reports() -> Reports:
     """Return room for the updates of a block."""
-    return Reports(np.empty((BLOCK_TICKS, 4), np.int64), np.empty((BLOCK_TICKS, 11), np.float32))
+    return Reports(np.empty((BLOCK_TICKS, 5), np.int64), np.empty((BLOCK_TICKS, 11), np.float32))
 
 
 def empty_rows() -> Array:

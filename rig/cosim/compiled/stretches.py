@@ -7,7 +7,6 @@ import numpy as np
 from coldloop.process.load_profile import MAX_LOAD_W, LoadProfile
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.safety import AlarmKind
 from control_plc.program import ControlProgram
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.solvers import KernelSolver
@@ -47,8 +46,8 @@ class CompiledStretches:
         sensors = control_plc.sensors
         self._world = World(
             plants.constants_of(plant), plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
-            control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), sensors.frozen_ticks, MAX_LOAD_W,
-            control_plc.watchdog.time, optimizer_plc.settings.interrupting_load_step_w,
+            control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), np.array(sensors.least),
+            MAX_LOAD_W, control_plc.watchdog.time, optimizer_plc.settings.interrupting_load_step_w,
         )  # fmt: skip
 
     def ahead(self, until: int) -> Stretch | None:
@@ -60,7 +59,7 @@ class CompiledStretches:
         if not whole and not answered and self._control.player.load_step:
             return None  # the programs deliver at once what a load step may cut off
         until = min(until, (self._control.tick // BLOCK_TICKS + 1) * BLOCK_TICKS)
-        until = int(min(until, self._control.alarms.due(AlarmKind.CAPACITY)))
+        until = int(min(until, control.due(self._control)))
         ticks = until - self._control.tick
         with self._plant.noise(ticks) as noise:
             plant = plants.state_of(self._plant, noise, ticks)
@@ -102,7 +101,8 @@ class CompiledStretches:
             update = control.latched_update(program, s, self._trace)
             sequence = control.played_sequence(s, update.update - 1, rows[0], optimizer_plc.model_digest)
             program.player.take_over(sequence, update, int(s["next_update"]), int(s["accepted"]))
-            program.shortage = float(np.float32(o.state.numbers[0]["shortage"]))
+            now = o.state.numbers[0]
+            program.shortage, program.suspects = float(np.float32(now["shortage"])), int(now["suspects"])
         return Stretch(block, _optimizations(self._reports, solved))
 
     def _give_back(self, plant: PlantState, s: np.void, guard: np.void) -> SampleBlock:

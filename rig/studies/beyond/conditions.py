@@ -27,8 +27,21 @@ CONDITIONS: Final = {
     ESTIMATED: (f"{PROGRAM}estimator.load_known=false", f"{PROGRAM}estimator.load_walk_w=30"),
 }  # fmt: skip
 """What differs from what the controller believes. Bias: 0.2 % of level, 0.2 K, 5 mbar."""
+_OTHERS: Final = {"heater": ("heater", 0.2), "load as announced": ("load", 0.05), "level gauge": ("level_gauge", 0.01)}
+BESIDE_THE_BOX: Final = {
+    **{
+        f"{name} {100 * part:+.0f} %": (f"{MISMATCH}{key}={1 + part}",)
+        for name, (key, size) in _OTHERS.items() for part in (-size, size)
+    },
+    **{f"delay of {ticks} ticks": (f"{MISMATCH}delay_ticks={ticks}",) for ticks in (1, 2)},
+}  # fmt: skip
+"""The same of heater, load, gauge and actuators, for which no loop is compiled."""
+LINEAR: Final = {
+    "linear plant": (), "linear plant, sensor noise": NOISE, "linear plant, sensor bias": CONDITIONS["sensor bias"],
+}  # fmt: skip
+"""Controls: the model itself in the place of the plant."""
 LEFT_OUT: Final = (
-    "No setting expresses dead times or loads that are announced wrongly, and several errors at once are not tried. "
+    "Several errors at once, and sensors that fail, are not tried. "
     "Costs and bands are of true values under bias, and of measured ones, which are noisy, under noise. "
     f"Under '{ESTIMATED}' `tuned` has the estimator of `paper`, and no period can be interrupted: rules run without."
 )

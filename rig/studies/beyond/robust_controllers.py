@@ -7,14 +7,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rig.results.indicators import Indicators
-from rig.studies.beyond.conditions import CONDITIONS, LEFT_OUT, NOMINAL
+from rig.studies.beyond import conditions
+from rig.studies.beyond.conditions import LEFT_OUT, LINEAR, NOMINAL
 from rig.studies.drawing import ratio_rows
 from rig.studies.intervals import Interval, interval_of_mean, mean_ratio
 from rig.studies.paper.updating_period import ADAPTIVE
-from rig.studies.request import RunRequest, Series
+from rig.studies.request import Procedure, RunRequest, Series
 from rig.studies.study import PROGRAM, Load, StudyOptions, loads
 from rig.text_tables import markdown_table
 
+CONDITIONS: Final = {**conditions.CONDITIONS, **conditions.BESIDE_THE_BOX, **LINEAR}
 TUNED: Final = f"{PROGRAM}preset=tuned"
 DEFAULT: Final = "tuned, Algorithm 1"
 CONTROLLERS: Final = {
@@ -64,8 +66,10 @@ def controller_cases(options: StudyOptions) -> Iterator[Case]:
     hours = loads(options, *options.hours, usual=1)
     for controller, (period_s, assignments) in CONTROLLERS.items():
         for condition, changes in CONDITIONS.items():
+            procedure = Procedure.LINEAR_PLANT if condition in LINEAR else Procedure.CONFIGURED
             for load in hours:
-                yield condition, controller, load, load.request(period_s, *assignments, *changes)
+                request = load.request(period_s, *assignments, *changes, procedure=procedure)
+                yield condition, controller, load, request
 
 
 def controllers_remarks(options: StudyOptions, found: Found) -> list[str]:

@@ -45,7 +45,7 @@ class Rule(NamedTuple):
 
     @property
     def first(self) -> int:
-        """Iterations of the first period, q(t_0)."""
+        """q(t_0)."""
         return self.chosen.first
 
     @property
@@ -54,12 +54,8 @@ class Rule(NamedTuple):
         return self.chosen.status
 
     def after_interruption(self, memory: Array) -> int:
-        """Return the iterations of the period that begins with a load step."""
+        """Return the q of the period that begins with a load step."""
         return self.chosen.after_interruption(memory)
-
-    def fixed(self, iterations: int) -> "Rule":
-        """Return the rule that always decides for so many iterations."""
-        return self._replace(kind=FIXED_PERIOD, fixed_period=FixedPeriod(iterations))
 
 
 @decides_by(Rule)
@@ -67,7 +63,7 @@ class Rule(NamedTuple):
 def decide(rule: Rule, memory: Array, o: Observation, a: Assessment) -> int:
     """Return q(t_{k+1})."""
     if rule.kind == FIXED_PERIOD:
-        return rule.fixed_period.iterations
+        return rule.fixed_period.q
     if rule.kind == ALGORITHM_1:
         return algorithm_1.decide(rule.algorithm_1, memory, o, a)
     return contraction.decide(rule.contraction, memory, o, a)
@@ -78,14 +74,14 @@ def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, re
 
     Args:
         settings: Of the program.
-        budget: Says how many iterations fit into a fixed period.
+        budget: Knows the q of a fixed period.
         fixed_ticks: Fixed updating period; 0 is adaptive.
         real: Floating-point type of the costs.
     """
     adaptive, own = settings.adaptive, settings.adaptive.contraction
     return Rule(
         FIXED_PERIOD if fixed_ticks else int(UpdatingRuleKind[adaptive.rule.name]),  # one type, compiled once
-        FixedPeriod(budget.iterations(fixed_ticks)),
+        FixedPeriod(budget.q(fixed_ticks)),
         Algorithm1(adaptive.q_first, adaptive.q_min, adaptive.q_max, adaptive.delta),
         ContractionRule(own.q_busy, own.q_quiet, own.q_step, real(own.rate), real(own.memory), real(own.surprise)),
     )

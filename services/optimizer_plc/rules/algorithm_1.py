@@ -45,4 +45,4 @@ def decide(rule: Algorithm1, memory: Array, o: Observation, a: Assessment) -> in
     """Return max(q_min, min(q_max, q - delta sign(Gamma)))."""
     zero = type(a.gamma)(0.0)
     sign = int(a.gamma > zero) - int(a.gamma < zero)
-    return max(rule.q_min, min(rule.q_max, o.iterations - rule.delta * sign))
+    return max(rule.q_min, min(rule.q_max, o.q - rule.delta * sign))

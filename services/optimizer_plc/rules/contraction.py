@@ -2,7 +2,7 @@
 
 With g = max(0, ln(J-hat_k / J-hat_{k+1})) / tau_u the rate at which successive profiles improve, and v its decaying
 maximum, q goes from `q_quiet` at v = 0 down to `q_busy` at v = `rate`. A profile that turns out worse than `surprise`
-times what was predicted, and a load step, are answered by one long solve of `q_step` iterations
+times what was predicted, and a load step, are answered by one long solve, with `q_step`
 (`docs/updating-period.md`).
 """
 
@@ -39,7 +39,7 @@ class ContractionRule(NamedTuple):
 
     @property
     def first(self) -> int:
-        """Iterations in quiet."""
+        """Q in quiet."""
         return self.q_quiet
 
     @property
@@ -48,7 +48,7 @@ class ContractionRule(NamedTuple):
         return UpdatingRuleStatus(UpdatingRuleKind.CONTRACTION, self.q_step, self.q_busy, self.q_step)
 
     def after_interruption(self, memory: Array) -> int:
-        """Return what one long solve takes."""
+        """Return the q of one long solve."""
         memory[DELIVERED] = 0.0  # another load is another problem: its cost says nothing of contraction
         return self.q_step
 

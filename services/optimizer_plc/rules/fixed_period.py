@@ -1,4 +1,4 @@
-"""Always the same number of iterations: what adaptive periods are compared with."""
+"""Always the same period: what adaptive periods are compared with."""
 
 from typing import NamedTuple
 
@@ -14,27 +14,27 @@ Array = NDArray[np.float64]
 
 
 class FixedPeriod(NamedTuple):
-    """Always the same number of iterations."""
+    """Always the same q."""
 
-    iterations: int
+    q: int
 
     @property
     def first(self) -> int:
-        """The fixed number."""
-        return self.iterations
+        """The fixed one."""
+        return self.q
 
     @property
     def status(self) -> UpdatingRuleStatus:
-        """The fixed number."""
-        return UpdatingRuleStatus(UpdatingRuleKind.FIXED, self.iterations, self.iterations, self.iterations)
+        """The fixed one."""
+        return UpdatingRuleStatus(UpdatingRuleKind.FIXED, self.q, self.q, self.q)
 
     def after_interruption(self, memory: Array) -> int:  # noqa: ARG002 it remembers nothing
-        """Return the fixed number."""
-        return self.iterations
+        """Return the fixed one."""
+        return self.q
 
 
 @decides_by(FixedPeriod)
 @kernel
 def decide(rule: FixedPeriod, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001
-    """Return the fixed number."""
-    return rule.iterations
+    """Return the fixed one."""
+    return rule.q

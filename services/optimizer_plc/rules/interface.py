@@ -1,8 +1,8 @@
 """What a rule of the updating period is, and the call of the right rule's kernel.
 
-A rule decides q(t_{k+1}), the number of iterations of the next period; `PlcBudget` knows how long that takes. Its file
-has a NamedTuple of its parameters and a kernel `decide` that is registered for it. It takes single and double precision
-alike.
+A rule decides q(t_{k+1}), the number of the next period in the ladder of periods; `PlcBudget` knows the ladder, and how
+many iterations of the solver fit into each. Its file has a NamedTuple of its parameters and a kernel `decide` that is
+registered for it. It takes single and double precision alike.
 """
 
 from collections.abc import Callable
@@ -26,14 +26,14 @@ class UpdatingRule(Protocol):
 
     @property
     def first(self) -> int:
-        """Iterations of the first period, q(t_0)."""
+        """q(t_0)."""
 
     @property
     def status(self) -> UpdatingRuleStatus:
         """The rule and its parameters, as registers show them."""
 
     def after_interruption(self, memory: Array) -> int:
-        """Return the iterations of the period that begins with a load step."""
+        """Return the q of the period that begins with a load step."""
 
 
 Decision = Callable[[Any, Array, Observation, Assessment], int]

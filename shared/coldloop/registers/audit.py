@@ -53,7 +53,7 @@ class EventKind(IntEnum):
     CONTROL_LINK = 21
     """Subject is the new state of the optimiser's link to the control PLC; 2 is up."""
     SENSOR = 22
-    """The control PLC began or ceased to substitute a measurement: subject the output, cause 1 bad, 0 good again."""
+    """Subject is the output, cause 1 bad: it is substituted, 2 suspect: the optimiser does without it, 0 good again."""
     PACE = 23
     """The time base of a session was changed: subject 0 lock-step, 1 real time, 2 paused; value the factor."""
     LIVE_LOAD = 24

@@ -232,6 +232,9 @@ class Plan(NamedTuple):
     shortage: Annotated[
         float, f32("Estimated load above what can be held; negative: below what is needed; 0 is neither", unit="W")
     ] = 0.0
+    suspects: Annotated[
+        int, u32("Outputs whose reading is not used, as prediction and other readings contradict it: bit i is output i")
+    ] = 0
     crc: Annotated[int, u32("CRC-32 of the registers before; none, or a wrong one, is refused")] = 0
 
 
@@ -357,7 +360,7 @@ CONTROL_MAP: Final = RegisterMap(
         Block("plant link", 330, PlantLinkStatus, "Link to the rack, and the clocks of both"),
         Block("optimiser lease", 360, LeaseStatus, "Who may write as the optimiser"),
         Block("await update", 400, AwaitUpdate, "Makes a read of the latch wait", Role.OPTIMIZER, sealed=True),
-        Block("plan", 410, Plan, "Decided updating period", Role.OPTIMIZER, sealed=True),
+        Block("plan", 408, Plan, "Decided updating period", Role.OPTIMIZER, sealed=True),
         Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence", sealed=True),
         Block("heartbeat", 430, Heartbeat, "Heartbeat of the optimiser", Role.OPTIMIZER, sealed=True),
         Block("watchdog", 440, WatchdogStatus, "Watches the optimiser"),

@@ -77,7 +77,8 @@ class Optimization(NamedTuple):
     update: Annotated[int, u32("Update")]
     tick: Annotated[int, u32("Tick of the updating instant t_i")]
     tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i", unit="0.25 s")]
-    iterations: Annotated[int, u16("Iterations done: q(t_i), or fewer if more would have changed nothing")]
+    q: Annotated[int, u16("q(t_i): the number of the period that the rule chose in the ladder of periods")]
+    iterations: Annotated[int, u16("Iterations done: what fits into that period, or fewer if more change nothing")]
     verdict: Annotated[int, u16("Verdict of the control PLC on the sequence", values=Verdict)]
     j_effective: Annotated[float, f32("J_i: the profile being played, at the state reached", finite=False)]
     j_hot_start: Annotated[float, f32("J+_i: the shifted profile, at the predicted state", finite=False)]
@@ -111,10 +112,10 @@ class UpdatingRuleStatus(NamedTuple):
     rule: Annotated[int, u16("0 fixed period, 1 Algorithm 1, 2 contraction rule", values=UpdatingRuleKind)] = (
         UpdatingRuleKind.FIXED
     )
-    q_first: Annotated[int, u16("Iterations of the first period, and of one that follows an interruption")] = 0
-    q_min: Annotated[int, u16("Fewest iterations that the rule chooses")] = 0
-    q_max: Annotated[int, u16("Most iterations that the rule chooses")] = 0
-    delta: Annotated[int, u16("Step of Algorithm 1 in iterations; 0 for other rules")] = 0
+    q_first: Annotated[int, u16("q of the first period, and of one that follows an interruption")] = 0
+    q_min: Annotated[int, u16("Least q that the rule chooses")] = 0
+    q_max: Annotated[int, u16("Largest q that the rule chooses")] = 0
+    delta: Annotated[int, u16("Step of Algorithm 1 in q; 0 for other rules")] = 0
     slots: Annotated[float, f32("Time reserved in a period for the preparation", unit="s")] = 0.0
     preparation: Annotated[float, f32("Duration of the preparation", unit="s")] = 0.0
     iteration: Annotated[float, f32("Duration of an iteration", unit="s")] = 0.0

@@ -82,6 +82,8 @@ class AlarmKind(IntEnum):
     """In real time no scan is made, and the link to the rack has no reason for it."""
     CAPACITY = 20
     """The load is one that no inputs within their limits hold: the bands will be left."""
+    SENSOR_SUSPECT = 21
+    """A reading contradicts the prediction and the other readings."""
 
 
 class CapacityCause(IntEnum):

@@ -98,7 +98,7 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
     EventKind.LOAD: _Wording(_row, unit="W"),
     EventKind.CERTIFICATE: _Wording(_listed(("", "expires soon", "has expired")), unit="days left"),
     EventKind.LOST: _Wording(unit="events or lines"),
-    EventKind.SENSOR: _Wording(_listed(OUTPUT_NAMES), _listed(("good again", "bad"))),
+    EventKind.SENSOR: _Wording(_listed(OUTPUT_NAMES), _listed(("good again", "bad", "suspect"))),
     EventKind.LIVE_LOAD: _Wording(_listed(("from one tick on", "steps ahead")), unit="W"),
     EventKind.STATION_ALARM: _Wording(
         _listed([str(alarm.name).lower().replace("_", " ") for alarm in StationAlarm]), _listed(("returned", "raised"))
@@ -111,6 +111,7 @@ _ALARM_CAUSES: Final[Mapping[int, Words]] = {
     AlarmKind.STATE_NOT_RETAINED: _listed(("", "the previous one was set aside")),
     AlarmKind.MODE: _causes(Cause),
     AlarmKind.SENSOR_BAD: _listed(OUTPUT_NAMES),
+    AlarmKind.SENSOR_SUSPECT: _listed(OUTPUT_NAMES),
     AlarmKind.CAPACITY: _listed(
         ("", "too much load: reduce it, or the bath will run dry", "too little load: raise it, or the bath will flood")
     ),

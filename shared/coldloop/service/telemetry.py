@@ -59,7 +59,9 @@ class Telemetry:
         while True:
             try:
                 await self._publish()
-            except Exception as error:  # noqa: BLE001 - a service never ends because of its telemetry
+            except Exception as error:  # a service never ends because of its telemetry
+                if _is_cancelled():  # and the library has raised its own error instead
+                    raise asyncio.CancelledError from error
                 reason = str(error) or "no answer in time"
                 log.warning("broker lost", extra={"broker": self._settings.broker, "reason": reason})
             await asyncio.sleep(self._settings.timeout_s)
@@ -117,6 +119,12 @@ class _Publisher:
         data: bytes = self._receive(bufsize)
         self._unasked -= len(data)
         return data
+
+
+def _is_cancelled() -> bool:
+    """Return whether the current task is to end."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
 
 
 def _finite(value: object) -> object:

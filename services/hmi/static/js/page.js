@@ -54,7 +54,7 @@ function overview() {
     if (update || names === null) {
       const found = state.update;
       tau.textContent = found ? `${found.period_s.toFixed(2)} s` : "–";
-      byId("tau-u-q").textContent = found ? `q = ${found.iterations}, J = ${Number(found.update.j_effective.toPrecision(4))}` : "";
+      byId("tau-u-q").textContent = found ? `q = ${found.q}, J = ${Number(found.update.j_effective.toPrecision(4))}` : "";
       byId("tau-u-sentence").replaceChildren(...(found ? indexed(found.sentence) : ["No update yet."]));
     }
     const values = state.values, upcoming = values["plant.load status.upcoming"];

@@ -9,7 +9,8 @@ const digits = (value, count = 4) => (value === null || value === undefined ? "�
 function quantities(found) {
   const u = found.update, before = found.before;
   const rows = [
-    ["q", found.iterations_before === null ? `${found.iterations}` : `${found.iterations_before} → ${found.iterations}`, "iterations, the period before → this one"],
+    ["q", found.q_before === null ? `${found.q}` : `${found.q_before} → ${found.q}`, "number of the period in the ladder, before → now"],
+    ["n", before ? `${before.iterations} → ${u.iterations}` : `${u.iterations}`, "iterations done, before → now"],
     ["τ_u", found.period_before_s === null ? `${found.period_s} s` : `${found.period_before_s} → ${found.period_s} s`, "updating period"],
     ["J_k", before ? digits(before.j_effective, 6) : "–", "cost reached at the instant before"],
     ["J⁺_k", before ? digits(before.j_hot_start, 6) : "–", "shifted profile, at the predicted state"],
@@ -18,18 +19,18 @@ function quantities(found) {
     ["E", digits(u.efficiency, 6), "efficiency of the solver, Ĵ_{k+1} / J⁺_k"],
     ["D", digits(u.mismatch, 6), "model mismatch"],
     ["K", digits(u.contraction, 6), "contraction, E D"],
-    ["ΔE/Δq", found.increments ? digits(found.increments.efficiency) : "–", ""],
-    ["ΔD/Δq", found.increments ? digits(found.increments.mismatch) : "–", ""],
-    ["ΔK/Δq", found.increments ? digits(found.increments.contraction) : "–", ""],
-    ["Γ", digits(u.gamma), !found.increments ? "" : u.contraction >= 1 ? "= ΔK/Δq, as K ≥ 1" : "= Δt_r/Δq, as K < 1"],
+    ["ΔE/Δn", found.increments ? digits(found.increments.efficiency) : "–", ""],
+    ["ΔD/Δn", found.increments ? digits(found.increments.mismatch) : "–", ""],
+    ["ΔK/Δn", found.increments ? digits(found.increments.contraction) : "–", ""],
+    ["Γ", digits(u.gamma), !found.increments ? "" : u.contraction >= 1 ? "= ΔK/Δn, as K ≥ 1" : "= Δt_r/Δn, as K < 1"],
     ["branch", found.branch, "what decided"],
   ];
   byId("why-quantities").replaceChildren(...rows.map(([name, value, meaning]) => element("tr", {}, element("td", {}, ...indexed(name)), element("td", { class: "number", text: value }), element("td", { class: "minor" }, ...indexed(meaning)))));
 }
 
 function alternatives(found) {
-  const rows = found.alternatives.map((one) => element("tr", { class: one.iterations === found.iterations ? "chosen" : "" },
-    element("td", { class: "number", text: `${one.iterations}${one.iterations === found.iterations ? " (chosen)" : ""}` }), element("td", { class: "number", text: `${one.period_s} s` }),
+  const rows = found.alternatives.map((one) => element("tr", { class: one.q === found.q ? "chosen" : "" },
+    element("td", { class: "number", text: `${one.q}${one.q === found.q ? " (chosen)" : ""}` }), element("td", { class: "number", text: `${one.period_s} s` }),
     element("td", { class: "number", text: digits(one.contraction, 6) }), element("td", { class: "number", text: one.response_s === null ? "does not fall" : `${digits(one.response_s)} s` })));
   byId("why-alternatives").replaceChildren(...(rows.length ? rows : [element("tr", {}, element("td", { colspan: "4", class: "minor", text: ["up", "down", "level"].includes(found.branch) ? "K is 1 to the precision of the registers: no estimate for other q." : "Algorithm 1 did not decide here." }))]));
 }

@@ -1,0 +1,228 @@
+"""Readings against the prediction and against each other: the innovation of a Kalman filter, and what to believe of it.
+
+The residual of an output is its innovation less what those of the others say of it; over its standard deviation it is
+standard normal where plant and sensors are as the filter takes them, and its square is what the quadratic form of all
+innovations loses without the output. So one wrong reading has the largest residual, and without it all others agree.
+"""
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.kernels.compiled import kernel
+from coldloop.process.signals import OUTPUT_NAMES
+from optimizer_plc.computing_settings import PlausibilitySettings
+from optimizer_plc.qp.arithmetic import Real
+from optimizer_plc.qp.linear_algebra import cholesky, cholesky_solve
+from optimizer_plc.qp.prediction import PredictionModel
+
+Array = NDArray[np.float64]
+
+USED: Final = 0
+"""A reading is believed."""
+MISSING: Final = 1
+"""There is no number: the control PLC has taken it out."""
+SUSPECT: Final = 2
+"""It contradicts prediction and other readings, and is left out."""
+
+READING: Final = (("state", "i8"), ("since_s", "real"), ("agreed_s", "real"))
+"""state: `USED`, `MISSING` or `SUSPECT`. since_s: how long it has been that. agreed_s: for how long a suspect has
+agreed with the others again."""
+
+
+class Plausibility(NamedTuple):
+    """What is plausible, in the on-line floating-point type."""
+
+    sigmas: float
+    """Largest residual over its standard deviation; 0: any is plausible."""
+    allowance: Array
+    """What a plant that is not its model adds to a residual, shape (22,)."""
+    in_all: float
+    """Largest quadratic form of the innovations that the outputs which are left may have."""
+    longest_period_s: float
+    """Of those that inverse covariances are for."""
+    settled_s: float
+    agreeing_s: float
+    longest_s: float
+    most: int
+    constants: NDArray[np.int64]
+    """State that is the constant error of each output; below 0: it has none. Shape (22,)."""
+
+
+def plausibility_of(
+    settings: PlausibilitySettings, prediction: PredictionModel, longest_period_s: float, real: Real
+) -> Plausibility:
+    """Return what is plausible with a model and inverse covariances for periods up to the longest."""
+    n_y = len(OUTPUT_NAMES)
+    constants = np.full(n_y, -1)
+    disturbances = prediction.disturbances
+    for place, signal in enumerate(disturbances, prediction.n_states - len(disturbances)):
+        if signal < n_y:
+            constants[signal] = place
+    spread = 2.0 / (9.0 * n_y)  # Wilson and Hilferty: the quantile of chi-square at so many sigmas
+    in_all = n_y * (1.0 - spread + settings.sigmas * math.sqrt(spread)) ** 3
+    return Plausibility(
+        real(settings.sigmas), np.array(settings.allowances, real), real(in_all), real(longest_period_s),
+        real(settings.settled_s), real(settings.agreeing_s), real(settings.longest_s), settings.most, constants,
+    )  # fmt: skip
+
+
+def new_readings(real: Real) -> Any:  # noqa: ANN401 records
+    """Return the state of all readings at a beginning: used since just now, shape (22,)."""
+    return np.zeros(len(OUTPUT_NAMES), [(name, real if kind == "real" else kind) for name, kind in READING])
+
+
+@kernel
+def note_surprise(surprise: Array, innovation: Array, J: Array, share: float) -> None:
+    """Let an innovation (n_y,), whose inverse covariance is J, count with a share of up to 1 in the mean squares.
+
+    (J e)_i / sqrt(J_ii) is the residual of output i given all others, over its standard deviation.
+    """
+    for i in range(surprise.shape[0]):
+        residual = residual_of(i, innovation, J)
+        surprise[i] += min(share, surprise.dtype.type(1.0)) * (residual * residual - surprise[i])
+
+
+@kernel
+def residual_of(output: int, innovation: Array, J: Array) -> float:
+    """Return the residual of an output given all others, over its standard deviation."""
+    total = innovation.dtype.type(0.0)
+    for j in range(innovation.shape[0]):
+        total += J[output, j] * innovation[j]
+    residual: float = total / np.sqrt(J[output, output])
+    return residual
+
+
+@kernel
+def imputed(innovation: Array, inverse_covariance: Array) -> Array:
+    """Return the innovation (n_y,), its elements that are not finite replaced by their mean given the others.
+
+    J_MM e_M = -J_MO e_O, with the inverse covariance J (n_y, n_y): the gain for all outputs then corrects as that for
+    the others alone. Without any it is zero.
+    """
+    n, real = innovation.size, innovation.dtype.type
+    M, mean = np.zeros((n, n), innovation.dtype), np.zeros(n, innovation.dtype)
+    finite = np.isfinite(innovation)
+    for i in range(n):
+        if finite[i]:
+            M[i, i], mean[i] = real(1.0), innovation[i]
+            continue
+        for j in range(n):
+            if finite[j]:
+                mean[i] -= inverse_covariance[i, j] * innovation[j]
+            else:
+                M[i, j] = inverse_covariance[i, j]
+    cholesky_solve(M, cholesky(M), mean)
+    return mean
+
+
+@kernel
+def judge(
+    p: Plausibility, readings: Any, predicted: Array, innovation: Array, J: Array, elapsed_s: float  # noqa: ANN401
+) -> Array:  # fmt: skip
+    """Return the innovation (n_y,) without the elements of suspects, which are no number.
+
+    `readings` is `new_readings`'s, `elapsed_s` the time since the judgement before. Constant errors in `predicted` are
+    set to what a reading shows that is taken back. There are no new suspects after a longer time than J is for.
+    """
+    believed, returning = innovation.copy(), False
+    for i in range(innovation.shape[0]):
+        r = readings[i]
+        r.since_s += elapsed_s
+        if not np.isfinite(innovation[i]):
+            enter(r, MISSING)
+        elif r.state != USED:
+            believed[i] = np.nan
+            returning = True
+    if returning:
+        take_back(p, readings, predicted, innovation, believed, J, elapsed_s)
+    if elapsed_s <= p.longest_period_s:
+        suspect_some(p, readings, believed, J)
+    return believed
+
+
+@kernel
+def enter(r: Any, state: int) -> None:  # noqa: ANN401 a record
+    """Let a reading be in a state."""
+    if r.state != state:
+        r.state, r.since_s, r.agreed_s = state, 0.0, 0.0
+
+
+@kernel
+def take_back(
+    p: Plausibility, readings: Any, predicted: Array, innovation: Array, believed: Array, J: Array, elapsed_s: float  # noqa: ANN401
+) -> None:  # fmt: skip
+    """Take back suspects that agree again, or have been out for the longest time, and readings that were missing.
+
+    After a long time what the others say of a reading is no better than the reading: its constant error, if it has one,
+    is set so that it agrees.
+    """
+    expected = imputed(believed, J)
+    for i in range(innovation.shape[0]):
+        r, difference = readings[i], innovation[i] - expected[i]
+        if r.state == USED or not np.isfinite(difference):
+            continue
+        if abs(difference) > p.allowance[i] + p.sigmas / np.sqrt(J[i, i]):
+            r.agreed_s = 0.0
+        else:
+            r.agreed_s += elapsed_s
+        agrees = r.state == SUSPECT and r.agreed_s >= p.agreeing_s
+        if not (agrees or r.state == MISSING or r.since_s >= p.longest_s):
+            continue
+        believed[i] = innovation[i]
+        if not agrees and p.constants[i] >= 0:
+            predicted[p.constants[i]] += difference
+            believed[i] = expected[i]
+        enter(r, USED)
+
+
+@kernel
+def suspect_some(p: Plausibility, readings: Any, believed: Array, J: Array) -> None:  # noqa: ANN401
+    """Leave out readings whose residual is too large, the worst first, if what is left then agrees in all."""
+    before, expected, out = believed.copy(), believed, 0
+    for i in range(believed.shape[0]):
+        out += not np.isfinite(believed[i])
+    if out:
+        expected = imputed(believed, J)
+    worst = least_plausible(p, readings, believed, expected, J)
+    if worst < 0:
+        return
+    while worst >= 0 and out < p.most:
+        believed[worst] = np.nan
+        out += 1
+        expected = imputed(believed, J)
+        worst = least_plausible(p, readings, believed, expected, J)
+    total = believed.dtype.type(0.0)
+    for i in range(believed.shape[0]):
+        for j in range(believed.shape[0]):
+            total += expected[i] * J[i, j] * expected[j]
+    if worst >= 0 or total > p.in_all:  # so many do not fail at once: it is the plant
+        believed[:] = before
+        return
+    for i in range(believed.shape[0]):
+        if np.isfinite(before[i]) and not np.isfinite(believed[i]):
+            enter(readings[i], SUSPECT)
+
+
+@kernel
+def least_plausible(p: Plausibility, readings: Any, believed: Array, expected: Array, J: Array) -> int:  # noqa: ANN401
+    """Return the reading with the largest residual of those that are too large, or -1; new ones are not judged."""
+    worst, largest = -1, p.sigmas
+    for i in range(believed.shape[0]):
+        if np.isfinite(believed[i]) and readings[i].since_s >= p.settled_s:
+            size = abs(residual_of(i, expected, J)) - p.allowance[i] * np.sqrt(J[i, i])
+            if size > largest:
+                worst, largest = i, size
+    return worst
+
+
+@kernel
+def suspects_of(readings: Any) -> int:  # noqa: ANN401 records
+    """Return the suspects: bit i is output i."""
+    mask = 0
+    for i in range(readings.shape[0]):
+        if readings[i].state == SUSPECT:
+            mask |= 1 << i
+    return mask

@@ -1,0 +1,45 @@
+"""Which updating periods there are, and what a PLC computes in each."""
+
+import math
+from typing import Final, NamedTuple
+
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+
+SHORTEST_TICKS: Final = 2
+LONGEST_TICKS: Final = TICKS_PER_SAMPLE
+ROUNDING: Final = 1e-5
+"""Share of an iteration that may be missing: times come through registers in single precision."""
+
+
+class ComputingTimes(NamedTuple):
+    """Times of one solver on its PLC, s."""
+
+    slots: float
+    """Kept free in an updating period for the preparation."""
+    preparation: float
+    iteration: float
+
+    def iterations(self, ticks: int) -> int:
+        """Return the iterations that fit into an updating period; at least one is always done."""
+        return max(1, math.floor((ticks * TICK_S - self.slots) / self.iteration + ROUNDING))
+
+    def holds(self, ticks: int) -> bool:
+        """Return whether one iteration fits into an updating period."""
+        return ticks * TICK_S - self.slots >= self.iteration * (1.0 - ROUNDING)
+
+    def ladder(self) -> tuple[int, ...]:
+        """Return the updating periods, in ticks, that hold more iterations than any shorter one.
+
+        A rule's q is the number of a period in it, from 1. Where an iteration takes a slot of 0.25 s, as in the paper,
+        or longer, it is the number of iterations as well; a faster solver does more in the same period.
+        """
+        found: list[int] = []
+        for ticks in range(SHORTEST_TICKS, LONGEST_TICKS + 1):
+            if self.holds(ticks) and not (found and self.iterations(ticks) == self.iterations(found[-1])):
+                found.append(ticks)
+        return tuple(found) or (LONGEST_TICKS,)
+
+    def period(self, q: int) -> int:
+        """Return the updating period of a q, in ticks; of one beyond the ladder its longest."""
+        ladder = self.ladder()
+        return ladder[min(q, len(ladder)) - 1]

@@ -1,0 +1,172 @@
+"""An optimiser that is not ours, and knows the registers alone, takes the place of ours."""
+
+import ast
+import asyncio
+import importlib.util
+import re
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import pytest
+
+from coldloop.modbus.client import RegisterClient
+from coldloop.process.limits import InputLimits
+from coldloop.process.load_profile import LoadProfile
+from coldloop.process.signals import OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
+from coldloop.registers.codec import WordOrder
+from coldloop.registers.common import MAGIC
+from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, Mode, Status, Verdict
+from coldloop.registers.safety import LeaseState, LeaseStatus
+from rig import cli
+from rig.cosim.endpoints import REQUIRED
+from rig.cosim.scenario import Scenario
+from rig.cosim.session_client import SessionClient
+from tests.conftest import Coldloop
+from tests.harness.processes import Process, Processes
+
+if TYPE_CHECKING:
+    from tests.rig.conftest import OnTheBus
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "optimiser_by_registers.py"
+FACTOR = 5.0
+PATIENCE_S = 120.0
+
+
+def start(processes: Processes, port: int) -> Process:
+    return processes.python(str(EXAMPLE), "--port", str(port), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def end(optimiser: Process) -> list[str]:
+    """End it; return the verdicts that it got. On a busy machine sequences may be late; anything else is an error."""
+    assert optimiser.alive, optimiser.ended().err
+    optimiser.popen.send_signal(2)
+    ended = optimiser.ended()
+    assert ended.code == 0, ended.err
+    verdicts = re.findall(r"(accepted|verdict \d+)$", ended.out, re.MULTILINE)
+    late = {f"verdict {verdict:d}" for verdict in (Verdict.LATE, Verdict.WRONG_UPDATE)}
+    assert set(verdicts) <= {"accepted"} | late, ended.out
+    return verdicts
+
+
+async def until_accepted(control: RegisterClient, more: int) -> None:
+    """Wait until so many more sequences have been accepted, and one of them is being played."""
+    wanted = (await control.read(Status)).accepted + more
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            status = await control.read(Status)
+            if status.accepted >= wanted and status.mode == Mode.MPC:
+                return
+            await asyncio.sleep(0.05)
+
+
+@asynccontextmanager
+async def without_optimizer(
+    on_the_bus: "OnTheBus", load: LoadProfile, order: WordOrder
+) -> AsyncIterator[tuple[RegisterClient, int]]:
+    """A session of a plant and a control PLC in real time; yields a client of the latter, and its port."""
+    async with on_the_bus(order=order, services=REQUIRED) as bus:
+        rig = SessionClient(bus.endpoints, bus.settings, services=REQUIRED)
+        try:
+            await rig.connect(PATIENCE_S)
+            await rig.start(Scenario(14400, load, 0.0, 1, realtime=True, factor=FACTOR))
+            yield rig.control, bus.endpoints.control_plc.port
+        finally:
+            rig.close()
+
+
+@pytest.mark.usefixtures("realtime")
+@pytest.mark.parametrize("order", list(WordOrder))
+async def test_its_sequences_are_accepted_in_either_word_order(
+    order: WordOrder, load_a: LoadProfile, on_the_bus: "OnTheBus", processes: Processes
+) -> None:
+    async with without_optimizer(on_the_bus, load_a, order) as (control, port):
+        optimiser = start(processes, port)
+        await until_accepted(control, 3)
+        lease = await control.read(LeaseStatus)
+        verdicts = await asyncio.to_thread(end, optimiser)
+    assert lease.state == LeaseState.HELD
+    assert lease.holder != 0
+    assert verdicts.count("accepted") >= 3
+
+
+@pytest.mark.usefixtures("realtime")
+async def test_one_that_was_restarted_drives_again(
+    load_a: LoadProfile, on_the_bus: "OnTheBus", processes: Processes
+) -> None:
+    async with without_optimizer(on_the_bus, load_a, WordOrder.HIGH_FIRST) as (control, port):
+        first = start(processes, port)
+        await until_accepted(control, 1)
+        first.kill()
+        async with asyncio.timeout(PATIENCE_S):
+            while (await control.read(LadderStatus)).optimizer:  # noqa: ASYNC110 it is seen by its registers
+                await asyncio.sleep(0.05)
+        second = start(processes, port)
+        await until_accepted(control, 2)
+        assert (await asyncio.to_thread(end, second)).count("accepted") >= 2
+
+
+@pytest.fixture
+def up(processes: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """The first port of a rig that is up without an optimiser."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    base = processes.three_ports()
+    words = ("--without", "optimizer", "--load", "a", "--factor", FACTOR, "--detach")
+    started = processes.coldloop("up", "--port-base", base, *words)
+    assert started.popen.wait(PATIENCE_S) == 0, started.said
+    assert "yours: a client of the control PLC" in started.said
+    yield base
+    assert cli.main(["down", "--port-base", str(base)]) == 0
+
+
+@pytest.mark.usefixtures("realtime")
+def test_a_rig_is_kept_up_and_operated_without_our_optimiser(up: int, coldloop: Coldloop, processes: Processes) -> None:
+    optimiser = start(processes, up + 1)
+
+    async def driven() -> None:
+        control = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=up + 1, timeout_s=PATIENCE_S)
+        await until_accepted(control, 2)
+        control.close()
+
+    asyncio.run(driven())
+    status = coldloop("status")
+    assert status.code == 0, status.complaints
+    assert re.search(r"^tau_u +-$", status.out, re.MULTILINE), status
+    assert "factor 4" in coldloop("set", "factor", "4").out
+    killed = coldloop("fault", "kill", "optimizer_plc")
+    assert killed.code == 2
+    assert killed.complaints == ["coldloop: the rig was started without an optimizer_plc service"]
+    end(optimiser)
+
+
+# -- what it knows -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def example() -> ModuleType:
+    specification = importlib.util.spec_from_file_location("optimiser_by_registers", EXAMPLE)
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
+
+
+def test_it_uses_pymodbus_and_nothing_of_ours() -> None:
+    tree = ast.walk(ast.parse(EXAMPLE.read_text(encoding="utf-8")))
+    names = {node.module or "" for node in tree if isinstance(node, ast.ImportFrom)}
+    tree = ast.walk(ast.parse(EXAMPLE.read_text(encoding="utf-8")))
+    names |= {alias.name for node in tree if isinstance(node, ast.Import) for alias in node.names}
+    foreign = {name.partition(".")[0] for name in names} - set(sys.stdlib_module_names)
+    assert foreign == {"pymodbus"}
+
+
+def test_what_it_has_written_down_is_what_the_rig_has(example: ModuleType) -> None:
+    limits = InputLimits()
+    assert (limits.low, limits.high, limits.rate) == (example.LOW, example.HIGH, example.RATE)
+    assert (example.TICK_S, example.PERIOD_TICKS, example.MAGIC) == (TICK_S, TICKS_PER_SAMPLE, MAGIC)
+    assert [OUTPUT_NAMES[place] for place in (example.L1, example.T5)] == ["L1", "T5"]
