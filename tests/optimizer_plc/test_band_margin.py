@@ -57,7 +57,7 @@ def test_an_output_that_rests_at_its_limit_rests_within_the_band() -> None:
     """A better turbine: T5 rests at 9 K."""
     outside = [
         simulate(
-            load="a", duration_s=600, plant={"mismatch": {"turbine_efficiency": 1.1}},
+            load="a", solver="ode", duration_s=600, plant={"mismatch": {"turbine_efficiency": 1.1}},
             optimizer_plc={"program": {"design": {"band_margin": margin}}},
         ).summary["T5_outside_band_pct"]
         for margin in ((0.0, 0.0), ProgramSettings().design.band_margin)
