@@ -10,12 +10,13 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process.signals import L1, OUTPUT_NAMES, T5, TICK_S
+from coldloop.process.signals import L1, OUTPUT_NAMES, T1, T5, TICK_S
 from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
 CONTROLLED = (L1, T5)
-TEMPERATURES, PRESSURES = range(2, 12), range(12, 22)
+P1 = OUTPUT_NAMES.index("P1")
+"""First of the pressures, which are the last outputs; the temperatures, from T1 on, are before them."""
 MOVES = 240
 """Ticks in which an output that is not controlled must have moved before it can be frozen."""
 FIRST_RESTS = [0 if output in CONTROLLED else -MOVES for output in range(len(OUTPUT_NAMES))]
@@ -88,9 +89,9 @@ def count_unchanged(
     longest such times of those that are not controlled, without the times for which they were frozen; below 0: the
     moves that are missing until they count.
     """
-    most = 2 * moved(before, y, range(len(y))) > len(y)
-    half = len(PRESSURES) // 2
-    most_of_each = moved(before, y, TEMPERATURES) > half and moved(before, y, PRESSURES) > half
+    most = 2 * moved(before, y, 0, len(y)) > len(y)
+    temperatures, pressures = moved(before, y, T1, P1), moved(before, y, P1, len(y))
+    most_of_each = 2 * temperatures > P1 - T1 and 2 * pressures > len(y) - P1
     for output in range(len(y)):
         if y[output] == before[output]:
             unchanged[output] += elapsed * (most if output in CONTROLLED else most_of_each)
@@ -108,10 +109,10 @@ def is_frozen(unchanged: float, rest: float, least: float) -> bool:
     return rest >= 0 and unchanged >= least and unchanged >= 2 * rest
 
 
-def moved(before: Numbers, y: Numbers, outputs: range) -> int:
-    """Return how many of these outputs are others than before."""
+def moved(before: Numbers, y: Numbers, first: int, end: int) -> int:
+    """Return how many of the outputs from the first to the one before the end are others than before."""
     count = 0
-    for output in outputs:
+    for output in range(first, end):
         count += y[output] != before[output]
     return count
 
