@@ -129,8 +129,10 @@ def test_a_rig_is_kept_up_and_operated_without_our_optimiser(up: int, coldloop: 
 
     async def driven() -> None:
         control = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=up + 1, timeout_s=PATIENCE_S)
-        await until_accepted(control, 2)
-        control.close()
+        try:
+            await until_accepted(control, 2)
+        finally:
+            control.close()
 
     asyncio.run(driven())
     status = coldloop("status")
