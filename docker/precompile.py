@@ -161,7 +161,7 @@ PARTS: Final[dict[str, tuple[Callable[[], None], int]]] = {
     "refrigerator-in-one-process": (in_one_process(plant={"kind": "refrigerator"}), 27),
     "single-precision-in-one-process": (in_one_process(optimizer_plc={"program": {"arithmetic": "float32"}}), 25),
     "interior-point-in-one-process": (in_one_process(solver="interior-point"), 25),
-    "ode-in-one-process": (in_one_process(solver="ode"), 25),
+    "hybrid-in-one-process": (in_one_process(solver="hybrid"), 25),
     "fast-gradient-in-one-process": (in_one_process(solver="fast-gradient"), 25),
     "linear-models": (linear_models, 20),
     "run-modules": (run_modules, 4),

@@ -116,7 +116,6 @@ class ProgramSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     solver: SolverName = SolverName.ODE
-    """If not set, that of the preset; the ODE-based one where that names none."""
     arithmetic: Arithmetic = Arithmetic.FLOAT64
     """Floating-point type of all that is computed on line; the PLC of the paper has float32 only."""
     updating_period_s: Annotated[float, Field(ge=0, le=MAX_PERIOD_TICKS * TICK_S)] = ADAPTIVE
@@ -133,8 +132,8 @@ class ProgramSettings(BaseModel):
     design: ControlDesign = ControlDesign()
     cold_end: ColdEndSettings = ColdEndSettings()
     preset: Preset = Preset.TUNED
-    """Solver, penalties, start of the ODE-based one, disturbances, limit of CV155, margin of the bands,
-    limit of residuals, if not set."""
+    """Penalties, start of the ODE-based solver, disturbances, limit of CV155, margin of the bands, limit of residuals,
+    if not set."""
     penalties: PenaltySettings = PenaltySettings()
     budget: BudgetSettings = BudgetSettings()
     estimator: EstimatorSettings = EstimatorSettings()
@@ -165,20 +164,12 @@ class ProgramSettings(BaseModel):
             usual_filter = self.estimator.kind is EstimatorKind.KALMAN and self.estimator.load_known
             if name in ("estimator", "plausibility") and not usual_filter:
                 continue  # state feedback estimates nothing, and an unmeasured load needs a walk of its own
-            if not name:
-                self.__dict__.update(self._not_set(values))
-                continue
             self.__dict__[name] = completed(getattr(self, name), values)  # before it is used: it is frozen then
         alpha = alpha_of(self.penalties, self.design)
         for key in ALPHAS:
             name = key.partition(".")[0]
             self.__dict__[name] = completed(getattr(self, name), {"alpha": alpha})
         return self
-
-    def _not_set(self, values: Mapping[str, str]) -> dict[str, object]:
-        """Return those of a preset's values of this section's own keys that were not set."""
-        kinds = {"solver": SolverName}
-        return {key: kinds[key](value) for key, value in values.items() if key not in self.model_fields_set}
 
     @model_validator(mode="after")
     def _load_steps_are_seen(self) -> Self:

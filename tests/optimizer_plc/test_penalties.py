@@ -13,7 +13,7 @@ from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.penalties import PRESETS, PenaltySettings, Preset
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
-from optimizer_plc.settings import ProgramSettings, SolverName
+from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers.ode import ode_solver
 
 if TYPE_CHECKING:
@@ -31,18 +31,11 @@ def as_printed_problem(prediction: PredictionModel) -> PredictiveProblem:
 # -- settings ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_tuned_preset_is_the_default_and_has_the_penalties_of_the_paper_s() -> None:
+def test_the_tuned_preset_is_the_default_and_differs_from_the_paper_s_in_the_estimator() -> None:
     chosen, paper = ProgramSettings(preset=Preset.TUNED), ProgramSettings(preset=Preset.PAPER)
     assert chosen == ProgramSettings()
-    assert (chosen.solver, paper.solver) == (SolverName.HYBRID, SolverName.ODE)
-    assert chosen.penalties == paper.penalties == PenaltySettings()
-    assert (chosen.ode, paper.ode) == (OdeSettings(cost_scale=1e-7), OdeSettings())
+    assert (chosen.penalties, chosen.ode) == (paper.penalties, paper.ode) == (PenaltySettings(), OdeSettings())
     assert (chosen.estimator.disturbances, paper.estimator) == (("outputs",), EstimatorSettings())
-
-
-def test_a_solver_that_is_set_comes_before_the_preset_s() -> None:
-    assert ProgramSettings(solver=SolverName.ODE).solver is SolverName.ODE
-    assert ProgramSettings.model_validate({"solver": "qpoases", "preset": "tuned"}).solver is SolverName.QPOASES
 
 
 def test_state_feedback_estimates_no_disturbances_whatever_the_preset() -> None:
@@ -76,8 +69,7 @@ def test_settings_of_a_preset_survive_being_written_and_read() -> None:
 def test_a_preset_names_keys_that_there_are(preset: Preset) -> None:
     chosen = ProgramSettings(preset=preset)
     for section, values in PRESETS[preset].items():
-        of_section = getattr(chosen, section) if section else chosen
-        assert {key: getattr(of_section, key) for key in values} == dict(values)
+        assert {key: getattr(getattr(chosen, section), key) for key in values} == dict(values)
 
 
 def test_alpha_follows_from_the_weight_of_a_violation_for_all_solvers_alike() -> None:

@@ -302,7 +302,7 @@ def test_the_manifest_of_an_attached_run_says_what_the_rig_runs(coldloop: Coldlo
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (("--solver", "osqp"), "--solver: the rig runs optimizer_plc.program.solver = hybrid"),
+        (("--solver", "osqp"), "--solver: the rig runs optimizer_plc.program.solver = ode"),
         (("--set", "plant.sensors.level=5"), "the rig runs plant.sensors.level = 0.01"),
         (("--set", "plant.sensors={level=5}"), "the rig runs plant.sensors.level = 0.01"),
         (("--set", "limits.high=[50,100,50]"), "the rig runs limits.high = [60.0, 150.0, 60.0]"),
@@ -319,7 +319,7 @@ def test_what_attach_cannot_set_is_refused(
 
 
 def test_what_a_rig_runs_may_be_named_again(coldloop: Coldloop, up: str, results: Path) -> None:
-    same = ("--solver", "hybrid", "--set", "plant.sensors.level=0.01")
+    same = ("--solver", "ode", "--set", "plant.sensors.level=0.01")
     run = (*attach(up), "--load", "e", "--duration", "5s", "--figures", "png", *same, "--out", results)
     assert coldloop(*run).code == 0
 

@@ -46,9 +46,8 @@ class Preset(StrEnum):
     """Sets of settings by name; what is set explicitly in the same place comes before the preset's."""
 
     TUNED = "tuned"
-    """As good as this project knows how to make it: the paper's preset with the hybrid solver, damped, an estimator of
-    constant errors, a limit of CV155 where opening it further cools less, and rows that keep outputs inside their bands
-    at rest (`docs/default-controller.md`)."""
+    """As good as this project knows how to make it: the paper's preset, an estimator of constant errors, a limit of
+    CV155 where opening it further cools less, and rows that keep outputs inside their bands at rest."""
     PAPER = "paper"
     """The paper's problem and estimator, with the truncated solver as good as this project knows how to make it."""
     AS_PRINTED = "as-printed"
@@ -58,8 +57,6 @@ class Preset(StrEnum):
 
 PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
     Preset.TUNED: {
-        "": {"solver": "hybrid"},
-        "ode": {"cost_scale": 1e-7},
         "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
         "cold_end": {"approach_k": 0.3},
         "design": {"band_margin": (0.1, 0.1)},
@@ -71,12 +68,9 @@ PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
         "ode": {"cost_scale": 1e-8, "look_ahead_rows": False, "hold_at_bounds": False},
     },
 }
-"""Settings of each preset by section of `optimizer_plc.program`, its own ones under no name."""
+"""Settings of each preset by section of `optimizer_plc.program`."""
 OF_PRESETS: Final = tuple(
-    f"{section}.{key}".lstrip(".")
-    for preset in PRESETS.values()
-    for section, values in preset.items()
-    for key in values
+    f"{section}.{key}" for preset in PRESETS.values() for section, values in preset.items() for key in values
 )
 """Keys of `optimizer_plc.program` that a preset decides."""
 OF_ALPHA: Final = ("penalties.output_rows", "design.violation_weight")
