@@ -97,7 +97,7 @@ def count_unchanged(
             unchanged[output] += elapsed * (most if output in CONTROLLED else most_of_each)
             continue
         if rests[output] < 0:
-            rests[output] += 1
+            rests[output] += bool(abs(y[output] - before[output]) > 0.0)  # from or to no number is no move
         elif output not in CONTROLLED and not is_frozen(unchanged[output], rests[output], least[output]):
             rests[output] = max(unchanged[output], rests[output])
         unchanged[output] = 0

@@ -318,6 +318,17 @@ def test_another_sensor_that_stands_still_is_found_if_it_has_not_stood_so_long_b
     assert bench.program.bad_sensors == 1 << t1
 
 
+def test_a_constant_that_was_dead_for_long_is_not_taken_for_frozen(new_bench: NewBench) -> None:
+    p2 = OUTPUT_NAMES.index("P2")
+    bench = new_bench(InputLimits(), section())
+    bench.steady = bench.moving = True
+    bench.readings[p2] = math.nan
+    bench.scans(300)
+    bench.readings[p2] = 16.0
+    bench.scans(400)
+    assert bench.program.bad_sensors == 0
+
+
 def test_exact_sensors_of_one_kind_may_rest_while_noisy_ones_of_the_other_move(new_bench: NewBench) -> None:
     bench = new_bench(InputLimits(), section())
     bench.steady = bench.moving = True
