@@ -40,7 +40,7 @@ RATE = (0.5, 10.0, 0.1)
 L1, T5 = 0, 6
 """Places of the outputs in an update."""
 
-IDENTITY, AWAIT_UPDATE, UPDATE, PLAN = 0, 400, 200, 410
+IDENTITY, AWAIT_UPDATE, UPDATE, PLAN = 0, 400, 200, 408
 ACKNOWLEDGEMENT, HEARTBEAT, HEADER, SEQUENCE = 420, 430, 488, 500
 UPDATE_WORDS, ACKNOWLEDGEMENT_WORDS = 124, 5
 MAGIC = 123.456
@@ -167,8 +167,8 @@ class ControlPlc:
         return Update(session, number, tick, playing, load, tuple(rest[3:6]), tuple(rest[6:28]))
 
     def plan(self, update: Update) -> None:
-        """Say when the next updating instant is; no load step is to cut it short, no shortage of power is known."""
-        sealed = self._sealed("IIff", update.number, update.tick + PERIOD_TICKS, 0.0, 0.0)
+        """Say when the next updating instant is; no load step cuts it short, no shortage and no suspect reading is known."""
+        sealed = self._sealed("IIffI", update.number, update.tick + PERIOD_TICKS, 0.0, 0.0, 0)
         self._ask(self._client.write_registers(PLAN, sealed))
 
     def send(self, update: Update, rows: Rows) -> int:
