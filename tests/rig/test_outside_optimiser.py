@@ -172,3 +172,5 @@ def test_what_it_has_written_down_is_what_the_rig_has(example: ModuleType) -> No
     assert (limits.low, limits.high, limits.rate) == (example.LOW, example.HIGH, example.RATE)
     assert (example.TICK_S, example.PERIOD_TICKS, example.MAGIC) == (TICK_S, TICKS_PER_SAMPLE, MAGIC)
     assert [OUTPUT_NAMES[place] for place in (example.L1, example.T5)] == ["L1", "T5"]
+    blocks = {"update": example.UPDATE, "plan": example.PLAN, "acknowledgement": example.ACKNOWLEDGEMENT}
+    assert {name: block.address for block in CONTROL_MAP.blocks if (name := block.name) in blocks} == blocks
