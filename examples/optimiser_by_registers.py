@@ -167,7 +167,7 @@ class ControlPlc:
         return Update(session, number, tick, playing, load, tuple(rest[3:6]), tuple(rest[6:28]))
 
     def plan(self, update: Update) -> None:
-        """Say when the next updating instant is; no load step cuts it short, no shortage or suspect reading is known."""
+        """Say when the next updating instant is; no load step cuts it short, no shortage, no reading is suspect."""
         sealed = self._sealed("IIffI", update.number, update.tick + PERIOD_TICKS, 0.0, 0.0, 0)
         self._ask(self._client.write_registers(PLAN, sealed))
 
