@@ -20,8 +20,13 @@ from rig.results.columns import FORMAT
 Curves = dict[str, NDArray[np.float64]]
 """Columns by name; what is null is NaN."""
 
-OLDER: Final[dict[str, Any]] = {"optimizer_plc.program.estimator.disturbances": []}
-"""Configuration of runs that were recorded before there was a key."""
+OLDER: Final[dict[str, Any]] = {
+    "optimizer_plc.program.estimator.disturbances": [],
+    "optimizer_plc.program.cold_end.approach_k": 0.0,
+    "optimizer_plc.program.design.band_margin": [0.0, 0.0],
+    "optimizer_plc.program.plausibility.sigmas": 0.0,
+}
+"""Configuration of runs that were recorded before there was a key: what the preset would decide now."""
 DRAWN_TICKS: Final = 60_000
 """A longer trace is drawn by the least and the largest value of many ticks."""
 

@@ -126,7 +126,6 @@ def test_targets_are_those_of_independent_solvers(inputs_off: PredictionModel, r
     compare(inputs_off, 300, real, tolerance)
 
 
-@pytest.mark.xfail(reason="fails in some case that has not been looked at", strict=False)
 @pytest.mark.exhaustive
 def test_targets_are_those_of_independent_solvers_in_10_000_cases(inputs_off: PredictionModel) -> None:
     compare(inputs_off, 10_000, DOUBLE, 1e-3)

@@ -157,6 +157,7 @@ def test_suspects_come_and_go(lively: LoadProfile) -> None:
     """What the comparison above is about."""
     events = left_by(COMPILED["suspects"], lively, 1500, compiled=True).events
     assert {cause for _, _, kind, _, cause in events if kind == EventKind.SENSOR} == {0, 2}, "none stands still"
+    assert sum(kind == EventKind.SENSOR for _, _, kind, _, _ in events) >= 8
 
 
 def done_by_the_loop(monkeypatch: pytest.MonkeyPatch, assignments: tuple[str, ...], load: LoadProfile) -> int:

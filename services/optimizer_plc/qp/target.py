@@ -23,8 +23,9 @@ from optimizer_plc.qp.rest import rest_map
 Array = NDArray[np.float64]
 
 CV155 = INPUT_NAMES.index("CV155")
-TOLERANCE = 1e-4
-"""What a bound may be missed by, scaled; in single precision a corner of bounds is met no better than within 1e-5."""
+TOLERANCES = {8: 1e-8, 4: 1e-4}
+"""What a bound may be missed by, scaled, by the bytes of a number: in single precision a corner of bounds is met no
+better than within 1e-5."""
 
 
 class Rest(NamedTuple):
@@ -60,6 +61,8 @@ class TargetSearch(NamedTuple):
     """Which states are the constants of inputs and T5, shape (4,); -1 is none."""
     scale: Array
     """Of the constants: input_scale and 1, shape (4,)."""
+    tolerance: float
+    """What a bound may be missed by."""
 
 
 def rest_of(prediction: PredictionModel, design: ControlDesign) -> Rest:
@@ -100,6 +103,7 @@ def target_search(
         followed=design.target is not Target.OPERATING_POINT,
         of_load=real(design.target is Target.LOAD),
         constants=np.array([places.get(signal, -1) for signal in signals]),
+        tolerance=real(TOLERANCES[np.dtype(real).itemsize]),
         **{name: np.ascontiguousarray(array).astype(real, copy=False) for name, array in arrays.items()},
     )
 
@@ -131,41 +135,43 @@ def find_target(c: TargetSearch, x: Array, w: float, mismatch: float, most_open:
         low[last] -= c.temperature[i] * target[i]
         high[last] -= c.temperature[i] * target[i]
     bounds[last, 0], bounds[last, 1] = low[last], high[last]
-    point = nearest_point(c.rows, bounds)
+    point = nearest_point(c.rows, bounds, c.tolerance)
     for i in range(last):
         moved = target[i] + c.plane[i, 0] * point[0] + c.plane[i, 1] * point[1]
         target[i] = min(max(moved, low[i]), high[i])
 
 
 @kernel
-def nearest_point(rows: Array, bounds: Array) -> Array:
+def nearest_point(rows: Array, bounds: Array, tolerance: float) -> Array:
     """Return the point (2,) nearest to the origin with `rows` (4, 2) times it between `bounds` (4, 2).
 
     Where there is none, the bounds of the first three rows come before those of the last. Of strips it is the origin,
     its projection on a bound, or where two bounds meet.
     """
     best, missed = np.zeros(2, rows.dtype), np.empty(3, rows.dtype)
-    judge_point(rows, bounds, best, missed)
+    judge_point(rows, bounds, tolerance, best, missed)
     point, found = np.empty(2, rows.dtype), np.empty(3, rows.dtype)
     for i in range(rows.shape[0]):
         square = rows[i, 0] * rows[i, 0] + rows[i, 1] * rows[i, 1]
         for at in range(2):
             share = bounds[i, at] / square
             point[0], point[1] = share * rows[i, 0], share * rows[i, 1]
-            take_better(rows, bounds, point, found, best, missed)
+            take_better(rows, bounds, tolerance, point, found, best, missed)
             for j in range(i):
                 cross = rows[i, 0] * rows[j, 1] - rows[i, 1] * rows[j, 0]
                 for other in range(2):
                     one, two = bounds[i, at] / cross, bounds[j, other] / cross
                     point[0], point[1] = one * rows[j, 1] - two * rows[i, 1], two * rows[i, 0] - one * rows[j, 0]
-                    take_better(rows, bounds, point, found, best, missed)
+                    take_better(rows, bounds, tolerance, point, found, best, missed)
     return best
 
 
 @kernel
-def take_better(rows: Array, bounds: Array, point: Array, found: Array, best: Array, missed: Array) -> None:
+def take_better(
+    rows: Array, bounds: Array, tolerance: float, point: Array, found: Array, best: Array, missed: Array
+) -> None:
     """Copy a point to `best` if it is better than that; `found` and `missed` (3,) are as `judge_point` judges them."""
-    judge_point(rows, bounds, point, found)
+    judge_point(rows, bounds, tolerance, point, found)
     for k in range(found.shape[0]):
         if not found[k] <= missed[k]:
             return
@@ -175,10 +181,10 @@ def take_better(rows: Array, bounds: Array, point: Array, found: Array, best: Ar
 
 
 @kernel
-def judge_point(rows: Array, bounds: Array, point: Array, missed: Array) -> None:
+def judge_point(rows: Array, bounds: Array, tolerance: float, point: Array, missed: Array) -> None:
     """Write what a point misses the bounds (4, 2) of the first three rows by, those of the last, and its square."""
-    n, real = rows.shape[0], rows.dtype.type
-    missed[0] = missed[1] = real(TOLERANCE)
+    n = rows.shape[0]
+    missed[0] = missed[1] = tolerance
     for i in range(n):
         value = rows[i, 0] * point[0] + rows[i, 1] * point[1]
         k = 1 if i == n - 1 else 0
