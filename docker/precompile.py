@@ -61,12 +61,20 @@ def nothing() -> None:
 
 def optimizer_plc() -> None:
     """Make the program with each solver that has kernels of its own, in each precision, which compiles them."""
-    from optimizer_plc.computing_settings import Arithmetic  # noqa: PLC0415
-    from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings  # noqa: PLC0415
+    for arithmetic in ("float32", "float64"):
+        solvers_in(arithmetic)()
 
-    for arithmetic in (Arithmetic.FLOAT32, Arithmetic.FLOAT64):
+
+def solvers_in(arithmetic: str) -> Callable[[], None]:
+    """Return what makes the program with each solver that has kernels of its own, in one precision."""
+
+    def make() -> None:
+        from optimizer_plc.settings import SINGLE_PRECISION_SOLVERS, ProgramSettings  # noqa: PLC0415
+
         for solver in SINGLE_PRECISION_SOLVERS:
-            _make_optimizer(ProgramSettings(solver=solver, arithmetic=arithmetic))
+            _make_optimizer(ProgramSettings.model_validate({"solver": solver, "arithmetic": arithmetic}))
+
+    return make
 
 
 def default_optimizer() -> None:
@@ -154,6 +162,8 @@ PARTS: Final[dict[str, tuple[Callable[[], None], int]]] = {
     "control_plc": (nothing, 1),
     "optimizer_plc": (optimizer_plc, 25),
     "hmi": (nothing, 1),
+    "solvers": (solvers_in("float64"), 15),
+    "single-precision-solvers": (solvers_in("float32"), 20),
     "default-plant": (default_plant, 9),
     "default-solver": (default_solver, 13),
     "default-optimizer": (default_optimizer, 10),
