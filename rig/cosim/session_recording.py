@@ -108,7 +108,7 @@ async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recor
     from_now = _FromNow(recorder, session.identity.tick, first_update)
     readers = {service: JournalReader(rig.clients[service]) for service in (CONTROL, PLANT)}
     for service, reader in readers.items():
-        for event in state_of(await reader.read_on()):
+        for event in state_of(await reader.read_on(), session.identity.tick):
             from_now.event(event, service)
     events = SessionEvents(readers, from_now)
     number, end = session.identity.session, session.identity.tick + scenario.ticks
@@ -144,21 +144,29 @@ async def _next_update(rig: SessionClient) -> int:
     return 0 if last is None else last.update + 1
 
 
-def state_of(events: Iterable[Event]) -> list[Event]:
-    """Return, of what has been noted in a session so far, the events that say how everything is now."""
+def state_of(events: Iterable[Event], tick: int) -> list[Event]:
+    """Return, of what has been noted in a session so far, the events that say how everything is at a tick.
+
+    And all of later ticks: a session goes on while it is asked.
+    """
     last: dict[tuple[int, int], Event] = {}
     alarms: dict[int, list[Event]] = {}
+    later: list[Event] = []
     for event in events:
         if event.kind == EventKind.SESSION:
             last.clear()
             alarms.clear()
+            later.clear()
+        if event.tick > tick:
+            later.append(event)
+            continue
         if event.kind in PASSING:
             before = [] if event.kind == EventKind.ALARM_RAISED else alarms.get(event.subject, [])
             alarms[event.subject] = [*before, event]
         for group, kinds in enumerate(HELD):
             if event.kind in kinds:
                 last[group, event.subject if group else 0] = event
-    return sorted([*last.values(), *chain.from_iterable(alarms.values())])
+    return [*sorted([*last.values(), *chain.from_iterable(alarms.values())]), *later]
 
 
 class Lateness:

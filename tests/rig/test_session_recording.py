@@ -19,6 +19,9 @@ from rig.results.recorded import LinkStatistics
 from rig.results.recorded_alarms import alarms_after
 from rig.results.recording import Records
 
+NOW = 1000
+"""A tick after all that is noted."""
+
 
 def noted(number: int, kind: EventKind, subject: int = 0, cause: int = 0) -> Event:
     return Event(number=number, tick=10 * number, kind=kind, subject=subject, cause=cause)
@@ -30,7 +33,7 @@ def test_the_last_mode_and_the_last_of_each_alarm_and_sensor_count() -> None:
         noted(4, EventKind.SENSOR_FAULT, 2, 1), noted(5, EventKind.SENSOR, 2, 1), noted(6, EventKind.ALARM_RETURNED, 5),
         noted(7, EventKind.MODE, 2), noted(8, EventKind.OPERATOR_MODE, 1), noted(9, EventKind.SENSOR_FAULT, 3, 2),
     ]  # fmt: skip
-    assert [event.number for event in state_of(events)] == [2, 3, 4, 5, 6, 7, 9]
+    assert [event.number for event in state_of(events, NOW)] == [2, 3, 4, 5, 6, 7, 9]
 
 
 def test_an_alarm_is_as_it_was_when_the_recording_begins() -> None:
@@ -39,7 +42,7 @@ def test_an_alarm_is_as_it_was_when_the_recording_begins() -> None:
         noted(1, EventKind.ALARM_SHELVED, 5), noted(2, raised, 5), noted(3, returned, 5), noted(4, raised, 5),
         noted(5, acknowledged, 5), noted(6, raised, 7), noted(7, returned, 7), noted(8, EventKind.ALARM_UNSHELVED, 5),
     ]  # fmt: skip
-    entry = [JournalEntry.of("control_plc", event) for event in state_of(events)]
+    entry = [JournalEntry.of("control_plc", event) for event in state_of(events, NOW)]
     rows = alarms_after(entry)
     assert (rows[5].state, rows[5].active, rows[5].raised) == (AlarmState.ACKNOWLEDGED, 1, 40)
     assert (rows[7].state, rows[7].active) == (AlarmState.RETURNED, 0)
@@ -47,8 +50,16 @@ def test_an_alarm_is_as_it_was_when_the_recording_begins() -> None:
 
 def test_what_was_noted_in_a_session_before_does_not_count() -> None:
     events = [noted(1, EventKind.SENSOR_FAULT, 2, 1), noted(2, EventKind.SESSION), noted(3, EventKind.MODE, 1)]
-    assert [event.number for event in state_of(events)] == [3]
-    assert state_of([]) == []
+    assert [event.number for event in state_of(events, NOW)] == [3]
+    assert state_of([], NOW) == []
+
+
+def test_what_happens_while_a_session_is_asked_is_of_its_own_tick() -> None:
+    """A session that is quick, or asked by a busy machine, goes on between its tick and its journal."""
+    held, driven, raised = noted(2, EventKind.MODE, 2), noted(4, EventKind.MODE, 1), noted(5, EventKind.ALARM_RAISED, 5)
+    events = [noted(90, EventKind.MODE, 3), noted(1, EventKind.SESSION), held, driven, raised]
+    assert state_of(events, driven.tick - 1) == [held, driven, raised]
+    assert state_of(events, driven.tick) == [driven, raised]
 
 
 def counted(misses: int, overruns: int, lateness_ms: float) -> Status:
