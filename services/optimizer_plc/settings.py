@@ -122,7 +122,7 @@ class ProgramSettings(BaseModel):
     """Fixed updating period, a multiple of 0.25 s; 0 is adaptive."""
     interrupting_load_step_w: Annotated[float, Field(ge=0)] = 0.0
     """A load step of more than this ends an updating period at once, whatever decides its length; 0 is never."""
-    holdable_load_w: tuple[FiniteFloat, FiniteFloat] = (138.0, 553.0)
+    holdable_load_w: tuple[FiniteFloat, FiniteFloat] = (128.0, 553.0)
     """Loads that some inputs within their limits hold at rest within the bands, W: of the cold box, by steady states of
     its nonlinear plant. A load that is estimated outside raises the alarm `capacity`."""
     sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 18
