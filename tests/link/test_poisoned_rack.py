@@ -61,10 +61,21 @@ async def test_an_age_that_makes_no_sense_is_one_bad_answer(field: "FieldAt") ->
         site.link.treat = poisoner
         await control.drive(*SETPOINTS)
         for age in (math.nan, math.inf, 3.4e38, -1e9):
-            poisoner.changes = [aged(age)]
-            await is_still_itself(site, control, poisoner)
-        raised = [(event.subject, event.cause) for event in await control.events(EventKind.ALARM_RAISED)]
-        assert raised.count((AlarmKind.PLANT_LOST, LinkCause.IMPLAUSIBLE)) == 4
+            lost = [LinkCause.NO_ANSWER]
+            while LinkCause.NO_ANSWER in lost:  # a busy machine: then the alarm was up already
+                await site.follows(control)
+                before = len(await losses(control))
+                poisoner.changes = [aged(age)]
+                await is_still_itself(site, control, poisoner)
+                lost = (await losses(control))[before:]
+            assert lost == [LinkCause.IMPLAUSIBLE]
+
+
+async def losses(control: "Control") -> list[int]:
+    """Return why the control PLC has raised the alarm that the rack is lost, each time."""
+    return [
+        event.cause for event in await control.events(EventKind.ALARM_RAISED) if event.subject == AlarmKind.PLANT_LOST
+    ]
 
 
 async def test_a_lie_about_the_outputs_right_after_a_break_moves_nothing(field: "FieldAt") -> None:
