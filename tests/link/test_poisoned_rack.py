@@ -55,6 +55,13 @@ async def is_still_itself(site: "Field", control: "Control", poisoner: Poisoner)
     assert site.rack.violations() == []
 
 
+async def losses(control: "Control") -> list[int]:
+    """Return why the control PLC has raised the alarm that the rack is lost, each time."""
+    return [
+        event.cause for event in await control.events(EventKind.ALARM_RAISED) if event.subject == AlarmKind.PLANT_LOST
+    ]
+
+
 async def test_an_age_that_makes_no_sense_is_one_bad_answer(field: "FieldAt") -> None:
     async with field() as site:
         control, poisoner = await site.joined(), Poisoner()
@@ -62,20 +69,13 @@ async def test_an_age_that_makes_no_sense_is_one_bad_answer(field: "FieldAt") ->
         await control.drive(*SETPOINTS)
         for age in (math.nan, math.inf, 3.4e38, -1e9):
             lost = [LinkCause.NO_ANSWER]
-            while LinkCause.NO_ANSWER in lost:  # a busy machine: then the alarm was up already
+            while lost and LinkCause.IMPLAUSIBLE not in lost:  # a busy machine lost it: the alarm was up already
                 await site.follows(control)
                 before = len(await losses(control))
                 poisoner.changes = [aged(age)]
                 await is_still_itself(site, control, poisoner)
                 lost = (await losses(control))[before:]
-            assert lost == [LinkCause.IMPLAUSIBLE]
-
-
-async def losses(control: "Control") -> list[int]:
-    """Return why the control PLC has raised the alarm that the rack is lost, each time."""
-    return [
-        event.cause for event in await control.events(EventKind.ALARM_RAISED) if event.subject == AlarmKind.PLANT_LOST
-    ]
+            assert lost.count(LinkCause.IMPLAUSIBLE) == 1
 
 
 async def test_a_lie_about_the_outputs_right_after_a_break_moves_nothing(field: "FieldAt") -> None:

@@ -58,7 +58,7 @@ def test_a_load_that_is_held_raises_nothing(watts: float, tmp_path: Path) -> Non
 
 
 def test_a_load_that_is_too_small_is_said_and_stays_so_though_the_estimate_is_higher(tmp_path: Path) -> None:
-    """At 115 W the linear model is some 14 W off, for which the filter takes it for a load."""
+    """What the linear model is off by there, the filter takes for a load."""
     run = with_load(115.0, tmp_path, 30)
     assert [(event["kind"], event["cause"]) for event in of_capacity(run)] == [
         ("alarm raised", "too little load: raise it, or the bath will flood")
