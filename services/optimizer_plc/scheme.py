@@ -19,7 +19,7 @@ from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, pred
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.qp.profile import inputs_of, shifted
-from optimizer_plc.qp.target import CV155, TargetSearch, find_target
+from optimizer_plc.qp.target import CV155, TargetSearch, bounds_at, find_target, loads_held
 from optimizer_plc.rules.assessment import Observation, assessed
 from optimizer_plc.rules.interface import UpdatingRule, decide_by
 from optimizer_plc.session_state import Delivery, OptimizerState
@@ -60,6 +60,8 @@ class Constants(NamedTuple):
     least_load: float
     """That can be held, as a deviation, W."""
     largest_load: float
+    reserve: float
+    """Of what the model holds, W."""
     approach: float
     """T2 - T1 at which CV155 is opened no further, K; infinite is any."""
     opening_per_k: float
@@ -97,6 +99,7 @@ def constants_of(
         alpha=real(alpha), floor=real(settings.adaptive.cost_floor),
         least_load=real(settings.holdable_load_w[0] - estimator.w0),
         largest_load=real(settings.holdable_load_w[1] - estimator.w0),
+        reserve=real(settings.capacity_reserve_w),
         approach=real(settings.cold_end.approach_k or np.inf),
         opening_per_k=real(settings.cold_end.opening_per_k),
         opening_from=real(settings.cold_end.opening_from - estimator.u0[CV155]),
@@ -231,14 +234,18 @@ def copy_delivery(source: Delivery, target: Delivery) -> None:
 
 
 @kernel
-def shortage(c: Constants, w: float, load: float, none: float) -> float:
+def shortage(c: Constants, x: Array, w: float, load: float, most_open: float, none: float) -> float:
     """Return what the load is above what can be held, W; negative: below what is needed; `none`, that is 0, otherwise.
 
-    The estimate w (a deviation) has what the plant lacks beside its model, and errors of a model far from its operating
-    point; the load itself (W), where it is measured, has neither. Each counts.
+    The estimate w (a deviation) has what the plant lacks beside its model, so it is compared with what the model holds
+    at rest within the inputs' bounds and the limit of CV155, less a reserve. The load itself (W), where it is measured,
+    is compared with what the plant holds that is as its model.
     """
     measured = load - c.estimator.w0 if c.estimator.load_known else w
-    return max(max(w, measured) - c.largest_load, none) + min(min(w, measured) - c.least_load, none)
+    low, high = bounds_at(c.target, x, most_open)
+    _, most = loads_held(c.target, low, high)
+    too_much = max(w + c.reserve - most, measured - c.largest_load)
+    return max(too_much, none) + min(min(w, measured) - c.least_load, none)
 
 
 @kernel
@@ -276,8 +283,8 @@ def plan(
     correct(c.estimator, m.belief, u_before, load, y, x)
     w = m.belief.numbers[0].w
     now.suspects = suspects_of(m.belief.readings)
-    now.shortage = shortage(c, w, load, real(0.0))
     now.most_open = most_open(c, m.u, y)
+    now.shortage = shortage(c, m.belief.x, w, load, now.most_open, real(0.0))
     find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, m.target)
     qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, m.target, now.most_open)
     effective = with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)

@@ -124,7 +124,9 @@ class ProgramSettings(BaseModel):
     """A load step of more than this ends an updating period at once, whatever decides its length; 0 is never."""
     holdable_load_w: tuple[FiniteFloat, FiniteFloat] = (128.0, 553.0)
     """Loads that some inputs within their limits hold at rest within the bands, W: of the cold box, by steady states of
-    its nonlinear plant. A load that is estimated outside raises the alarm `capacity`."""
+    its nonlinear plant. A load outside raises the alarm `capacity`."""
+    capacity_reserve_w: Annotated[float, Field(ge=0)] = 25.0
+    """So does an estimated load this near the largest one that the linear model holds with CV155 at its limit."""
     sequence_ticks: Annotated[int, Field(ge=2, le=SEQUENCE_ROWS)] = 18
     """Shortest sequence sent; 18 rows fit into one Modbus request with their header. It is never shorter than two
     updating periods: one to be played, one in case the next sequence is late."""

@@ -81,7 +81,7 @@ def test_the_gain_for_all_outputs_then_corrects_as_that_for_the_others(drawn: Fi
     found = drawn.P @ drawn.C.T @ J @ imputed(without(innovation, bad), J)
     expected = drawn.correction(innovation, sorted(EVERY - bad))
     size = max(1.0, np.abs(drawn.correction(innovation, sorted(EVERY))).max())
-    assert np.abs(found - expected).max() <= 1e-9 * size
+    assert np.abs(found - expected).max() <= 1e-6 * size  # covariances of a condition of 2e5 are inverted, twice
 
 
 def test_one_output_has_the_mean_that_its_row_says() -> None:

@@ -50,6 +50,27 @@ def test_an_overload_is_said_before_the_band_is_left(factors: dict[str, float], 
     assert float(str(alarm["value"])) > 0.0
 
 
+@pytest.mark.parametrize(
+    ("watts", "factors"),
+    [
+        (490.0, {"turbine_efficiency": 0.9}),
+        (490.0, {"heat_transfer": 0.8}),
+        (520.0, {"jt_valve": 0.8, "turbine_valve": 0.8}),
+    ],
+    ids=str,
+)
+def test_a_load_that_only_a_better_plant_holds_is_said_before_the_band_is_left(
+    watts: float, factors: dict[str, float], tmp_path: Path
+) -> None:
+    """They are held by a plant as its model; these hold up to 474, 467 and 503 W."""
+    run = with_load(watts, tmp_path, 10, **factors)
+    alarm, columns = raised(run), run.trace.to_dict()
+    below = [time for time, L1 in zip(columns["time_s"], columns["L1"], strict=True) if LEVEL_BAND[0] > L1]
+    assert alarm is not None
+    assert STEP_S < float(str(alarm["time_s"])) < min(below)
+    assert "reduce" in str(alarm["cause"])
+
+
 @pytest.mark.parametrize("watts", [150.0, 200.0, 440.0])
 def test_a_load_that_is_held_raises_nothing(watts: float, tmp_path: Path) -> None:
     run = with_load(watts, tmp_path, 20)

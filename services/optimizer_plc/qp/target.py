@@ -113,20 +113,8 @@ def find_target(c: TargetSearch, x: Array, w: float, mismatch: float, most_open:
     """Write the target (3,) for estimated states (n_x,), load and its mismatch, and a limit of CV155."""
     if not c.followed:
         return
-    real = x.dtype.type
-    low, high = c.low.copy(), c.high.copy()
-    high[CV155] = max(min(high[CV155], most_open), low[CV155])
-    most, least = real(0.0), real(0.0)
-    for i in range(low.shape[0]):
-        if c.constants[i] >= 0:
-            constant = x[c.constants[i]] / c.scale[i]
-            sign = real(1.0) if i < target.shape[0] else real(-1.0)
-            low[i] += sign * constant
-            high[i] += sign * constant
-    for i in range(target.shape[0]):
-        one, other = c.held[i] * low[i], c.held[i] * high[i]
-        most += max(one, other)
-        least += min(one, other)
+    low, high = bounds_at(c, x, most_open)
+    least, most = loads_held(c, low, high)
     load = min(max(mismatch + c.of_load * (w - mismatch), least), most)
     bounds, last = np.empty((low.shape[0], 2), x.dtype), target.shape[0]
     for i in range(last):
@@ -139,6 +127,31 @@ def find_target(c: TargetSearch, x: Array, w: float, mismatch: float, most_open:
     for i in range(last):
         moved = target[i] + c.plane[i, 0] * point[0] + c.plane[i, 1] * point[1]
         target[i] = min(max(moved, low[i]), high[i])
+
+
+@kernel
+def bounds_at(c: TargetSearch, x: Array, most_open: float) -> tuple[Array, Array]:
+    """Return the bounds (4,), (4,) of the inputs that act and of T5 without its constant, with a limit of CV155."""
+    low, high = c.low.copy(), c.high.copy()
+    high[CV155] = max(min(high[CV155], most_open), low[CV155])
+    for i in range(low.shape[0]):
+        if c.constants[i] >= 0:
+            constant = x[c.constants[i]] / c.scale[i]
+            sign = x.dtype.type(1.0 if i < c.held.shape[0] else -1.0)
+            low[i] += sign * constant
+            high[i] += sign * constant
+    return low, high
+
+
+@kernel
+def loads_held(c: TargetSearch, low: Array, high: Array) -> tuple[float, float]:
+    """Return the least and the largest load that inputs within these bounds hold at rest, deviations in W."""
+    least, most = low.dtype.type(0.0), low.dtype.type(0.0)
+    for i in range(c.held.shape[0]):
+        one, other = c.held[i] * low[i], c.held[i] * high[i]
+        least += min(one, other)
+        most += max(one, other)
+    return least, most
 
 
 @kernel
