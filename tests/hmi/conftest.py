@@ -139,11 +139,13 @@ class Site:
     def audited(self) -> list[dict[str, str]]:
         return [json.loads(line) for line in self.audit.read_text(encoding="utf-8").splitlines()]
 
-    def is_live(self) -> bool:
+    def is_live(self, service: str = "") -> bool:
+        """Return whether the page hears a service, or all of them."""
         try:
-            return self.ask("/healthz").status == 200
+            answer = self.ask("/healthz")
         except OSError:
             return False
+        return bool(answer.document["services"][service]["live"]) if service else answer.status == 200
 
 
 def _answer(status: int, raw: bytes, headers: Message) -> Answer:

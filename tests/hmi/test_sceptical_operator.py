@@ -93,7 +93,7 @@ def test_a_service_that_dies_between_the_two_steps_has_not_taken_the_command(ope
         operated.click("#confirm-yes")
         eventually(lambda: "refused because" in outcome(operated), "it is told")
         assert "uncertain" not in (operated.get_attribute("#outcome-line", "class") or "")
-        eventually(lambda: not site.is_live(), "the page knows that it is gone")
+        eventually(lambda: not site.is_live("control_plc"), "the page knows that it is gone")
     finally:
         site.start("control_plc")
     eventually(site.is_live, "all services answer the page")

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -18,17 +18,20 @@ if TYPE_CHECKING:
 __all__ = ["operated"]  # a fixture
 
 
+def trend_of_level(site: Site) -> Any:  # noqa: ANN401 - JSON
+    return site.ask("/api/trend?names=L1").document
+
+
 def test_a_time_in_which_nothing_was_read_is_a_gap_and_no_line(page: "Page", site: Site) -> None:
     view(page, "trends")
-    before = len(site.ask("/api/trend?names=L1").document["gaps"])
+    frozen_at = trend_of_level(site)["now_s"]
     site.freeze("control_plc")
     try:
-        eventually(lambda: not site.is_live(), "the page notices")
+        eventually(lambda: not site.is_live("control_plc"), "the page notices")
     finally:
         site.thaw("control_plc")
-    trend = eventually(
-        lambda: found if len((found := site.ask("/api/trend?names=L1").document)["gaps"]) > before else None, "a gap"
-    )
+    eventually(lambda: any(end > frozen_at for _, end in trend_of_level(site)["gaps"]), "a gap")
+    trend = trend_of_level(site)
     start, end = trend["gaps"][-1]
     inside = [value for time, value in zip(trend["time"], trend["series"]["L1"], strict=True) if start < time < end]
     assert inside == [None], "the line is interrupted once"
@@ -46,7 +49,7 @@ def test_in_manual_nothing_of_mpc_looks_current_and_the_button_says_who_drives(o
     try:
         eventually(lambda: operated.evaluate(pressed) == ["manual"], "manual is pressed")
         eventually(lambda: operated.locator("#tau-u.stale").count() == 1, "the updating period is crossed out")
-        assert not site.ask("/api/trend?names=L1").document["planned"]
+        assert not trend_of_level(site)["planned"]
         view(operated, "trends")
         eventually(lambda: "mode manual" in operated.inner_text("#trend-legend"), "its colour has a name")
         assert "expected" not in operated.inner_text("#trend-legend")

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import aiomqtt
 import pytest
 
 from coldloop.service.telemetry import Telemetry
@@ -106,6 +107,28 @@ async def test_a_service_can_be_stopped_while_its_broker_is_frozen(
     async with frozen_broker(free_port) as known, publishing(free_port, lambda: {"tick": 1}) as task:
         await keeps(known, "coldloop/plant/state", ONLINE)
         known.frozen = True
+        task.cancel()
+        done, _ = await asyncio.wait({task}, timeout=PATIENCE_S)
+        assert done
+
+
+async def test_a_service_that_is_stopped_just_as_its_broker_answers_ends(
+    frozen_broker: "ServeFrozen", free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish = aiomqtt.Client.publish
+    answered = asyncio.Event()
+
+    async def publish_and_forget_a_cancellation(client: aiomqtt.Client, *what: Any, **how: Any) -> None:  # noqa: ANN401
+        await publish(client, *what, **how)
+        answered.set()
+        with contextlib.suppress(asyncio.CancelledError):  # as asyncio.wait_for of Python 3.11 does
+            await asyncio.sleep(PATIENCE_S)
+
+    async with frozen_broker(free_port) as known, publishing(free_port, lambda: {"tick": 1}) as task:
+        await keeps(known, "coldloop/plant/telemetry", {"tick": 1})
+        monkeypatch.setattr(aiomqtt.Client, "publish", publish_and_forget_a_cancellation)
+        await answered.wait()
+        monkeypatch.undo()
         task.cancel()
         done, _ = await asyncio.wait({task}, timeout=PATIENCE_S)
         assert done

@@ -111,6 +111,8 @@ class _Publisher:
     async def publish(self, topic: str, message: str) -> None:
         self._unasked = UNASKED_BYTES
         await self._client.publish(topic, message, qos=1, retain=True)
+        if _is_cancelled():  # wait_for of Python 3.11 forgets a cancellation that comes with the answer
+            raise asyncio.CancelledError
 
     def _limited(self, bufsize: int) -> bytes:
         """Return at most `bufsize` bytes from the socket; the library takes the error for a lost connection."""
