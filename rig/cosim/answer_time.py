@@ -9,6 +9,8 @@ from coldloop.errors import LinkError
 
 ANSWER_S: Final = 10.0
 """How long a rig may take to answer all that a command asks at once."""
+QUIET_S: Final = 20.0
+"""A run gives up a rig on which nothing happens, or a service that does not answer, for this long."""
 
 
 @asynccontextmanager

@@ -18,6 +18,7 @@ from coldloop.registers.control_plc import CONTROL_MAP, ControlSession, Grant, L
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OptimizerSession
 from coldloop.registers.plant import HISTORY_ROWS, PLANT_MAP, STATION_ROWS, PlantSession
 from plant.own_model import own_header
+from rig.cosim.answer_time import QUIET_S
 from rig.cosim.endpoints import RigEndpoints
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_events import SessionEvents
@@ -37,8 +38,6 @@ SHORTEST_PAUSE_S: Final = 0.001
 LONGEST_PAUSE_S: Final = 0.2
 LONGEST_LOCKSTEP_PAUSE_S: Final = 0.01
 """A rig that does not move is looked at so often."""
-QUIET_S: Final = 20.0
-"""A rig on which nothing happens for this long is given up."""
 LAST_LOOK_S: Final = 2.0
 """How long the events of a run that has ended are waited for."""
 CONTACT_S: Final = 1.0
@@ -198,7 +197,7 @@ class SessionClient:
         status = await self.contact(self.control.read(Status))
         if status is not None and status.mode != Mode.CLASSICAL:  # the loops ask for no updates
             last = 0 if self._scenario.realtime else status.update
-            await self.contact(self._updates.read_until(self._scenario.ticks, last, QUIET_S))
+            await self.contact(self._updates.read_until(self._scenario.ticks, last, QUIET_S), within_s=2.0 * QUIET_S)
             status = await self.contact(self.control.read(Status))
         if status is not None:
             self._recorder.link = LinkStatistics(
@@ -282,12 +281,12 @@ class SessionClient:
         self._noted_events = ladder.events
         return ladder
 
-    async def contact(self, request: Awaitable[T]) -> T | None:
+    async def contact(self, request: Awaitable[T], *, within_s: float = CONTACT_S) -> T | None:
         """Return the answer to a request; with `tolerant`, None when the service does not answer in time."""
         if not self._tolerant:
             return await request
         try:
-            async with asyncio.timeout(CONTACT_S):
+            async with asyncio.timeout(within_s):
                 return await request
         except (PeerUnreachableError, TimeoutError):
             self.lost_contacts += 1

@@ -17,9 +17,10 @@ from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Status
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus, PlantSample, StationSample
+from rig.cosim.answer_time import QUIET_S
 from rig.cosim.journal_reader import JournalReader
 from rig.cosim.scenario import Scenario
-from rig.cosim.session_client import QUIET_S, SessionClient
+from rig.cosim.session_client import SessionClient
 from rig.cosim.session_events import SessionEvents
 from rig.cosim.session_reader import SampleReader, UpdateReader
 from rig.results.driving import CONTROL, PLANT

@@ -6,6 +6,7 @@ from typing import Final, NamedTuple
 
 from coldloop.modbus.endpoints import Endpoint
 from coldloop.safety.retained import RetainSettings
+from rig.cosim.answer_time import QUIET_S
 from rig.cosim.endpoints import RigEndpoints
 from rig.settings import Settings
 
@@ -36,6 +37,7 @@ def _endpoint(settings: Settings, service: str, port: int) -> Endpoint:
         port=port,
         word_order=section.word_order,
         tls=settings.rig.tls if section.server.tls else None,
+        timeout_s=QUIET_S,
     )
 
 

@@ -20,8 +20,9 @@ from rig.chaos.faults import AnyFault, WrongModel
 from rig.chaos.injection import Injector
 from rig.chaos.models import WRONG_MODEL, save_wrong_model
 from rig.chaos.proxied_services import ProxiedServices
+from rig.cosim.answer_time import QUIET_S
 from rig.cosim.endpoints import RigEndpoints
-from rig.cosim.session_client import QUIET_S, SessionClient
+from rig.cosim.session_client import SessionClient
 from rig.cosim.wiring import SERVICES, START_PATIENCE_S
 from rig.python_settings import Period, configured
 from rig.runs.running import check_certificates, make_scenario

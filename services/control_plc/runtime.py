@@ -200,8 +200,9 @@ class ControlPlc:
             async with asyncio.timeout(since + self._settings.control_plc.ladder.optimizer_patience_s - now):
                 await self.clients.changed.wait()
         except TimeoutError:
-            self._program.optimizer_lost()
-            self._awaiting_since = None
+            if not self.clients.changed.is_set():  # else it is this process that was late, and the answer is there
+                self._program.optimizer_lost()
+                self._awaiting_since = None
 
     async def _scan(self) -> None:
         program = self._program

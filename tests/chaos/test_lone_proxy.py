@@ -168,7 +168,7 @@ def server(processes: Processes) -> int:
 def test_a_client_meets_the_exception_of_the_plan_and_then_the_server(
     processes: Processes, tmp_path: Path, server: int
 ) -> None:
-    plan = '[[faults]]\nkind = "exception"\ncode = 6\nduration_s = 4\n'
+    plan = '[[faults]]\nkind = "exception"\ncode = 6\nduration_s = 30\n'
     _, port = proxy(processes, tmp_path, plan, server)
     first = read(port, PATIENCE_S)
     assert isinstance(first, ModbusPDU)

@@ -166,6 +166,7 @@ def test_drops_that_no_line_has_told_are_told_by_the_last_one(stalled: Stalled) 
     stalled.read.set()
     await_lines()
     end_logs()
+    await_lines()
     last = json.loads(stalled.getvalue().splitlines()[-1])
     assert (last["event"], last["dropped"]) == ("lines dropped", 3)
 
@@ -174,6 +175,7 @@ def test_the_last_line_is_written_after_all_others(stream: io.StringIO) -> None:
     set_up_logs("plant", "info", stream)
     log_many(50)
     end_logs("plant: cannot listen")
+    await_lines()
     assert stream.getvalue().count("\n") == 51
     assert stream.getvalue().endswith("\nplant: cannot listen\n")
 

@@ -96,7 +96,7 @@ def test_a_state_that_is_no_json_is_a_failure_and_the_next_one_is_written(tmp_pa
         assert not writer.flush(0.01)
     assert "not JSON serializable" in writer.failed
     writer.keep({"tick": 2})
-    assert writer.close()
+    assert writer.close(LONG_S)
     assert file.load() == {"tick": 2}
 
 
@@ -105,7 +105,7 @@ def test_the_newest_state_is_written_at_the_end(tmp_path: Path) -> None:
     writer = RetainedStateWriter(file, pause_s=LONG_S)
     for tick in range(10):
         writer.keep({"tick": tick})
-    assert writer.close()
+    assert writer.close(LONG_S)
     assert file.load() == {"tick": 9}
 
 

@@ -87,7 +87,7 @@ async def running(rack: SmallRack | None = None, **sections: Any) -> AsyncIterat
         server = ModbusServer(rack.bank, settings=ServerSettings(port=0), on_write=rack.on_write, identity=identity)
         await server.start()
         port = server.port
-    section = {**sections.pop("control_plc", {}), "plant": {"port": port}}
+    section = {**sections.pop("control_plc", {}), "plant": {"port": port, "timeout_s": WITHIN_S}}
     plc = ControlPlc(ControlSettings.model_validate({"control_plc": section, **sections}))
     task = asyncio.create_task(plc.run())
     try:
@@ -131,6 +131,7 @@ async def test_scans_that_are_not_made_are_alarmed_from_outside_of_them(monkeypa
     ended = asyncio.Event()
     async with running(SmallRack(1)) as plc:
         monkeypatch.setattr(plc, "_scan", ended.wait)
+        monkeypatch.setattr("control_plc.rack_finder.SEARCH_S", WITHIN_S)
         watch = asyncio.create_task(plc.watch_scans())
         ask(plc, ControlSession(1, 1, 10.0))
         await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.SYNCHRONISED)

@@ -200,7 +200,7 @@ def site(
 
 def read_registers(port: int, address: int, count: int) -> bytes:
     """Read holding registers with nothing but a socket."""
-    with socket.create_connection(("127.0.0.1", port), 5) as bus:
+    with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as bus:
         bus.sendall(struct.pack(">HHHBBHH", 1, 0, 6, 255, 3, address, count))
         answer = b""
         while len(answer) < 9 + 2 * count:
@@ -214,7 +214,7 @@ def read_registers(port: int, address: int, count: int) -> bytes:
 def write_registers(port: int, address: int, data: bytes) -> None:
     """Write holding registers with nothing but a socket."""
     words = len(data) // 2
-    with socket.create_connection(("127.0.0.1", port), 5) as bus:
+    with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as bus:
         bus.sendall(struct.pack(">HHHBBHHB", 1, 0, 7 + len(data), 255, 16, address, words, len(data)) + data)
         answer = bus.recv(1024)
     assert answer[7:] == struct.pack(">BHH", 16, address, words)

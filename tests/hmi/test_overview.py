@@ -96,7 +96,7 @@ def test_values_of_a_service_that_is_dead_or_frozen_are_crossed_out_and_come_bac
 def test_when_the_page_itself_is_killed_the_browser_says_so_and_comes_back(page: "Page", site: Site) -> None:
     site.kill("hmi")
     eventually(lambda: all(crossed_out(page, f"{service}.") for service in SERVICES[:3]), "everything is crossed out")
-    assert "own server" in (page.text_content("#banner") or "")
+    eventually(lambda: "own server" in (page.text_content("#banner") or ""), "it says that its server is gone")
     before = tick_of(page)
     site.start("hmi")
     eventually(lambda: tick_of(page) > before, "ticks go on")

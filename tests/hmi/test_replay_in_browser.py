@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tests.hmi.conftest import Served, eventually, opened
+from tests.hmi.conftest import PATIENCE_S, Served, eventually, opened
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -25,12 +25,13 @@ def test_two_runs_are_replayed_side_by_side(browser: "Browser", processes: "Proc
     both = Served(processes, recorded_run, recorded_run)
     try:
         page = browser.new_page()
+        page.set_default_timeout(1000 * PATIENCE_S)
         page.goto(both.address + "/")
         frames = [page.frame_locator(f"#run-{number}") for number in (1, 2)]
         for frame in frames:
             frame.locator("body[data-tick]").wait_for()
         page.click("#play")
-        eventually(lambda: both.ask("/run/2/api/replay")["playing"], "both play")
+        eventually(lambda: both.ask("/run/2/api/replay")["tick"] > 0, "both play")
         page.select_option("#view", "trends")
         for frame in frames:
             frame.locator("#trends").wait_for(state="visible")

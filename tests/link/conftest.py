@@ -121,7 +121,7 @@ class Rack:
 
     def __init__(self, port: int) -> None:
         self.port = port
-        self.client = RegisterClient(PLANT_MAP, host=HOST, port=port, timeout_s=5.0)
+        self.client = RegisterClient(PLANT_MAP, host=HOST, port=port, timeout_s=PATIENCE_S)
         self.applied: dict[int, tuple[float, ...]] = {}
         self.session = 0
         self.tick = 0
@@ -140,17 +140,18 @@ class Rack:
         return (await self.client.read(LeaseStatus)).state == LeaseState.FREE
 
     async def look(self) -> None:
-        """Read the history on."""
+        """Read the history on; what a busy machine lets be overwritten before it is read is left out."""
         identity = await self.client.read(Identity)
         if identity.session != self.session:
             return
+        self.tick = max(self.tick, identity.tick - HISTORY_ROWS)
         while self.tick < identity.tick:
             row = self.tick % HISTORY_ROWS
             for sample in await self.client.read_rows(
                 PlantSample, row, min(identity.tick - self.tick, HISTORY_ROWS - row)
             ):
-                assert sample.tick == self.tick, f"tick {self.tick} was overwritten before it was read"
-                self.applied[self.tick] = sample.u
+                if sample.tick == self.tick:
+                    self.applied[self.tick] = sample.u
                 self.tick += 1
 
     async def until(self, condition: Callable[[], Awaitable[bool]], within_s: float = PATIENCE_S) -> None:
@@ -174,12 +175,21 @@ class Rack:
     async def measurement(self) -> Measurement:
         return await self.client.read(Measurement)
 
+    @property
+    def last(self) -> tuple[float, ...]:
+        """What it applied last."""
+        return self.applied[max(self.applied)]
+
+    def since(self, tick: int) -> list[tuple[float, ...]]:
+        """Return what it applied from a tick on."""
+        return [u for at, u in self.applied.items() if at >= tick]
+
     def violations(self, since: int = 0) -> list[Step]:
         """Return what nobody may do: values out of bounds, and steps beyond the rate except to the safe state."""
         found: list[Step] = []
         history = [(tick, u) for tick, u in self.applied.items() if tick >= since]
-        for (_, before), (tick, after) in pairwise(history):
-            if after == SAFE_STATE:
+        for (earlier, before), (tick, after) in pairwise(history):
+            if after == SAFE_STATE or tick > earlier + 1:
                 continue
             inside = all(
                 low - ROUNDING <= value <= high + ROUNDING
@@ -197,7 +207,7 @@ class Control:
 
     def __init__(self, service: Process) -> None:
         self.service = service
-        self.client = RegisterClient(CONTROL_MAP, host=HOST, port=service.port, timeout_s=5.0)
+        self.client = RegisterClient(CONTROL_MAP, host=HOST, port=service.port, timeout_s=PATIENCE_S)
 
     async def link(self) -> PlantLinkStatus:
         return await self.client.read(PlantLinkStatus)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tests.link.conftest import FieldAt, WireTo
 
 ILLEGAL_VALUE = 3
-START_S = 90.0
+START_S = PATIENCE_S = 90.0
 
 
 def address_of(register_map: RegisterMap, record: type[tuple[object, ...]], field: str) -> int:
@@ -37,7 +37,7 @@ async def test_real_time_without_a_factor_is_refused_and_the_service_lives(
     wire: "WireTo",
 ) -> None:
     process = processes.service(service)
-    client = RegisterClient(register_map, host="127.0.0.1", port=process.port, timeout_s=5.0)
+    client = RegisterClient(register_map, host="127.0.0.1", port=process.port, timeout_s=PATIENCE_S)
     await client.connect(START_S)
     async with wire(process.port) as simple:
         for name, value in (("realtime", 1), ("session", 0), ("realtime", 0)):
@@ -76,7 +76,7 @@ async def test_an_updating_period_out_of_range_is_refused_and_the_optimiser_serv
     async with field() as site:
         control = site.control()
         optimizer = processes.service("optimizer_plc", f"optimizer_plc.control_plc.port={control.service.port}")
-        client = RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=optimizer.port, timeout_s=5.0)
+        client = RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=optimizer.port, timeout_s=PATIENCE_S)
         await client.connect(START_S)
         await site.rack.begin(factor=5.0)
         session = site.rack.session

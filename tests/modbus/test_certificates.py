@@ -25,7 +25,7 @@ MAGIC = bytes.fromhex("03 04 42f6e979")
 
 
 def client_of(running: "Running", tls: TlsSettings) -> RegisterClient:
-    return RegisterClient.at(CONTROL_MAP, Endpoint(port=running.server.port, timeout_s=5.0, tls=tls))
+    return RegisterClient.at(CONTROL_MAP, Endpoint(port=running.server.port, timeout_s=60.0, tls=tls))
 
 
 def not_yet_valid(pki: "Pki") -> Pair:

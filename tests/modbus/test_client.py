@@ -32,7 +32,11 @@ MEASUREMENT = sealed(
 
 @contextlib.asynccontextmanager
 async def client_of(
-    port: int, *, register_map: RegisterMap = PLANT_MAP, timeout_s: float = 5.0, order: WordOrder = WordOrder.HIGH_FIRST
+    port: int,
+    *,
+    register_map: RegisterMap = PLANT_MAP,
+    timeout_s: float = 60.0,
+    order: WordOrder = WordOrder.HIGH_FIRST,
 ) -> AsyncIterator[RegisterClient]:
     client = RegisterClient(register_map, host="127.0.0.1", port=port, timeout_s=timeout_s, order=order)
     try:

@@ -37,7 +37,7 @@ LIBMODBUS_PROGRAM = r"""
 int main(int count, char **arguments)
 {
     modbus_t *bus = modbus_new_tcp("127.0.0.1", atoi(arguments[1]));
-    if (bus == NULL || modbus_connect(bus) != 0) {
+    if (bus == NULL || modbus_set_response_timeout(bus, 60, 0) != 0 || modbus_connect(bus) != 0) {
         fprintf(stderr, "connect: %s\n", modbus_strerror(errno));
         return 1;
     }
@@ -62,7 +62,7 @@ async function main() {
   const client = new ModbusRTU();
   await client.connectTCP("127.0.0.1", { port });
   client.setID(1);
-  client.setTimeout(5000);
+  client.setTimeout(60000);
   for (const address of addresses) {
     const { buffer } = await client.readHoldingRegisters(address, 2);
     console.log(buffer.readFloatBE(0).toFixed(3));
@@ -131,7 +131,7 @@ async def test_mbpoll_reads_holding_and_input_registers(serve: "Serve", mbpoll: 
         for table in ("4:float", "3:float"):
             for address, value in zip(ADDRESSES, ("123.456", "20.25"), strict=True):
                 where = ["-p", port, "-a", "1", "-0", "-r", address, "-c", "1", "-B", "-t", table]
-                shown = await output_of(mbpoll, "-m", "tcp", *where, "-1", "127.0.0.1")
+                shown = await output_of(mbpoll, "-o", "10", "-m", "tcp", *where, "-1", "127.0.0.1")
                 assert f"[{address}]: \t{value}" in shown
 
 
@@ -139,7 +139,24 @@ async def test_mbpoll_counts_from_one_unless_told_otherwise(serve: "Serve", mbpo
     async with serve() as running:
         port = measuring(running)
         shown = await output_of(
-            mbpoll, "-m", "tcp", "-p", port, "-a", "1", "-r", "1", "-c", "1", "-B", "-t", "4:float", "-1", "127.0.0.1"
+            mbpoll,
+            "-o",
+            "10",
+            "-m",
+            "tcp",
+            "-p",
+            port,
+            "-a",
+            "1",
+            "-r",
+            "1",
+            "-c",
+            "1",
+            "-B",
+            "-t",
+            "4:float",
+            "-1",
+            "127.0.0.1",
         )
         assert "[1]: \t123.456" in shown
 

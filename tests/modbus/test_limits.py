@@ -20,7 +20,7 @@ def numbered(transaction: int) -> bytes:
 async def test_where_two_hundred_are_at_work_the_next_one_is_refused_politely(
     serve: "Serve", caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with serve(connection_limit=200) as running:
+    async with serve(connection_limit=200, replaceable_after_s=600) as running:
         wires: list[Wire] = [await running.connect() for _ in range(200)]
         assert [await wire.ask(READ_MAGIC) for wire in wires] == [MAGIC] * 200
         newcomer = await running.connect()

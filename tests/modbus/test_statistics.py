@@ -25,7 +25,7 @@ async def test_every_map_has_the_statistics_of_its_server(serve: "Serve", regist
         gone.send(bytes.fromhex("ffff ffff ffff"))
         assert await gone.closed() == b""
         await wire.ask(bytes.fromhex("03 0000 0001"), unit=9)
-        client = RegisterClient(register_map, host="127.0.0.1", port=running.server.port, timeout_s=5.0)
+        client = RegisterClient(register_map, host="127.0.0.1", port=running.server.port, timeout_s=60.0)
         statistics = await client.read(ServerStatistics)
         client.close()
         assert statistics == ServerStatistics(

@@ -27,7 +27,7 @@ WRITE_ROW = bytes.fromhex("10 01f4 0006 0c 41200000 41200000 41200000")
 
 
 def client_of(running: "Running", tls: TlsSettings | None) -> RegisterClient:
-    return RegisterClient.at(CONTROL_MAP, Endpoint(port=running.server.port, timeout_s=5.0, tls=tls))
+    return RegisterClient.at(CONTROL_MAP, Endpoint(port=running.server.port, timeout_s=60.0, tls=tls))
 
 
 def bare_context(pki: "Pki") -> ssl.SSLContext:

@@ -44,7 +44,7 @@ async def connected_to(handle: Handle) -> AsyncIterator[Transport]:
         finished.set()
 
     server = await asyncio.start_server(serve, "127.0.0.1", 0)
-    transport = Transport("somebody", "127.0.0.1", server.sockets[0].getsockname()[1], 5.0, None)
+    transport = Transport("somebody", "127.0.0.1", server.sockets[0].getsockname()[1], 60.0, None)
     await transport.open()
     try:
         yield transport
@@ -60,7 +60,7 @@ async def test_answers_in_another_order_go_to_their_requests() -> None:
         writer.write(b"".join(frame(number, pdu.upper()) for number, pdu in reversed(asked)))
 
     async with connected_to(backwards) as transport:
-        assert await transport.transact([b"a", b"b", b"c"], 5.0) == [b"A", b"B", b"C"]
+        assert await transport.transact([b"a", b"b", b"c"], 60.0) == [b"A", b"B", b"C"]
 
 
 async def test_an_answer_in_single_bytes_is_one_answer() -> None:
@@ -72,7 +72,7 @@ async def test_an_answer_in_single_bytes_is_one_answer() -> None:
             await asyncio.sleep(0)
 
     async with connected_to(slowly) as transport:
-        assert await transport.transact([b"xy"], 5.0) == [b"xy" * 100]
+        assert await transport.transact([b"xy"], 60.0) == [b"xy" * 100]
 
 
 async def test_what_answers_no_request_is_passed_over() -> None:
@@ -83,8 +83,8 @@ async def test_what_answers_no_request_is_passed_over() -> None:
             writer.write(stale + of_another_unit + frame(number, pdu) + frame(number, b"twice"))
 
     async with connected_to(with_strangers) as transport:
-        assert await transport.transact([b"one"], 5.0) == [b"one"]
-        assert await transport.transact([b"two"], 5.0) == [b"two"]
+        assert await transport.transact([b"one"], 60.0) == [b"one"]
+        assert await transport.transact([b"two"], 60.0) == [b"two"]
 
 
 async def test_silence_about_one_of_several_requests_ends_all_and_the_connection() -> None:
@@ -99,7 +99,7 @@ async def test_silence_about_one_of_several_requests_ends_all_and_the_connection
         assert not told.value.closed
         assert not transport.connected
         with pytest.raises(NoAnswerError):
-            await transport.transact([b"a"], 5.0)
+            await transport.transact([b"a"], 60.0)
 
 
 async def test_a_peer_that_closes_is_not_waited_for() -> None:
@@ -146,12 +146,12 @@ async def test_transaction_ids_begin_again_after_the_last() -> None:
         assert transport._wire is not None  # noqa: SLF001
         transport._wire._last_id = 0xFFFE  # noqa: SLF001
         for pdu in (b"a", b"b", b"c"):
-            assert await transport.transact([pdu], 5.0) == [pdu]
+            assert await transport.transact([pdu], 60.0) == [pdu]
 
 
 async def test_nobody_listens(free_port: int) -> None:
     with pytest.raises(PeerUnreachableError, match=f"nothing listens as plant at 127.0.0.1:{free_port}"):
-        await Transport("plant", "127.0.0.1", free_port, 5.0, None).open()
+        await Transport("plant", "127.0.0.1", free_port, 60.0, None).open()
 
 
 def test_pymodbus_makes_frames_and_the_identity_by_its_public_names() -> None:

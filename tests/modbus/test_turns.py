@@ -190,7 +190,7 @@ def test_who_has_no_role_has_a_request_limit_by_default(
 
 async def test_a_reader_that_floods_is_read_from_later_and_one_with_a_role_is_not(serve: "Serve") -> None:
     access = {role: ["127.0.0.2"] for role in NOBODY}
-    async with serve(access=access, reader_request_rate=0.1, request_burst=10) as running:
+    async with serve(access=access, reader_request_rate=0.001, request_burst=10) as running:
         reader, control = await running.connect("127.0.0.3"), await running.connect("127.0.0.2")
         for wire in (reader, control):
             wire.send(pipeline(5000))

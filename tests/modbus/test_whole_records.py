@@ -228,7 +228,7 @@ async def test_a_signalling_nan_in_a_sealed_record_is_a_bad_sensor_and_no_damage
     async with serve(order=order) as running:
         in_order = codec_of(block, order).canonical(raw)  # swapping words is its own inverse
         running.bank._memory[2 * block.address : 2 * block.end] = in_order  # noqa: SLF001 - bits that no float keeps
-        client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=running.server.port, timeout_s=5.0, order=order)
+        client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=running.server.port, timeout_s=60.0, order=order)
         arrived = await client.read(Measurement)
         assert math.isnan(arrived.y[0])
         assert arrived.y[1:] == record.y[1:]
@@ -248,7 +248,7 @@ def sealed_raw(raw: bytes) -> bytes:
 async def test_an_unsealed_answer_of_a_sealed_block_is_damage(serve: "Serve") -> None:
     async with serve() as running:
         running.bank.put(running.bank.get(Measurement)._replace(crc=0))
-        client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=running.server.port, timeout_s=5.0)
+        client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=running.server.port, timeout_s=60.0)
         with pytest.raises(DamagedAnswerError):
             await client.read(Measurement)
         client.close()
@@ -264,7 +264,7 @@ async def test_a_second_writer_is_refused_with_06_counted_as_such_and_stores_not
     kinds: list[str] = []
     async with serve(on_refusal=kinds.append) as running:
         running.bank.judged_by(busy, Actuators)
-        client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=running.server.port, timeout_s=5.0)
+        client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=running.server.port, timeout_s=60.0)
         for refused in range(1, 4):
             with pytest.raises(RequestRefusedError, match="exception 6, another client holds the lease") as refusal:
                 await client.exchange(Actuators(7, 43.0, 75.0, 36.0, session=1), Measurement)

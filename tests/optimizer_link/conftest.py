@@ -269,7 +269,7 @@ async def listening(
 async def connected(control: PlayedControlPlc, **program: object) -> AsyncIterator[Link]:
     """Run an optimiser PLC that finds a control PLC at the other end of a wire."""
     async with listening(control.bank, control.on_write) as server, Wire(server.port) as wire:
-        here = {"host": "127.0.0.1", "port": wire.port, "timeout_s": 2.0}
+        here = {"host": "127.0.0.1", "port": wire.port, "timeout_s": 60.0}
         section = {"control_plc": here, "program": program}
         optimizer = OptimizerPlc(OptimizerSettings.model_validate({"optimizer_plc": section}))
         shown = optimizer.publication

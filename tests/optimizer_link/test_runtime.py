@@ -284,7 +284,7 @@ async def test_its_own_server_answers_at_the_highest_factor(connect: "Connect", 
     async with connect(control) as link:
         link.optimizer.publication.bank.put(OptimizerSession(1, 1, 10_000.0, 0))
         await link.answers(1)
-        reader = RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=link.port, timeout_s=5.0)
+        reader = RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=link.port, timeout_s=60.0)
         for _ in range(20):
             sent = len(control.headers)
             assert (await reader.read(Identity)).session == 1

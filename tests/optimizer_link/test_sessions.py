@@ -35,7 +35,7 @@ def shown(power: float = 1.0, tau_1_s: float = 0.25) -> OptimizerPublication:
 
 @asynccontextmanager
 async def panel(link: "Link") -> AsyncIterator[RegisterClient]:
-    client = RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=link.port, timeout_s=5.0)
+    client = RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=link.port, timeout_s=60.0)
     try:
         yield client
     finally:

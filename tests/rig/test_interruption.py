@@ -72,7 +72,7 @@ def test_a_signal_in_the_middle_leaves_what_was_recorded(
     way: tuple[str, ...], number: signal.Signals, tmp_path: Path, processes: Processes
 ) -> None:
     out = tmp_path / "run"
-    words = ("run", *way, "--load", "6h", "--figures", "png", "--out", str(out))
+    words = ("run", *way, "--load", "6h", "--duration", "1000h", "--figures", "png", "--out", str(out))
     run = processes.python("-c", SOON_ON_DISK, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     deadline = time.monotonic() + PATIENCE_S
     while not (out / "trace.parquet").exists() or (out / "trace.parquet").stat().st_size < 20_000:

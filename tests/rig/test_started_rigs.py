@@ -30,6 +30,7 @@ from rig.live.started_rigs import (
     running_rig,
     state_folder,
 )
+from tests.harness.processes import END_S
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
@@ -79,7 +80,7 @@ def state_of(process: Process, first_port: int = FIRST, **changes: object) -> di
 def test_down_ends_the_process_of_the_rig(coldloop: "Coldloop", other: Process) -> None:
     keep(FIRST, state_of(other))
     outcome = coldloop("down")
-    assert (outcome.code, other.wait(10)) == (0, -signal.SIGTERM), outcome.complaints
+    assert (outcome.code, other.wait(END_S)) == (0, -signal.SIGTERM), outcome.complaints
     assert str(other.pid) in outcome.out
 
 
@@ -134,7 +135,7 @@ def test_a_damaged_file_does_not_hide_a_rig_that_is_up(other: Process) -> None:
 def test_a_service_is_killed(coldloop: "Coldloop", other: Process) -> None:
     keep(FIRST, state_of(other))
     outcome = coldloop("fault", "kill", "control_plc")
-    assert (outcome.code, other.wait(10)) == (0, -signal.SIGKILL), outcome.complaints
+    assert (outcome.code, other.wait(END_S)) == (0, -signal.SIGKILL), outcome.complaints
     again = coldloop("fault", "kill", "control_plc")
     assert (again.code, len(again.complaints)) == (2, 1)
 

@@ -32,7 +32,7 @@ def unread_pipe() -> Iterator[tuple[int, int]]:
 
 @contextlib.asynccontextmanager
 async def client_of_plant(port: int) -> AsyncIterator[RegisterClient]:
-    client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=port, timeout_s=5.0)
+    client = RegisterClient(PLANT_MAP, host="127.0.0.1", port=port, timeout_s=60.0)
     try:
         await client.connect(60.0)
         yield client

@@ -80,7 +80,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(
 
 
 def test_a_run_that_the_scheduler_gives_up_is_one_line(requests: "Requests", store: Store, client: "Client") -> None:
-    asked = [replace(request, ticks=2400) for request in requests(4)]
+    asked = [replace(request, ticks=2400) for request in requests(12)]  # the last is not under way for long
     last = Future(f"run-{asked[-1].digest}", client=client)  # type: ignore[no-untyped-call]
 
     def give_up() -> None:

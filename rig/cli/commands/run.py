@@ -55,6 +55,7 @@ def execute(options: argparse.Namespace) -> int:
 def _job(options: argparse.Namespace) -> "Job":
     """Return the run that the options and the configuration ask for."""
     from coldloop.modbus.endpoints import Endpoint
+    from rig.cosim.answer_time import QUIET_S
     from rig.cosim.job import Job
     from rig.results.way import Way
     from rig.runs.running import check_certificates, make_scenario
@@ -69,7 +70,9 @@ def _job(options: argparse.Namespace) -> "Job":
         raise UsageError(f"{factor_from}: a factor has no effect in lock-step; add --mode realtime")
     scenario = make_scenario(settings, options.duration)
     if options.attach:
-        ends = [Endpoint(host=end.host, port=end.port, tls=settings.rig.tls) for end in options.attach]
+        ends = [
+            Endpoint(host=end.host, port=end.port, tls=settings.rig.tls, timeout_s=QUIET_S) for end in options.attach
+        ]
         from rig.cosim.networked_run import as_attached
 
         return Job(as_attached(effective, ends), scenario, Way.ATTACHED, tuple(ends))
