@@ -30,6 +30,7 @@ from coldloop.registers.safety import Alarm, AlarmAction, AlarmCommand, AlarmKin
 from coldloop.registers.seal import sealed
 from coldloop.safety.retained import RetainedFile
 from control_plc.certificate_watch import EXPIRES_SOON, UNREADABLE
+from control_plc.program import ControlProgram
 from control_plc.retained_state import OWNER
 from control_plc.runtime import ControlPlc
 from control_plc.sessions import ADOPT_AFTER_S
@@ -299,3 +300,20 @@ async def test_a_retained_state_that_cannot_be_keeps_nobody_from_starting(tmp_pa
         await until(lambda: plc.bank.get(PlantLinkStatus).state == PlantLinkState.IDLE)
         assert alarm(plc, AlarmKind.STATE_NOT_RETAINED) is AlarmState.UNACKNOWLEDGED
         assert file.with_name("state.refused").exists(), "it is set aside"
+
+
+@pytest.mark.parametrize("answered", [True, False])
+async def test_an_answer_that_came_while_the_control_plc_stood_still_is_in_time(
+    *, answered: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost: list[ControlPlc] = []
+    monkeypatch.setattr(ControlProgram, "optimizer_lost", lambda _: lost.append(plc))
+    section = {"ladder": {"optimizer_patience_s": 0.01}}
+    plc = ControlPlc(ControlSettings.model_validate({"control_plc": section}))
+    waiting = asyncio.create_task(plc._until_answered())  # noqa: SLF001 - the moment is not to be had from outside
+    await asyncio.sleep(0)
+    if answered:
+        asyncio.get_running_loop().call_later(0.005, plc.clients.changed.set)
+    time.sleep(0.05)  # noqa: ASYNC251 - this process, so that answer and limit are found together
+    await waiting
+    assert bool(lost) is not answered
