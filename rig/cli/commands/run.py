@@ -55,7 +55,6 @@ def execute(options: argparse.Namespace) -> int:
 def _job(options: argparse.Namespace) -> "Job":
     """Return the run that the options and the configuration ask for."""
     from coldloop.modbus.endpoints import Endpoint
-    from rig.cosim.answer_time import QUIET_S
     from rig.cosim.job import Job
     from rig.results.way import Way
     from rig.runs.running import check_certificates, make_scenario
@@ -70,6 +69,8 @@ def _job(options: argparse.Namespace) -> "Job":
         raise UsageError(f"{factor_from}: a factor has no effect in lock-step; add --mode realtime")
     scenario = make_scenario(settings, options.duration)
     if options.attach:
+        from rig.cosim.answer_time import QUIET_S
+
         ends = [
             Endpoint(host=end.host, port=end.port, tls=settings.rig.tls, timeout_s=QUIET_S) for end in options.attach
         ]
