@@ -8,7 +8,7 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 import pytest
@@ -93,6 +93,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if item not in left_out]
 
 
+LAST_LINES = 12
+"""Of a program's log that are shown of a test that failed."""
 PATIENCE_S = 120.0
 """A coroutine has failed when it takes longer; the first one on a bus may have to compile the kernels."""
 
@@ -110,6 +112,17 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
     asyncio.run(story())
     return True
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Show what the programs of a test that failed have said last."""
+    report = yield
+    if report.failed:
+        for fixture in getattr(item, "funcargs", {}).values():
+            if isinstance(fixture, Processes):
+                report.sections.append(("programs", fixture.said_last(LAST_LINES)))
+    return report
 
 
 @pytest.fixture(autouse=True)

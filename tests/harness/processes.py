@@ -100,6 +100,15 @@ class Processes:
         self._ports: list[ReservedPorts] = []
         self._started: list[Process] = []
 
+    def said_last(self, lines: int) -> str:
+        """Return the last lines of each program's log, for who has to find out why a test failed."""
+        logs = dict.fromkeys(one.log for one in self._started)
+        return "\n".join(
+            f"-- {log.name}\n" + "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-lines:])
+            for log in logs
+            if log.exists()
+        )
+
     def free_port(self) -> int:
         """Return a port on localhost that nobody else gets while these processes live."""
         self._ports.append(ReservedPorts(1))
