@@ -197,7 +197,8 @@ class SessionClient:
         status = await self.contact(self.control.read(Status))
         if status is not None and status.mode != Mode.CLASSICAL:  # the loops ask for no updates
             last = 0 if self._scenario.realtime else status.update
-            await self.contact(self._updates.read_until(self._scenario.ticks, last, QUIET_S), within_s=2.0 * QUIET_S)
+            updates = self._updates.read_until(self._scenario.ticks, last, QUIET_S)
+            await self.contact(updates, within_s=2.0 * QUIET_S)  # it gives up by itself, and says why
             status = await self.contact(self.control.read(Status))
         if status is not None:
             self._recorder.link = LinkStatistics(

@@ -8,13 +8,12 @@ import socket
 import struct
 import subprocess
 import threading
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping
 from email.message import Message
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import pytest
 
@@ -23,28 +22,17 @@ from rig import cli
 from rig.figures.worker import FigureProcess
 from rig.settings import Settings
 from tests.harness.processes import END_S, Process, Processes
+from tests.harness.waiting import PATIENCE_S, eventually
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-T = TypeVar("T")
-
 SERVICES = ("plant", "control_plc", "optimizer_plc", "hmi")
-PATIENCE_S = 120.0
 OPERATOR = ("anna", "cold as helium")
 VIEWER = ("lena", "only looks at it")
 FACTOR = 2.0
 RECORDED_S = 120
 """Length of the run that is replayed."""
-
-
-def eventually(condition: Callable[[], T], what: str) -> T:
-    """Wait until a condition holds; return what it returned."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not (found := condition()):
-        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE_S:g} s"
-        time.sleep(0.02)
-    return found
 
 
 class Answer(NamedTuple):

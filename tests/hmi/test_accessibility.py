@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.hmi.conftest import Site, eventually, log_in_by_clicks, opened
+from tests.harness.waiting import eventually
+from tests.hmi.conftest import Site, log_in_by_clicks, opened
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -18,7 +18,8 @@ from hmi.process_image import Model
 from hmi.reading import MOST_NAMES, ROWS_AT_ONCE
 from hmi.settings import HmiSection
 from hmi.trends import NAMES
-from tests.hmi.conftest import OPERATOR, Site, eventually
+from tests.harness.waiting import eventually
+from tests.hmi.conftest import OPERATOR, Site
 
 BROWSERS = 4
 CONNECTIONS = 24

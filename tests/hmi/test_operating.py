@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.hmi.conftest import OPERATOR, VIEWER, Site, eventually, log_in_by_clicks, read_registers
+from tests.harness.waiting import eventually
+from tests.hmi.conftest import OPERATOR, VIEWER, Site, log_in_by_clicks, read_registers
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES
-from tests.hmi.conftest import SERVICES, Site, Witness, eventually
+from tests.harness.waiting import eventually
+from tests.hmi.conftest import SERVICES, Site, Witness
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

@@ -16,7 +16,8 @@ from hmi.compression_station import plant_document
 from hmi.process_image import Model
 from hmi.reading import STATIC
 from hmi.signals import signals_of
-from tests.hmi.conftest import Served, Site, eventually, opened, read_registers, record, write_registers
+from tests.harness.waiting import eventually
+from tests.hmi.conftest import Served, Site, opened, read_registers, record, write_registers
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

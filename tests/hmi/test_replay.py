@@ -20,7 +20,8 @@ from rig.live.recorded_page import RecordedPage, _bits
 from rig.results.run_folder import RunFolder
 from tests.conftest import Coldloop
 from tests.harness.processes import END_S, Processes
-from tests.hmi.conftest import RECORDED_S, Served, eventually
+from tests.harness.waiting import eventually
+from tests.hmi.conftest import RECORDED_S, Served
 
 
 def test_the_page_shows_what_the_files_of_the_run_have(served: Served, recorded_run: Path) -> None:

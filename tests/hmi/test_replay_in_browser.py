@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tests.hmi.conftest import PATIENCE_S, Served, eventually, opened
+from tests.harness.waiting import PATIENCE_S, eventually
+from tests.hmi.conftest import Served, opened
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

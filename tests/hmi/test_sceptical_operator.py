@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.hmi.conftest import Site, eventually, log_in_by_clicks, opened
+from tests.harness.waiting import eventually
+from tests.hmi.conftest import Site, log_in_by_clicks, opened
 from tests.hmi.test_operating import MPC, SENSOR_BAD, alarm_state, confirm, load, mode, view
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ import pytest
 
 from hmi.trends import NAMES
 from tests.harness.processes import Processes
-from tests.hmi.conftest import RECORDED_S, Served, Site, eventually, opened
+from tests.harness.waiting import eventually
+from tests.hmi.conftest import RECORDED_S, Served, Site, opened
 from tests.hmi.test_operating import MANUAL, MPC, confirm, mode, view
 from tests.hmi.test_sceptical_operator import operated, outcome
 

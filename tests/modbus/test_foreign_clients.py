@@ -138,26 +138,8 @@ async def test_mbpoll_reads_holding_and_input_registers(serve: "Serve", mbpoll: 
 async def test_mbpoll_counts_from_one_unless_told_otherwise(serve: "Serve", mbpoll: str) -> None:
     async with serve() as running:
         port = measuring(running)
-        shown = await output_of(
-            mbpoll,
-            "-o",
-            "10",
-            "-m",
-            "tcp",
-            "-p",
-            port,
-            "-a",
-            "1",
-            "-r",
-            "1",
-            "-c",
-            "1",
-            "-B",
-            "-t",
-            "4:float",
-            "-1",
-            "127.0.0.1",
-        )
+        where = ["-p", port, "-a", "1", "-r", "1", "-c", "1", "-B", "-t", "4:float"]
+        shown = await output_of(mbpoll, "-o", "10", "-m", "tcp", *where, "-1", "127.0.0.1")
         assert "[1]: \t123.456" in shown
 
 

@@ -149,9 +149,9 @@ def test_a_rig_that_is_paused_stands_and_goes_on_without_alarm(tmp_path: Path) -
     async def check() -> None:
         async with running(tmp_path) as rig:
             deadline, rounds, alarms = time.monotonic() + PATIENCE_S, 0, -1
-            while alarms != (alarms := len(await rig.alarms())):  # a busy machine may lose the plant without a pause
+            while len(await rig.alarms()) > alarms:  # a busy machine may lose the plant without a pause: once more
                 assert time.monotonic() < deadline
-                rounds += 1
+                rounds, alarms = rounds + 1, len(await rig.alarms())
                 await rig.pace(FACTOR, paused=True)
                 stood = await rig.tick()
                 begun = time.monotonic()

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import socket
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,11 +19,11 @@ from rig.live.link_cuts import CUT_FILES, CuttableLinks
 from rig.live.started_rigs import running_rig, state_folder
 from tests.conftest import Coldloop
 from tests.harness.processes import Processes
+from tests.harness.waiting import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.usefixtures("realtime", "undrawn")
 
 FACTOR = "5"
-PATIENCE_S = 120.0
 
 
 @pytest.fixture(scope="module")
@@ -57,23 +56,21 @@ def up(tmp_path_factory: pytest.TempPathFactory, shared_processes: Processes) ->
 
 def shown(coldloop: Coldloop, base: str) -> dict[str, str]:
     """What `coldloop status` shows, by its first words."""
-    deadline = time.monotonic() + PATIENCE_S
-    while (outcome := coldloop("status", "--port-base", base)).code:  # on a busy machine it may answer too slowly
-        assert time.monotonic() < deadline, outcome.complaints
-    return dict(line.split(maxsplit=1) for line in outcome.out.splitlines())
+
+    def answered() -> str:  # on a busy machine it may answer too slowly
+        outcome = coldloop("status", "--port-base", base)
+        return "" if outcome.code else str(outcome.out)
+
+    return dict(line.split(maxsplit=1) for line in eventually(answered, "a status").splitlines())
 
 
-def until(coldloop: Coldloop, base: str, row: str, part: str) -> str:
-    deadline = time.monotonic() + PATIENCE_S
-    while part not in (text := shown(coldloop, base)[row]):
-        assert time.monotonic() < deadline, f"{row} is {text}, not {part}"
-    return text
+def until(coldloop: Coldloop, base: str, row: str, part: str) -> None:
+    eventually(lambda: part in shown(coldloop, base)[row], f"{row} is {part}")
 
 
 def until_plant_time_passes(coldloop: Coldloop, base: str) -> None:
-    before, deadline = shown(coldloop, base)["session"], time.monotonic() + PATIENCE_S
-    while shown(coldloop, base)["session"] == before:
-        assert time.monotonic() < deadline, "plant time stands still"
+    before = shown(coldloop, base)["session"]
+    eventually(lambda: shown(coldloop, base)["session"] != before, "plant time goes on")
 
 
 def test_status_shows_session_mode_load_outputs_and_alarms(coldloop: Coldloop, up: str) -> None:
@@ -110,9 +107,7 @@ def test_each_command_says_what_came_back(coldloop: Coldloop, up: str) -> None:
 
     assert "(was " in told("load", "450")
     until(coldloop, up, "load", "450 W")
-    deadline = time.monotonic() + PATIENCE_S
-    while "in manual (operator)" not in (said := told("mode", "manual")):  # it waits for its effect, and not for long
-        assert time.monotonic() < deadline, said
+    eventually(lambda: "in manual (operator)" in told("mode", "manual"), "its effect, for which it does not wait long")
     assert "setpoint of CV155 45 %" in told("setpoint", "cv155", "45")
     assert "operator's mode auto" in told("mode", "auto")
     assert "paused" in told("pause")
@@ -157,9 +152,7 @@ def test_a_setpoint_beyond_the_bounds_is_refused_by_the_control_plc_itself(up: s
 def let_the_load_be(coldloop: Coldloop, base: str, watts: int) -> None:
     """Write a load, and wait until it is the present one and no other is to come."""
     assert coldloop("set", "--port-base", base, "load", str(watts)).code == 0
-    deadline = time.monotonic() + PATIENCE_S
-    while (load := shown(coldloop, base)["load"]) != f"{watts} W":
-        assert time.monotonic() < deadline, load
+    eventually(lambda: shown(coldloop, base)["load"] == f"{watts} W", f"{watts} W and no other load")
 
 
 def test_a_load_file_begins_now(coldloop: Coldloop, up: str, tmp_path: Path) -> None:
@@ -226,9 +219,8 @@ def test_a_link_is_cut_for_a_while_and_the_rig_finds_back(coldloop: Coldloop, up
     outcome = coldloop("fault", "--port-base", up, "cut", link, "6")
     assert outcome.out == f"the {link} link is cut for 6 s\n", outcome
     until(coldloop, up, "alarms", alarm)
-    log, deadline = state_folder(int(up)) / "up.log", time.monotonic() + PATIENCE_S
-    while f"the {link} link is restored" not in log.read_text():
-        assert time.monotonic() < deadline, log.read_text()
+    log = state_folder(int(up)) / "up.log"
+    eventually(lambda: f"the {link} link is restored" in log.read_text(), "the link is restored")
     until(coldloop, up, "mode", "mpc")
 
 
@@ -254,12 +246,14 @@ def test_two_cuts_at_once_are_both_made(coldloop: Coldloop, up: str, processes: 
     until(coldloop, up, "mode", "mpc")
     log = state_folder(int(up)) / "up.log"
     links = ("plant", "optimizer")
-    before = [log.read_text().count(f"the {link} link is cut") for link in links]
+
+    def cuts() -> list[int]:
+        return [log.read_text().count(f"the {link} link is cut") for link in links]
+
+    before = cuts()
     asked = [processes.coldloop("fault", "--port-base", up, "cut", link, "1") for link in links]
     assert [each.popen.wait(PATIENCE_S) for each in asked] == [0, 0]
-    deadline = time.monotonic() + PATIENCE_S
-    while [log.read_text().count(f"the {link} link is cut") for link in links] != [1 + count for count in before]:
-        assert time.monotonic() < deadline, log.read_text()
+    eventually(lambda: cuts() == [1 + count for count in before], "both are cut")
 
 
 def test_a_second_rig_on_the_same_ports_is_refused_and_the_holder_named(coldloop: Coldloop, up: str) -> None:
@@ -339,9 +333,8 @@ def test_a_service_that_is_killed_is_started_again_and_the_session_goes_on(
     log = state_folder(int(up)) / "up.log"
     before = log.read_text().count("started again")
     assert coldloop("fault", "--port-base", up, "kill", service).code == 0
-    deadline = time.monotonic() + PATIENCE_S
-    while coldloop("status", "--port-base", up).code or log.read_text().count("started again") == before:
-        assert time.monotonic() < deadline, log.read_text()
+    eventually(lambda: log.read_text().count("started again") > before, "it is started again")
+    eventually(lambda: not coldloop("status", "--port-base", up).code, "it answers")
     assert f"the {service} service was ended by SIGKILL" in log.read_text().splitlines()[-1]
     assert " of 5)" in log.read_text().splitlines()[-1]
     until(coldloop, up, "mode", "mpc")
@@ -362,11 +355,9 @@ def test_a_control_plc_that_comes_back_before_its_rack_can_be_reached_keeps_its_
     restarts, whole = (log.read_text().count(words) for words in ("started again", "link is restored"))
     assert coldloop("fault", "--port-base", up, "cut", "plant", "15").code == 0
     assert coldloop("fault", "--port-base", up, "kill", "control_plc").code == 0
-    deadline = time.monotonic() + PATIENCE_S
-    while log.read_text().count("started again") == restarts or log.read_text().count("link is restored") == whole:
-        assert time.monotonic() < deadline, log.read_text()
-    while coldloop("status", "--port-base", up).code:  # a busy machine starts it later still
-        assert time.monotonic() < deadline, log.read_text()
+    eventually(lambda: log.read_text().count("started again") > restarts, "it is started again")
+    eventually(lambda: log.read_text().count("link is restored") > whole, "the link is restored")
+    eventually(lambda: not coldloop("status", "--port-base", up).code, "it answers")
     until(coldloop, up, "mode", "mpc")
     assert shown(coldloop, up)["session"].partition(",")[0] == session
     assert "had no state to resume" not in log.read_text()
@@ -377,10 +368,13 @@ def test_a_paused_session_goes_on_when_its_control_plc_was_started_again(coldloo
     session = shown(coldloop, up)["session"].partition(",")[0]
     assert coldloop("set", "--port-base", up, "pause").code == 0
     assert coldloop("fault", "--port-base", up, "kill", "control_plc").code == 0
-    deadline = time.monotonic() + PATIENCE_S
-    while (outcome := coldloop("set", "--port-base", up, "resume")).code:
-        assert len(outcome.complaints) == 1, outcome
-        assert time.monotonic() < deadline, outcome
+
+    def resumed() -> bool:
+        outcome = coldloop("set", "--port-base", up, "resume")
+        assert outcome.code == 0 or len(outcome.complaints) == 1, outcome
+        return outcome.code == 0
+
+    eventually(resumed, "it can be resumed")
     until(coldloop, up, "session", f"{FACTOR} x real time")
     until(coldloop, up, "mode", "mpc")
     until_plant_time_passes(coldloop, up)
@@ -394,9 +388,7 @@ def test_a_service_that_stands_still_runs_again_when_the_terminal_is_closed(
     assert rig is not None
     state = Path(f"/proc/{rig.services['optimizer_plc'].pid}/stat")
     freezing = processes.coldloop("fault", "--port-base", up, "freeze", "optimizer_plc", "3600")
-    deadline = time.monotonic() + PATIENCE_S
-    while state.read_text().rpartition(")")[2].split()[0] != "T":
-        assert time.monotonic() < deadline
+    eventually(lambda: state.read_text().rpartition(")")[2].split()[0] == "T", "it is stopped")
     assert freezing.interrupt(signal.SIGHUP) == 130
     assert state.read_text().rpartition(")")[2].split()[0] != "T"
     until(coldloop, up, "mode", "mpc")

@@ -70,12 +70,11 @@ def _job(options: argparse.Namespace) -> "Job":
     scenario = make_scenario(settings, options.duration)
     if options.attach:
         from rig.cosim.answer_time import QUIET_S
+        from rig.cosim.networked_run import as_attached
 
         ends = [
             Endpoint(host=end.host, port=end.port, tls=settings.rig.tls, timeout_s=QUIET_S) for end in options.attach
         ]
-        from rig.cosim.networked_run import as_attached
-
         return Job(as_attached(effective, ends), scenario, Way.ATTACHED, tuple(ends))
     refuse_ineffective(effective, {**dict.fromkeys(PLACES, OWN_PORTS), "session.autostart": "it begins a session"})
     if options.in_process:
