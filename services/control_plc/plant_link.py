@@ -133,8 +133,11 @@ class PlantLink:
             self._enter(PlantLinkState.JOINING, LinkCause.MISSED_SCANS)
 
     def repaced(self) -> None:
-        """Note that the time base was changed: tick and speed of the rack are determined again."""
-        self._moved_at = None
+        """Note that the time base was changed: tick and speed of the rack are determined again.
+
+        What was noted in ticks of the old one says nothing in the new one.
+        """
+        self._moved_at = self._old_since = self._read = None
         if self.synchronised:
             self._enter(PlantLinkState.JOINING, LinkCause.TIME_BASE)
 

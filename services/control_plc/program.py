@@ -229,8 +229,8 @@ class ControlProgram:
         if self.watchdog.check(tick):
             self.optimizer_lost()
         began = self.player.begin(tick)
-        if self.player.broken_promise:
-            self._failed_handshake = tick
+        if self.player.broken_promise and self._held_from is not None:
+            self._failed_handshake, self._held_from = tick, None
         row = self.player.row(tick)
         self._climb(tick, row)
         applied = self.guard.admit(tick, self._wanted(tick, row), update=began)

@@ -6,7 +6,7 @@ from typing import Final, TypeVar
 from coldloop.errors import BUSY, DamagedAnswerError, LinkError, ModelFileError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
-from coldloop.registers.common import Identity
+from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import (
     CONTROL_MAP,
     Acknowledgement,
@@ -19,6 +19,7 @@ from coldloop.registers.control_plc import (
 )
 from coldloop.registers.optimizer_plc import ControlLinkState
 from coldloop.safety.sequence import InputSequence
+from coldloop.session.time_base import TimeBase
 from optimizer_plc.control_link import ControlLink
 
 T = TypeVar("T")
@@ -102,6 +103,14 @@ class ControlClient:
     def _heartbeat(self) -> Heartbeat:
         self._beats = (self._beats + 1) & 0xFFFF
         return Heartbeat(self._beats, self._model_digest, self._link.holder)
+
+    async def pace(self, session: int) -> TimeBase | None:
+        """Return the time base of a session; None where the control PLC is in another, or shows none that can be."""
+        shown = await self._again(lambda: self._client.read(SessionPace))
+        try:
+            return shown.of(session) if shown.session == session else None
+        except ValueError:
+            return None
 
     # -- updates -------------------------------------------------------------------------------------------------------
 

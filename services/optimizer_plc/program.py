@@ -135,7 +135,7 @@ class OptimizerProgram:
         elif 0 < elapsed != now["ticks"]:
             scheme.predict_played(self.constants, state, elapsed)
         interrupted = self._is_interrupted(update)
-        in_time = self._follow(update)
+        in_time = self._follow(update, u)
         now["sequences"] = max(int(now["sequences"]), update.playing)
         state.u[:] = u
         scheme.plan(
@@ -179,13 +179,15 @@ class OptimizerProgram:
         stepped = abs(update.load - float(now["load"])) > self.settings.interrupting_load_step_w > 0
         return stepped and 0 < elapsed < int(now["ticks"])
 
-    def _follow(self, update: Update) -> bool:
+    def _follow(self, update: Update, u: Array) -> bool:
         """Find out which profile is played from this instant on; return whether it is the last answer, in time."""
         sent, playing = self._sent, self.state.playing
         late = 0
         if begun := bool(sent["length"] and sent["number"] == update.playing):
             scheme.begin_sent(self.state)
             late = update.tick - int(sent["first_tick"])  # scans were missed: it began before this instant
+        elif self._now["planned"] and not self._playing["length"]:  # others may have moved the inputs again
+            playing.z[:], playing.u_before[:] = self.problem.hold(u), u
         elif self._now["planned"]:
             late = update.tick - int(self._now["tick"])
         if late > 0:
@@ -242,7 +244,8 @@ class OptimizerProgram:
         """Note how an answer came: after a late one adaptive periods get longer, after one in time shorter again.
 
         The budget is what the PLC should need; this is what machine and link really take. Each late answer doubles
-        what is allowed for them, each one in time takes a tick off.
+        what is allowed for them, each one in time takes a tick off. Where a period is fixed, or is the longest, there
+        are fewer iterations instead.
         """
         allowance = int(self._now["allowance"])
         self._now["allowance"] = min(max(1, 2 * allowance), MAX_PERIOD_TICKS) if late else max(0, allowance - 1)

@@ -180,15 +180,15 @@ class OptimizerPlc:
             return True
         return self._wanted is FRESH_UPDATE or update.update >= self._wanted.update
 
-    def _start(self, session: int) -> None:
-        """Begin a session, with the operator's settings where they are for this one."""
-        self._session = session
-        pace = self._configured_pace
+    async def _start(self, session: int) -> None:
+        """Begin a session, or begin it anew: at the pace that it has by now, with the period that is asked for."""
         period_s = self._settings.optimizer_plc.program.updating_period_s
-        asked = self.publication.asked_for(session)
+        pace, asked = await self._control.pace(session), self.publication.asked_for(session)
         if asked is not None:
-            pace = TimeBase(bool(asked.realtime), asked.factor)
             period_s = asked.updating_period * TICK_S
+        if pace is None:
+            pace = TimeBase(bool(asked.realtime), asked.factor) if asked is not None else self._configured_pace
+        self._session = session
         self._program.restart(period_s)
         self.publication.session_started(session, pace, self._program.rule_status())
         log.info("session started", extra={"session": session, "updating_period_s": period_s})
@@ -198,7 +198,7 @@ class OptimizerPlc:
         program = self._program
         self._link.tick = update.tick
         if update.session != self._session:
-            self._start(update.session)
+            await self._start(update.session)
         self._link.computes()
         plan = program.plan(update)
         sending = asyncio.ensure_future(self._control.plan(plan))

@@ -299,8 +299,6 @@ def plan(
         wanted = decide_by(rule, m.rule, o, a)
         now.efficiency, now.mismatch, now.contraction, now.gamma = a.efficiency, a.mismatch, a.contraction, a.gamma
     now.q = min(wanted, c.most)  # step (5): its period, and what fits; then step (2), what was sent is played
-    now.ticks = c.fixed_ticks or c.periods[now.q]
-    now.iterations = c.fitting[now.ticks]
-    if not c.fixed_ticks:
-        now.ticks = min(now.ticks + now.allowance, MAX_PERIOD_TICKS)
+    now.ticks = c.fixed_ticks or min(c.periods[now.q] + now.allowance, MAX_PERIOD_TICKS)
+    now.iterations = c.fitting[max(now.ticks - now.allowance, 0)]  # where a period cannot grow, they are fewer
     now.update, now.tick, now.load, now.effective, now.planned = update, tick, load, effective, True

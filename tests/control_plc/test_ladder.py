@@ -110,6 +110,35 @@ def test_a_handshake_that_comes_to_nothing_does_not_keep_the_loops_from_working(
     assert moved.count(True) >= 4
 
 
+@pytest.mark.parametrize("phase", range(0, 20, 4))
+def test_an_optimiser_whose_answers_are_refused_gets_its_handshake_after_the_pause(
+    rig: "Bench", phase: int, at: At
+) -> None:
+    """The loops move the inputs between update and answer, so that it is beyond the rates, as often as it is tried."""
+    program = rig.program
+    rig.temperature = 2.0
+    rig.play([at()] * 2, ticks=2)
+    rig.scans(2 + 20 + HOLD_TICKS + 30)
+    rig.scans((phase - program.tick) % 20)
+    program.abandon()
+    rig.scan()
+    began = program.tick
+    for _ in range(3):
+        assert rig.plan(20)
+        rig.scans(20)  # and nothing is sent: a handshake that comes to nothing, and two more broken promises
+    assert program.mode is Mode.CLASSICAL
+    while program.mode is not Mode.MPC and program.tick < began + 400:
+        update = program.player.update
+        assert update is not None
+        first = SequenceRow(*update.u)
+        assert rig.plan(20)
+        rig.scans(10)
+        rig.offer(rig.sequence([first._replace(cv156=first.cv156 - 0.1)] * 40))
+        rig.scans(10)
+    assert program.mode is Mode.MPC
+    assert program.tick <= began + 20 + 120 + 3 * 20, "a failure, a pause of 30 s and a handshake"
+
+
 WAYS = ("silence", "abandoned", "interrupted", "interrupted answers", "an answer far ahead")
 
 

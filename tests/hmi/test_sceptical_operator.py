@@ -188,10 +188,10 @@ def test_a_file_that_cannot_be_read_any_more_and_no_file_are_told(operated: "Pag
 
 
 def test_a_load_file_at_a_high_factor_begins_in_time(operated: "Page", site: Site) -> None:
-    operated.fill("#factor", "20")
-    operated.click("#factor-set")
-    assert "factor 20" in confirm(operated)
     try:
+        operated.fill("#factor", "20")
+        operated.click("#factor-set")
+        assert "factor 20" in confirm(operated)
         content = "time_s,load_w\n0,401\n" + "".join(f"{600 + i},{402 + i % 2}\n" for i in range(60))
         operated.set_input_files("#load-file", {"name": "a.csv", "mimeType": "text/csv", "buffer": content.encode()})
         operated.click("#load-play")

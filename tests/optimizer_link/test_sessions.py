@@ -14,6 +14,7 @@ from coldloop.modbus.client import RegisterClient
 from coldloop.registers.audit import Event, EventKind, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.bank import Caller, IllegalValueError, RefusedAccessError
 from coldloop.registers.codec import WordOrder
+from coldloop.registers.common import SessionPace
 from coldloop.registers.declaration import Role
 from coldloop.registers.optimizer_plc import OPTIMIZER_MAP, OperatingLimits, OptimizerSession
 from coldloop.registers.text import from_words
@@ -170,3 +171,19 @@ async def test_a_new_session_does_not_wait_for_the_answer_of_a_slow_one(
         control.session, control.updates = 2, 0
         control.latch()
         await until(lambda: control.plans)  # the answer of the slow one would take 200 s
+
+
+@pytest.mark.parametrize("asked", [None, OptimizerSession(7, 1, 300.0, 12)])
+async def test_an_optimiser_takes_the_pace_that_the_session_has_by_now(
+    connect: "Connect", control: "PlayedControlPlc", asked: OptimizerSession | None
+) -> None:
+    """It has been changed since the session was asked for: this optimiser was not there, or had to begin anew."""
+    control.session = 7
+    control.bank.put(SessionPace(7, 1, 1000.0))
+    async with connect(control) as link, panel(link) as client:
+        if asked is not None:
+            await client.write(asked)
+        control.latch()
+        await link.answers(1)
+        assert await client.read(SessionPace) == SessionPace(7, 1, 1000.0)
+        assert asked is None or control.headers[0].tau_u == asked.updating_period

@@ -1,10 +1,12 @@
 """Answers that come late by the clock: the PLC's budget is not what machine and link really take."""
 
+import numpy as np
 import pytest
 
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from coldloop.registers.control_plc import Update
+from coldloop.process.signals import TICK_S
+from coldloop.registers.control_plc import Update, Verdict
 from optimizer_plc.budget import MAX_PERIOD_TICKS
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.settings import ProgramSettings
@@ -47,7 +49,39 @@ def test_no_period_is_longer_than_the_longest(program: OptimizerProgram, model: 
     assert period(program, model) < MAX_PERIOD_TICKS, "a session begins without"
 
 
+@pytest.mark.parametrize("fixed_s", [0.0, 5.0])
+def test_where_a_period_cannot_grow_an_answer_comes_sooner(model: LtiModel, fixed_s: float) -> None:
+    """At the longest period, too, an optimiser that is late is in time in the end: there are fewer iterations."""
+    longest = {"adaptive": {"q_first": 19, "q_min": 19, "q_max": 19}}
+    program = OptimizerProgram(model, ProgramSettings.model_validate(longest), InputLimits())
+    program.restart(fixed_s)
+    slack = []
+    for _ in range(7):
+        slack.append(period(program, model) * TICK_S - program.answer_after_s())
+        program.solve()
+        program.answered(late=True)
+    assert slack[0] < 0.25, "no time for machine and link"
+    assert slack == sorted(slack)
+    assert slack[-1] > 4.0
+    assert program.report(Verdict.LATE).iterations >= 1
+
+
 def test_a_fixed_period_is_fixed(program: OptimizerProgram, model: LtiModel) -> None:
     program.restart(2.5)
     program.answered(late=True)
     assert period(program, model) == 10
+
+
+def test_while_others_drive_the_guess_is_where_they_have_led_the_inputs(
+    program: OptimizerProgram, model: LtiModel
+) -> None:
+    """Nothing of ours is played: update after update finds the inputs elsewhere."""
+    program.restart(0.0)
+    u0, y, x = (tuple(values.tolist()) for values in (model.u0, model.y0, model.x0))
+    for number in range(4):
+        u = (u0[0], u0[1], u0[2] + 0.125 * number)
+        program.plan(Update(1, number, 10_000 + 20 * number, 0, load=model.w0, u_before=u, u=u, y=y, x=x))
+        deviation = np.array(u) - model.u0
+        np.testing.assert_allclose(program.state.playing.z, program.problem.hold(deviation), atol=1e-12)
+        np.testing.assert_allclose(program.state.playing.u_before, deviation, atol=1e-12)
+        program.solve()
