@@ -178,6 +178,7 @@ class Clients:
             self._note(EventKind.SESSION, asked.realtime, caller.name, value=asked.factor)
         elif record is SessionPace:
             self.pending_time_base = pace = self._bank.get(SessionPace).of(program.session)
+            self._bank.put(SessionPace.shown(program.session, pace))
             self._note(EventKind.PACE, pace_subject(pace), caller.name, value=pace.factor)
         elif record is Operator:
             self._operate(self._bank.get(Operator), caller.name)

@@ -104,7 +104,8 @@ class PlantLink:
 
     def begin(self) -> None:
         """Begin a session: read back first. What the rack applied in the one before does not matter."""
-        self.generation, self._read, self._known_place = 0, None, None
+        self.generation, self._known_place = 0, None
+        self._forget_times()
         self._enter(PlantLinkState.JOINING, LinkCause.STARTED)
 
     def starting(self) -> None:
@@ -133,11 +134,8 @@ class PlantLink:
             self._enter(PlantLinkState.JOINING, LinkCause.MISSED_SCANS)
 
     def repaced(self) -> None:
-        """Note that the time base was changed: tick and speed of the rack are determined again.
-
-        What was noted in ticks of the old one says nothing in the new one.
-        """
-        self._moved_at = self._old_since = self._read = None
+        """Note that the time base was changed: tick and speed of the rack are determined again."""
+        self._forget_times()
         if self.synchronised:
             self._enter(PlantLinkState.JOINING, LinkCause.TIME_BASE)
 
@@ -221,6 +219,10 @@ class PlantLink:
         self._return_alarms()
 
     # -- inside --------------------------------------------------------------------------------------------------------
+
+    def _forget_times(self) -> None:
+        """Forget what was noted in ticks of a time base that may be another now."""
+        self._moved_at = self._old_since = self._read = None
 
     def _is_old(self, reading: Measurement, now: float | None) -> bool:
         """Return whether a reading is of a time before what is known, as from a gateway that is behind.

@@ -164,8 +164,10 @@ class ControlProgram:
         self._failed_handshake = -math.inf
         self._held_from: int | None = None
         """Since when the loops have been held for the sequence to come."""
+        self._held_for_answer = False
+        """It had been accepted."""
         self._answer_failed = False
-        """The last handshake came to nothing with a sequence that had been accepted."""
+        """A handshake came to nothing with a sequence that had been accepted."""
         self._in_scan = False
         self.watchdog.set(self.watchdog.time, tick)
         self._loops.restart()
@@ -229,8 +231,8 @@ class ControlProgram:
         if self.watchdog.check(tick):
             self.optimizer_lost()
         began = self.player.begin(tick)
-        if self.player.broken_promise and self._held_from is not None:
-            self._failed_handshake, self._held_from = tick, None
+        if self.player.broken_promise and self.ladder.mode is not Mode.CLASSICAL:
+            self._failed_handshake = tick
         row = self.player.row(tick)
         self._climb(tick, row)
         applied = self.guard.admit(tick, self._wanted(tick, row), update=began)
@@ -274,20 +276,29 @@ class ControlProgram:
     def _handing_over(self, tick: int) -> bool:
         """Return whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows.
 
-        A handshake fails when its update is abandoned or its sequence refused, and in any case after `HANDSHAKE_TICKS`.
+        A handshake fails when its update is abandoned, its sequence refused or missing, and in any case after
+        `HANDSHAKE_TICKS`. The next begins with an update, not amid one: the loops may have moved the inputs since.
         """
         player, held_from = self.player, self._held_from
-        if held_from is not None and (player.given_up or not 0 <= tick - held_from < HANDSHAKE_TICKS):
-            self._failed_handshake, self._held_from = tick, None
-            self._answer_failed = player.has_answer
-        rested = tick - self._failed_handshake > HANDSHAKE_PAUSE_S / TICK_S
+        if held_from is not None:
+            over = player.given_up or player.broken_promise or not 0 <= tick - held_from < HANDSHAKE_TICKS
+            if over:
+                self._failed_handshake, self._held_from = tick, None
+                self._answer_failed = self._answer_failed or self._held_for_answer
         if player.has_answer:  # it was judged from where the inputs are
-            held = rested or not self._answer_failed
+            held = self._rested_by(tick) or not self._answer_failed
+        elif player.update is None or player.broken_promise or self.operator.mode != OperatorMode.AUTO:
+            held = False
         else:
-            held = rested and self.operator.mode == OperatorMode.AUTO and player.answering
+            held = player.answering and (self._held_from is not None or self._rested_by(player.update.tick + 1))
         if held and self._held_from is None:
-            self._held_from = tick
+            self._held_from, self._held_for_answer = tick, False
+        self._held_for_answer |= held and player.has_answer
         return held
+
+    def _rested_by(self, tick: int) -> bool:
+        """Return whether the loops have worked for long enough since a handshake failed."""
+        return tick - self._failed_handshake > HANDSHAKE_PAUSE_S / TICK_S
 
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""

@@ -27,7 +27,7 @@ from coldloop.registers.optimizer_plc import (
 )
 from coldloop.safety.sequence import InputSequence, with_checksum
 from optimizer_plc import scheme
-from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
+from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import estimator_of
 from optimizer_plc.qp.arithmetic import real_of
@@ -247,8 +247,8 @@ class OptimizerProgram:
         what is allowed for them, each one in time takes a tick off. Where a period is fixed, or is the longest, there
         are fewer iterations instead.
         """
-        allowance = int(self._now["allowance"])
-        self._now["allowance"] = min(max(1, 2 * allowance), MAX_PERIOD_TICKS) if late else max(0, allowance - 1)
+        allowance, period = int(self._now["allowance"]), int(self._now["ticks"])
+        self._now["allowance"] = min(max(1, 2 * allowance), period) if late else max(0, allowance - 1)
 
     # -- diagnostics --------------------------------------------------------------------------------------------------
 

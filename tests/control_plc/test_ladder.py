@@ -110,9 +110,10 @@ def test_a_handshake_that_comes_to_nothing_does_not_keep_the_loops_from_working(
     assert moved.count(True) >= 4
 
 
-@pytest.mark.parametrize("phase", range(0, 20, 4))
+@pytest.mark.parametrize("period", [14, 16, 18, 19, 20])
+@pytest.mark.parametrize("phase", range(0, 20, 2))
 def test_an_optimiser_whose_answers_are_refused_gets_its_handshake_after_the_pause(
-    rig: "Bench", phase: int, at: At
+    rig: "Bench", phase: int, period: int, at: At
 ) -> None:
     """The loops move the inputs between update and answer, so that it is beyond the rates, as often as it is tried."""
     program = rig.program
@@ -124,19 +125,60 @@ def test_an_optimiser_whose_answers_are_refused_gets_its_handshake_after_the_pau
     rig.scan()
     began = program.tick
     for _ in range(3):
-        assert rig.plan(20)
-        rig.scans(20)  # and nothing is sent: a handshake that comes to nothing, and two more broken promises
+        assert rig.plan(period)
+        rig.scans(period)  # and nothing is sent: a handshake that comes to nothing, and two more broken promises
     assert program.mode is Mode.CLASSICAL
     while program.mode is not Mode.MPC and program.tick < began + 400:
         update = program.player.update
         assert update is not None
         first = SequenceRow(*update.u)
-        assert rig.plan(20)
+        assert rig.plan(period)
         rig.scans(10)
         rig.offer(rig.sequence([first._replace(cv156=first.cv156 - 0.1)] * 40))
-        rig.scans(10)
+        rig.scans(period - 10)
     assert program.mode is Mode.MPC
-    assert program.tick <= began + 20 + 120 + 3 * 20, "a failure, a pause of 30 s and a handshake"
+    assert program.tick <= began + 120 + 3 * period, "a failure, a pause of 30 s and a handshake"
+
+
+def test_loops_that_have_waited_for_the_hold_to_end_do_not_wait_for_a_late_optimiser(
+    new_bench: NewBench, monkeypatch: pytest.MonkeyPatch, at: At
+) -> None:
+    rig = new_bench(InputLimits())
+    rig.steady = True
+    rig.scan()
+    rig.play([at()] * 2, ticks=2)
+    at_work: list[int] = []
+    monkeypatch.setattr(rig.program._loops, "wanted", lambda tick, _, applied, **__: at_work.append(tick) or applied)  # noqa: SLF001
+    while rig.program.mode is not Mode.CLASSICAL:
+        if rig.program.player.awaiting_plan:
+            rig.plan(20)
+        rig.scan()
+    assert at_work == [rig.program.tick - 1], "at once, though a sequence has been promised again"
+
+
+class LoopsAtWork:
+    """Bench whose loops drive; the ticks at which they were at work. What is held is not seen where rates hold too."""
+
+    def __init__(self, bench: "Bench", monkeypatch: pytest.MonkeyPatch) -> None:
+        bench.level = 1.0
+        bench.scans(2 + 20 + HOLD_TICKS + 30)
+        self.program = bench.program
+        assert self.program.mode is Mode.CLASSICAL
+        self.program.abandon()
+        self.begun = self.program.tick
+        self.ticks: list[int] = []
+        self._wanted = self.program._loops.wanted  # noqa: SLF001
+        monkeypatch.setattr(self.program._loops, "wanted", self._work)  # noqa: SLF001
+
+    def _work(self, tick: int, *arguments: Any, **named: Any) -> SequenceRow:  # noqa: ANN401 - as they are
+        self.ticks.append(tick)
+        return self._wanted(tick, *arguments, **named)
+
+    def check(self) -> None:
+        """Demand that they are held for 5 s at a time, and then not for 30 s."""
+        passed = self.program.tick - self.begun
+        assert max(after - before for before, after in pairwise([self.begun, *self.ticks])) <= 20 + 1
+        assert passed - len(self.ticks) <= passed * 20 / 140 + 40
 
 
 WAYS = ("silence", "abandoned", "interrupted", "interrupted answers", "an answer far ahead")
@@ -147,22 +189,10 @@ def test_an_optimiser_that_plans_and_never_delivers_does_not_hold_the_loops(
     rig: "Bench", way: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program, far = rig.program, way in {"silence", "an answer far ahead"}
-    rig.level = 1.0
-    rig.scans(2 + 20 + HOLD_TICKS + 30)
-    assert program.mode is Mode.CLASSICAL
-    program.abandon()
-    at_work: list[int] = []
-    wanted = program._loops.wanted  # noqa: SLF001 - what is held is not seen where the rate holds as well
-
-    def working(tick: int, *arguments: Any, **named: Any) -> SequenceRow:  # noqa: ANN401 - as they are
-        at_work.append(tick)
-        return wanted(tick, *arguments, **named)
-
-    monkeypatch.setattr(program._loops, "wanted", working)  # noqa: SLF001
-    begun = program.tick
+    at_work = LoopsAtWork(rig, monkeypatch)
     for tick in range(1200):
         if program.player.awaiting_plan:
-            rig.plan(239 if far else 20, load_step=0.5 if "interrupted" in way else 0.0)
+            rig.plan(239 if far else 20, load_step=0.25 if "interrupted" in way else 0.0)
         if "answer" in way and not program.player.has_answer:
             rig.offer(rig.sequence([program.applied] * 20))
         if way == "abandoned" and tick % 15 == 14:
@@ -172,9 +202,24 @@ def test_an_optimiser_that_plans_and_never_delivers_does_not_hold_the_loops(
         rig.scan()
         if program.mode is not Mode.CLASSICAL:
             break
-    ticks = program.tick - begun
-    assert max(after - before for before, after in pairwise([begun, *at_work])) <= 20 + 1, "5 s"
-    assert ticks - len(at_work) <= ticks * 20 / 140 + 40, "and then not for 30 s"
+    at_work.check()
+
+
+def test_answers_that_load_steps_drop_and_promises_that_are_broken_in_turns_do_not_hold_the_loops(
+    rig: "Bench", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program, at_work = rig.program, LoopsAtWork(rig, monkeypatch)
+    rig.scan()
+    for _ in range(70):
+        assert rig.plan(20, load_step=0.25)
+        assert rig.offer(rig.sequence([program.applied] * 20)).verdict == Verdict.ACCEPTED
+        rig.scans(14)
+        rig.load = 768.5 - rig.load
+        rig.scan()
+        assert rig.plan(2)
+        rig.scans(2)
+        assert program.mode is Mode.CLASSICAL
+    at_work.check()
 
 
 @pytest.mark.parametrize("mode", [OperatorMode.CLASSICAL, OperatorMode.MANUAL])
