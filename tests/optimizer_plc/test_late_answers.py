@@ -43,6 +43,7 @@ def test_a_late_answer_is_followed_by_longer_periods_and_those_in_time_by_shorte
 def test_no_period_is_longer_than_the_longest(program: OptimizerProgram, model: LtiModel) -> None:
     program.restart(0.0)
     for _ in range(20):
+        period(program, model)
         program.answered(late=True)
     assert period(program, model) == MAX_PERIOD_TICKS
     program.restart(0.0)
