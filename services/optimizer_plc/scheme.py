@@ -19,7 +19,7 @@ from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, pred
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.qp.profile import inputs_of, shifted
-from optimizer_plc.qp.target import CV155, TargetSearch, bounds_at, find_target, loads_held
+from optimizer_plc.qp.target import CV155, TargetSearch, bounds_at, find_target, least_warm_load, loads_held
 from optimizer_plc.rules.assessment import Observation, assessed
 from optimizer_plc.rules.interface import UpdatingRule, decide_by
 from optimizer_plc.session_state import Delivery, OptimizerState
@@ -29,6 +29,8 @@ from optimizer_plc.solvers.kernel_solver import solve_by
 
 Array = NDArray[np.float64]
 
+LEAST_LOAD_ERROR_W: Final = 25.0
+"""What the model's least load within T5's row is above that of a plant that rests there, at most."""
 BY_THE_RULE: Final = 0
 """The q that `plan` is given when the rule is to decide it."""
 
@@ -238,14 +240,17 @@ def shortage(c: Constants, x: Array, w: float, load: float, most_open: float, no
     """Return what the load is above what can be held, W; negative: below what is needed; `none`, that is 0, otherwise.
 
     The estimate w (a deviation) has what the plant lacks beside its model, so it is compared with what the model holds
-    at rest within the inputs' bounds and the limit of CV155, less a reserve. The load itself (W), where it is measured,
-    is compared with what the plant holds that is as its model.
+    at rest within the inputs' bounds and the limit of CV155, less a reserve, and with the least that it holds without
+    T5 getting too cold, by the constant error of T5. The load itself (W), where it is measured, is compared with what
+    the plant holds that is as its model.
     """
     measured = load - c.estimator.w0 if c.estimator.load_known else w
     low, high = bounds_at(c.target, x, most_open)
     _, most = loads_held(c.target, low, high)
     too_much = max(w + c.reserve - most, measured - c.largest_load)
-    return max(too_much, none) + min(min(w, measured) - c.least_load, none)
+    warm = least_warm_load(c.target, low, high) - x.dtype.type(LEAST_LOAD_ERROR_W)
+    too_little = min(w - warm, min(w, measured) - c.least_load)
+    return max(too_much, none) + min(too_little, none)
 
 
 @kernel

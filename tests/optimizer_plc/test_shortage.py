@@ -6,13 +6,15 @@ import pytest
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import INPUT_NAMES
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.scheme import Constants, shortage
+from optimizer_plc.scheme import LEAST_LOAD_ERROR_W, Constants, shortage
 from optimizer_plc.settings import ProgramSettings
 from tests.optimizer_plc.test_target import LIMITS
 
 CV155, HEATER, CV156 = range(len(INPUT_NAMES))
 PER_CENT_W = (9.48784, -1.0, -0.209227)
 """What a per cent of CV155, a watt of the heater and a per cent of CV156 hold at rest, W."""
+PER_CENT_K = (0.146879, 0.0, -0.0776139)
+"""What they warm T5 by, K; 1.2835 K below the operating point, 0.1 K above the band's end, is its row."""
 RESERVE_W = ProgramSettings().capacity_reserve_w
 LEAST, LARGEST = ProgramSettings().holdable_load_w
 
@@ -24,10 +26,12 @@ def c(model: LtiModel) -> Constants:
     return OptimizerProgram(model, ProgramSettings.model_validate(settings), LIMITS).constants
 
 
-def short(c: Constants, estimated: float, load: float, limit: float = 60.0, error: float = 0.0) -> float:
-    """Return the shortage by an estimated and a measured load (W), the limit of CV155 and its constant error (%)."""
+def short(
+    c: Constants, estimated: float, load: float, limit: float = 60.0, error: float = 0.0, colder: float = 0.0
+) -> float:
+    """Return the shortage by an estimated and a measured load (W), the limit of CV155, its error (%) and T5's (K)."""
     x = np.zeros(c.estimator.steps.A.shape[-1])
-    x[c.target.constants[CV155]] = error
+    x[c.target.constants[CV155]], x[c.target.constants[-1]] = error, -colder
     most_open = (limit - c.estimator.u0[CV155]) / c.input_scale[CV155]
     return float(shortage(c, x, estimated - c.estimator.w0, load, most_open, 0.0))
 
@@ -64,4 +68,20 @@ def test_a_load_that_is_measured_counts_by_what_the_plant_holds_that_is_as_its_m
 
 
 def test_an_estimate_below_the_least_load_is_too_little(c: Constants) -> None:
-    assert short(c, LEAST - 7.0, 400.0) == pytest.approx(-7.0)
+    assert short(c, LEAST - 7.0, 400.0, colder=-1.0) == pytest.approx(-7.0), "T5 is warm enough"
+
+
+def test_a_turbine_that_is_colder_needs_more_load(c: Constants) -> None:
+    """T5 at rest is 2 K colder than the model says: CV156 closes, then CV155 opens, until it is at its row."""
+    coldest = c.estimator.w0 - 23.0 * PER_CENT_W[0] - 75.0 + 24.0 * PER_CENT_W[2]
+    lacking = 2.0 - 1.2835 + 23.0 * PER_CENT_K[0] - 24.0 * PER_CENT_K[2]
+    opened = (lacking + 40.0 * PER_CENT_K[2]) / PER_CENT_K[0]
+    least = coldest - 40.0 * PER_CENT_W[2] + opened * PER_CENT_W[0] - LEAST_LOAD_ERROR_W
+    assert 20.0 < 20.0 + opened < 60.0
+    assert short(c, least + 0.5, 400.0, colder=2.0) == 0.0
+    assert short(c, least - 7.0, 400.0, colder=2.0) == pytest.approx(-7.0, abs=0.2)
+
+
+def test_a_turbine_that_no_inputs_warm_enough_needs_the_load_with_which_it_is_warmest(c: Constants) -> None:
+    warmest = c.estimator.w0 + 17.0 * PER_CENT_W[0] - 75.0 - 16.0 * PER_CENT_W[2] - LEAST_LOAD_ERROR_W
+    assert short(c, 400.0, 400.0, colder=20.0) == pytest.approx(400.0 - warmest, abs=0.2)

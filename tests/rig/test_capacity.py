@@ -82,8 +82,18 @@ def test_a_load_that_is_too_small_is_said_and_stays_so_though_the_estimate_is_hi
     """What the linear model is off by there, the filter takes for a load."""
     run = with_load(115.0, tmp_path, 30)
     assert [(event["kind"], event["cause"]) for event in of_capacity(run)] == [
-        ("alarm raised", "too little load: raise it, or the bath will flood")
+        ("alarm raised", "too little load: raise it, or the turbine gets too cold and the bath floods")
     ]
+
+
+def test_a_load_with_which_a_better_turbine_gets_too_cold_is_said(tmp_path: Path) -> None:
+    """It holds 265 W and more; a plant as its model holds this."""
+    run = with_load(225.0, tmp_path, 15, turbine_efficiency=1.2)
+    alarm, columns = raised(run), run.trace.to_dict()
+    assert min(columns["T5"]) < T5_BAND[0]
+    assert alarm is not None
+    assert STEP_S <= float(str(alarm["time_s"])) < STEP_S + 40.0, "with its delay of 30 s"
+    assert "raise it" in str(alarm["cause"])
 
 
 @pytest.mark.exhaustive

@@ -155,6 +155,36 @@ def loads_held(c: TargetSearch, low: Array, high: Array) -> tuple[float, float]:
 
 
 @kernel
+def least_warm_load(c: TargetSearch, low: Array, high: Array) -> float:
+    """Return the least load that inputs within these bounds hold at rest with T5 above its lower row, a deviation in W.
+
+    From the inputs that hold least those move that warm T5 the most for each watt. Where that is not enough it is the
+    load with which T5 is warmest.
+    """
+    last = c.held.shape[0]
+    room, load, lacking = np.empty(last, low.dtype), low.dtype.type(0.0), low[last]
+    for i in range(last):
+        room[i] = high[i] - low[i]
+        at = low[i] if c.held[i] > 0 else high[i]
+        load += c.held[i] * at
+        lacking -= c.temperature[i] * at
+    while lacking > 0:
+        best, most = -1, low.dtype.type(0.0)
+        for i in range(last):
+            warms = c.temperature[i] * c.held[i] > 0  # in the direction in which it holds more
+            share = abs(c.temperature[i] / c.held[i])
+            if warms and room[i] > 0 and share > most:
+                best, most = i, share
+        if best < 0:
+            break
+        moved = min(room[best], lacking / abs(c.temperature[best]))
+        load += abs(c.held[best]) * moved
+        lacking -= abs(c.temperature[best]) * room[best]
+        room[best] = low.dtype.type(0.0)
+    return load
+
+
+@kernel
 def nearest_point(rows: Array, bounds: Array, tolerance: float) -> Array:
     """Return the point (2,) nearest to the origin with `rows` (4, 2) times it between `bounds` (4, 2).
 
