@@ -6,6 +6,7 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from plant.cold_box.physics import ColdBox, cold_box_of, evaluate
+from plant.components.phase_separator import add_to_account, settle_account, start_account
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import RealArray
 
@@ -28,19 +29,23 @@ def advance_along(
 ) -> RealArray:
     """Return the state after `dt` seconds, where `slope` (28,), dx/dt at `x`, is known; it is overwritten."""
     n = x.shape[0]
-    y = np.empty(22)
+    y, bath = np.empty(22), box.separator
     stage, total = np.empty(n), np.empty(n)
+    account = start_account(bath, x, slope, helium)
     for i in range(n):
         total[i] = slope[i]
         stage[i] = x[i] + 0.5 * dt * slope[i]
     for fraction in (0.5, 1.0):
         evaluate(stage, u, w, box, helium, slope, y)
+        account = add_to_account(bath, account, stage, slope, 2.0, helium)
         for i in range(n):
             total[i] += 2.0 * slope[i]
             stage[i] = x[i] + fraction * dt * slope[i]
     evaluate(stage, u, w, box, helium, slope, y)
+    account = add_to_account(bath, account, stage, slope, 1.0, helium)
     for i in range(n):
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
+    settle_account(bath, account, dt / 6.0, stage, helium)
     return stage
 
 

@@ -23,7 +23,7 @@ from coldloop.process import signals as process
 from plant.cold_box.physics import REFERENCE, ColdBox, cold_box_of, evaluate
 from plant.components.heat_exchanger import HighPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
-from plant.components.phase_separator import contents
+from plant.components.phase_separator import add_to_account, content, settle_account, start_account
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import Array, RealArray
 from plant.refrigerator.compression_station import (
@@ -96,7 +96,8 @@ def evaluate_refrigerator(
     joined = ColdBox(
         box.separator, box.jt_valve, box.turbine, box.nef1, box.nef2, box.nef34, box.return_line, P.HP, P.LP, x[coil]
     )
-    cold, leaving = evaluate(x[:BOX_STATES], u, d[0], joined, helium, dx[:BOX_STATES], y)
+    inputs = u if d[4].real + d[5].real > 0.0 else 0.0 * u
+    cold, leaving, relief = evaluate(x[:BOX_STATES], inputs, d[0], joined, helium, dx[:BOX_STATES], y)
     entering = HighPressureFlow(cold.m_jt + cold.m_t, d[1] + station.cooler_approach, P.HP)
     cooling = precooler_rates(
         x[BOX_STATES:STATION], v[3], entering, leaving, d[3], precooler, helium, dx[BOX_STATES:STATION]
@@ -104,10 +105,12 @@ def evaluate_refrigerator(
     flows = station_rates(
         x[STATION:], v, P, entering.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station, dx[STATION:]
     )
+    dx[STATION + 3] += relief
     signals[0], signals[1], signals[2] = P.LP / 1e5, P.HP / 1e5, P.buffer / 1e5
     signals[3], signals[4] = cooling.warm_end.T, x[coil - 1]
     signals[5] = 1e3 * entering.mass_flow
     _write_flows(flows, signals[6:])
+    signals[10] += 1e3 * relief
     signals[13] = nitrogen_level(precooler.nef5, x[coil + 1])
     signals[14] = x[coil + 2]
     signals[15] = 1e3 * cooling.boiling.boil_off
@@ -127,7 +130,7 @@ def _write_flows(flows: StationFlows, signals: Array) -> None:
 @kernel
 def inventory(x: Array, plant: Refrigerator, helium: Helium) -> float:
     """Return the helium (kg) in lines, buffer and bath; what was lost is not in it."""
-    in_bath, _ = contents(plant.box.separator, x[0], x[1], helium)
+    in_bath = content(plant.box.separator, x[0], x[1], helium).mass
     total: float = x[STATION] + x[STATION + 1] + x[STATION + 2] + in_bath
     return total
 
@@ -161,17 +164,22 @@ def advance_refrigerator(
     slope, y, signals = np.empty(n), np.empty(22), np.empty(SIGNALS)
     stage, total = np.empty(n), np.empty(n)
     evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
+    bath = plant.box.separator
+    account = start_account(bath, x, slope, helium)
     for i in range(n):
         total[i] = slope[i]
         stage[i] = x[i] + 0.5 * dt * slope[i]
     for fraction in (0.5, 1.0):
         evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
+        account = add_to_account(bath, account, stage, slope, 2.0, helium)
         for i in range(n):
             total[i] += 2.0 * slope[i]
             stage[i] = x[i] + fraction * dt * slope[i]
     evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
+    account = add_to_account(bath, account, stage, slope, 1.0, helium)
     for i in range(n):
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
+    settle_account(bath, account, dt / 6.0, stage, helium)
     return stage
 
 

@@ -59,6 +59,8 @@ class StationAlarmSettings(BaseModel):
     nitrogen_low: Percent = 25.0
     """%."""
     helium_lost_kg: PositiveFloat = 0.5
+    bath_relief_bar: Bar = 1.8
+    """At which the bath's relief valve opens."""
 
     @model_validator(mode="after")
     def _low_is_below_high(self) -> "StationAlarmSettings":

@@ -64,6 +64,8 @@ class EventKind(IntEnum):
     """The mode of the station's controller changed: subject the new one."""
     SURROUNDINGS = 27
     """Something was changed that a refrigerator is given: subject what, value its new value."""
+    MODEL_RANGE = 28
+    """The simulation left its property tables: subject what, its number from 0, cause 1 left, 0 returned."""
 
 
 class Event(NamedTuple):
