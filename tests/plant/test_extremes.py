@@ -1,31 +1,44 @@
 """Far from its operating point the plant neither makes nor loses helium or energy, and says where its tables end."""
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.model_range import CELLS_K, SATURATION_BAR, model_range
+from coldloop.process.model_range import CELLS_K, SATURATION_BAR, WARMEST_BATH_M3, model_range
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.range_bits import ModelRange
 from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationAlarm, StationMode
 from plant.cold_box.balance import energy_gained, energy_rates
-from plant.cold_box.physics import REFERENCE, derivative, streams
-from plant.components.phase_separator import SUPERHEAT, content, outflow, separate
-from plant.helium.properties import HIGHEST_SATURATION, LOWEST_SATURATION, load_helium, saturation
+from plant.cold_box.physics import REFERENCE, cold_box_of, derivative, streams
+from plant.components.phase_separator import (
+    SUPERHEAT,
+    content,
+    outflow,
+    separate,
+    start_account,
+    thinness,
+)
+from plant.components.return_line import return_flow
+from plant.helium.properties import HIGHEST_SATURATION, LOWEST_SATURATION, WARM_CP, helium_of, load_helium, saturation
 from plant.integrator import advance, plain_tuples
 from plant.kinds import plant_maker
 from plant.numeric import RealArray
 from plant.own_model import own_header
 from plant.program import PlantProgram
+from plant.refrigerator.balance import refrigerator_energy_rates
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
 from plant.refrigerator.physics import (
     REFERENCE_REFRIGERATOR,
+    SIGNAL_NAMES,
     STATE_NAMES,
-    advance_and_read_refrigerator,
+    advance_refrigerator,
+    evaluate_refrigerator,
     inventory,
+    refrigerator_of,
 )
 from plant.settings import PlantSettings
 
@@ -92,6 +105,24 @@ def test_a_full_bath_sends_liquid_along_and_no_more_than_it_has() -> None:
     assert carried[:2] == [sat.h_v, sat.h_v]
     assert sat.h_l < carried[2] < sat.h_v
     assert carried[3:] == pytest.approx([sat.h_l, sat.h_l])
+
+
+@given(P=bath_pressures, V_l=st.floats(-60.0 * BATH.volume, -31.0 * BATH.volume))
+def test_the_wall_of_a_dry_bath_goes_on_to_take_up_heat_above_300_k(P: float, V_l: float) -> None:
+    c, dV = content(BATH, P, V_l, HELIUM), 1e-4
+    hotter, colder = content(BATH, P, V_l - dV, HELIUM), content(BATH, P, V_l + dV, HELIUM)
+    assert (colder.energy - hotter.energy) / (2.0 * dV) == pytest.approx(c.U_V, rel=1e-6)
+
+
+@given(P=bath_pressures, superheat=st.floats(1.0, 250.0), over=st.floats(0.0, 2e4), exhaust=st.floats(0.0, 0.08))
+def test_the_pressure_of_a_dry_bath_settles_slowly_enough_for_a_tick(
+    P: float, superheat: float, over: float, exhaust: float
+) -> None:
+    V_l = -superheat * WARM_CP * BATH.volume / SUPERHEAT
+    thin, line = thinness(BATH, P, V_l, HELIUM), REFERENCE.return_line
+    more, _ = return_flow(line, P + over + 5.0, P, exhaust, thin)
+    less, _ = return_flow(line, P + over, P, exhaust, thin)
+    assert (more - less) / 5.0 / content(BATH, P, V_l, HELIUM).M_P < 2.5 / 0.25
 
 
 # -- the turbine -------------------------------------------------------------------------------------------------------
@@ -219,6 +250,10 @@ def test_the_alarm_for_the_end_of_the_tables_knows_what_has_left_them() -> None:
     assert model_range(x, 4.0, 0.2) == ModelRange.SUPPLY_PRESSURE | ModelRange.RETURN_PRESSURE
     far = np.tile(x, (2, 1))
     far[0, -1], far[1, 5] = CELLS_K[1] + 1.0, CELLS_K[0] - 0.1
+    dry = np.concatenate([x[:1], [1.01 * WARMEST_BATH_M3], x[2:]])
+    assert model_range(dry, 16.0, 1.05) == ModelRange.WARM_BATH
+    warmest = outflow(BATH, 1.2e5, WARMEST_BATH_M3, saturation(1.2e5, HELIUM), HELIUM)
+    assert pytest.approx(CELLS_K[1], abs=1.0) == warmest.T
     assert model_range(far, 16.0, 1.05).tolist() == [ModelRange.WARM_CELL, ModelRange.COLD_CELL]
     assert (1e5 * SATURATION_BAR[0], 1e5 * SATURATION_BAR[1]) == (LOWEST_SATURATION, HIGHEST_SATURATION)
 
@@ -232,66 +267,109 @@ happenings = st.tuples(st.floats(0.0, 6000.0), st.floats(275.0, 320.0), st.float
 pieces = st.tuples(st.integers(40, 1200), inputs, st.tuples(percent, percent, percent, percent), happenings)
 
 
-def helium_over_random_events(
-    course: list[tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]],
-) -> None:
-    """Valves stuck anywhere, trips, leaks, lost nitrogen and loads: what is in the circuit and what has left add up."""
+Course = list[tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]]
+
+
+WEIGHTS = np.array([0.25 / 6.0, 0.25 / 3.0, 0.25 / 3.0, 0.25 / 6.0])
+AHEAD = np.array([0.125, 0.125, 0.25, 0.0])
+"""Of the stages of a tick, s."""
+
+
+@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+def held(
+    x: RealArray, u: RealArray, v: RealArray, d: RealArray, ticks: int, plain: object, tables: object
+) -> tuple[RealArray, RealArray]:
+    """Return the state after some ticks, and sums over their stages.
+
+    What crossed the boundary and its size (J), what the bath's rates brought it (J), and the largest difference between
+    what crosses and what is stored (W).
+    """
+    plant, helium = refrigerator_of(plain), helium_of(tables)
+    sums, slope, y, signals = np.zeros(4), np.empty(x.shape[0]), np.empty(22), np.empty(len(SIGNAL_NAMES))
+    for _ in range(ticks):
+        stage = x
+        for k in range(4):
+            crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
+            stored, inwards = refrigerator_energy_rates(stage, slope, crossing, d[0], plant, helium)
+            sums[0] += WEIGHTS[k] * inwards
+            sums[1] += WEIGHTS[k] * abs(inwards)
+            sums[2] += WEIGHTS[k] * start_account(plant.box.separator, stage, slope, helium).heat
+            sums[3] = max(sums[3], abs(stored - inwards))
+            stage = x + AHEAD[k] * slope
+        x = advance_refrigerator(x, u, v, d, 0.25, plant, helium)
+    return x, sums
+
+
+def balances_over_random_events(course: Course) -> None:
+    """Valves stuck anywhere, trips, leaks, lost nitrogen and loads: helium and energy add up, stage by stage."""
     x = np.array(FILE.x0)
     before = inventory(x, PLANT, HELIUM)
+    in_bath = content(BATH, x[0], x[1], HELIUM).energy
     for ticks, u, v, d in course:
-        for _ in range(ticks):
-            x, _, _ = advance_and_read_refrigerator(x, np.array(u), np.array(v), np.array(d), 0.25, PLAIN, TABLES)
+        x, sums = held(x, np.array(u), np.array(v), np.array(d), ticks, PLAIN, TABLES)
         assert np.all(np.isfinite(x))
         assert inventory(x, PLANT, HELIUM) + x[M_LOST] == pytest.approx(before, rel=1e-9)
+        assert sums[3] < 1e-6 * sums[1] / (0.25 * ticks) + 1e-6
+        gained = content(BATH, x[0], x[1], HELIUM).energy - in_bath
+        assert gained == pytest.approx(sums[2], abs=1e-6 * sums[1])
+        in_bath += gained
 
 
 @given(course=st.lists(pieces, min_size=2, max_size=4))
 @settings(max_examples=3)
-def test_helium_is_conserved_whatever_happens(
-    course: list[tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]],
-) -> None:
-    helium_over_random_events(course)
+def test_helium_and_energy_are_conserved_whatever_happens(course: Course) -> None:
+    balances_over_random_events(course)
 
 
 @pytest.mark.exhaustive
 @given(course=st.lists(pieces, min_size=24, max_size=24))
 @settings(max_examples=2000)
-def test_helium_is_conserved_over_hours_of_whatever_happens(
-    course: list[tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]],
-) -> None:
-    helium_over_random_events(course)
+def test_helium_and_energy_are_conserved_over_hours_of_whatever_happens(course: Course) -> None:
+    balances_over_random_events(course)
 
 
-box_pieces = st.lists(st.tuples(st.integers(40, 400), inputs, st.floats(0.0, 6000.0)), min_size=2, max_size=4)
+box_pieces = st.tuples(st.integers(40, 1200), inputs, st.floats(0.0, 6000.0))
+BoxCourse = list[tuple[int, tuple[float, ...], float]]
+BOX = plain_tuples(REFERENCE)
 
 
-def energy_over_random_events(course: list[tuple[int, tuple[float, ...], float]]) -> None:
-    """What a cold box has gained in the end is what crossed its boundary, summed over the stages of each step."""
-    x, box = np.array(HEADER.x0), REFERENCE
-    start, supplied, moved = x, 0.0, 0.0
-    for ticks, inputs_held, w in course:
-        u = np.array(inputs_held)
-        for _ in range(ticks):
-            stage, crossed = x, 0.0
-            for weight, ahead in ((1.0, 0.125), (2.0, 0.125), (2.0, 0.25), (1.0, 0.0)):
-                stored, crossing = energy_rates(stage, u, w, box, HELIUM)
-                assert stored == pytest.approx(crossing, abs=1e-6 * max(1.0, abs(w)))
-                crossed += weight * crossing
-                stage = x + ahead * derivative(stage, u, w, box, HELIUM)
-            supplied += 0.25 / 6.0 * crossed
-            moved += 0.25 / 6.0 * abs(crossed)
-            x = advance(x, u, w, 0.25, box, HELIUM)
-    assert energy_gained(start, x, box, HELIUM) == pytest.approx(supplied, abs=1e-6 * moved)
+@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+def box_held(
+    x: RealArray, u: RealArray, w: float, ticks: int, plain: object, tables: object
+) -> tuple[RealArray, RealArray]:
+    """Return the same for a cold box: what crossed, its size (J), and the largest difference (W)."""
+    box, helium, sums = cold_box_of(plain), helium_of(tables), np.zeros(3)
+    for _ in range(ticks):
+        stage = x
+        for k in range(4):
+            stored, inwards = energy_rates(stage, u, w, box, helium)
+            sums[0] += WEIGHTS[k] * inwards
+            sums[1] += WEIGHTS[k] * abs(inwards)
+            sums[2] = max(sums[2], abs(stored - inwards))
+            stage = x + AHEAD[k] * derivative(stage, u, w, box, helium)
+        x = advance(x, u, w, 0.25, box, helium)
+    return x, sums
 
 
-@given(course=box_pieces)
+def energy_over_random_events(course: BoxCourse) -> None:
+    """What a cold box has gained in the end, by its states alone, is what crossed its boundary."""
+    x, crossed, size = np.array(HEADER.x0), 0.0, 0.0
+    start = x
+    for ticks, u, w in course:
+        x, sums = box_held(x, np.array(u), w, ticks, BOX, TABLES)
+        crossed, size = crossed + sums[0], size + sums[1]
+        assert sums[2] < 1e-6
+    assert energy_gained(start, x, REFERENCE, HELIUM) == pytest.approx(crossed, abs=1e-6 * size)
+
+
+@given(course=st.lists(box_pieces, min_size=2, max_size=4))
 @settings(max_examples=3)
-def test_energy_is_conserved_whatever_happens(course: list[tuple[int, tuple[float, ...], float]]) -> None:
+def test_a_cold_box_has_gained_what_crossed_its_boundary(course: BoxCourse) -> None:
     energy_over_random_events(course)
 
 
 @pytest.mark.exhaustive
-@given(course=box_pieces)
+@given(course=st.lists(box_pieces, min_size=24, max_size=24))
 @settings(max_examples=2000)
-def test_energy_is_conserved_through_many_more_events(course: list[tuple[int, tuple[float, ...], float]]) -> None:
+def test_a_cold_box_has_gained_what_crossed_its_boundary_in_hours_of_events(course: BoxCourse) -> None:
     energy_over_random_events(course)

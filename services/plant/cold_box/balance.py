@@ -8,6 +8,7 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from plant.cold_box.physics import ColdBox, evaluate
+from plant.components.cell_account import heat_capacity
 from plant.components.heat_exchanger import HeatExchanger
 from plant.components.phase_separator import content, outflow
 from plant.helium.properties import Helium, saturation, supply_cell
@@ -25,13 +26,8 @@ def energy_rates(x: Array, u: Array, w: float, box: ColdBox, helium: Helium) -> 
     """
     dx = np.empty_like(x)
     s, warm, relief = evaluate(x, u, w, box, helium, dx, np.empty(22, dtype=x.dtype))
-    c = content(box.separator, x[0], x[1], helium)
-    stored = c.U_P * dx[0] + c.U_V * dx[1]
-    first2 = 2 + box.nef1.cells
-    first34 = first2 + box.nef2.cells
-    stored += _stored_in_cells(box.nef1, box.P_HP, x[2:first2], dx[2:first2], helium)
-    stored += _stored_in_cells(box.nef2, box.P_HP, x[first2:first34], dx[first2:first34], helium)
-    stored += _stored_in_cells(box.nef34, box.P_HP, x[first34:], dx[first34:], helium)
+    stored = stored_rate(x, dx, box, box.P_HP, helium)
+    first34 = 2 + box.nef1.cells + box.nef2.cells
     top = outflow(box.separator, x[0], x[1], saturation(x[0], helium), helium)
     h_in, _, _ = supply_cell(box.P_HP, box.T_in, helium)
     h_turbine, _, _ = supply_cell(box.P_HP, x[first34 + box.nef34.cells - 1], helium)
@@ -41,18 +37,26 @@ def energy_rates(x: Array, u: Array, w: float, box: ColdBox, helium: Helium) -> 
 
 
 @kernel
-def _stored_in_cells(exchanger: HeatExchanger, P: float, T: Array, dT: Array, helium: Helium) -> float:
+def stored_rate(x: Array, dx: Array, box: ColdBox, P: float, helium: Helium) -> float:
+    """Return how fast the stored energy rises (W) with the rates `dx` and the supply at `P` (Pa)."""
+    c = content(box.separator, x[0], x[1], helium)
+    first2 = 2 + box.nef1.cells
+    first34 = first2 + box.nef2.cells
+    last = first34 + box.nef34.cells
+    stored: float = c.U_P * dx[0] + c.U_V * dx[1]
+    stored += stored_in_cells(box.nef1, P, x[2:first2], dx[2:first2], helium)
+    stored += stored_in_cells(box.nef2, P, x[first2:first34], dx[first2:first34], helium)
+    stored += stored_in_cells(box.nef34, P, x[first34:last], dx[first34:last], helium)
+    return stored
+
+
+@kernel
+def stored_in_cells(exchanger: HeatExchanger, P: float, T: Array, dT: Array, helium: Helium) -> float:
+    """Return how fast the energy in the cells of an exchanger rises (W)."""
     total: float = 0.0 * (T[0] + P)
     for i in range(exchanger.cells):
         total += heat_capacity(exchanger, P, T[i], helium) * dT[i]
     return total
-
-
-@kernel
-def heat_capacity(exchanger: HeatExchanger, P: float, T: float, helium: Helium) -> float:
-    """Return the heat capacity of one cell (J/K) at `P` (Pa) and `T` (K)."""
-    _, rho_cp, c_wall = supply_cell(P, T, helium)
-    return (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
 
 
 def energy_gained(before: RealArray, after: RealArray, box: ColdBox, helium: Helium) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from coldloop.kernels.compiled import kernel
 from plant.components.gas_valve import CRITICAL_RATIO, cold_valve_flow
 from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow, exchange
-from plant.components.phase_separator import PhaseSeparator, bath_relief, level, outflow, separate
+from plant.components.phase_separator import PhaseSeparator, bath_relief, level, outflow, separate, thinness
 from plant.components.return_line import ReturnLine, return_flow
 from plant.components.turbine import Back, Expansion, Turbine, expand, throttled_flow, turbine_flow
 from plant.components.valve import Valve
@@ -100,9 +100,10 @@ def streams(x: Array, u: Array, box: ColdBox, helium: Helium) -> Streams:
     T_turbine = x[1 + box.nef1.cells + box.nef2.cells + box.nef34.cells]
     h_turbine, rho_turbine = supply_enthalpy_and_density(box.P_HP, T_turbine, helium)
     m_t, P_turbine = turbine_flow(box.turbine, u[2], box.P_HP, T_turbine, rho_turbine)
-    m_v, P_mix = return_flow(box.return_line, x[0], box.P_LP, m_t)
+    thin = thinness(box.separator, x[0], x[1], helium)
+    m_v, P_mix = return_flow(box.return_line, x[0], box.P_LP, m_t, thin)
     if P_mix.real > CRITICAL_RATIO * P_turbine.real:
-        back = Back(box.return_line, x[0], box.P_LP)
+        back = Back(box.return_line, x[0], box.P_LP, thin)
         m_t, P_turbine, m_v, P_mix = throttled_flow(box.turbine, u[2], box.P_HP, T_turbine, rho_turbine, back)
     exhaust = expand(box.turbine, m_t, h_turbine, P_turbine, P_mix, helium)
     return Streams(m_jt, h_jt, m_v, m_t, P_turbine, P_mix, exhaust)

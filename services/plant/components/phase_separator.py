@@ -17,6 +17,7 @@ from plant.components.gas_valve import CHOKED
 from plant.helium.interpolation import hermite_slope_weights, hermite_weights, locate, read_curve
 from plant.helium.properties import (
     WARM_CP,
+    WARMEST_ISOBAR,
     Helium,
     Saturation,
     saturation,
@@ -113,11 +114,12 @@ def dry_content(separator: PhaseSeparator, P: float, V_l: float, helium: Helium)
     h = sat.h_v + excess
     rho, rho_P, rho_h = vapour_density(P, excess, sat, slope, helium)
     T_wall = COLD_WALL + excess / WARM_CP
+    T = at_most(T_wall, WARMEST_ISOBAR)  # above it the wall has the heat capacity that it has there
     table = helium.isobar
-    i, t = locate(np.log(T_wall), table.start, table.step, table.before, table.nodes.shape[0])
-    stored = separator.wall * read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, hermite_weights(t))
-    heat = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, hermite_slope_weights(t)) / table.step
-    wall = separator.wall * heat / (T_wall * WARM_CP)
+    i, t = locate(np.log(T), table.start, table.step, table.before, table.nodes.shape[0])
+    capacity = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, hermite_slope_weights(t)) / (table.step * T)
+    stored = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, hermite_weights(t)) + capacity * (T_wall - T)
+    stored, wall = separator.wall * stored, separator.wall * capacity / WARM_CP
     return Content(
         V * rho,
         V * (rho * h - P) + stored,
@@ -141,6 +143,15 @@ def outflow(separator: PhaseSeparator, P: float, V_l: float, sat: Saturation, he
     share = at_most(share, 1.0)
     carried = share * share * (3.0 - 2.0 * share)
     return Outflow(sat.T, sat.h_v - carried * (sat.h_v - sat.h_l), sat.rho_v)
+
+
+@kernel
+def thinness(separator: PhaseSeparator, P: float, V_l: float, helium: Helium) -> float:
+    """Return by how much the vapour of a dry vessel is thinner than saturated vapour; 1 in one that is not dry."""
+    if V_l.real >= 0.0:
+        return 1.0 + 0.0 * P
+    thin: float = separator.volume * saturation(P, helium).rho_v / dry_content(separator, P, V_l, helium).mass
+    return thin
 
 
 @inlined

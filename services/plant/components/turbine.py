@@ -43,6 +43,8 @@ class Back(NamedTuple):
     """Pa."""
     P_suction: float
     """Pa."""
+    thinness: float
+    """Of the vapour, see `return_flow`."""
 
 
 class Expansion(NamedTuple):
@@ -88,7 +90,7 @@ def throttled_flow(
     none = 0.0 * (P_supply + T_in + density + back.P_bath + back.P_suction + area)
     c = 2.0 * density * area * area + none
     if area.real < SHUT:
-        m_v, P_mix = return_flow(back.line, back.P_bath, back.P_suction, none)
+        m_v, P_mix = return_flow(back.line, back.P_bath, back.P_suction, none, back.thinness)
         return none, P_mix + none, m_v + none, P_mix + none
     low, choked = 0.0, np.sqrt((1.0 - CRITICAL_RATIO) * c.real * P_supply.real)
     high = choked
@@ -114,7 +116,7 @@ def _flow_excess(
 ) -> tuple[float, float, float, float]:
     """Return by how much a flow is more than what the nozzle passes (kg/s), and what `throttled_flow` returns."""
     P_between = at_least(P_supply - flow * flow / c, 0.0)
-    m_v, P_mix = return_flow(back.line, back.P_bath, back.P_suction, flow)
+    m_v, P_mix = return_flow(back.line, back.P_bath, back.P_suction, flow, back.thinness)
     ratio = at_most(P_mix / at_least(P_between, 1.0), 1.0)
     passed = turbine.nozzle * P_between / np.sqrt(T_in) * expansion(ratio) / CHOKED
     return flow - passed, P_between, m_v, P_mix

@@ -20,8 +20,9 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process import signals as process
-from plant.cold_box.physics import REFERENCE, ColdBox, cold_box_of, evaluate
-from plant.components.heat_exchanger import HighPressureFlow
+from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, evaluate
+from plant.components.cell_account import settle_cells
+from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
 from plant.components.phase_separator import add_to_account, content, settle_account, start_account
 from plant.helium.properties import Helium, helium_of
@@ -40,6 +41,7 @@ from plant.refrigerator.precooler import (
     PRECOOLER_STATE_UNITS,
     PRECOOLER_STATES,
     Precooler,
+    Precooling,
     check_precooler,
     precooler_of,
     precooler_rates,
@@ -70,6 +72,23 @@ class Refrigerator(NamedTuple):
 REFERENCE_REFRIGERATOR: Final = Refrigerator()
 
 
+class Crossing(NamedTuple):
+    """Streams over the boundary of the cold part, and within it."""
+
+    entering: HighPressureFlow
+    """From the compressors."""
+    cold: Streams
+    """Of the cold box."""
+    leaving: LowPressureFlow
+    """From the cold box to NEF6."""
+    relief: float
+    """From the bath into the recovery line, kg/s."""
+    cooling: Precooling
+    """What NEF6 and NEF5 do."""
+    heater: float
+    """W."""
+
+
 @kernel
 def refrigerator_of(fields: Any) -> Refrigerator:  # noqa: ANN401 - any nesting of tuples
     """Rebuild the parameters from nested plain tuples, see `plant.integrator.advance_and_read`."""
@@ -87,8 +106,11 @@ def evaluate_refrigerator(
     dx: Array,
     y: Array,
     signals: Array,
-) -> None:
-    """Write the rates (48, per second), the cold box's outputs (22) and the warm signals (19, `SIGNAL_NAMES`)."""
+) -> Crossing:
+    """Write the rates (48, per second), the cold box's outputs (22) and the warm signals (19, `SIGNAL_NAMES`).
+
+    Returns the streams that cross the boundary of its cold part, for `plant.refrigerator.balance`.
+    """
     station, precooler = plant.station, plant.precooler
     coil = BOX_STATES + precooler.nef6.cells
     P = station_pressures(x[STATION:], station, d[1])
@@ -117,6 +139,7 @@ def evaluate_refrigerator(
     signals[16] = inventory(x, plant, helium)
     signals[17] = x[STATION + 3]
     signals[18] = d[1]
+    return Crossing(entering, cold, leaving, relief, cooling, inputs[1])
 
 
 @kernel
@@ -163,23 +186,35 @@ def advance_refrigerator(
     n = x.shape[0]
     slope, y, signals = np.empty(n), np.empty(22), np.empty(SIGNALS)
     stage, total = np.empty(n), np.empty(n)
+    stages, slopes = np.empty((4, n)), np.empty((4, n))
     evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
     bath = plant.box.separator
     account = start_account(bath, x, slope, helium)
     for i in range(n):
+        stages[0, i], slopes[0, i] = x[i], slope[i]
         total[i] = slope[i]
         stage[i] = x[i] + 0.5 * dt * slope[i]
-    for fraction in (0.5, 1.0):
+    for k, fraction in ((1, 0.5), (2, 1.0)):
         evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
         account = add_to_account(bath, account, stage, slope, 2.0, helium)
         for i in range(n):
+            stages[k, i], slopes[k, i] = stage[i], slope[i]
             total[i] += 2.0 * slope[i]
             stage[i] = x[i] + fraction * dt * slope[i]
     evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
     account = add_to_account(bath, account, stage, slope, 1.0, helium)
     for i in range(n):
+        stages[3, i], slopes[3, i] = stage[i], slope[i]
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
     settle_account(bath, account, dt / 6.0, stage, helium)
+    P = np.empty(4)
+    for k in range(4):
+        P[k] = station_pressures(stages[k, STATION:], plant.station, d[1]).HP
+    box = plant.box
+    settle_cells(box.nef1, 2, P, stages, slopes, dt, stage, helium)
+    settle_cells(box.nef2, 2 + box.nef1.cells, P, stages, slopes, dt, stage, helium)
+    settle_cells(box.nef34, 2 + box.nef1.cells + box.nef2.cells, P, stages, slopes, dt, stage, helium)
+    settle_cells(plant.precooler.nef6, BOX_STATES, P, stages, slopes, dt, stage, helium)
     return stage
 
 

@@ -17,6 +17,8 @@ SUPPLY_BAR: Final = (5.0, 19.0)
 """Of the high-pressure side, where its properties are fitted."""
 CELLS_K: Final = (2.5, 300.0)
 """Of the exchangers' cells."""
+WARMEST_BATH_M3: Final = -6.16
+"""V_l of a dry bath that is at 300 K."""
 COLD_BOX_BAR: Final = (16.0, 1.05)
 """Supply and return of a cold box alone."""
 
@@ -33,6 +35,7 @@ def model_range(x: NDArray[Any], supply: NDArray[Any] | float, suction: NDArray[
         ModelRange.RETURN_PRESSURE: _outside(suction, SATURATION_BAR),
         ModelRange.COLD_CELL: np.min(cells, axis=-1) < CELLS_K[0],
         ModelRange.WARM_CELL: np.max(cells, axis=-1) > CELLS_K[1],
+        ModelRange.WARM_BATH: x[..., 1] < WARMEST_BATH_M3,
     }
     bits = np.zeros(bath.shape, np.int32)
     for bit, left in outside.items():

@@ -11,3 +11,4 @@ class ModelRange(IntFlag):
     RETURN_PRESSURE = 4
     COLD_CELL = 8
     WARM_CELL = 16
+    WARM_BATH = 32

@@ -287,7 +287,11 @@ class ModelRangeStatus(NamedTuple):
     """Whether the simulation is within its property tables; outside them its values are not to be believed."""
 
     outside: Annotated[
-        int, u16("Bits: 1 bath, 2 supply, 4 return pressure, 8 a cell too cold, 16 a cell too warm; 0 is within")
+        int,
+        u16(
+            "Bits: 1 bath, 2 supply, 4 return pressure, 8 a cell too cold, 16 a cell too warm, "
+            "32 a dry bath too warm; 0 is within"
+        ),
     ] = 0
     since: Annotated[int, u32("Tick at which this last changed")] = 0
 
