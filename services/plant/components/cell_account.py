@@ -12,7 +12,7 @@ from plant.components.heat_exchanger import HeatExchanger
 from plant.helium.properties import Helium, supply_cell
 from plant.numeric import RealArray
 
-COARSE = 0.02  # K
+COARSE = 0.1  # K
 PANEL = 0.1  # K, of the integral over the heat capacity
 LEAST_ENERGY = 1e-6  # J: what is less is left alone
 MOST_CORRECTIONS = 4
