@@ -13,6 +13,7 @@ from plant.helium.properties import Helium, supply_cell
 from plant.numeric import RealArray
 
 COARSE = 0.1  # K
+WILD = 50.0  # K in one step: no state of a plant, and not worth being summed up
 PANEL = 0.1  # K, of the integral over the heat capacity
 LEAST_ENERGY = 1e-6  # J: what is less is left alone
 MOST_CORRECTIONS = 4
@@ -51,7 +52,7 @@ def settle_cells(
     """
     for i in range(first, first + exchanger.cells):
         change = x[i] - stages[0, i]
-        if abs(change) > COARSE:
+        if COARSE < abs(change) < WILD:
             brought: float = 0.0
             for k in range(4):
                 weight = dt / 6.0 if k in (0, 3) else dt / 3.0

@@ -70,13 +70,13 @@ def take_up(
     """Return T (K), h (J/kg) and cp (J/(kg K)) of the low-pressure flow after one cell of `UA` (W/K).
 
     Wet vapour, as a very cold turbine exhaust brings it, boils dry at constant temperature before it warms up, and
-    saturated vapour that is cooled becomes wet.
+    saturated vapour that is cooled becomes wet, at most all of it liquid.
     """
     if low.h.real < sat.h_v.real:
         boiling = UA * drive / low.mass_flow
         missing = sat.h_v - low.h
         if boiling.real <= missing.real:
-            return sat.T + 0.0 * boiling, low.h + boiling, cp
+            return sat.T + 0.0 * boiling, at_least(low.h + boiling, at_most(sat.h_l, low.h)), cp
         UA = UA * (1.0 - missing / boiling)
     T = low.T + drive * (1.0 - np.exp(-UA / (low.mass_flow * cp)))
     if T.real < sat.T.real:

@@ -35,6 +35,7 @@ LEAST_MASS, LEAST_ENERGY = 2e-12, 1e-7  # kg and J in a step: what is less is le
 ROUNDING = 1e-14  # share of mass to which `holding` solves
 MAX_NEWTON_STEPS = 30
 JUST_DRY = 1e-16  # m3
+LEAST_PRESSURE, CRITICAL_PRESSURE = 0.05e5, 2.28e5  # Pa
 
 
 class PhaseSeparator(NamedTuple):
@@ -233,19 +234,24 @@ def settle_account(separator: PhaseSeparator, account: Account, dt: float, x: Ar
     mass, energy = account.mass + dt * account.inflow, account.energy + dt * account.heat
     c = content(separator, x[0], x[1], helium)
     if abs(mass - c.mass) > LEAST_MASS or abs(energy - c.energy) > LEAST_ENERGY:
-        x[0], x[1] = holding(separator, x[0], x[1], mass, energy, helium)
+        found, P, V_l = holding(separator, x[0], x[1], mass, energy, helium)
+        if found:
+            x[0], x[1] = P, V_l
 
 
 @kernel
 def holding(
     separator: PhaseSeparator, P: float, V_l: float, mass: float, energy: float, helium: Helium
-) -> tuple[float, float]:
-    """Return P (Pa) and V_l (m3) of a vessel that holds `mass` (kg) and `energy` (J), near those given."""
+) -> tuple[bool, float, float]:
+    """Return whether a vessel can hold `mass` (kg) and `energy` (J), and with which P (Pa) and V_l (m3) near those given.
+
+    From far away Newton's method may find none, or one beyond the critical point.
+    """
     for _ in range(MAX_NEWTON_STEPS):
         c = content(separator, P, V_l, helium)
         more, hotter = mass - c.mass, energy - c.energy
         if abs(more) <= ROUNDING * mass and abs(hotter) <= 0.1 * LEAST_ENERGY:
-            break
+            return LEAST_PRESSURE < P < CRITICAL_PRESSURE, P, V_l
         determinant = c.M_P * c.U_V - c.M_V * c.U_P
         dP = (more * c.U_V - c.M_V * hotter) / determinant
         dV = (c.M_P * hotter - c.U_P * more) / determinant
@@ -253,4 +259,4 @@ def holding(
             P, V_l = P + dP, V_l + dV
         else:  # the bend between dry and wet: go there, and on with the other side's slopes
             P, V_l = P - V_l / dV * dP, 0.0 if V_l < 0.0 else -JUST_DRY
-    return P, V_l
+    return False, P, V_l

@@ -17,7 +17,7 @@ from plant.numeric import at_least, at_most
 
 BISECTIONS = 40
 SHUT = 1e-12  # m2, of a valve that passes less than 1e-6 g/s
-SMALL_FLOW = 1e-9  # kg/s, of a difference quotient
+SMALL_FLOW, SMALL_PRESSURE = 1e-9, 1.0  # kg/s and Pa, of difference quotients
 
 
 class Turbine(NamedTuple):
@@ -80,8 +80,9 @@ def throttled_flow(
 ) -> tuple[float, float, float, float]:
     """Return the flow through a turbine whose nozzle is not choked, and what it makes of the pressures.
 
-    The flow lies between none and that of `turbine_flow`; it raises the pressure behind the nozzle and lowers that
-    before it. Bisection, and a last step of Newton's method that carries derivatives.
+    The flow lies between none and what the valve passes when it is choked; it raises the pressure behind the nozzle and
+    lowers that before it. Where the nozzle passes all that a choked valve does, the pressure between them is as low as
+    it needs for that. Bisection, and a last step of Newton's method that carries derivatives.
 
     Returns:
         m (kg/s), the pressure between valve and nozzle (Pa), the vapour's flow (kg/s), the mixing pressure (Pa).
@@ -92,8 +93,12 @@ def throttled_flow(
     if area.real < SHUT:
         m_v, P_mix = return_flow(back.line, back.P_bath, back.P_suction, none, back.thinness)
         return none, P_mix + none, m_v + none, P_mix + none
-    low, choked = 0.0, np.sqrt((1.0 - CRITICAL_RATIO) * c.real * P_supply.real)
-    high = choked
+    choked = np.sqrt((1.0 - CRITICAL_RATIO) * c * P_supply)
+    excess, _, m_v, P_mix = _flow_excess(turbine, c, choked, P_supply, T_in, back)
+    if excess.real < 0.0:
+        P_between = _nozzle_inlet(turbine, choked, P_mix, CRITICAL_RATIO * P_supply, T_in)
+        return choked, P_between, m_v + none, P_mix + none
+    low, high = 0.0, choked.real
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         excess, _, _, _ = _flow_excess(turbine, c, middle + none, P_supply, T_in, back)
@@ -117,9 +122,31 @@ def _flow_excess(
     """Return by how much a flow is more than what the nozzle passes (kg/s), and what `throttled_flow` returns."""
     P_between = at_least(P_supply - flow * flow / c, 0.0)
     m_v, P_mix = return_flow(back.line, back.P_bath, back.P_suction, flow, back.thinness)
-    ratio = at_most(P_mix / at_least(P_between, 1.0), 1.0)
-    passed = turbine.nozzle * P_between / np.sqrt(T_in) * expansion(ratio) / CHOKED
-    return flow - passed, P_between, m_v, P_mix
+    return flow - _nozzle_flow(turbine, P_between, P_mix, T_in), P_between, m_v, P_mix
+
+
+@inlined
+def _nozzle_flow(turbine: Turbine, P_in: float, P_out: float, T_in: float) -> float:
+    """Return what the nozzle passes between two pressures (kg/s)."""
+    ratio = at_most(P_out / at_least(P_in, 1.0), 1.0)
+    flow: float = turbine.nozzle * P_in / np.sqrt(T_in) * expansion(ratio) / CHOKED
+    return flow
+
+
+@kernel
+def _nozzle_inlet(turbine: Turbine, flow: float, P_out: float, highest: float, T_in: float) -> float:
+    """Return the pressure (Pa, `highest` or less) with which the nozzle passes a flow (kg/s)."""
+    low, high = P_out.real, highest.real
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if _nozzle_flow(turbine, middle + 0.0 * P_out, P_out, T_in).real > flow.real:
+            high = middle
+        else:
+            low = middle
+    P_in = 0.5 * (low + high) + 0.0 * (flow + P_out + highest + T_in)
+    passed = _nozzle_flow(turbine, P_in, P_out, T_in)
+    further = _nozzle_flow(turbine, P_in + SMALL_PRESSURE, P_out, T_in)
+    return P_in + (flow - passed) * SMALL_PRESSURE / at_least(further.real - passed.real, 1e-12)
 
 
 @inlined

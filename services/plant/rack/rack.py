@@ -153,6 +153,7 @@ class Rack:
         cv155, ncr22, cv156 = state.program["u"]
         self._set_up(Session(state.session, state.pace, load, state.seed))
         self._program, self.load = program, schedule
+        self.model_range = ModelRangeStatus(program.model_range, program.tick)
         self.watchdog.set(state.watchdog, program.tick)
         self.outputs = AppliedOutputs(
             (cv155, ncr22, cv156), rate=self._rate, holder=state.holder, generation=next_generation(state.generation)

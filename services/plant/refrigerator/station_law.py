@@ -24,7 +24,9 @@ ROUNDING: Final = 1e-9
 """kg/s, by which flows that are the same may differ."""
 STOPPED_RISE: Final = 0.25
 """bar above its set point, at which the low pressure shuts the bypass when no compressor runs."""
-STOPPED_SPAN: Final = 0.1
+STOPPED_HIGHEST: Final = 1.3
+"""bar, to which that is limited: the relief valve of the low-pressure line opens at 1.5 bar."""
+STOPPED_SPAN: Final = 0.25
 """bar below that, at which the bypass is fully open."""
 LEAST_PRESSURE: Final = 0.5
 """bar, taken for the valves' flows when a line is emptier."""
@@ -136,7 +138,7 @@ def control_station(c: StationLaw, integrals: RealArray, m: StationMeasurement) 
     feed = nitrogen_feed(c, integrals, m.nitrogen)
     if not (m.nc1 or m.nc2):
         integrals[:2] = 0.0
-        bypass = 100.0 * min(max((c.lp + STOPPED_RISE - m.lp) / STOPPED_SPAN, 0.0), 1.0)
+        bypass = 100.0 * min(max((min(c.lp + STOPPED_RISE, STOPPED_HIGHEST) - m.lp) / STOPPED_SPAN, 0.0), 1.0)
         return Commands(bypass, 100.0 if m.hp > m.buffer else 0.0, 0.0, feed), STOPPED
     wanted = flows_of_lq(c, integrals, m) if c.is_lq else flows_of_pi(c, integrals, m)
     given, openings = split(c, wanted, m)

@@ -60,7 +60,7 @@ class StationAlarmSettings(BaseModel):
     """%."""
     helium_lost_kg: PositiveFloat = 0.5
     bath_relief_bar: Bar = 1.8
-    """At which the bath's relief valve opens."""
+    """Of the bath; its relief valve opens at 1.8 bar."""
 
     @model_validator(mode="after")
     def _low_is_below_high(self) -> "StationAlarmSettings":
