@@ -6,8 +6,8 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from plant.cold_box.physics import ColdBox, cold_box_of, evaluate
-from plant.components.cell_account import settle_cells
-from plant.components.phase_separator import add_to_account, settle_account, start_account
+from plant.cold_box.settling import settle_box
+from plant.components.phase_separator import add_to_account, start_account
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import RealArray
 
@@ -50,11 +50,7 @@ def advance_along(
     for i in range(n):
         stages[3, i], slopes[3, i] = stage[i], slope[i]
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
-    settle_account(bath, account, dt / 6.0, stage, helium)
-    P = np.full(4, box.P_HP)
-    settle_cells(box.nef1, 2, P, stages, slopes, dt, stage, helium)
-    settle_cells(box.nef2, 2 + box.nef1.cells, P, stages, slopes, dt, stage, helium)
-    settle_cells(box.nef34, 2 + box.nef1.cells + box.nef2.cells, P, stages, slopes, dt, stage, helium)
+    settle_box(box, account, np.full(4, box.P_HP), stages, slopes, dt, stage, helium)
     return stage
 
 

@@ -21,10 +21,11 @@ import numpy as np
 from coldloop.kernels.compiled import kernel
 from coldloop.process import signals as process
 from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, evaluate
+from plant.cold_box.settling import settle_box
 from plant.components.cell_account import settle_cells
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
-from plant.components.phase_separator import add_to_account, content, settle_account, start_account
+from plant.components.phase_separator import add_to_account, content, start_account
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import Array, RealArray
 from plant.refrigerator.compression_station import (
@@ -206,14 +207,10 @@ def advance_refrigerator(
     for i in range(n):
         stages[3, i], slopes[3, i] = stage[i], slope[i]
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
-    settle_account(bath, account, dt / 6.0, stage, helium)
     P = np.empty(4)
     for k in range(4):
         P[k] = station_pressures(stages[k, STATION:], plant.station, d[1]).HP
-    box = plant.box
-    settle_cells(box.nef1, 2, P, stages, slopes, dt, stage, helium)
-    settle_cells(box.nef2, 2 + box.nef1.cells, P, stages, slopes, dt, stage, helium)
-    settle_cells(box.nef34, 2 + box.nef1.cells + box.nef2.cells, P, stages, slopes, dt, stage, helium)
+    settle_box(plant.box, account, P, stages, slopes, dt, stage, helium)
     settle_cells(plant.precooler.nef6, BOX_STATES, P, stages, slopes, dt, stage, helium)
     return stage
 
