@@ -130,7 +130,7 @@ def test_an_expansion_of_warm_gas_and_its_density_agree(P: float, T: float) -> N
     assert vapour_density(P, h) == pytest.approx(rho, rel=4e-3)
 
 
-@given(P=st.floats(3e5, 20e5), h=st.one_of(st.floats(8e3, 36e3), st.floats(528e3, 1570e3)))
+@given(P=st.floats(3e5, 19e5), h=st.one_of(st.floats(8e3, 36e3), st.floats(528e3, 1570e3)))
 def test_entropy_agrees_from_a_cold_turbine_to_a_warm_one(P: float, h: float) -> None:
     s = coolprop("S", "P", P, "H", h)
     assert helium_at.entropy_before_expansion(P, h, HELIUM) == pytest.approx(s, abs=0.2)

@@ -1,8 +1,8 @@
 """Cells of exchangers hold what the stages of a step brought them.
 
 A Runge-Kutta step integrates temperatures. Where a cell warms by much in one step, while its heat capacity bends, it
-gains a little more or less than its flows brought; the temperature is corrected for that. In ordinary operation cells
-move by less than `COARSE` a step, and nothing is corrected.
+gains a little more or less than its flows brought; the temperature is corrected for that. In ordinary operation the
+stages of a step move cells by less than `COARSE`, and nothing is corrected.
 """
 
 import numpy as np
@@ -12,10 +12,11 @@ from plant.components.heat_exchanger import HeatExchanger
 from plant.helium.properties import Helium, supply_cell
 from plant.numeric import RealArray
 
-COARSE = 0.1  # K
+COARSE = 0.04  # K
 WILD = 50.0  # K in one step: no state of a plant, and not worth being summed up
 PANEL = 0.1  # K, of the integral over the heat capacity
-LEAST_ENERGY = 1e-6  # J: what is less is left alone
+LEAST_ENERGY = 1e-3  # J: what is less is left alone,
+SETTLED_ENERGY = 1e-6  # J, and what is more is corrected to this
 MOST_CORRECTIONS = 4
 NODE = np.sqrt(0.6)  # of Gauss and Legendre's rule of three nodes
 
@@ -40,6 +41,8 @@ def settle_cells(
 ) -> None:
     """Correct the temperatures in `x` of an exchanger's cells, whose first is `first`, where they moved by much.
 
+    Those that hold what they were brought within `LEAST_ENERGY` are left alone: halving a step has to pay.
+
     Args:
         exchanger: Parameters.
         first: Index of its first cell in `x`.
@@ -51,17 +54,22 @@ def settle_cells(
         helium: Tables.
     """
     for i in range(first, first + exchanger.cells):
-        change = x[i] - stages[0, i]
-        if COARSE < abs(change) < WILD:
+        widest = abs(x[i] - stages[0, i])
+        for k in range(1, 4):
+            widest = max(widest, abs(stages[k, i] - stages[0, i]))
+        if COARSE < widest < WILD:
             brought: float = 0.0
             for k in range(4):
                 weight = dt / 6.0 if k in (0, 3) else dt / 3.0
                 brought += weight * heat_capacity(exchanger, P[k], stages[k, i], helium) * slopes[k, i]
+            missing = brought - _held_between(exchanger, P[1], stages[0, i], x[i], helium)
+            if abs(missing) <= LEAST_ENERGY:
+                continue
             for _ in range(MOST_CORRECTIONS):
-                missing = brought - _held_between(exchanger, P[1], stages[0, i], x[i], helium)
-                if abs(missing) <= LEAST_ENERGY:
-                    break
                 x[i] += missing / heat_capacity(exchanger, P[1], x[i], helium)
+                missing = brought - _held_between(exchanger, P[1], stages[0, i], x[i], helium)
+                if abs(missing) <= SETTLED_ENERGY:
+                    break
 
 
 @kernel

@@ -243,7 +243,7 @@ def settle_account(separator: PhaseSeparator, account: Account, dt: float, x: Ar
 def holding(
     separator: PhaseSeparator, P: float, V_l: float, mass: float, energy: float, helium: Helium
 ) -> tuple[bool, float, float]:
-    """Return whether a vessel can hold `mass` (kg) and `energy` (J), and with which P (Pa) and V_l (m3) near those given.
+    """Return whether a vessel can hold `mass` (kg) and `energy` (J), with which P (Pa) and V_l (m3) near those given.
 
     From far away Newton's method may find none, or one beyond the critical point.
     """
