@@ -19,7 +19,7 @@ from coldloop.registers.audit import Event
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import Actuators, PlantSample, StationMode, StationSample
+from coldloop.registers.plant import Actuators, ModelRangeStatus, PlantSample, StationMode, StationSample
 from rig.results.driving import SHOWN
 
 FORMAT: Final = 2
@@ -47,6 +47,8 @@ _TIME: Final = Column("time_s", pa.float64(), "s", "Plant time since the start o
 _TAU_U: Final = Column("tau_u_s", pa.float64(), "s", "Updating period t_{i+1} - t_i")
 _UPDATE: Final = fields_of(Optimization)
 _EVENT: Final = fields_of(Event)
+
+MODEL_RANGE_COLUMN: Final = Column("model_range", pa.int32(), "1", fields_of(ModelRangeStatus)["outside"].description)
 
 PHYSICAL_COLUMNS: Final = (
     Column("load_w", pa.float32(), "W", fields_of(PlantSample)["load"].description),
@@ -95,6 +97,7 @@ TRACE: Final = (
     *DRIVING_COLUMNS,
     Column("stage_cost", pa.float64(), "1", "Stage cost of what was reached: deviations and violations of the bands"),
     *HELD_COLUMNS,
+    MODEL_RANGE_COLUMN,
 )
 
 UPDATES: Final = (

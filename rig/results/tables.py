@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from coldloop.process.model_range import recorded_model_range
 from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.service.event_text import describe, utc_text
 from rig.results.arrow_arrays import number_array, text_array
-from rig.results.columns import EVENTS, STATION, TRACE, UPDATES, arrow_schema
+from rig.results.columns import EVENTS, HELD_COLUMNS, MODEL_RANGE_COLUMN, STATION, TRACE, UPDATES, arrow_schema
 from rig.results.driving import DrivingHistory
 from rig.results.indicators import StageCost
 from rig.results.recording import SampleBlock
@@ -31,7 +32,7 @@ def trace_table(
     ticks = block.first + np.arange(len(block.load))
     columns = [
         ticks, ticks * TICK_S, *block.rows.T, *driving.measured(ticks, block.y), *driving.columns(ticks),
-        cost.of(block), *_held(ticks, updates),
+        cost.of(block), *_held(ticks, updates), _model_range(block),
     ]  # fmt: skip
     schema = arrow_schema(TRACE)
     arrays = [
@@ -39,6 +40,12 @@ def trace_table(
         for field, data in zip(schema, columns, strict=True)
     ]
     return pa.table(arrays, schema)
+
+
+def _model_range(block: SampleBlock) -> pa.Array:
+    """Return what was outside the property tables; null at unknown ticks."""
+    bits = recorded_model_range(block.x, block.station)
+    return number_array(bits, MODEL_RANGE_COLUMN.kind, np.isnan(block.load))
 
 
 def station_table(block: SampleBlock) -> pa.Table:
@@ -65,7 +72,7 @@ def _held(ticks: Any, updates: Sequence[Optimization]) -> list[pa.Array]:  # noq
         [row.j_effective for row in updates],
     ]
     held = [np.asarray(column or [0])[np.maximum(latest, 0)] for column in values]
-    types = [column.kind for column in TRACE[-len(values) :]]
+    types = [column.kind for column in HELD_COLUMNS]
     return [number_array(column, kind, none) for column, kind in zip(held, types, strict=True)]
 
 

@@ -8,9 +8,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from coldloop.process.model_range import model_range
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.plant import StationSample, StationStatus, Surroundings
-from plant.cold_box.physics import ColdBox, outputs
+from plant.cold_box.physics import PA_PER_BAR, ColdBox, outputs
 from plant.helium.properties import load_helium
 from plant.integrator import advance_and_read, plain_tuples
 from plant.numeric import RealArray
@@ -157,6 +158,11 @@ class PlantProgram:
     def station(self) -> StationSample | None:
         """Compression station and nitrogen at the current tick; a cold box alone has none."""
         return None
+
+    @property
+    def model_range(self) -> int:
+        """What is outside the property tables at the current tick, bits of `ModelRange`."""
+        return int(model_range(self._x, self.box.P_HP / PA_PER_BAR, self.box.P_LP / PA_PER_BAR))
 
     @property
     def station_status(self) -> StationStatus | None:

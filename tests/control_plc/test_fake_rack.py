@@ -72,6 +72,7 @@ class StillPlant:
         self._load = load
         self.state = HEADER.x0
         self.station = self.station_status = None
+        self.model_range = 0
 
     @property
     def load(self) -> float:

@@ -130,7 +130,8 @@ def test_the_plant_stays_finite_at_the_corners_of_its_range(
     assert np.all(np.isfinite(x))
     y = plant.outputs(x, inputs, load)
     assert 0.0 <= y["L1"] <= 100.0
-    assert all(4.0 <= y[f"T{k}"] <= 80.0 for k in range(1, 11))
+    warmed = {"T1", "T2"} if y["L1"] == 0.0 else set()  # a dry bath takes up the heat, and warms what enters it
+    assert all(4.0 <= y[f"T{k}"] <= (300.0 if f"T{k}" in warmed else 80.0) for k in range(1, 11))
 
 
 def test_the_shipped_model_is_that_of_the_reference_plant(plant: Plant) -> None:

@@ -101,7 +101,7 @@ def test_the_cold_part_balances_its_energy(rest: Point) -> None:
 
 def turbine_power(y: dict[str, float]) -> float:
     h_6, _ = supply_enthalpy_and_density(16e5, y["T6"], HELIUM)
-    exhaust = expand(PLANT.box.turbine, h_6, 1e5 * y["P6"], 1e5 * y["P3"], HELIUM)
+    exhaust = expand(PLANT.box.turbine, 0.05, h_6, 1e5 * y["P6"], 1e5 * y["P3"], HELIUM)
     flow = PLANT.box.turbine.nozzle * 1e5 * y["P6"] / np.sqrt(y["T6"])
     return float(flow * (h_6 - exhaust.h_out))
 

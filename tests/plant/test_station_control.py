@@ -24,7 +24,7 @@ from plant.settings import PlantSection
 FILE = read_refrigerator_file(SHIPPED)
 HP, LP, LEVEL, LOST = (STATION_SIGNAL_NAMES.index(name) for name in ("P12", "P11", "L_N2", "lost"))
 BOTH = pytest.mark.parametrize("control", ["lq", "pi"])
-AT_REST = StationMeasurement(16.0, 1.05, 6.0, FILE.v0[0], 0.0, 0.0, 60.0, 0.0, nc1=True, nc2=True)
+AT_REST = StationMeasurement(16.0, 1.05, 6.0, FILE.v0[0], 0.0, 0.0, 60.0, 0.0, 1.23, nc1=True, nc2=True)
 
 
 def make(
@@ -92,11 +92,20 @@ def test_the_lq_controller_loses_no_helium_in_a_trip_and_the_pi_does() -> None:
     assert lost["pi"] > 0.1
 
 
-def test_without_compressors_the_valves_shut_and_stay_shut() -> None:
+def test_without_compressors_the_high_pressure_line_empties_into_the_buffer_and_lifts_the_low_one_a_little() -> None:
     program = make(events=[event(10.0, "nc1", 0), event(10.0, "nc2", 0)])
-    run(program, 60.0)
+    run(program, 12.0)
     assert program.station.mode == StationMode.STOPPED
-    assert program.commands[:3] == (0.0, 0.0, 0.0)
+    assert program.commands[0] > 50.0
+    assert program.commands[1:3] == (100.0, 0.0)
+    signals = run(program, 20.0)
+    bypass, discharge, charge = program.commands[:3]
+    assert bypass < 10.0
+    assert (discharge, charge) == (100.0, 0.0)
+    assert max(signals[:, LP]) == pytest.approx(1.30, abs=0.01)
+    later = run(program, 40.0)
+    assert program.commands[0] == 0.0, "what lifts the low pressure further is what the load evaporates"
+    assert signals[-1, LP] < later[-1, LP] < 1.5
 
 
 def test_nitrogen_that_runs_out_raises_its_alarm_and_comes_back() -> None:

@@ -125,7 +125,7 @@ def test_the_units_of_the_trace_are_those_of_the_process(folder: Path) -> None:
         **dict(zip(OUTPUT_NAMES, OUTPUT_UNITS, strict=True)),
         **{f"x_{name}": unit for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)},
         "L1_measured": "%", "T5_measured": "K", **dict.fromkeys(("mode", "cause", "driver", "bad_sensors"), ""),
-        "stage_cost": "1", "update": "1", "tau_u_s": "s", "iterations": "1", "J": "1",
+        "stage_cost": "1", "update": "1", "tau_u_s": "s", "iterations": "1", "J": "1", "model_range": "1",
     }  # fmt: skip
 
 

@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
+from plant.components.gas_valve import CRITICAL_RATIO, cold_valve_flow
 from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow, exchange
-from plant.components.phase_separator import PhaseSeparator, level, separate
+from plant.components.phase_separator import PhaseSeparator, bath_relief, level, outflow, separate, thinness
 from plant.components.return_line import ReturnLine, return_flow
-from plant.components.turbine import Expansion, Turbine, expand, turbine_flow
-from plant.components.valve import Valve, valve_mass_flow
+from plant.components.turbine import Back, Expansion, Turbine, expand, throttled_flow, turbine_flow
+from plant.components.valve import Valve
 from plant.helium.properties import Helium, saturation, supply_enthalpy_and_density, vapour_temperature
 from plant.numeric import Array, at_least
 
@@ -61,7 +62,7 @@ def cold_box_of(fields: Any) -> ColdBox:  # noqa: ANN401 - any nesting of tuples
     return ColdBox(
         PhaseSeparator(*fields[0]),
         Valve(*fields[1]),
-        Turbine(Valve(*fields[2][0]), fields[2][1], fields[2][2], fields[2][3]),
+        Turbine(Valve(*fields[2][0]), fields[2][1], fields[2][2], fields[2][3], fields[2][4]),
         HeatExchanger(*fields[3]),
         HeatExchanger(*fields[4]),
         HeatExchanger(*fields[5]),
@@ -95,12 +96,16 @@ class Streams(NamedTuple):
 def streams(x: Array, u: Array, box: ColdBox, helium: Helium) -> Streams:
     """Return the flows at the state `x` under the inputs `u`."""
     h_jt, rho_jt = supply_enthalpy_and_density(box.P_HP, x[1 + box.nef1.cells], helium)
-    m_jt = valve_mass_flow(box.jt_valve, u[0], rho_jt, box.P_HP, x[0])
+    m_jt = cold_valve_flow(box.jt_valve, u[0], x[1 + box.nef1.cells], rho_jt, box.P_HP, x[0])
     T_turbine = x[1 + box.nef1.cells + box.nef2.cells + box.nef34.cells]
     h_turbine, rho_turbine = supply_enthalpy_and_density(box.P_HP, T_turbine, helium)
     m_t, P_turbine = turbine_flow(box.turbine, u[2], box.P_HP, T_turbine, rho_turbine)
-    m_v, P_mix = return_flow(box.return_line, x[0], box.P_LP, m_t)
-    exhaust = expand(box.turbine, h_turbine, P_turbine, P_mix, helium)
+    thin = thinness(box.separator, x[0], x[1], helium)
+    m_v, P_mix = return_flow(box.return_line, x[0], box.P_LP, m_t, thin)
+    if P_mix.real > CRITICAL_RATIO * P_turbine.real:
+        back = Back(box.return_line, x[0], box.P_LP, thin)
+        m_t, P_turbine, m_v, P_mix = throttled_flow(box.turbine, u[2], box.P_HP, T_turbine, rho_turbine, back)
+    exhaust = expand(box.turbine, m_t, h_turbine, P_turbine, P_mix, helium)
     return Streams(m_jt, h_jt, m_v, m_t, P_turbine, P_mix, exhaust)
 
 
@@ -115,19 +120,22 @@ def mix(vapour: LowPressureFlow, s: Streams, helium: Helium) -> LowPressureFlow:
 @kernel
 def evaluate(
     x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Array, y: Array
-) -> tuple[Streams, LowPressureFlow]:
+) -> tuple[Streams, LowPressureFlow, float]:
     """Write the rates of the states into `dx` (28, per second) and the outputs into `y` (22, `OUTPUT_UNITS`).
 
-    Returns the flows, and what leaves at the warm end of the low-pressure side.
+    Returns the flows, what leaves at the warm end of the low-pressure side, and what the bath's relief valve blows into
+    the recovery line (kg/s).
     """
     s = streams(x, u, box, helium)
     first2 = 2 + box.nef1.cells
     first34 = first2 + box.nef2.cells
     sat = saturation(x[0], helium)
     heat = at_least(u[1], 0.0) + w
-    dx[0], dx[1] = separate(box.separator, x[0], x[1], s.m_jt, s.h_jt, s.m_v, heat, helium)
+    top = outflow(box.separator, x[0], x[1], sat, helium)
+    relief = bath_relief(box.separator, x[0], top.rho)
+    dx[0], dx[1] = separate(box.separator, x[0], x[1], s.m_jt, s.h_jt, s.m_v + relief, top.h, heat, helium)
 
-    vapour = LowPressureFlow(s.m_v, x[0], sat.T, sat.h_v)
+    vapour = LowPressureFlow(s.m_v, x[0], top.T, top.h)
     into_nef1 = HighPressureFlow(s.m_jt, x[first34 - 1], box.P_HP)
     cold = exchange(box.nef1, x[2:first2], into_nef1, vapour, helium, dx[2:first2])
     mixed = mix(cold, s, helium)
@@ -139,7 +147,7 @@ def evaluate(
     exhaust_saturation = saturation(s.P_mix, helium)
     y[0] = level(box.separator, x[1])
     y[1] = s.exhaust.speed
-    y[2] = sat.T
+    y[2] = top.T
     y[3] = x[first2 - 1]
     y[4] = cold.T
     y[5] = into_nef1.T
@@ -150,7 +158,7 @@ def evaluate(
     y[10] = box.T_in
     y[11] = warm.T
     _write_pressures(x[0], s, box, y[12:])
-    return s, warm
+    return s, warm, relief
 
 
 @kernel

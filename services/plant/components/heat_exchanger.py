@@ -10,6 +10,7 @@ from plant.helium.properties import Helium, Saturation, saturation, supply_cell,
 from plant.numeric import Array, at_least, at_most
 
 LARGEST_RATIO = 8.0  # of the mean to the cold-end difference; more would be too stiff for a step of 0.25 s
+STILL = 2e-3  # kg/s of high-pressure gas, below which the walls alone warm the low-pressure gas more and more
 TRICKLE = 1e-9  # kg/s, below which the low-pressure gas simply takes the temperature of the cell
 
 
@@ -69,13 +70,13 @@ def take_up(
     """Return T (K), h (J/kg) and cp (J/(kg K)) of the low-pressure flow after one cell of `UA` (W/K).
 
     Wet vapour, as a very cold turbine exhaust brings it, boils dry at constant temperature before it warms up, and
-    saturated vapour that is cooled becomes wet.
+    saturated vapour that is cooled becomes wet, at most all of it liquid.
     """
     if low.h.real < sat.h_v.real:
         boiling = UA * drive / low.mass_flow
         missing = sat.h_v - low.h
         if boiling.real <= missing.real:
-            return sat.T + 0.0 * boiling, low.h + boiling, cp
+            return sat.T + 0.0 * boiling, at_least(low.h + boiling, at_most(sat.h_l, low.h)), cp
         UA = UA * (1.0 - missing / boiling)
     T = low.T + drive * (1.0 - np.exp(-UA / (low.mass_flow * cp)))
     if T.real < sat.T.real:
@@ -92,18 +93,21 @@ def exchange(
 
     `T` holds the temperatures of gas and wall in each cell, hot end first (K). The low-pressure side is marched from
     the cold end; in a cell it approaches the mean T_m of the gas that enters and the gas that leaves:
-    T_out = T_m - (T_m - T_L) exp(-UA/(N m_L cp_L)), with cp_L where it enters the cell.
+    T_out = T_m - (T_m - T_L) exp(-UA/(N m_L cp_L)), with cp_L where it enters the cell. As the high-pressure flow comes
+    to rest, T_m becomes the temperature of the cell itself.
     """
     sat = saturation(low.P, helium)
     UA = exchanger.UA / exchanger.cells
     sweeping = at_least(low.mass_flow, TRICKLE)
+    moving = at_most(high.mass_flow / STILL, 1.0)
     T_low, h_low = low.T, low.h
     _, cp_low = vapour_enthalpy_and_cp(low.P, T_low, sat.T, helium.vapour)
     h_cell, rho_cp, c_wall = supply_cell(high.P, T[exchanger.cells - 1], helium)
     for i in range(exchanger.cells - 1, -1, -1):
         T_before = T[i - 1] if i > 0 else high.T
         h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, helium)
-        drive = driving_difference(T_before, T[i], T_low)
+        T_ahead = T_before if moving.real >= 1.0 else T[i] + moving * (T_before - T[i])
+        drive = driving_difference(T_ahead, T[i], T_low)
         T_low, h_next, cp_low = take_up(
             LowPressureFlow(sweeping, low.P, T_low, h_low), cp_low, drive, UA, sat, helium.vapour
         )

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
+from plant.components.heat_exchanger import STILL
 from plant.components.parameters import require
 from plant.components.valve import Valve, effective_area
 from plant.numeric import at_least, at_most
@@ -19,6 +20,7 @@ LIQUID_DENSITY = 804.7  # kg/m3
 FEED_EXCESS = 4.9e3  # J/kg
 FEED_PRESSURE = 1.45e5  # Pa, from the tank to the bath
 TRICKLE = 1e-6  # kg/s
+ROOM = 0.02  # share of the vessel that vapour needs to condense freely
 
 
 class NitrogenBath(NamedTuple):
@@ -55,21 +57,36 @@ def nitrogen_level(bath: NitrogenBath, mass: float) -> float:
 
 @kernel
 def boil(
-    bath: NitrogenBath, mass: float, helium_flow: float, cp: float, T_in: float, opening: float, supply: float
+    bath: NitrogenBath,
+    mass: float,
+    helium_flow: float,
+    cp: float,
+    T_in: float,
+    T_coil: float,
+    opening: float,
+    supply: float,
 ) -> Boiling:
     """Return heat, boil-off and feed with `mass` (kg) of nitrogen in the bath and helium entering at `T_in` (K).
 
-    Q = m cp (T_in - T_N) (1 - exp(-UA wet/(m cp))), never from the nitrogen to the helium; `cp` in J/(kg K). The wet
-    share of the coil grows smoothly with the level. `opening` (%) is that of the feed valve, `supply` 1 with nitrogen
+    Q = m cp (T_in - T_N) (1 - exp(-UA wet/(m cp))), `cp` in J/(kg K); as the helium comes to rest it is the heat of the
+    coil itself, at `T_coil` (K). Heat to colder helium condenses vapour that the vent line gives back, where the vessel
+    has room for it: less and less in the last of it (`ROOM`). The wet share of
+    the coil grows smoothly with the level. `opening` (%) is that of the feed valve, `supply` 1 with nitrogen
     in the tank and 0 without. A full vessel takes no more than what boils off.
     """
     share = at_most(nitrogen_level(bath, mass) / bath.wet_level, 1.0)
     wet = share * share * (3.0 - 2.0 * share)
     capacity_flow = at_least(helium_flow, TRICKLE) * cp
-    heat = capacity_flow * at_least(T_in - BOILING_POINT, 0.0) * (1.0 - np.exp(-bath.UA * wet / capacity_flow))
+    heat = capacity_flow * (T_in - BOILING_POINT) * (1.0 - np.exp(-bath.UA * wet / capacity_flow))
+    moving = at_most(helium_flow / STILL, 1.0)
+    if moving.real < 1.0:
+        heat = moving * heat + (1.0 - moving) * bath.UA * wet * (T_coil - BOILING_POINT)
+    if heat.real < 0.0:
+        room = 1.0 - mass / (LIQUID_DENSITY * bath.volume)
+        heat = heat * at_most(at_least(room / ROOM, 0.0), 1.0)
     feed = supply * effective_area(bath.feed, opening) * np.sqrt(2.0 * LIQUID_DENSITY * FEED_PRESSURE)
     if mass.real >= LIQUID_DENSITY * bath.volume:
-        feed = at_most(feed, heat / (LATENT_HEAT - FEED_EXCESS))
+        feed = at_most(feed, at_least(heat, 0.0) / (LATENT_HEAT - FEED_EXCESS))
     return Boiling(heat, (heat + feed * FEED_EXCESS) / LATENT_HEAT, feed)
 
 

@@ -1,4 +1,4 @@
-"""Control valve with a linear characteristic and incompressible flow."""
+"""Control valve with a linear characteristic and incompressible flow; `gas_valve` has the compressible ones."""
 
 from typing import NamedTuple
 

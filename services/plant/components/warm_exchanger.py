@@ -8,10 +8,10 @@ counter-flow exchanger: at rest, cells in series are exactly one exchanger of th
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from plant.components.heat_exchanger import TRICKLE, HeatExchanger, HighPressureFlow, LowPressureFlow
+from plant.components.heat_exchanger import STILL, TRICKLE, HeatExchanger, HighPressureFlow, LowPressureFlow
 from plant.components.parameters import require
 from plant.helium.properties import WARM_CP, Helium, supply_cell
-from plant.numeric import Array, at_least
+from plant.numeric import Array, at_least, at_most
 
 SMALL = 1e-3
 LARGEST_EXPONENT = 30.0
@@ -47,17 +47,22 @@ def exchange_warm(
 ) -> LowPressureFlow:
     """Write the rates of the cell temperatures into `dT` (K/s) and return the low-pressure flow at the hot end.
 
-    `T` holds the temperature at which the high-pressure gas leaves each cell, hot end first (K), and of its wall.
+    `T` holds the temperature at which the high-pressure gas leaves each cell, hot end first (K), and of its wall. As
+    the high-pressure flow comes to rest, the low-pressure gas takes its heat from the wall.
     """
     UA = exchanger.UA / exchanger.cells
     C_high = at_least(high.mass_flow, TRICKLE) * WARM_CP
     C_low = at_least(low.mass_flow, TRICKLE) * WARM_CP
+    moving, sweeping = at_most(high.mass_flow / STILL, 1.0), at_most(low.mass_flow / TRICKLE, 1.0)
+    by_wall = (1.0 - moving) * C_low * (1.0 - np.exp(-2.0 * UA / C_low))
     T_low, h_low = low.T, low.h
     h_cell, rho_cp, c_wall = supply_cell(high.P, T[exchanger.cells - 1], helium)
     for i in range(exchanger.cells - 1, -1, -1):
         T_before = T[i - 1] if i > 0 else high.T
         h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, helium)
         heat = exchanged_heat(UA, C_high, C_low, T_before - T_low)
+        if moving.real < 1.0:
+            heat = sweeping * (moving * heat + by_wall * (T[i] - T_low))
         capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
         dT[i] = (high.mass_flow * (h_before - h_cell) - heat) / capacity
         T_low = T_low + heat / C_low

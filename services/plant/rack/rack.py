@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from coldloop.process.load_profile import LoadProfile
+from coldloop.process.range_bits import ModelRange
 from coldloop.process.signals import INPUT_NAMES, LAST_TICK, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.bank import Caller
@@ -19,6 +20,7 @@ from coldloop.registers.plant import (
     LoadAhead,
     LoadStep,
     Measurement,
+    ModelRangeStatus,
     OutputVerdict,
     PlantSample,
     SensorFault,
@@ -98,6 +100,8 @@ class Rack:
         """Who writes steps of the load ahead."""
         self.faults = SensorFaults()
         self.watchdog.set(self.watchdog.time, 0)
+        self.model_range = ModelRangeStatus(self._program.model_range, self._program.tick)
+        """What of the simulation is outside its property tables, and since when."""
         self.moving = False
         """The plant is due to move: in lock-step by one tick, in real time by the clock from now on."""
 
@@ -149,6 +153,7 @@ class Rack:
         cv155, ncr22, cv156 = state.program["u"]
         self._set_up(Session(state.session, state.pace, load, state.seed))
         self._program, self.load = program, schedule
+        self.model_range = ModelRangeStatus(program.model_range, program.tick)
         self.watchdog.set(state.watchdog, program.tick)
         self.outputs = AppliedOutputs(
             (cv155, ncr22, cv156), rate=self._rate, holder=state.holder, generation=next_generation(state.generation)
@@ -189,6 +194,7 @@ class Rack:
         self.outputs.begin_tick()
         if before is not None and program.station is not None:
             self._note_station(before, program.station)
+        self._note_model_range(program.model_range)
         if self.watchdog.check(program.tick):
             self._watchdog_expired()
         return sample
@@ -200,6 +206,16 @@ class Rack:
         for number, alarm in enumerate(StationAlarm):
             if (now.alarms ^ before.alarms) & alarm:
                 self.journal.note(self.tick, EventKind.STATION_ALARM, number, int(bool(now.alarms & alarm)))
+
+    def _note_model_range(self, outside: int) -> None:
+        """Note what has left the property tables, or returned."""
+        before = self.model_range.outside
+        if outside == before:
+            return
+        for number, part in enumerate(ModelRange):
+            if (outside ^ before) & part:
+                self.journal.note(self.tick, EventKind.MODEL_RANGE, number, int(bool(outside & part)))
+        self.model_range = ModelRangeStatus(outside, self.tick)
 
     def give(self, asked: Surroundings, who: str) -> None:
         """Change what a refrigerator is given, from the next tick on.
@@ -298,6 +314,7 @@ class Rack:
             "load_w": program.load,
             "inputs": dict(zip(INPUT_NAMES, self.outputs.u, strict=True)),
             "outputs": dict(zip(OUTPUT_NAMES, program.measure(), strict=True)),
+            "model_range": [part.name.lower() for part in ModelRange(self.model_range.outside) if part.name],
             **({} if station is None else {"station": station_snapshot(station)}),
         }
 

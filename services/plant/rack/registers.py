@@ -25,6 +25,7 @@ from coldloop.registers.plant import (
     LoadStatus,
     LoadStep,
     Measurement,
+    ModelRangeStatus,
     OutputVerdict,
     PlantSession,
     SensorFault,
@@ -146,6 +147,7 @@ class RackRegisters:
         bank.keep_fresh(WatchdogStatus, lambda: self.rack.watchdog.registers(self.rack.tick))
         bank.keep_fresh(LeaseStatus, self.lease.registers)
         bank.keep_fresh(StationStatus, lambda: self.rack.station_status)
+        bank.keep_fresh(ModelRangeStatus, lambda: self.rack.model_range)
         bank.keep_fresh(LoadStatus, lambda: self.rack.load.status(self.rack.tick))
         self._takers: dict[type[tuple[object, ...]], Callable[[str], None]] = {
             PlantSession: self._start_session,

@@ -20,10 +20,12 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process import signals as process
-from plant.cold_box.physics import REFERENCE, ColdBox, cold_box_of, evaluate
-from plant.components.heat_exchanger import HighPressureFlow
+from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, evaluate
+from plant.cold_box.settling import settle_box
+from plant.components.cell_account import settle_cells
+from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
-from plant.components.phase_separator import contents
+from plant.components.phase_separator import NO_ACCOUNT, add_to_account, content, is_calm, start_account
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import Array, RealArray
 from plant.refrigerator.compression_station import (
@@ -40,6 +42,7 @@ from plant.refrigerator.precooler import (
     PRECOOLER_STATE_UNITS,
     PRECOOLER_STATES,
     Precooler,
+    Precooling,
     check_precooler,
     precooler_of,
     precooler_rates,
@@ -70,6 +73,23 @@ class Refrigerator(NamedTuple):
 REFERENCE_REFRIGERATOR: Final = Refrigerator()
 
 
+class Crossing(NamedTuple):
+    """Streams over the boundary of the cold part, and within it."""
+
+    entering: HighPressureFlow
+    """From the compressors."""
+    cold: Streams
+    """Of the cold box."""
+    leaving: LowPressureFlow
+    """From the cold box to NEF6."""
+    relief: float
+    """From the bath into the recovery line, kg/s."""
+    cooling: Precooling
+    """What NEF6 and NEF5 do."""
+    heater: float
+    """W."""
+
+
 @kernel
 def refrigerator_of(fields: Any) -> Refrigerator:  # noqa: ANN401 - any nesting of tuples
     """Rebuild the parameters from nested plain tuples, see `plant.integrator.advance_and_read`."""
@@ -87,8 +107,11 @@ def evaluate_refrigerator(
     dx: Array,
     y: Array,
     signals: Array,
-) -> None:
-    """Write the rates (48, per second), the cold box's outputs (22) and the warm signals (19, `SIGNAL_NAMES`)."""
+) -> Crossing:
+    """Write the rates (48, per second), the cold box's outputs (22) and the warm signals (19, `SIGNAL_NAMES`).
+
+    Returns the streams that cross the boundary of its cold part, for `plant.refrigerator.balance`.
+    """
     station, precooler = plant.station, plant.precooler
     coil = BOX_STATES + precooler.nef6.cells
     P = station_pressures(x[STATION:], station, d[1])
@@ -96,7 +119,8 @@ def evaluate_refrigerator(
     joined = ColdBox(
         box.separator, box.jt_valve, box.turbine, box.nef1, box.nef2, box.nef34, box.return_line, P.HP, P.LP, x[coil]
     )
-    cold, leaving = evaluate(x[:BOX_STATES], u, d[0], joined, helium, dx[:BOX_STATES], y)
+    inputs = u if d[4].real + d[5].real > 0.0 else 0.0 * u
+    cold, leaving, relief = evaluate(x[:BOX_STATES], inputs, d[0], joined, helium, dx[:BOX_STATES], y)
     entering = HighPressureFlow(cold.m_jt + cold.m_t, d[1] + station.cooler_approach, P.HP)
     cooling = precooler_rates(
         x[BOX_STATES:STATION], v[3], entering, leaving, d[3], precooler, helium, dx[BOX_STATES:STATION]
@@ -104,16 +128,19 @@ def evaluate_refrigerator(
     flows = station_rates(
         x[STATION:], v, P, entering.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station, dx[STATION:]
     )
+    dx[STATION + 3] += relief
     signals[0], signals[1], signals[2] = P.LP / 1e5, P.HP / 1e5, P.buffer / 1e5
     signals[3], signals[4] = cooling.warm_end.T, x[coil - 1]
     signals[5] = 1e3 * entering.mass_flow
     _write_flows(flows, signals[6:])
+    signals[10] += 1e3 * relief
     signals[13] = nitrogen_level(precooler.nef5, x[coil + 1])
     signals[14] = x[coil + 2]
     signals[15] = 1e3 * cooling.boiling.boil_off
     signals[16] = inventory(x, plant, helium)
     signals[17] = x[STATION + 3]
     signals[18] = d[1]
+    return Crossing(entering, cold, leaving, relief, cooling, inputs[1])
 
 
 @kernel
@@ -127,7 +154,7 @@ def _write_flows(flows: StationFlows, signals: Array) -> None:
 @kernel
 def inventory(x: Array, plant: Refrigerator, helium: Helium) -> float:
     """Return the helium (kg) in lines, buffer and bath; what was lost is not in it."""
-    in_bath, _ = contents(plant.box.separator, x[0], x[1], helium)
+    in_bath = content(plant.box.separator, x[0], x[1], helium).mass
     total: float = x[STATION] + x[STATION + 1] + x[STATION + 2] + in_bath
     return total
 
@@ -160,18 +187,34 @@ def advance_refrigerator(
     n = x.shape[0]
     slope, y, signals = np.empty(n), np.empty(22), np.empty(SIGNALS)
     stage, total = np.empty(n), np.empty(n)
+    stages, slopes = np.empty((4, n)), np.empty((4, n))
     evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
+    bath = plant.box.separator
+    calm = is_calm(bath, x, slope, dt)
+    account = NO_ACCOUNT if calm else start_account(bath, x, slope, helium)
     for i in range(n):
+        stages[0, i], slopes[0, i] = x[i], slope[i]
         total[i] = slope[i]
         stage[i] = x[i] + 0.5 * dt * slope[i]
-    for fraction in (0.5, 1.0):
+    for k, fraction in ((1, 0.5), (2, 1.0)):
         evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
+        if not calm:
+            account = add_to_account(bath, account, stage, slope, 2.0, helium)
         for i in range(n):
+            stages[k, i], slopes[k, i] = stage[i], slope[i]
             total[i] += 2.0 * slope[i]
             stage[i] = x[i] + fraction * dt * slope[i]
     evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
+    if not calm:
+        account = add_to_account(bath, account, stage, slope, 1.0, helium)
     for i in range(n):
+        stages[3, i], slopes[3, i] = stage[i], slope[i]
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
+    P = np.empty(4)
+    for k in range(4):
+        P[k] = station_pressures(stages[k, STATION:], plant.station, d[1]).HP
+    settle_box(plant.box, account, P, stages, slopes, dt, stage, helium)
+    settle_cells(plant.precooler.nef6, BOX_STATES, P, stages, slopes, dt, stage, helium)
     return stage
 
 

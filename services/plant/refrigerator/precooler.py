@@ -77,7 +77,7 @@ def precooler_rates(
     warm_end = exchange_warm(precooler.nef6, x[:cells], high, low, helium, dx[:cells])
     h_in, _, _ = supply_cell(high.P, x[cells - 1], helium)
     h_out, _, _ = supply_cell(high.P, x[cells], helium)
-    boiling = boil(precooler.nef5, x[cells + 1], high.mass_flow, WARM_CP, x[cells - 1], x[cells + 2], supply)
+    boiling = boil(precooler.nef5, x[cells + 1], high.mass_flow, WARM_CP, x[cells - 1], x[cells], x[cells + 2], supply)
     dx[cells] = (high.mass_flow * (h_in - h_out) - boiling.heat) / precooler.nef5.capacity
     dx[cells + 1] = boiling.feed - boiling.boil_off
     dx[cells + 2] = opening_rate(precooler.actuator, x[cells + 2], command)

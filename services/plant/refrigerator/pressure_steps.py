@@ -109,7 +109,9 @@ def pressures_after(
 def _measured(x: RealArray, signals: RealArray) -> StationMeasurement:
     hp, lp, buffer, nitrogen = (float(signals[index]) for index in (*PRESSURES, BUFFER, NITROGEN))
     bypass, discharge, charge = (float(x[index]) for index in OPENINGS)
-    return StationMeasurement(hp, lp, buffer, bypass, discharge, charge, nitrogen, lost=0.0, nc1=True, nc2=True)
+    return StationMeasurement(
+        hp, lp, buffer, bypass, discharge, charge, nitrogen, lost=0.0, bath=1.23, nc1=True, nc2=True
+    )
 
 
 def table(seconds: float, steps: Sequence[tuple[str, float]] = STEPS) -> list[str]:

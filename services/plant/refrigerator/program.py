@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from coldloop.process.model_range import model_range
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
 from plant.helium.properties import load_helium
 from plant.integrator import plain_tuples
@@ -21,7 +22,7 @@ from plant.refrigerator.physics import (
 from plant.refrigerator.station_control import station_law
 from plant.refrigerator.station_law import Commands
 from plant.refrigerator.station_settings import StationSettings
-from plant.refrigerator.tick import ALARMS, MODE, RefrigeratorMemory, advance_program_tick, control_tick
+from plant.refrigerator.tick import ALARMS, HP, LP, MODE, RefrigeratorMemory, advance_program_tick, control_tick
 
 
 class RefrigeratorProgram(PlantProgram):
@@ -74,6 +75,12 @@ class RefrigeratorProgram(PlantProgram):
         m = self._memory
         mode, alarms = StationMode(int(m.status[MODE])), StationAlarm(int(m.status[ALARMS]))
         return StationSample(self.tick, tuple(m.signals.tolist()), mode, alarms)
+
+    @property
+    def model_range(self) -> int:
+        """What is outside the property tables at the current tick, bits of `ModelRange`."""
+        signals = self._memory.signals
+        return int(model_range(self._x, signals[HP], signals[LP]))
 
     @property
     def station_status(self) -> StationStatus:

@@ -72,7 +72,7 @@ def station_law(settings: StationSettings, reference: StationReference, station:
         nitrogen=settings.nitrogen_level, feed=reference.feed,
         alarms=AlarmLimits(
             limits.hp_high_bar, limits.hp_low_bar, limits.lp_high_bar, limits.lp_low_bar, limits.nitrogen_low,
-            limits.helium_lost_kg,
+            limits.helium_lost_kg, limits.bath_relief_bar,
         ),
     )  # fmt: skip
 

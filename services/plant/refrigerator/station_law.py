@@ -22,6 +22,12 @@ DESIGN_TEMPERATURE: Final = 300.0
 """K, at which the controller takes the valves' flows to be."""
 ROUNDING: Final = 1e-9
 """kg/s, by which flows that are the same may differ."""
+STOPPED_RISE: Final = 0.25
+"""bar above its set point, at which the low pressure shuts the bypass when no compressor runs."""
+STOPPED_HIGHEST: Final = 1.3
+"""bar, to which that is limited: the relief valve of the low-pressure line opens at 1.5 bar."""
+STOPPED_SPAN: Final = 0.25
+"""bar below that, at which the bypass is fully open."""
 LEAST_PRESSURE: Final = 0.5
 """bar, taken for the valves' flows when a line is emptier."""
 AUTOMATIC, LIMITED, CHARGE_STOPPED, ONE_COMPRESSOR, STOPPED = map(int, StationMode)
@@ -46,6 +52,8 @@ class StationMeasurement(NamedTuple):
     """Level, %."""
     lost: float
     """Helium that has left the circuit, kg."""
+    bath: float
+    """Pressure of the bath, bar."""
     nc1: bool
     """Whether the compressor is switched on."""
     nc2: bool
@@ -76,6 +84,7 @@ class AlarmLimits(NamedTuple):
     lp_low: float
     nitrogen_low: float
     helium_lost: float
+    bath_relief: float
 
 
 class StationLaw(NamedTuple):
@@ -129,7 +138,8 @@ def control_station(c: StationLaw, integrals: RealArray, m: StationMeasurement) 
     feed = nitrogen_feed(c, integrals, m.nitrogen)
     if not (m.nc1 or m.nc2):
         integrals[:2] = 0.0
-        return Commands(0.0, 0.0, 0.0, feed), STOPPED
+        bypass = 100.0 * min(max((min(c.lp + STOPPED_RISE, STOPPED_HIGHEST) - m.lp) / STOPPED_SPAN, 0.0), 1.0)
+        return Commands(bypass, 100.0 if m.hp > m.buffer else 0.0, 0.0, feed), STOPPED
     wanted = flows_of_lq(c, integrals, m) if c.is_lq else flows_of_pi(c, integrals, m)
     given, openings = split(c, wanted, m)
     follow(c, integrals, wanted, given, m)
@@ -231,6 +241,7 @@ def raised_alarms(limits: AlarmLimits, m: StationMeasurement) -> int:
     conditions = (
         m.hp > limits.hp_high, m.hp < limits.hp_low, m.lp > limits.lp_high, m.lp < limits.lp_low,
         not m.nc1, not m.nc2, m.nitrogen < limits.nitrogen_low, m.lost > limits.helium_lost,
+        not (m.nc1 or m.nc2), m.bath > limits.bath_relief,
     )  # fmt: skip
     raised = 0
     for bit in range(len(conditions)):

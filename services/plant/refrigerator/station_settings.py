@@ -59,6 +59,8 @@ class StationAlarmSettings(BaseModel):
     nitrogen_low: Percent = 25.0
     """%."""
     helium_lost_kg: PositiveFloat = 0.5
+    bath_relief_bar: Bar = 1.8
+    """Of the bath; its relief valve opens at 1.8 bar."""
 
     @model_validator(mode="after")
     def _low_is_below_high(self) -> "StationAlarmSettings":

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import OUTPUT_NAMES, TICK_S
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import RealArray
 from plant.refrigerator.physics import (
@@ -21,6 +21,7 @@ from plant.refrigerator.station_law import StationLaw, StationMeasurement, contr
 
 HP, LP, BUFFER, NITROGEN, LOST = (SIGNAL_NAMES.index(name) for name in ("P12", "P11", "P13", "L_N2", "lost"))
 CV956, CV952, CV953 = (STATE_NAMES.index(name) for name in ("CV956", "CV952", "CV953"))
+P1: Final = OUTPUT_NAMES.index("P1")
 NC1, NC2 = 4, 5
 """Columns of the disturbances."""
 MODE: Final = 0
@@ -50,7 +51,7 @@ def control_tick(m: RefrigeratorMemory, d: RealArray, law: StationLaw) -> None:
     x, signals = m.x, m.signals
     measured = StationMeasurement(
         signals[HP], signals[LP], signals[BUFFER], x[CV956], x[CV952], x[CV953], signals[NITROGEN], signals[LOST],
-        d[NC1] != 0.0, d[NC2] != 0.0,
+        m.y[P1], d[NC1] != 0.0, d[NC2] != 0.0,
     )  # fmt: skip
     m.status[ALARMS] = raised_alarms(law.alarms, measured)
     commands, m.status[MODE] = control_station(law, m.integrals, measured)

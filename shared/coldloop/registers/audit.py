@@ -64,6 +64,8 @@ class EventKind(IntEnum):
     """The mode of the station's controller changed: subject the new one."""
     SURROUNDINGS = 27
     """Something was changed that a refrigerator is given: subject what, value its new value."""
+    MODEL_RANGE = 28
+    """The simulation left its property tables: subject what, its number from 0, cause 1 left, 0 returned."""
 
 
 class Event(NamedTuple):
@@ -80,7 +82,7 @@ class Event(NamedTuple):
             "1 mode, 2 alarm raised, 3 returned, 4 acknowledged, 5 shelved, 6 unshelved, 7 out of service, 8 in "
             "service, 9 boot, 10 session, 11 operator mode, 12 setpoint, 13 watchdog time, 14 watchdog expired, "
             "15 plant link, 16 lease, 17 sensor fault, 18 load, 19 certificate, 20 lost, 21 control link, "
-            "22 sensor, 23 pace, 24 live load, 25 station alarm, 26 station mode, 27 surroundings",
+            "22 sensor, 23 pace, 24 live load, 25 station alarm, 26 station mode, 27 surroundings, 28 model range",
             values=EventKind,
         ),
     ] = 0

@@ -230,7 +230,7 @@ class StationMode(IntEnum):
     """The low pressure is so high that helium is no longer let in from the buffer."""
     ONE_COMPRESSOR = 3
     STOPPED = 4
-    """No compressor runs; the valves are closed."""
+    """No compressor runs: total trip. The cold box is isolated, the high-pressure line empties into the buffer."""
 
 
 class StationAlarm(IntFlag):
@@ -244,6 +244,10 @@ class StationAlarm(IntFlag):
     NC2_TRIPPED = 32
     NITROGEN_LOW = 64
     HELIUM_LOST = 128
+    TOTAL_TRIP = 256
+    """No compressor runs: CV155, CV156 and the heater are off, whatever the control PLC asks for."""
+    BATH_RELIEF = 512
+    """The bath's relief valve blows into the recovery line."""
 
 
 class StationSample(NamedTuple):
@@ -258,7 +262,10 @@ class StationSample(NamedTuple):
     ] = StationMode.AUTOMATIC
     alarms: Annotated[
         int,
-        u16("Bits: 1 HP high, 2 HP low, 4 LP high, 8 LP low, 16 NC1, 32 NC2 tripped, 64 nitrogen low, 128 helium lost"),
+        u16(
+            "Bits: 1 HP high, 2 HP low, 4 LP high, 8 LP low, 16 NC1, 32 NC2 tripped, 64 nitrogen low, 128 helium lost, "
+            "256 total trip, 512 relief of the bath"
+        ),
     ] = 0
 
 
@@ -276,6 +283,19 @@ class StationStatus(NamedTuple):
     ) * len(STATION_VALVE_NAMES)
 
 
+class ModelRangeStatus(NamedTuple):
+    """Whether the simulation is within its property tables; outside them its values are not to be believed."""
+
+    outside: Annotated[
+        int,
+        u16(
+            "Bits: 1 bath, 2 supply, 4 return pressure, 8 a cell too cold, 16 a cell too warm, "
+            "32 a dry bath too warm; 0 is within"
+        ),
+    ] = 0
+    since: Annotated[int, u32("Tick at which this last changed")] = 0
+
+
 class Surroundings(NamedTuple):
     """What a refrigerator is given, from the next tick on; refused by a cold box alone."""
 
@@ -288,7 +308,7 @@ class Surroundings(NamedTuple):
 
 PLANT_MAP: Final = RegisterMap(
     service="plant",
-    version=3,
+    version=4,
     blocks=(
         IDENTITY_BLOCK,
         STATISTICS_BLOCK,
@@ -318,6 +338,7 @@ PLANT_MAP: Final = RegisterMap(
             "Trips, nitrogen, leak and weather of a whole refrigerator",
             Role.OPERATOR,
         ),
+        Block("model range", 780, ModelRangeStatus, "Alarm of the simulation: it has left its property tables"),
         Block("load table", 1000, LoadStep, "Heat load over the session", Role.OPERATOR, LOAD_ROWS),
         Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
         Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from enum import IntEnum
 from typing import Final, NamedTuple
 
+from coldloop.process.range_bits import ModelRange
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, LinkCause, Mode, OperatorMode, PlantLinkState, Verdict
@@ -105,6 +106,9 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
     ),
     EventKind.STATION_MODE: _Wording(_members(StationMode)),
     EventKind.SURROUNDINGS: _Wording(_listed(Surroundings._fields), unit=""),
+    EventKind.MODEL_RANGE: _Wording(
+        _listed([str(part.name).lower().replace("_", " ") for part in ModelRange]), _listed(("returned", "left"))
+    ),
     EventKind.PACE: _Wording(_listed(("lock-step", "real time", "paused")), unit="x real time"),
 }
 _ALARM_CAUSES: Final[Mapping[int, Words]] = {

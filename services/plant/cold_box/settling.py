@@ -1,0 +1,38 @@
+"""After a step of the integrator the cold box holds what the stages of the step brought it."""
+
+from coldloop.kernels.compiled import kernel
+from plant.cold_box.physics import ColdBox
+from plant.components.cell_account import settle_cells
+from plant.components.phase_separator import Account, settle_account
+from plant.helium.properties import Helium
+from plant.numeric import RealArray
+
+
+@kernel
+def settle_box(
+    box: ColdBox,
+    account: Account,
+    P: RealArray,
+    stages: RealArray,
+    slopes: RealArray,
+    dt: float,
+    x: RealArray,
+    helium: Helium,
+) -> None:
+    """Correct the bath and the cells in `x`, whose first 28 states are the cold box's, where they need it.
+
+    Args:
+        box: Parameters.
+        account: Of the bath in this step, with the weights 1, 2, 2, 1.
+        P: Supply pressure at the stages, Pa, shape (4,).
+        stages: States at the stages, shape (4, N).
+        slopes: Their rates, shape (4, N).
+        dt: Step, s.
+        x: State after the step, shape (N,).
+        helium: Tables.
+    """
+    settle_account(box.separator, account, dt / 6.0, x, helium)
+    first2 = 2 + box.nef1.cells
+    settle_cells(box.nef1, 2, P, stages, slopes, dt, x, helium)
+    settle_cells(box.nef2, first2, P, stages, slopes, dt, x, helium)
+    settle_cells(box.nef34, first2 + box.nef2.cells, P, stages, slopes, dt, x, helium)

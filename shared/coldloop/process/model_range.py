@@ -1,0 +1,55 @@
+"""Where the plant's model has left the range of its property tables: beyond it, properties are held or go on straight.
+
+Balances still close there, but temperatures and flows are not to be believed.
+"""
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.process.range_bits import ModelRange
+from coldloop.process.signals import STATE_NAMES, STATION_SIGNAL_NAMES
+
+SATURATION_BAR: Final = (0.3, 2.25)
+"""Of bath and return; helium's critical point is at 2.28 bar."""
+SUPPLY_BAR: Final = (5.0, 19.0)
+"""Of the high-pressure side, where its properties are fitted."""
+CELLS_K: Final = (2.5, 300.0)
+"""Of the exchangers' cells."""
+WARMEST_BATH_M3: Final = -6.16
+"""V_l of a dry bath that is at 300 K."""
+COLD_BOX_BAR: Final = (16.0, 1.05)
+"""Supply and return of a cold box alone."""
+
+FIRST_CELL: Final = STATE_NAMES.index("T_nef1_1")
+HP, LP = STATION_SIGNAL_NAMES.index("P12"), STATION_SIGNAL_NAMES.index("P11")
+
+
+def model_range(x: NDArray[Any], supply: NDArray[Any] | float, suction: NDArray[Any] | float) -> NDArray[np.int32]:
+    """Return the bits of `ModelRange` for states of the cold box, shape (..., 28), and pressures in bar."""
+    cells, bath = x[..., FIRST_CELL:], 1e-5 * x[..., 0]
+    outside = {
+        ModelRange.BATH_PRESSURE: _outside(bath, SATURATION_BAR),
+        ModelRange.SUPPLY_PRESSURE: _outside(supply, SUPPLY_BAR),
+        ModelRange.RETURN_PRESSURE: _outside(suction, SATURATION_BAR),
+        ModelRange.COLD_CELL: np.min(cells, axis=-1) < CELLS_K[0],
+        ModelRange.WARM_CELL: np.max(cells, axis=-1) > CELLS_K[1],
+        ModelRange.WARM_BATH: x[..., 1] < WARMEST_BATH_M3,
+    }
+    bits = np.zeros(bath.shape, np.int32)
+    for bit, left in outside.items():
+        bits |= np.where(left, np.int32(bit), np.int32(0))
+    return bits
+
+
+def recorded_model_range(x: NDArray[Any], station: NDArray[Any]) -> NDArray[np.int32]:
+    """Return the same for recorded ticks: states (N, 28) and the station's columns, which a cold box alone has not."""
+    if not station.size:
+        return model_range(x, *COLD_BOX_BAR)
+    return model_range(x, station[:, HP], station[:, LP])
+
+
+def _outside(value: NDArray[Any] | float, ends: tuple[float, float]) -> NDArray[np.bool_]:
+    low, high = ends
+    return (np.asarray(value) < low) | (np.asarray(value) > high)

@@ -1,0 +1,388 @@
+"""Far from its operating point the plant neither makes nor loses helium or energy, and says where its tables end."""
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from coldloop.process.load_profile import LoadProfile
+from coldloop.process.model_range import CELLS_K, SATURATION_BAR, WARMEST_BATH_M3, model_range
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.range_bits import ModelRange
+from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES
+from coldloop.registers.plant import StationAlarm, StationMode
+from plant.cold_box.balance import energy_gained, energy_rates
+from plant.cold_box.physics import REFERENCE, cold_box_of, derivative, streams
+from plant.components.phase_separator import (
+    SUPERHEAT,
+    content,
+    outflow,
+    separate,
+    start_account,
+    thinness,
+)
+from plant.components.return_line import return_flow
+from plant.helium.properties import HIGHEST_SATURATION, LOWEST_SATURATION, WARM_CP, helium_of, load_helium, saturation
+from plant.integrator import advance, plain_tuples
+from plant.kinds import plant_maker
+from plant.numeric import RealArray
+from plant.own_model import own_header
+from plant.program import PlantProgram
+from plant.refrigerator.balance import refrigerator_energy_rates
+from plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from plant.refrigerator.physics import (
+    REFERENCE_REFRIGERATOR,
+    SIGNAL_NAMES,
+    STATE_NAMES,
+    advance_refrigerator,
+    evaluate_refrigerator,
+    inventory,
+    refrigerator_of,
+)
+from plant.settings import PlantSettings
+
+HELIUM = load_helium()
+PLANT = REFERENCE_REFRIGERATOR
+BATH = REFERENCE.separator
+HEADER = own_header(DEFAULT_MODEL_FILE)
+FILE = read_refrigerator_file(SHIPPED)
+M_LOST = STATE_NAMES.index("M_lost")
+PLAIN, TABLES = plain_tuples(PLANT), plain_tuples(HELIUM)
+
+
+# -- the bath ----------------------------------------------------------------------------------------------------------
+
+bath_pressures = st.floats(0.4e5, 2.2e5)
+liquid_volumes = st.floats(-20.0 * BATH.volume, 0.99 * BATH.volume).filter(lambda V: abs(V) > 1e-3 * BATH.volume)
+
+
+@given(P=bath_pressures, V_l=liquid_volumes)
+def test_the_slopes_of_what_a_bath_holds_are_its_derivatives_also_when_it_is_dry(P: float, V_l: float) -> None:
+    c, dP, dV = content(BATH, P, V_l, HELIUM), 2.0, 1e-6
+    above, below = content(BATH, P + dP, V_l, HELIUM), content(BATH, P - dP, V_l, HELIUM)
+    assert (above.mass - below.mass) / (2.0 * dP) == pytest.approx(c.M_P, rel=1e-3, abs=1e-9)
+    assert (above.energy - below.energy) / (2.0 * dP) == pytest.approx(c.U_P, rel=1e-3, abs=1e-4)
+    fuller, emptier = content(BATH, P, V_l + dV, HELIUM), content(BATH, P, V_l - dV, HELIUM)
+    assert (fuller.mass - emptier.mass) / (2.0 * dV) == pytest.approx(c.M_V, rel=1e-3)
+    assert (fuller.energy - emptier.energy) / (2.0 * dV) == pytest.approx(c.U_V, rel=1e-3)
+
+
+@given(P=bath_pressures)
+def test_a_bath_that_runs_dry_holds_the_same_on_both_sides(P: float) -> None:
+    wet, dry = content(BATH, P, 0.0, HELIUM), content(BATH, P, -1e-15, HELIUM)
+    assert dry.mass == pytest.approx(wet.mass, rel=1e-12)
+    assert dry.energy == pytest.approx(wet.energy, abs=1e-6)
+
+
+@given(
+    P=bath_pressures, V_l=liquid_volumes, inflow=st.floats(0.0, 0.1), out=st.floats(0.0, 0.2), heat=st.floats(0.0, 1e4)
+)
+def test_a_bath_stores_what_enters_whatever_it_holds(
+    P: float, V_l: float, inflow: float, out: float, heat: float
+) -> None:
+    top = outflow(BATH, P, V_l, saturation(P, HELIUM), HELIUM)
+    dP, dV = separate(BATH, P, V_l, inflow, 7600.0, out, top.h, heat, HELIUM)
+    c = content(BATH, P, V_l, HELIUM)
+    assert c.M_P * dP + c.M_V * dV == pytest.approx(inflow - out, abs=1e-12)
+    assert c.U_P * dP + c.U_V * dV == pytest.approx(inflow * 7600.0 - out * top.h + heat, abs=1e-7)
+
+
+@given(P=bath_pressures, superheat=st.floats(0.1, 250.0))
+def test_the_vapour_in_a_dry_bath_is_that_of_coolprop(P: float, superheat: float) -> None:
+    library = pytest.importorskip("CoolProp.CoolProp")
+    sat = saturation(P, HELIUM)
+    h, rho = (library.PropsSI(name, "P", P, "T", sat.T + superheat, "Helium") for name in ("H", "D"))
+    V_l = -(h - sat.h_v) * BATH.volume / SUPERHEAT
+    top = outflow(BATH, P, V_l, sat, HELIUM)
+    assert pytest.approx(sat.T + superheat, rel=2e-3) == top.T
+    assert top.rho == pytest.approx(rho, rel=3e-3)
+
+
+def test_a_full_bath_sends_liquid_along_and_no_more_than_it_has() -> None:
+    sat = saturation(1.2e5, HELIUM)
+    carried = [outflow(BATH, 1.2e5, share * BATH.volume, sat, HELIUM).h for share in (0.9, 0.97, 0.985, 1.0, 1.01)]
+    assert carried[:2] == [sat.h_v, sat.h_v]
+    assert sat.h_l < carried[2] < sat.h_v
+    assert carried[3:] == pytest.approx([sat.h_l, sat.h_l])
+
+
+@given(P=bath_pressures, V_l=st.floats(-60.0 * BATH.volume, -31.0 * BATH.volume))
+def test_the_wall_of_a_dry_bath_goes_on_to_take_up_heat_above_300_k(P: float, V_l: float) -> None:
+    c, dV = content(BATH, P, V_l, HELIUM), 1e-4
+    hotter, colder = content(BATH, P, V_l - dV, HELIUM), content(BATH, P, V_l + dV, HELIUM)
+    assert (colder.energy - hotter.energy) / (2.0 * dV) == pytest.approx(c.U_V, rel=1e-6)
+
+
+@given(P=bath_pressures, superheat=st.floats(1.0, 250.0), over=st.floats(0.0, 2e4), exhaust=st.floats(0.0, 0.08))
+def test_the_pressure_of_a_dry_bath_settles_slowly_enough_for_a_tick(
+    P: float, superheat: float, over: float, exhaust: float
+) -> None:
+    V_l = -superheat * WARM_CP * BATH.volume / SUPERHEAT
+    thin, line = thinness(BATH, P, V_l, HELIUM), REFERENCE.return_line
+    more, _ = return_flow(line, P + over + 5.0, P, exhaust, thin)
+    less, _ = return_flow(line, P + over, P, exhaust, thin)
+    assert (more - less) / 5.0 / content(BATH, P, V_l, HELIUM).M_P < 2.5 / 0.25
+
+
+# -- the turbine -------------------------------------------------------------------------------------------------------
+
+
+@given(
+    P_HP=st.floats(1.0e5, 6e5), P_LP=st.floats(1.0e5, 2.2e5), P_bath=st.floats(1.0e5, 2.2e5), T=st.floats(8.0, 290.0)
+)
+def test_no_gas_flows_uphill_through_the_turbine_and_no_work_is_done_on_it(
+    P_HP: float, P_LP: float, P_bath: float, T: float
+) -> None:
+    box = REFERENCE._replace(P_HP=P_HP, P_LP=P_LP)
+    x = np.array(HEADER.x0)
+    x[0], x[2:] = P_bath, T
+    s = streams(x, np.array([40.0, 0.0, 60.0]), box, HELIUM)
+    assert s.m_t >= 0.0
+    assert s.m_t < 1e-15 or P_HP >= s.P_turbine > s.P_mix - 1.0
+    assert s.exhaust.h_out <= streams_inlet(x, box) + 1e-6
+    if P_HP <= P_LP:
+        assert s.m_t < 1e-9
+
+
+def streams_inlet(x: RealArray, box: object) -> float:
+    from plant.helium.properties import supply_enthalpy_and_density  # noqa: PLC0415
+
+    return float(supply_enthalpy_and_density(box.P_HP, x[-1], HELIUM)[0])  # type: ignore[attr-defined]
+
+
+def test_the_flow_of_the_turbine_is_continuous_where_its_nozzle_chokes() -> None:
+    x, u = np.array(HEADER.x0), np.array([40.0, 0.0, 60.0])
+    suctions = np.linspace(1.05e5, 8e5, 400)
+    flows = [streams(x, u, REFERENCE._replace(P_LP=float(P)), HELIUM).m_t for P in suctions]
+    assert flows[0] == flows[1]
+    assert np.all(np.diff(flows) <= 1e-12)
+    assert np.max(np.abs(np.diff(flows))) < 0.03 * flows[0]
+
+
+def test_closing_the_turbine_s_valve_takes_work_from_the_turbine_smoothly() -> None:
+    x = np.array(HEADER.x0)
+    openings = np.linspace(0.0, 12.0, 481)
+    found = [streams(x, np.array([43.0, 75.0, float(opening)]), REFERENCE, HELIUM) for opening in openings]
+    flows, between = np.array([s.m_t for s in found]), np.array([s.P_turbine for s in found])
+    drops = np.array([streams_inlet(x, REFERENCE) - s.exhaust.h_out for s in found])
+    for course, step in ((flows, 3e-4), (between[1:], 0.05e5), (drops[1:], 200.0)):
+        assert np.all(np.diff(course) >= -1e-9)
+        assert np.max(np.diff(course)) < step
+    assert between[1] == pytest.approx(found[0].P_mix, rel=0.01)
+
+
+# -- cases that were seen to make or swallow helium or heat ------------------------------------------------------------
+
+
+def program(load: LoadProfile, *events: tuple[float, str, float]) -> PlantProgram:
+    listed = [{"at_s": at, "target": target, "value": value} for at, target, value in events]
+    section = {"kind": "refrigerator", "refrigerator": {"events": listed}}
+    return plant_maker(HEADER, PlantSettings.model_validate({"plant": section}).plant)(load, 1)
+
+
+def signal(plant: PlantProgram, name: str) -> float:
+    assert plant.station is not None
+    return plant.station.signals[STATION_SIGNAL_NAMES.index(name)]
+
+
+def output(plant: PlantProgram, name: str) -> float:
+    return plant.measure()[OUTPUT_NAMES.index(name)]
+
+
+def total(plant: PlantProgram) -> float:
+    return signal(plant, "helium") + signal(plant, "lost")
+
+
+def test_a_quench_blows_helium_into_the_recovery_line_and_loses_none_on_the_way() -> None:
+    plant = program(LoadProfile((0, 40, 160), (HEADER.w0, 5385.0, HEADER.w0)))
+    before, highest, relieved = total(plant), 0.0, False
+    for _ in range(400):
+        plant.advance()
+        assert plant.station is not None
+        highest = max(highest, output(plant, "P1"))
+        relieved |= bool(plant.station.alarms & StationAlarm.BATH_RELIEF)
+    assert relieved
+    assert 1.8 < highest < SATURATION_BAR[1]
+    assert 3.0 < signal(plant, "lost") < 6.0
+    assert total(plant) == pytest.approx(before, rel=1e-11)
+
+
+def test_a_bath_that_is_full_sends_liquid_into_the_return_and_keeps_the_circuit_s_helium() -> None:
+    plant = program(LoadProfile((0,), (0.0,)))
+    before, coldest = total(plant), 80.0
+    for _ in range(4 * 3000):
+        plant.advance()
+        coldest = min(coldest, output(plant, "T3"))
+    assert output(plant, "L1") > 96.0
+    assert coldest < 4.7  # what leaves NEF1 is wet
+    assert signal(plant, "lost") == 0.0
+    assert total(plant) == pytest.approx(before, rel=1e-9)
+
+
+def test_a_bath_that_is_dry_warms_and_its_vapour_with_it() -> None:
+    plant = program(LoadProfile((0,), (HEADER.w0 + 250.0,)))
+    before = total(plant)
+    for _ in range(4 * 1800):
+        plant.advance()
+    assert output(plant, "L1") == 0.0
+    assert output(plant, "T1") > 6.0
+    assert total(plant) == pytest.approx(before, rel=1e-9)
+
+
+def test_a_total_trip_isolates_the_cold_box_and_saves_the_high_pressure_line_in_the_buffer() -> None:
+    plant = program(LoadProfile((0,), (HEADER.w0,)), (10.0, "nc1", 0.0), (10.0, "nc2", 0.0))
+    before = total(plant)
+    for _ in range(4 * 250):
+        plant.advance()
+    assert plant.station is not None
+    assert plant.station.mode == StationMode.STOPPED
+    assert plant.station.alarms & StationAlarm.TOTAL_TRIP
+    assert signal(plant, "M12") == 0.0
+    assert signal(plant, "P12") == pytest.approx(signal(plant, "P13"), abs=0.1)
+    assert signal(plant, "P13") > 6.8
+    assert total(plant) == pytest.approx(before, rel=1e-9)
+
+
+def test_after_a_total_trip_the_compressors_take_over_again() -> None:
+    events = [(10.0, "nc1", 0.0), (10.0, "nc2", 0.0), (130.0, "nc1", 1.0), (140.0, "nc2", 1.0)]
+    plant = program(LoadProfile((0,), (HEADER.w0,)), *events)
+    for _ in range(4 * 1500):
+        plant.advance()
+    assert plant.station is not None
+    assert not plant.station.alarms & StationAlarm.TOTAL_TRIP
+    assert signal(plant, "P11") == pytest.approx(1.05, abs=0.02)
+    assert signal(plant, "P12") > 12.0
+
+
+def test_the_alarm_for_the_end_of_the_tables_knows_what_has_left_them() -> None:
+    x = np.array(HEADER.x0)
+    assert model_range(x, 16.0, 1.05) == 0
+    assert model_range(np.concatenate([[2.3e5], x[1:]]), 16.0, 1.05) == ModelRange.BATH_PRESSURE
+    assert model_range(x, 4.0, 0.2) == ModelRange.SUPPLY_PRESSURE | ModelRange.RETURN_PRESSURE
+    far = np.tile(x, (2, 1))
+    far[0, -1], far[1, 5] = CELLS_K[1] + 1.0, CELLS_K[0] - 0.1
+    dry = np.concatenate([x[:1], [1.01 * WARMEST_BATH_M3], x[2:]])
+    assert model_range(dry, 16.0, 1.05) == ModelRange.WARM_BATH
+    warmest = outflow(BATH, 1.2e5, WARMEST_BATH_M3, saturation(1.2e5, HELIUM), HELIUM)
+    assert pytest.approx(CELLS_K[1], abs=1.0) == warmest.T
+    assert model_range(far, 16.0, 1.05).tolist() == [ModelRange.WARM_CELL, ModelRange.COLD_CELL]
+    assert (1e5 * SATURATION_BAR[0], 1e5 * SATURATION_BAR[1]) == (LOWEST_SATURATION, HIGHEST_SATURATION)
+
+
+# -- an hour of anything -----------------------------------------------------------------------------------------------
+
+percent = st.floats(0.0, 100.0)
+inputs = st.tuples(percent, st.floats(0.0, 150.0), percent)
+switch = st.sampled_from([1.0, 1.0, 0.0])
+happenings = st.tuples(st.floats(0.0, 6000.0), st.floats(275.0, 320.0), st.floats(0.0, 0.01), switch, switch, switch)
+pieces = st.tuples(st.integers(40, 1200), inputs, st.tuples(percent, percent, percent, percent), happenings)
+
+
+Course = list[tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]]
+
+
+WEIGHTS = np.array([0.25 / 6.0, 0.25 / 3.0, 0.25 / 3.0, 0.25 / 6.0])
+AHEAD = np.array([0.125, 0.125, 0.25, 0.0])
+"""Of the stages of a tick, s."""
+
+
+@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+def held(
+    x: RealArray, u: RealArray, v: RealArray, d: RealArray, ticks: int, plain: object, tables: object
+) -> tuple[RealArray, RealArray]:
+    """Return the state after some ticks, and sums over their stages.
+
+    What crossed the boundary and its size (J), what the bath's rates brought it (J), and the largest difference between
+    what crosses and what is stored (W).
+    """
+    plant, helium = refrigerator_of(plain), helium_of(tables)
+    sums, slope, y, signals = np.zeros(4), np.empty(x.shape[0]), np.empty(22), np.empty(len(SIGNAL_NAMES))
+    for _ in range(ticks):
+        stage = x
+        for k in range(4):
+            crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
+            stored, inwards = refrigerator_energy_rates(stage, slope, crossing, d[0], plant, helium)
+            sums[0] += WEIGHTS[k] * inwards
+            sums[1] += WEIGHTS[k] * abs(inwards)
+            sums[2] += WEIGHTS[k] * start_account(plant.box.separator, stage, slope, helium).heat
+            sums[3] = max(sums[3], abs(stored - inwards))
+            stage = x + AHEAD[k] * slope
+        x = advance_refrigerator(x, u, v, d, 0.25, plant, helium)
+    return x, sums
+
+
+def balances_over_random_events(course: Course) -> None:
+    """Valves stuck anywhere, trips, leaks, lost nitrogen and loads: helium and energy add up, stage by stage."""
+    x = np.array(FILE.x0)
+    before = inventory(x, PLANT, HELIUM)
+    in_bath = content(BATH, x[0], x[1], HELIUM).energy
+    for ticks, u, v, d in course:
+        x, sums = held(x, np.array(u), np.array(v), np.array(d), ticks, PLAIN, TABLES)
+        assert np.all(np.isfinite(x))
+        assert inventory(x, PLANT, HELIUM) + x[M_LOST] == pytest.approx(before, rel=1e-9)
+        assert sums[3] < 1e-6 * sums[1] / (0.25 * ticks) + 1e-6
+        gained = content(BATH, x[0], x[1], HELIUM).energy - in_bath
+        assert gained == pytest.approx(sums[2], abs=1e-6 * sums[1])
+        in_bath += gained
+
+
+@given(course=st.lists(pieces, min_size=2, max_size=4))
+@settings(max_examples=3)
+def test_helium_and_energy_are_conserved_whatever_happens(course: Course) -> None:
+    balances_over_random_events(course)
+
+
+@pytest.mark.exhaustive
+@given(course=st.lists(pieces, min_size=24, max_size=24))
+@settings(max_examples=2000)
+def test_helium_and_energy_are_conserved_over_hours_of_whatever_happens(course: Course) -> None:
+    balances_over_random_events(course)
+
+
+box_pieces = st.tuples(st.integers(40, 1200), inputs, st.floats(0.0, 6000.0))
+BoxCourse = list[tuple[int, tuple[float, ...], float]]
+BOX = plain_tuples(REFERENCE)
+
+
+@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+def box_held(
+    x: RealArray, u: RealArray, w: float, ticks: int, plain: object, tables: object
+) -> tuple[RealArray, RealArray]:
+    """Return the same for a cold box: what crossed, its size (J), and the largest difference (W)."""
+    box, helium, sums = cold_box_of(plain), helium_of(tables), np.zeros(3)
+    for _ in range(ticks):
+        stage = x
+        for k in range(4):
+            stored, inwards = energy_rates(stage, u, w, box, helium)
+            sums[0] += WEIGHTS[k] * inwards
+            sums[1] += WEIGHTS[k] * abs(inwards)
+            sums[2] = max(sums[2], abs(stored - inwards))
+            stage = x + AHEAD[k] * derivative(stage, u, w, box, helium)
+        x = advance(x, u, w, 0.25, box, helium)
+    return x, sums
+
+
+def energy_over_random_events(course: BoxCourse) -> None:
+    """What a cold box has gained in the end, by its states alone, is what crossed its boundary."""
+    x, crossed, size = np.array(HEADER.x0), 0.0, 0.0
+    start = x
+    for ticks, u, w in course:
+        x, sums = box_held(x, np.array(u), w, ticks, BOX, TABLES)
+        crossed, size = crossed + sums[0], size + sums[1]
+        assert sums[2] < 1e-6
+    assert energy_gained(start, x, REFERENCE, HELIUM) == pytest.approx(crossed, abs=1e-6 * size)
+
+
+@given(course=st.lists(box_pieces, min_size=2, max_size=4))
+@example(course=[(40, (0.0, 0.0, 0.0), 0.0), (134, (0.0, 0.0, 7.0), 1924.0)])  # cells move little, and there and back
+@settings(max_examples=3)
+def test_a_cold_box_has_gained_what_crossed_its_boundary(course: BoxCourse) -> None:
+    energy_over_random_events(course)
+
+
+@pytest.mark.exhaustive
+@given(course=st.lists(box_pieces, min_size=24, max_size=24))
+@settings(max_examples=2000)
+def test_a_cold_box_has_gained_what_crossed_its_boundary_in_hours_of_events(course: BoxCourse) -> None:
+    energy_over_random_events(course)
