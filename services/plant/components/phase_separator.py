@@ -214,7 +214,7 @@ NO_ACCOUNT = Account(0.0, 0.0, 0.0, 0.0)
 def is_calm(separator: PhaseSeparator, x: Array, slope: Array, dt: float) -> bool:
     """Return whether a step of `dt` (s) from `x` is so far from all bends that its account would correct nothing."""
     share = x[1] / separator.volume
-    calm = CALM_LEVEL < share < CARRY_OVER - CALM_LEVEL and x[0] < separator.relief_pressure - CALM_RISE
+    calm: bool = CALM_LEVEL < share < CARRY_OVER - CALM_LEVEL and x[0] < separator.relief_pressure - CALM_RISE
     return calm and abs(slope[0]) * dt < CALM_RISE and abs(slope[1]) * dt < CALM_LEVEL * separator.volume
 
 

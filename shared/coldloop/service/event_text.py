@@ -117,7 +117,11 @@ _ALARM_CAUSES: Final[Mapping[int, Words]] = {
     AlarmKind.SENSOR_BAD: _listed(OUTPUT_NAMES),
     AlarmKind.SENSOR_SUSPECT: _listed(OUTPUT_NAMES),
     AlarmKind.CAPACITY: _listed(
-        ("", "too much load: reduce it, or the bath will run dry", "too little load: raise it, or the turbine gets too cold and the bath floods")
+        (
+            "",
+            "too much load: reduce it, or the bath will run dry",
+            "too little load: raise it, or the turbine gets too cold and the bath floods",
+        )
     ),
     AlarmKind.SEQUENCE_REJECTED: _causes(Verdict),
     AlarmKind.PLANT_LOST: _causes(LinkCause),
