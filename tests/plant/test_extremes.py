@@ -335,7 +335,7 @@ def test_helium_and_energy_are_conserved_whatever_happens(course: Course) -> Non
 
 @pytest.mark.exhaustive
 @given(course=st.lists(pieces, min_size=24, max_size=24))
-@settings(max_examples=2000)
+@settings(max_examples=20)
 def test_helium_and_energy_are_conserved_over_hours_of_whatever_happens(course: Course) -> None:
     balances_over_random_events(course)
 
@@ -383,6 +383,6 @@ def test_a_cold_box_has_gained_what_crossed_its_boundary(course: BoxCourse) -> N
 
 @pytest.mark.exhaustive
 @given(course=st.lists(box_pieces, min_size=24, max_size=24))
-@settings(max_examples=2000)
+@settings(max_examples=20)
 def test_a_cold_box_has_gained_what_crossed_its_boundary_in_hours_of_events(course: BoxCourse) -> None:
     energy_over_random_events(course)

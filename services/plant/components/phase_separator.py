@@ -35,7 +35,6 @@ LEAST_MASS, LEAST_ENERGY = 2e-12, 1e-7  # kg and J in a step: what is less is le
 ROUNDING = 1e-14  # share of mass to which `holding` solves
 MAX_NEWTON_STEPS = 30
 JUST_DRY = 1e-16  # m3
-CALM_LEVEL, CALM_RISE = 1e-2, 200.0  # share of the vessel, and Pa
 LEAST_PRESSURE, CRITICAL_PRESSURE = 0.05e5, 2.28e5  # Pa
 
 
@@ -147,7 +146,7 @@ def outflow(separator: PhaseSeparator, P: float, V_l: float, sat: Saturation, he
     return Outflow(sat.T, sat.h_v - carried * (sat.h_v - sat.h_l), sat.rho_v)
 
 
-@inlined
+@kernel
 def thinness(separator: PhaseSeparator, P: float, V_l: float, helium: Helium) -> float:
     """Return by how much the vapour of a dry vessel is thinner than saturated vapour; 1 in one that is not dry."""
     if V_l.real >= 0.0:
@@ -206,18 +205,6 @@ class Account(NamedTuple):
     """W."""
 
 
-NO_ACCOUNT = Account(0.0, 0.0, 0.0, 0.0)
-"""Of a step that needs none."""
-
-
-@inlined
-def is_calm(separator: PhaseSeparator, x: Array, slope: Array, dt: float) -> bool:
-    """Return whether a step of `dt` (s) from `x` is so far from all bends that its account would correct nothing."""
-    share = x[1] / separator.volume
-    calm: bool = CALM_LEVEL < share < CARRY_OVER - CALM_LEVEL and x[0] < separator.relief_pressure - CALM_RISE
-    return calm and abs(slope[0]) * dt < CALM_RISE and abs(slope[1]) * dt < CALM_LEVEL * separator.volume
-
-
 @kernel
 def start_account(separator: PhaseSeparator, x: Array, slope: Array, helium: Helium) -> Account:
     """Begin to keep account of a step from the state `x`, whose first two are P and V_l, with their rates `slope`."""
@@ -243,12 +230,7 @@ def add_to_account(
 
 @kernel
 def settle_account(separator: PhaseSeparator, account: Account, dt: float, x: Array, helium: Helium) -> None:
-    """Correct P and V_l in `x`, if need be, so that the bath holds what the account says; `dt` (s) is of a weight.
-
-    Without an account nothing is corrected.
-    """
-    if account == NO_ACCOUNT:
-        return
+    """Correct P and V_l in `x`, if need be, so that the bath holds what the account says; `dt` (s) is of a weight."""
     mass, energy = account.mass + dt * account.inflow, account.energy + dt * account.heat
     c = content(separator, x[0], x[1], helium)
     if abs(mass - c.mass) > LEAST_MASS or abs(energy - c.energy) > LEAST_ENERGY:

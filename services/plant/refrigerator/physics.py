@@ -25,7 +25,7 @@ from plant.cold_box.settling import settle_box
 from plant.components.cell_account import settle_cells
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
-from plant.components.phase_separator import NO_ACCOUNT, add_to_account, content, is_calm, start_account
+from plant.components.phase_separator import add_to_account, content, start_account
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import Array, RealArray
 from plant.refrigerator.compression_station import (
@@ -190,23 +190,20 @@ def advance_refrigerator(
     stages, slopes = np.empty((4, n)), np.empty((4, n))
     evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
     bath = plant.box.separator
-    calm = is_calm(bath, x, slope, dt)
-    account = NO_ACCOUNT if calm else start_account(bath, x, slope, helium)
+    account = start_account(bath, x, slope, helium)
     for i in range(n):
         stages[0, i], slopes[0, i] = x[i], slope[i]
         total[i] = slope[i]
         stage[i] = x[i] + 0.5 * dt * slope[i]
     for k, fraction in ((1, 0.5), (2, 1.0)):
         evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
-        if not calm:
-            account = add_to_account(bath, account, stage, slope, 2.0, helium)
+        account = add_to_account(bath, account, stage, slope, 2.0, helium)
         for i in range(n):
             stages[k, i], slopes[k, i] = stage[i], slope[i]
             total[i] += 2.0 * slope[i]
             stage[i] = x[i] + fraction * dt * slope[i]
     evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
-    if not calm:
-        account = add_to_account(bath, account, stage, slope, 1.0, helium)
+    account = add_to_account(bath, account, stage, slope, 1.0, helium)
     for i in range(n):
         stages[3, i], slopes[3, i] = stage[i], slope[i]
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
