@@ -117,7 +117,7 @@ def test_bath_and_return_agree_from_a_vacuum_to_the_critical_point(P: float, sup
     assert sat.rho_v == pytest.approx(coolprop("D", "P", P, "Q", 1.0), rel=5e-5)
     T = sat.T + superheat
     h, cp, s, rho = (coolprop(name, "P", P, "T", T) for name in ("H", "C", "S", "D"))
-    assert helium_at.vapour_enthalpy_and_cp(P, T, sat.T, HELIUM.vapour)[0] == pytest.approx(h, abs=2e-4 * cp)
+    assert helium_at.vapour_enthalpy_and_cp(P, T, sat.T, HELIUM.vapour)[0] == pytest.approx(h, abs=3e-4 * cp)
     assert helium_at.vapour_temperature(P, h, sat, HELIUM) == pytest.approx(T, abs=2e-3)
     assert vapour_density(P, h) == pytest.approx(rho, rel=1e-3)
     assert helium_at.enthalpy_after_isentropic_expansion(P, s, HELIUM) == pytest.approx(h, abs=0.03 * cp)
