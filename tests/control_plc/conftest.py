@@ -11,6 +11,7 @@ from coldloop.process.signals import L1, T5
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.plant import Actuators, Measurement
+from coldloop.registers.safety import AlarmKind, AlarmState
 from coldloop.safety.sequence import InputSequence, with_checksum
 from control_plc.program import ControlProgram, OperatingPoint
 from control_plc.settings import ControlSection
@@ -18,6 +19,13 @@ from control_plc.settings import ControlSection
 MODEL = 0xC01D1005
 HEADER = read_header(DEFAULT_MODEL_FILE)
 INITIAL = SequenceRow(43.0, 75.0, 36.0)
+HOLD_TICKS = 12
+"""Of a hold that is short."""
+
+
+def section(**changed: object) -> ControlSection:
+    """Return settings with a short hold."""
+    return ControlSection.model_validate({"ladder": {"hold_s": HOLD_TICKS / 4}, **changed})
 
 
 class Bench:
@@ -101,6 +109,11 @@ class Bench:
         return self.program.offer(sequence)
 
 
+def alarm(bench: Bench, kind: AlarmKind) -> AlarmState:
+    """Return the state of an alarm."""
+    return AlarmState(bench.program.alarms.rows[kind].state)
+
+
 def moved(cv155: float = 0.0, ncr22: float = 0.0, cv156: float = 0.0) -> SequenceRow:
     """Return the initial inputs, moved."""
     return SequenceRow(INITIAL.cv155 + cv155, INITIAL.ncr22 + ncr22, INITIAL.cv156 + cv156)
@@ -120,5 +133,14 @@ def new_bench() -> Callable[[InputLimits], Bench]:
 def bench() -> Bench:
     """A control PLC whose first update (at tick 0) has been latched."""
     made = Bench(InputLimits())
+    made.scan()
+    return made
+
+
+@pytest.fixture
+def rig() -> Bench:
+    """A control PLC with a short hold, whose first update has been latched; the process stands at its setpoints."""
+    made = Bench(InputLimits(), section())
+    made.steady = True
     made.scan()
     return made

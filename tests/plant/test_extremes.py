@@ -13,7 +13,7 @@ from coldloop.process.range_bits import ModelRange
 from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationAlarm, StationMode
 from plant.cold_box.balance import energy_gained, energy_rates
-from plant.cold_box.physics import REFERENCE, cold_box_of, derivative, streams
+from plant.cold_box.physics import REFERENCE, ColdBox, cold_box_of, derivative, streams
 from plant.components.phase_separator import (
     SUPERHEAT,
     content,
@@ -23,7 +23,15 @@ from plant.components.phase_separator import (
     thinness,
 )
 from plant.components.return_line import return_flow
-from plant.helium.properties import HIGHEST_SATURATION, LOWEST_SATURATION, WARM_CP, helium_of, load_helium, saturation
+from plant.helium.properties import (
+    HIGHEST_SATURATION,
+    LOWEST_SATURATION,
+    WARM_CP,
+    helium_of,
+    load_helium,
+    saturation,
+    supply_enthalpy_and_density,
+)
 from plant.integrator import advance, plain_tuples
 from plant.kinds import plant_maker
 from plant.numeric import RealArray
@@ -145,10 +153,9 @@ def test_no_gas_flows_uphill_through_the_turbine_and_no_work_is_done_on_it(
         assert s.m_t < 1e-9
 
 
-def streams_inlet(x: RealArray, box: object) -> float:
-    from plant.helium.properties import supply_enthalpy_and_density  # noqa: PLC0415
-
-    return float(supply_enthalpy_and_density(box.P_HP, x[-1], HELIUM)[0])  # type: ignore[attr-defined]
+def streams_inlet(x: RealArray, box: ColdBox) -> float:
+    """Return the enthalpy before the turbine, J/kg."""
+    return float(supply_enthalpy_and_density(box.P_HP, x[-1], HELIUM)[0])
 
 
 def test_the_flow_of_the_turbine_is_continuous_where_its_nozzle_chokes() -> None:
