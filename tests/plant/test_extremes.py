@@ -330,7 +330,7 @@ def balances_over_random_events(course: Course) -> None:
         assert inventory(x, PLANT, HELIUM) + x[M_LOST] == pytest.approx(before, rel=1e-9)
         assert sums[3] < 1e-6 * sums[1] / (0.25 * ticks) + 1e-6
         gained = content(BATH, x[0], x[1], HELIUM).energy - in_bath
-        assert gained == pytest.approx(sums[2], abs=1e-6 * sums[1])
+        assert gained == pytest.approx(sums[2], abs=1e-6 * sums[1] + 1e-6)
         in_bath += gained
 
 
@@ -378,7 +378,7 @@ def energy_over_random_events(course: BoxCourse) -> None:
         x, sums = box_held(x, np.array(u), w, ticks, BOX, TABLES)
         crossed, size = crossed + sums[0], size + sums[1]
         assert sums[2] < 1e-6
-    assert energy_gained(start, x, REFERENCE, HELIUM) == pytest.approx(crossed, abs=1e-6 * size)
+    assert energy_gained(start, x, REFERENCE, HELIUM) == pytest.approx(crossed, abs=1e-6 * size + 1e-6)
 
 
 @given(course=st.lists(box_pieces, min_size=2, max_size=4))
