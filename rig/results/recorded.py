@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, STATION_SIGNAL_NAMES
+from coldloop.registers.audit import Event
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample, StationSample
 
@@ -145,6 +146,8 @@ class Recording(NamedTuple):
     link: LinkStatistics
     station: FloatArray = NO_STATION
     """As in `SampleBlock`."""
+    events: Sequence[tuple[str, Event]] = ()
+    """Of the journals, with the service that each is of."""
 
     @property
     def block(self) -> SampleBlock:

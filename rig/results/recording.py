@@ -77,7 +77,7 @@ class MemorySink(Sink):
     def recording(self, link: LinkStatistics) -> Recording:
         """Return what was kept."""
         block = joined(self._blocks)
-        return Recording(block.load, block.u, block.y, block.x, self._updates, link, block.station)
+        return Recording(block.load, block.u, block.y, block.x, self._updates, link, block.station, self.events)
 
 
 class Records(Protocol):

@@ -5,12 +5,12 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from functools import cached_property, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +105,15 @@ class RunRequest:
         return decisive_digest(self, settings_of(self.assignments))
 
 
+class Happening(NamedTuple):
+    """An event of a journal, without who caused it."""
+
+    service: str
+    tick: int
+    kind: int
+    subject: int
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What a run left behind."""
@@ -118,6 +127,8 @@ class Outcome:
     """Columns of the updates, by name."""
     trace: dict[str, list[float]]
     """Columns of the trace, by name; empty unless it was asked for."""
+    events: list[Happening] = field(default_factory=list)
+    """What the journals say, if the trace was asked for."""
 
     def column(self, name: str) -> Series:
         """Return a column of the updates."""
@@ -140,7 +151,8 @@ class Outcome:
         """
         try:
             content = json.loads(text)
-            return cls(**{**content, "indicators": Indicators(**content["indicators"])})
+            events = [Happening(*event) for event in content["events"]]
+            return cls(**{**content, "indicators": Indicators(**content["indicators"]), "events": events})
         except (TypeError, KeyError) as error:
             raise ValueError(str(error)) from None
 
@@ -252,6 +264,9 @@ def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outc
         deadline_misses=recording.link.deadline_misses,
         updates={name: [float(getattr(row, name)) for row in recording.updates] for name in UPDATE_COLUMNS},
         trace=_trace(recording, StageCost(model, design).of(recording.block), trace_ticks) if trace_ticks else {},
+        events=[Happening(service, event.tick, event.kind, event.subject) for service, event in recording.events]
+        if trace_ticks
+        else [],
     )
 
 

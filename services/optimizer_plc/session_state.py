@@ -24,14 +24,14 @@ costs of the guess, after q - 1 and after q iterations. j_dev, j_cst, violation:
 
 PERIOD: Final = (
     ("update", "i8"), ("tick", "i8"), ("q", "i8"), ("iterations", "i8"), ("ticks", "i8"), ("sequences", "i8"),
-    ("allowance", "i8"), ("planned", "?"), ("solved", "?"), ("load", "real"), ("effective", "real"),
+    ("allowance", "i8"), ("in_time", "i8"), ("planned", "?"), ("solved", "?"), ("load", "real"), ("effective", "real"),
     ("efficiency", "real"), ("mismatch", "real"), ("contraction", "real"), ("gamma", "real"),
     ("guessed_before", "real"), ("delivered_before", "real"), ("shortage", "real"), ("most_open", "real"),
     ("suspects", "i8"),
 )  # fmt: skip
 """update, tick, load: of the update under way. q, iterations, ticks, effective: q(t_k), what fits, tau_u and J_k.
 efficiency, mismatch, contraction, gamma: what q was decided by. sequences: number of the last sequence. allowance:
-ticks that adaptive periods are longer than the budget says. planned, solved: whether there is a period, and an answer
+ticks that adaptive periods are longer than the budget says. in_time: answers in a row that came in time. planned, solved: whether there is a period, and an answer
 to it. guessed_before, delivered_before: J+ and Jhat of the problem before, infinite where there was none. shortage:
 what the load is above what can be held (W); negative: below what is needed. most_open: limit of CV155, a scaled
 deviation. suspects: readings left out, bit i is output i."""

@@ -38,6 +38,7 @@ HOURS: Final = {
         str(hour): LoadFamily((0.0, 60.0, -60.0, 100.0, -100.0, 150.0), 60.0, 400.0, 20 + hour) for hour in range(1, 9)
     },  # sustained loads, under which throttled qpOASES predicts violations as large as in the paper (c1 of 20)
     "pulses": LoadFamily((-45.0, 135.0), 150.0, 450.0, 30, in_turn=True),  # like the magnets of a tokamak
+    "quench": LoadFamily((0.0, 5000.0), 30.0, 1800.0, 31, in_turn=True),  # their stored energy, into the bath
 }
 
 NAMED: Final = {
@@ -46,6 +47,7 @@ NAMED: Final = {
     "6h": tuple("abcdef"),
     "8h": tuple("12345678"),
     "pulses": ("pulses",),
+    "quench": ("quench",),
 }
 
 

@@ -8,7 +8,7 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import TICK_S
 from coldloop.registers.control_plc import Update, Verdict
 from optimizer_plc.budget import MAX_PERIOD_TICKS
-from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.program import PROVEN, OptimizerProgram
 from optimizer_plc.settings import ProgramSettings
 
 
@@ -33,11 +33,20 @@ def test_a_late_answer_is_followed_by_longer_periods_and_those_in_time_by_shorte
         program.answered(late=True)
         longer.append(period(program, model) - usual)
     assert longer == [1, 2, 4]
-    for _ in range(4):
+    shorter = []
+    for _ in range(5 * PROVEN):
         program.answered(late=False)
-    assert period(program, model) == usual
-    program.answered(late=False)
-    assert period(program, model) == usual
+        shorter.append(period(program, model) - usual)
+    assert shorter == [*[4] * (PROVEN - 1), *[3] * PROVEN, *[2] * PROVEN, *[1] * PROVEN, *[0] * (PROVEN + 1)]
+
+
+def test_where_a_tick_is_needed_for_good_few_answers_are_late(program: OptimizerProgram, model: LtiModel) -> None:
+    program.restart(0.0)
+    usual, late = period(program, model), []
+    for _ in range(90):
+        late.append(period(program, model) == usual)
+        program.answered(late=late[-1])
+    assert sum(late) == 10
 
 
 def test_no_period_is_longer_than_the_longest(program: OptimizerProgram, model: LtiModel) -> None:

@@ -1,18 +1,23 @@
 """What studies make of outcomes, each value computed by hand from outcomes that no run has given."""
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from coldloop.process.signals import STATION_SIGNAL_NAMES
+from coldloop.registers.audit import EventKind
+from coldloop.registers.control_plc import Mode
+from coldloop.registers.safety import AlarmKind
 from rig.studies import STUDIES
 from rig.studies.beyond.coupling import CASES as PLANTS
 from rig.studies.paper.cholesky import SLOW_DOWN, SPEED
 from rig.studies.paper.solver_comparison import measures
 from rig.studies.paper.trade_off import share_falling, won_and_lost
 from rig.studies.paper.trajectories import furthest_outside, iterations_by_event, load_steps
+from rig.studies.request import Happening
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult
 
 if TYPE_CHECKING:
@@ -187,13 +192,23 @@ def test_what_happens_to_a_refrigerator_is_told_by_its_ranges_modes_and_alarms(
     under: StudyOptions, made_up: "MakeOutcome"
 ) -> None:
     run = made_up(trace=station(mode=[1.0] * 8, alarms=[0.0] * 7 + [1.0], lost=[0.0] * 7 + [0.125]), J_BF=7.0)
+    happened = [
+        ("control_plc", 0, EventKind.MODE, Mode.HOLD), ("control_plc", 8, EventKind.MODE, Mode.MPC),
+        ("control_plc", 2400, EventKind.ALARM_RAISED, AlarmKind.CAPACITY),
+        ("control_plc", 2500, EventKind.ALARM_RAISED, AlarmKind.LEVEL_BAND),
+        ("control_plc", 2600, EventKind.ALARM_RAISED, AlarmKind.CAPACITY),
+        ("plant", 2600, EventKind.ALARM_RAISED, AlarmKind.T5_BAND),
+    ]  # fmt: skip
+    run = replace(run, events=[Happening(*event) for event in happened])
     asked = STUDIES["disturbances"].requests(under)
     result = STUDIES["disturbances"].evaluate(under, dict.fromkeys(asked, run))
-    assert len(result.rows) == len(asked) == 24
+    assert len(result.rows) == len(asked) == 36
     assert {row[3] for row in result.rows} == {7.0}
     assert {row[10] for row in result.rows} == {0.125}
     assert len({row[11] for row in result.rows}) == 1
     assert "none" not in {row[12] for row in result.rows}
+    assert {row[13] for row in result.rows} == {"hold 0 s, mpc 2 s"}
+    assert {row[14] for row in result.rows} == {"capacity, level band"}
 
 
 # -- solvers against power --------------------------------------------------------------------------------------------

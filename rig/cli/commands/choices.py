@@ -9,7 +9,7 @@ from typing import Final
 MODES: Final = ("lockstep", "realtime")
 SOLVERS: Final = ("ode", "qpoases", "osqp", "fast-gradient", "interior-point", "hybrid", "daqp")
 PRESETS: Final = ("tuned", "paper", "as-printed")
-LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h", "pulses")
+LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h", "pulses", "quench")
 SERVICES: Final = ("control_plc", "optimizer_plc", "plant")
 WITHOUT: Final = ("optimizer",)
 REGISTER_FORMATS: Final = ("csv", "json", "markdown", "table")

@@ -3,13 +3,25 @@
 from dataclasses import replace
 from typing import Final, NamedTuple
 
+from coldloop.process.signals import TICK_S
+from coldloop.registers.audit import EventKind
+from coldloop.registers.control_plc import Mode
 from coldloop.registers.plant import StationAlarm, StationMode
+from coldloop.registers.safety import AlarmKind
+from coldloop.service.event_text import word_of
+from rig.results.driving import CONTROL
 from rig.studies.beyond.coupling import REFRIGERATOR, TRACE_TICKS
 from rig.studies.drawing import over_time
-from rig.studies.request import Outcome, RunRequest
+from rig.studies.request import Happening, Outcome, RunRequest
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
 
 EVENTS: Final = "plant.refrigerator.events="
+
+
+def _both_off_until(s: int) -> str:
+    """Return the events of a total trip at ten minutes, after which the compressors start one after the other."""
+    off = "{at_s=600,target='nc1',value=0},{at_s=600,target='nc2',value=0}"
+    return f"{EVENTS}[{off},{{at_s={s},target='nc1',value=1}},{{at_s={s + 30},target='nc2',value=1}}]"
 
 
 class DisturbanceCase(NamedTuple):
@@ -32,12 +44,15 @@ CASES: Final = {
     ),
     "10 K warmer outside": DisturbanceCase("a", (f"{EVENTS}[{{at_s=600,target='ambient',value=310}}]",)),
     "a train of pulses": DisturbanceCase("pulses", ()),
+    "magnets quench, 5 kW for 30 s": DisturbanceCase("quench", ()),
+    "both compressors trip for 2 min": DisturbanceCase("a", (_both_off_until(720),)),
+    "both compressors trip for 10 min": DisturbanceCase("a", (_both_off_until(1200),)),
 }
 DRIVERS: Final = {"MPC": (), "classical loops": ("control_plc.driver=classical",)}
 STATION: Final = {"LQ": (), "PI": ("plant.station.control=pi",)}
 COLUMNS: Final = (
     "event", "cold box", "station", "J_BF", "L1 outside (%)", "T5 outside (%)", "L1 (%)", "T5 (K)", "HP (bar)",
-    "LP (bar)", "lost (kg)", "modes", "alarms",
+    "LP (bar)", "lost (kg)", "station's modes", "station's alarms", "control PLC", "control PLC's alarms",
 )  # fmt: skip
 SHOWN: Final = {
     "load": "load (W)", "L1": "L1 (%)", "T5": "T5 (K)", "P12": "HP (bar)", "P11": "LP (bar)", "L_N2": "nitrogen (%)",
@@ -99,5 +114,21 @@ def _measures(run: Outcome) -> tuple[str | float, ...]:
     lost = round(float(run.series("lost")[-1]), 3)
     return (
         i.J_BF, i.L1_outside_band_pct, i.T5_outside_band_pct, *spans, lost, ", ".join(modes),
-        ", ".join(sorted(raised)) or "none",
+        ", ".join(sorted(raised)) or "none", _ladder(run), ", ".join(_alarms(run)) or "none",
     )  # fmt: skip
+
+
+def _ladder(run: Outcome) -> str:
+    """Return the control PLC's modes in order, each with the second in which it began."""
+    began = [(one.tick, one.subject) for one in _of_control_plc(run, EventKind.MODE)]
+    return ", ".join(f"{word_of(Mode, mode)} {tick * TICK_S:.0f} s" for tick, mode in began)
+
+
+def _alarms(run: Outcome) -> list[str]:
+    """Return the control PLC's alarms in the order in which they were first raised."""
+    raised = [word_of(AlarmKind, one.subject) for one in _of_control_plc(run, EventKind.ALARM_RAISED)]
+    return list(dict.fromkeys(raised))
+
+
+def _of_control_plc(run: Outcome, kind: EventKind) -> list[Happening]:
+    return [event for event in run.events if event.service == CONTROL and event.kind == kind]
