@@ -36,9 +36,9 @@ from plant.integrator import advance, plain_tuples
 from plant.kinds import plant_maker
 from plant.numeric import RealArray
 from plant.own_model import own_header
-from plant.program import PlantProgram
 from plant.refrigerator.balance import refrigerator_energy_rates
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from plant.refrigerator.linearisation import jacobian, rate_scales
 from plant.refrigerator.physics import (
     REFERENCE_REFRIGERATOR,
     SIGNAL_NAMES,
@@ -48,6 +48,7 @@ from plant.refrigerator.physics import (
     inventory,
     refrigerator_of,
 )
+from plant.refrigerator.program import RefrigeratorProgram
 from plant.settings import PlantSettings
 
 HELIUM = load_helium()
@@ -182,22 +183,24 @@ def test_closing_the_turbine_s_valve_takes_work_from_the_turbine_smoothly() -> N
 # -- cases that were seen to make or swallow helium or heat ------------------------------------------------------------
 
 
-def program(load: LoadProfile, *events: tuple[float, str, float]) -> PlantProgram:
+def program(load: LoadProfile, *events: tuple[float, str, float]) -> RefrigeratorProgram:
     listed = [{"at_s": at, "target": target, "value": value} for at, target, value in events]
     section = {"kind": "refrigerator", "refrigerator": {"events": listed}}
-    return plant_maker(HEADER, PlantSettings.model_validate({"plant": section}).plant)(load, 1)
+    plant = plant_maker(HEADER, PlantSettings.model_validate({"plant": section}).plant)(load, 1)
+    assert isinstance(plant, RefrigeratorProgram)
+    return plant
 
 
-def signal(plant: PlantProgram, name: str) -> float:
+def signal(plant: RefrigeratorProgram, name: str) -> float:
     assert plant.station is not None
     return plant.station.signals[STATION_SIGNAL_NAMES.index(name)]
 
 
-def output(plant: PlantProgram, name: str) -> float:
+def output(plant: RefrigeratorProgram, name: str) -> float:
     return plant.measure()[OUTPUT_NAMES.index(name)]
 
 
-def total(plant: PlantProgram) -> float:
+def total(plant: RefrigeratorProgram) -> float:
     return signal(plant, "helium") + signal(plant, "lost")
 
 
@@ -260,6 +263,44 @@ def test_after_a_total_trip_the_compressors_take_over_again() -> None:
     assert not plant.station.alarms & StationAlarm.TOTAL_TRIP
     assert signal(plant, "P11") == pytest.approx(1.05, abs=0.02)
     assert signal(plant, "P12") > 12.0
+
+
+TRIP = ((10.0, "nc1", 0.0), (10.0, "nc2", 0.0), (130.0, "nc1", 1.0), (160.0, "nc2", 1.0))
+EVENTS = {
+    "both compressors trip": (LoadProfile((0,), (HEADER.w0,)), TRIP, 300),
+    "a compressor trips": (LoadProfile((0,), (HEADER.w0,)), TRIP[::2], 300),
+    "magnets quench": (LoadProfile((0, 40, 160), (HEADER.w0, 5385.0, HEADER.w0)), (), 300),
+    "the bath runs full": (LoadProfile((0,), (0.0,)), (), 3600),
+    "the bath runs dry": (LoadProfile((0,), (HEADER.w0 + 250.0,)), (), 3600),
+    "it gets warmer": (LoadProfile((0,), (HEADER.w0,)), ((10.0, "ambient", 310.0),), 300),
+}
+FINER = 8
+"""Steps in the place of one."""
+
+
+@pytest.mark.parametrize(
+    "event", ["both compressors trip", *(pytest.param(name, marks=pytest.mark.exhaustive) for name in list(EVENTS)[1:])]
+)
+def test_one_step_a_tick_is_stable_with_a_margin_and_exact_within_a_percent_of_each_move(event: str) -> None:
+    load, happens, seconds = EVENTS[event]
+    plant = program(load, *happens)
+    fine = plant.memory.x
+    u, stiffest, courses = np.array(FILE.u0), 0.0, []
+    for tick in range(4 * seconds):
+        memory = plant.memory
+        v, d = memory.commands, plant.ahead(0)[0] + np.array([plant.load, 0.0, 0.0, 0.0, 0.0, 0.0])
+        if tick % 8 == 0:
+            A = jacobian(memory.x, u, v, d, PLANT, HELIUM)[: len(STATE_NAMES), : len(STATE_NAMES)]
+            stiffest = min(stiffest, float(np.linalg.eigvals(A).real.min()))
+        for _ in range(FINER):
+            fine = advance_refrigerator(fine, u, v, d, 0.25 / FINER, PLANT, HELIUM)
+        plant.advance()
+        courses.append((plant.memory.x, fine))
+    coarse, fine_ones = np.transpose(courses, (1, 0, 2))
+    moves = np.ptp(fine_ones, axis=0)
+    assert stiffest > 0.85 * -2.785 / 0.25  # where a Runge-Kutta step of a tick ends to be stable
+    errors = np.abs(coarse - fine_ones).max(axis=0)
+    assert np.all(errors < 0.01 * moves + 1e-6 * rate_scales(PLANT))
 
 
 def test_the_alarm_for_the_end_of_the_tables_knows_what_has_left_them() -> None:

@@ -18,7 +18,11 @@ CHOKED = np.sqrt(GAMMA) * (2.0 / (GAMMA + 1.0)) ** ((GAMMA + 1.0) / (2.0 * (GAMM
 
 
 class ReliefValve(NamedTuple):
-    """A valve that opens in proportion above its set pressure and blows out of the circuit."""
+    """A valve that opens with the square of the rise above its set pressure and blows out of the circuit.
+
+    So the flow's slope is 0 where it opens: there the return line is at its steepest when the compressors stand, and
+    both together were too stiff for a step of 0.25 s.
+    """
 
     set_pressure: float
     """Pa."""
@@ -74,7 +78,8 @@ def cold_valve_flow(valve: Valve, opening: float, T: float, density: float, P_in
 @kernel
 def relief_flow(relief: ReliefValve, P: float, T: float) -> float:
     """Return what a relief valve blows off (kg/s) at `P` (Pa) and `T` (K), into the atmosphere."""
-    opening = 100.0 * at_least(P - relief.set_pressure, 0.0) / relief.span
+    rise = at_least(P - relief.set_pressure, 0.0) / relief.span
+    opening = 100.0 * rise * rise
     return gas_valve_flow(relief.valve, opening, P, 1e5, T)
 
 
