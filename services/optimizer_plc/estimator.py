@@ -152,7 +152,10 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     innovation = y - c.y0 - expected
     J = c.stationary.inverse_covariances[period]
     if c.plausible.sigmas > 0.0:
-        innovation = judge(c.plausible, belief.readings, belief.predicted, innovation, J, real(b.since) * real(TICK_S))
+        innovation = judge(
+            c.plausible, belief.readings, belief.surprise, belief.predicted, innovation, J,
+            real(b.since) * real(TICK_S),
+        )  # fmt: skip
     if not np.isfinite(innovation).all():
         innovation = imputed(innovation, J)
     note_surprise(belief.surprise, innovation, J, real(b.since) * real(TICK_S / MINUTE_S))

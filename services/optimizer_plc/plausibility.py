@@ -47,6 +47,8 @@ class Plausibility(NamedTuple):
     agreeing_s: float
     longest_s: float
     most: int
+    model_sigmas: float
+    """Largest residual over its standard deviation, root mean square, while the model holds."""
     constants: NDArray[np.int64]
     """State that is the constant error of each output; below 0: it has none. Shape (22,)."""
 
@@ -65,7 +67,8 @@ def plausibility_of(
     in_all = n_y * (1.0 - spread + settings.sigmas * math.sqrt(spread)) ** 3
     return Plausibility(
         real(settings.sigmas), np.array(settings.allowances, real), real(in_all), real(longest_period_s),
-        real(settings.settled_s), real(settings.agreeing_s), real(settings.longest_s), settings.most, constants,
+        real(settings.settled_s), real(settings.agreeing_s), real(settings.longest_s), settings.most,
+        real(settings.model_sigmas), constants,
     )  # fmt: skip
 
 
@@ -120,13 +123,15 @@ def imputed(innovation: Array, inverse_covariance: Array) -> Array:
 
 @kernel
 def judge(
-    p: Plausibility, readings: Any, predicted: Array, innovation: Array, J: Array, elapsed_s: float  # noqa: ANN401
+    p: Plausibility, readings: Any, surprise: Array, predicted: Array, innovation: Array, J: Array, elapsed_s: float  # noqa: ANN401
 ) -> Array:  # fmt: skip
     """Return the innovation (n_y,) without the elements of suspects, which are no number.
 
-    `readings` is `new_readings`'s, `elapsed_s` the time since the judgement before. Constant errors in `predicted` are
-    set to what a reading shows that is taken back. There are no new suspects after a longer time than J is for.
+    `readings` is `new_readings`'s, `surprise` that of the readings so far, `elapsed_s` the time since the judgement
+    before. Constant errors in `predicted` are set to what a reading shows that is taken back. There are no new suspects
+    after a longer time than J is for.
     """
+    contradicting, contradicts = against_the_model(p, readings, surprise, J)
     believed, returning = innovation.copy(), False
     for i in range(innovation.shape[0]):
         r = readings[i]
@@ -137,10 +142,21 @@ def judge(
             believed[i] = np.nan
             returning = True
     if returning:
-        take_back(p, readings, predicted, innovation, believed, J, elapsed_s)
-    if elapsed_s <= p.longest_period_s:
-        suspect_some(p, readings, believed, J)
+        take_back(p, readings, predicted, innovation, believed, J, elapsed_s, contradicting > 0)
+    if elapsed_s <= p.longest_period_s and contradicting < 2:
+        suspect_some(p, readings, believed, J, contradicts)
     return believed
+
+
+@kernel
+def against_the_model(p: Plausibility, readings: Any, surprise: Array, J: Array) -> tuple[int, int]:  # noqa: ANN401
+    """Return how many readings that are believed say that the model does not hold, and one of them, or -1."""
+    count, one = 0, -1
+    for i in range(surprise.shape[0]):
+        limit = p.model_sigmas + p.allowance[i] * np.sqrt(J[i, i])
+        if readings[i].state == USED and surprise[i] > limit * limit:
+            count, one = count + 1, i
+    return count, one
 
 
 @kernel
@@ -152,12 +168,13 @@ def enter(r: Any, state: int) -> None:  # noqa: ANN401 a record
 
 @kernel
 def take_back(
-    p: Plausibility, readings: Any, predicted: Array, innovation: Array, believed: Array, J: Array, elapsed_s: float  # noqa: ANN401
+    p: Plausibility, readings: Any, predicted: Array, innovation: Array, believed: Array, J: Array, elapsed_s: float,  # noqa: ANN401
+    model_fails: bool,  # noqa: FBT001 - a kernel takes its arguments by position
 ) -> None:  # fmt: skip
     """Take back suspects that agree again, or have been out for the longest time, and readings that were missing.
 
-    After a long time what the others say of a reading is no better than the reading: its constant error, if it has one,
-    is set so that it agrees.
+    After a long time, or when the model fails, what the others say of a reading is no better than the reading: its
+    constant error, if it has one, is set so that it agrees.
     """
     expected = imputed(believed, J)
     for i in range(innovation.shape[0]):
@@ -169,7 +186,7 @@ def take_back(
         else:
             r.agreed_s += elapsed_s
         agrees = r.state == SUSPECT and r.agreed_s >= p.agreeing_s
-        if not (agrees or r.state == MISSING or r.since_s >= p.longest_s):
+        if not (agrees or model_fails or r.state == MISSING or r.since_s >= p.longest_s):
             continue
         believed[i] = innovation[i]
         if not agrees and p.constants[i] >= 0:
@@ -179,21 +196,24 @@ def take_back(
 
 
 @kernel
-def suspect_some(p: Plausibility, readings: Any, believed: Array, J: Array) -> None:  # noqa: ANN401
-    """Leave out readings whose residual is too large, the worst first, if what is left then agrees in all."""
+def suspect_some(p: Plausibility, readings: Any, believed: Array, J: Array, only: int) -> None:  # noqa: ANN401
+    """Leave out readings whose residual is too large, the worst first, if what is left then agrees in all.
+
+    Where one says that the model does not hold it is the `only` one that may be wrong itself; -1: any may.
+    """
     before, expected, out = believed.copy(), believed, 0
     for i in range(believed.shape[0]):
         out += not np.isfinite(believed[i])
     if out:
         expected = imputed(believed, J)
-    worst = least_plausible(p, readings, believed, expected, J)
+    worst = least_plausible(p, readings, believed, expected, J, only)
     if worst < 0:
         return
     while worst >= 0 and out < p.most:
         believed[worst] = np.nan
         out += 1
         expected = imputed(believed, J)
-        worst = least_plausible(p, readings, believed, expected, J)
+        worst = least_plausible(p, readings, believed, expected, J, only)
     total = believed.dtype.type(0.0)
     for i in range(believed.shape[0]):
         for j in range(believed.shape[0]):
@@ -207,11 +227,11 @@ def suspect_some(p: Plausibility, readings: Any, believed: Array, J: Array) -> N
 
 
 @kernel
-def least_plausible(p: Plausibility, readings: Any, believed: Array, expected: Array, J: Array) -> int:  # noqa: ANN401
+def least_plausible(p: Plausibility, readings: Any, believed: Array, expected: Array, J: Array, only: int) -> int:  # noqa: ANN401
     """Return the reading with the largest residual of those that are too large, or -1; new ones are not judged."""
     worst, largest = -1, p.sigmas
     for i in range(believed.shape[0]):
-        if np.isfinite(believed[i]) and readings[i].since_s >= p.settled_s:
+        if np.isfinite(believed[i]) and readings[i].since_s >= p.settled_s and only in (-1, i):
             size = abs(residual_of(i, expected, J)) - p.allowance[i] * np.sqrt(J[i, i])
             if size > largest:
                 worst, largest = i, size

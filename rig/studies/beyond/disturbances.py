@@ -11,6 +11,7 @@ from coldloop.registers.safety import AlarmKind
 from coldloop.service.event_text import word_of
 from rig.results.driving import CONTROL
 from rig.studies.beyond.coupling import REFRIGERATOR, TRACE_TICKS
+from rig.studies.beyond.robust_controllers import TUNED
 from rig.studies.drawing import over_time
 from rig.studies.request import Happening, Outcome, RunRequest
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
@@ -48,7 +49,7 @@ CASES: Final = {
     "both compressors trip for 2 min": DisturbanceCase("a", (_both_off_until(720),)),
     "both compressors trip for 10 min": DisturbanceCase("a", (_both_off_until(1200),)),
 }
-DRIVERS: Final = {"MPC": (), "classical loops": ("control_plc.driver=classical",)}
+DRIVERS: Final = {"MPC": (TUNED,), "classical loops": ("control_plc.driver=classical",)}
 STATION: Final = {"LQ": (), "PI": ("plant.station.control=pi",)}
 COLUMNS: Final = (
     "event", "cold box", "station", "J_BF", "L1 outside (%)", "T5 outside (%)", "L1 (%)", "T5 (K)", "HP (bar)",
