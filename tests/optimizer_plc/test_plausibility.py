@@ -162,6 +162,24 @@ def test_when_more_contradict_the_prediction_than_can_fail_it_is_the_plant(world
     assert world.suspects == []
 
 
+def test_while_the_model_does_not_hold_suspects_are_taken_back_and_no_other_reading_becomes_one(world: World) -> None:
+    """The gauges of the supply see a compressor trip, of which a cold box's model knows nothing."""
+    world.error[L1] = JUMP[L1]
+    world.updates(1)
+    assert world.suspects == ["L1"]
+    for name in ("P2", "P4", "P6", "P9"):
+        world.error[OUTPUT_NAMES.index(name)] = -1.0
+    world.updates(3)
+    assert world.suspects == []
+    world.error[T5] = JUMP[T5]
+    world.updates(1)
+    assert world.suspects == []
+    world.updates(8 * MINUTE)
+    world.error[T5] = 2.0 * JUMP[T5]
+    world.updates(1)
+    assert world.suspects == ["T5"], "the filter has learnt how the plant is now"
+
+
 def test_after_a_longer_gap_than_the_filter_is_for_no_reading_becomes_suspect(world: World) -> None:
     predict(world.c, world.belief, np.zeros(3), 40)
     world.error[T5] = JUMP[T5]

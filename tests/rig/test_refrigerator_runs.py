@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pyarrow.parquet as pq
 import pytest
 
-from coldloop.process.signals import STATION_SIGNAL_NAMES
+from coldloop.process.signals import L1, STATION_SIGNAL_NAMES
 from rig import simulate
 
 if TYPE_CHECKING:
@@ -67,3 +67,14 @@ def test_the_optimiser_runs_with_a_model_that_knows_the_pressures() -> None:
     assert sum("bar" in label for label in labels) == 2, "high and low pressure are drawn as those of a run's folder"
     assert known.summary["trace_sha256"] != unknown.summary["trace_sha256"]
     assert known.summary["L1_outside_band_pct"] == known.summary["T5_outside_band_pct"] == 0.0
+
+
+def test_a_compressor_trip_makes_no_good_sensor_suspect_and_the_level_comes_back() -> None:
+    events = [{"at_s": 600, "target": "nc1", "value": 0}, {"at_s": 720, "target": "nc1", "value": 1}]
+    run = simulate("a", duration_s=1800, plant={"kind": "refrigerator", "refrigerator": {"events": events}})
+    alarms = {event["subject"] for event in run.events.arrow.to_pylist()}
+    assert "level band" in alarms, "the trip moves the plant"
+    assert "sensor suspect" not in alarms
+    level = run.recording.y[:, L1]
+    assert 55.0 < level.min() < 59.0
+    assert level[-400:].min() > 59.0
