@@ -11,6 +11,8 @@ from plant.cold_box.equilibrium import NoEquilibriumError, find_equilibrium
 from plant.cold_box.linearisation import linearisation_error, state_scales
 from plant.cold_box.model import build_model, parameters_digest
 from plant.cold_box.physics import REFERENCE, streams
+from plant.components.heat_exchanger import HeatExchanger
+from plant.helium.properties import saturation, supply_enthalpy_and_density, vapour_enthalpy_and_cp, vapour_temperature
 from plant.numeric import RealArray
 
 if TYPE_CHECKING:
@@ -28,6 +30,35 @@ def test_the_operating_point_has_the_paper_s_cold_power_and_temperature(plant: P
     assert rest[2] + 75.0 == pytest.approx(450.0, abs=15.0)
     assert y["T1"] == pytest.approx(4.4, abs=0.06)
     assert y["L1"] == pytest.approx(60.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("exchanger", "ends", "true_UA"),
+    [
+        (REFERENCE.nef1, ("T4", "T2", "T1", "T3", "P1"), 1365.0),
+        (REFERENCE.nef2, ("T6", "T4", "T7", "T8", "P7"), 2507.0),
+        (REFERENCE.nef34, ("T9", "T6", "T8", "T10", "P8"), 8605.0),
+    ],
+)
+def test_a_chain_of_cells_transfers_what_a_true_counter_flow_of_another_ua_does(
+    plant: Plant, rest: Rest, exchanger: HeatExchanger, ends: tuple[str, ...], true_UA: float
+) -> None:
+    """The integral of dQ/(T_H - T_L) between the ends, with the properties' own temperatures along the way."""
+    y, helium, s = plant.outputs(*rest), plant.helium, streams(rest[0], rest[1], REFERENCE, plant.helium)
+    hot, cool, cold, warmed, pressure = ends
+    flow = s.m_jt + s.m_t * (exchanger is REFERENCE.nef34)
+    returning = s.m_v + s.m_t * (exchanger is not REFERENCE.nef1)
+    T = np.linspace(4.0, 81.0, 8000)
+    h = np.array([supply_enthalpy_and_density(REFERENCE.P_HP, float(one), helium)[0] for one in T])
+    h_hot, h_cool = np.interp([y[hot], y[cool]], T, h)
+    heat = flow * (h_hot - h_cool) * (np.arange(4000) + 0.5) / 4000
+    T_high = np.interp(h_cool + heat / flow, h, T)
+    P_low = 1e5 * y[pressure]
+    sat = saturation(P_low, helium)
+    h_cold, _ = vapour_enthalpy_and_cp(P_low, y[cold], sat.T, helium.vapour)
+    T_low = np.array([vapour_temperature(P_low, h_cold + q / returning, sat, helium) for q in heat])
+    assert np.mean(1.0 / (T_high - T_low)) * flow * (h_hot - h_cool) == pytest.approx(true_UA, rel=5e-3)
+    assert T_low[-1] == pytest.approx(y[warmed], abs=0.02)
 
 
 def test_the_operating_point_agrees_with_the_feasibility_study(plant: Plant, rest: Rest) -> None:

@@ -50,7 +50,7 @@ class PhaseSeparator(NamedTuple):
     relief_span: float = 0.3e5
     """Rise above it at which the valve is fully open, Pa."""
     relief_area: float = 4e-4
-    """Its flow area then, m2: 0.9 kg/s of saturated vapour, what 10 kW evaporate."""
+    """Its flow area then, m2: 0.9 kg/s of saturated vapour at 2.1 bar."""
 
 
 class Content(NamedTuple):

@@ -16,7 +16,7 @@ from plant.helium.properties import Helium, enthalpy_after_isentropic_expansion,
 from plant.numeric import at_least, at_most
 
 BISECTIONS = 40
-SHUT = 1e-12  # m2, of a valve that passes less than 1e-6 g/s
+SHUT = 1e-12  # m2, of a valve that passes less than 2e-5 g/s
 SMALL_FLOW, SMALL_PRESSURE = 1e-9, 1.0  # kg/s and Pa, of difference quotients
 
 

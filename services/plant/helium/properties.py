@@ -275,8 +275,11 @@ def enthalpy_after_isentropic_expansion(P: float, s: float, helium: Helium) -> f
 
 @inlined
 def entropy_before_expansion(P: float, h: float, helium: Helium) -> float:
-    """Return s (J/(kg K)) at `P` (Pa, 0.3e5 to 20e5) and `h` (J/kg, 6e3 to 1600e3, that is 4 to 305 K at 16 bar)."""
+    """Return s (J/(kg K)) at `P` (Pa, 0.3e5 to 20e5) and `h` (J/kg, 6e3 to 1600e3, that is 4 to 305 K at 16 bar).
+
+    Held beyond these ends.
+    """
     log_pressure = np.log(at_least(P, 1.0))
-    entropy_sum, _ = read_surface(helium.turbine_entropy, log_pressure, np.log(h))
+    entropy_sum, _ = read_surface(helium.turbine_entropy, log_pressure, np.log(at_least(h, 1.0)))
     s: float = entropy_sum - GAS_CONSTANT * log_pressure
     return s

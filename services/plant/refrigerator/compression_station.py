@@ -1,6 +1,6 @@
 """The warm compression station, S4: lines, buffer, two screw compressors, and the valves that move helium between them.
 
-Sizes are those of a station for the flow that the cold box takes, 93.5 g/s from 1.05 to 16 bar; `docs/refrigerator.md`
+Sizes are those of a station for the flow that the cold box takes, 93.4 g/s from 1.05 to 16 bar; `docs/refrigerator.md`
 gives the reason of each. States, `STATION_STATES`: what the volumes hold and what was lost (kg), the speeds of the
 compressors (share of the full one), the openings of the valves (%).
 """
