@@ -7,26 +7,26 @@ from typing import Final
 import numpy as np
 
 from coldloop.process.lti_model import discretise, load
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import L1, TICK_S
 from plant.cold_box.equilibrium import find_equilibrium
 from plant.cold_box.linearisation import linearise
-from plant.cold_box.model import OPERATING_LEVEL
-from plant.cold_box.physics import REFERENCE
 from plant.helium.properties import load_helium
+from plant.own_model import box_of
 
 WRONG_MODEL: Final = "wrong_model.json"
 """Its file in the folder of a run."""
-OTHER_INPUTS: Final = (40.0, 60.0, 38.0)
-"""CV155 %, NCR22_A W, CV156 %."""
+MOVED_INPUTS: Final = (-3.0, -15.0, 2.0)
+"""From those of the right model: CV155 %, NCR22_A W, CV156 %."""
 
 
 def save_wrong_model(right: Path, wrong: Path) -> None:
-    """Write the linear model of the same plant at `OTHER_INPUTS`."""
-    helium = load_helium()
-    rest = find_equilibrium(np.array(OTHER_INPUTS), OPERATING_LEVEL, REFERENCE, helium)
-    linear = linearise(rest.x, rest.u, rest.w, REFERENCE, helium)
+    """Write the linear model of the same plant with its inputs moved by `MOVED_INPUTS`."""
+    model, helium = load(right), load_helium()
+    box = box_of(model)
+    rest = find_equilibrium(model.u0 + np.array(MOVED_INPUTS), float(model.y0[L1]), box, helium)
+    linear = linearise(rest.x, rest.u, rest.w, box, helium)
     tick = discretise(linear.A, linear.B, linear.F, TICK_S)
     replace(
-        load(right), **linear._asdict(), A_tick=tick.A, B_tick=tick.B, F_tick=tick.F,
+        model, **linear._asdict(), A_tick=tick.A, B_tick=tick.B, F_tick=tick.F,
         x0=rest.x, u0=rest.u, w0=rest.w, y0=rest.y,
     ).save(wrong)  # fmt: skip

@@ -5,32 +5,47 @@ from pathlib import Path
 import numpy as np
 
 from coldloop.errors import ModelFileError, printable
+from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.signals import L1, T5
-from plant.cold_box.equilibrium import Equilibrium, find_equilibrium
+from optimizer_plc.qp.design import ControlDesign
+from plant.cold_box.capacity import held_loads
+from plant.cold_box.diagnosis import operating_point
+from plant.cold_box.equilibrium import Equilibrium
 from plant.cold_box.linearisation import linearisation_error
-from plant.cold_box.model import OPERATING_INPUTS, OPERATING_LEVEL, build_model
-from plant.cold_box.physics import REFERENCE
+from plant.cold_box.model import model_at
+from plant.cold_box.plant_file import PlantFile
 from plant.helium.properties import load_helium
 
 HORIZON_S = 100.0
 """Time after which the gains are given: the level integrates, so there are no final ones."""
+TWO_SIDED = 1e-3
+"""Difference of the derivatives from central ones from which on the plant has a kink there."""
+GRID = 21, 3
+"""Openings of CV155 and of CV156 at which it is tried which loads the plant holds."""
 
 
-def describe_model(in_use: Path) -> tuple[LtiModel, str]:
+def describe_model(in_use: Path, plant: PlantFile, design: ControlDesign) -> tuple[LtiModel, str]:
     """Solve for the operating point and linearise there; return the model and its description.
 
     Args:
         in_use: Model file that is configured, which is compared by its digest.
+        plant: The cold box and its operating point.
+        design: Whose bands the outputs at rest are compared with.
+
+    Raises:
+        plant.cold_box.equilibrium.NoEquilibriumError: The plant does not come to rest there; one line that says why.
     """
-    helium = load_helium()
-    rest = find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, REFERENCE, helium)
-    model = build_model(REFERENCE)
-    error = linearisation_error(rest.x, rest.u, rest.w, REFERENCE, helium)
+    helium, box = load_helium(), plant.box
+    rest = operating_point(plant, helium)
+    model = model_at(rest, box, helium, plant.parameters)
+    error = linearisation_error(rest.x, rest.u, rest.w, box, helium)
     lines = [
         *_equilibrium_lines(model, rest),
         *_eigenvalue_lines(model, error),
         *_gain_lines(model),
+        *_kink_line(error),
+        *_band_lines(rest, design),
         f"model      sha256 {model.digest}",
         *_in_use_line(in_use),
     ]
@@ -80,4 +95,36 @@ def _gain_lines(model: LtiModel) -> list[str]:
     return [
         f"after {HORIZON_S:g} s of +1 {unit} {name}: L1 {effects[L1, i]:+.5f} %, T5 {effects[T5, i]:+.5f} K"
         for i, (name, unit) in enumerate(zip(names, units, strict=True))
+    ]
+
+
+def _kink_line(error: float) -> list[str]:
+    """Return that the model holds for one side only, if so."""
+    if error < TWO_SIDED:
+        return []
+    return ["kink       derivatives differ on both sides: the second law limits cells of NEF1 or NEF2; less UA there"]
+
+
+def held_line(plant: PlantFile, design: ControlDesign, limits: InputLimits) -> str:
+    """Return which loads a plant holds with L1 as in its file and T5 within its band: some seconds of computing."""
+    openings = [np.linspace(limits.low[k], limits.high[k], count) for k, count in zip((0, 2), GRID, strict=True)]
+    heater, warmth = (limits.low[1], limits.high[1]), (design.output_low[1], design.output_high[1])
+    level = plant.operating_point.level_pct
+    try:
+        with np.errstate(all="ignore"):
+            held = held_loads(plant.box, load_helium(), level, openings[0], heater, openings[1], warmth)
+    except ValueError:
+        return "holds      no load with T5 within its band\n"
+    loads = f"[{held.least.w:.0f},{held.largest.w:.0f}]"
+    return f"holds      loads of {loads} W at least: --set optimizer_plc.program.holdable_load_w={loads}\n"
+
+
+def _band_lines(rest: Equilibrium, design: ControlDesign) -> list[str]:
+    """Return what is to be set where an output at rest is outside its band."""
+    bands = zip((L1, T5), ("L1", "T5"), ("%", "K"), design.output_low, design.output_high, strict=True)
+    return [
+        f"outside    {name} rests at {rest.y[k]:.2f} {unit}, its band is {low:g} to {high:g} {unit}: set"
+        " optimizer_plc.program.design.output_low and output_high, and the bands of control_plc.alarms"
+        for k, name, unit, low, high in bands
+        if not low <= rest.y[k] <= high
     ]

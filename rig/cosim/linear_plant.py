@@ -7,9 +7,9 @@ from coldloop.errors import ConfigurationError
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.lti_model import load as load_model
-from plant.cold_box.physics import REFERENCE
 from plant.kinds import NO_MISMATCH, noise_of
 from plant.numeric import RealArray
+from plant.own_model import box_of
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.settings import PlantKind
 from rig.cosim.one_process import OneProcessRig
@@ -27,7 +27,7 @@ class LinearPlant(PlantProgram):
 
     def __init__(self, model: LtiModel, load: HeatLoad, noise: MeasurementNoise | None = None) -> None:
         self._model = model
-        super().__init__(box=REFERENCE, x0=model.x0.tolist(), u0=model.u0.tolist(), load=load, noise=noise)
+        super().__init__(box=box_of(model), x0=model.x0.tolist(), u0=model.u0.tolist(), load=load, noise=noise)
 
     def _step(self, w: float, *, held: bool) -> tuple[RealArray, RealArray]:  # noqa: ARG002 nothing is kept
         m = self._model

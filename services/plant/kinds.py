@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Final
 from coldloop.errors import ConfigurationError, ModelFileError
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.model_file import COLD_BOX, ModelHeader
-from plant.cold_box.physics import REFERENCE, ColdBox
+from plant.cold_box.physics import ColdBox
 from plant.components.valve import Valve
 from plant.mismatched import MismatchedPlant
+from plant.own_model import box_of
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.rack.rack import MakePlant
 from plant.refrigerator.events import EventSchedule
@@ -25,12 +26,16 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
     """Return what makes the plant at its operating point, for a load and a seed.
 
     Raises:
-        ModelFileError: The refrigerator's file cannot be used.
-        ConfigurationError: Its gains are not of the configured weights, or it is to differ from its model.
+        ModelFileError: The refrigerator's file, or what the model file says of the plant, cannot be used.
+        ConfigurationError: Its gains are not of the configured weights, or it is to differ from its model in what it
+            cannot.
     """
     if section.kind is PlantKind.COLD_BOX:
         if header.plant != COLD_BOX:
             raise ModelFileError(f"model.file: a model of the {header.plant}; set plant.kind to that, or take another")
+        efficiency = mismatched_box(box_of(header), section.mismatch).turbine.efficiency
+        if efficiency >= 1.0:
+            raise ConfigurationError(f"plant.mismatch.turbine_efficiency: that makes {efficiency:.2f} of this turbine")
         return partial(make_program, header, section.sensors, mismatch=section.mismatch)
     if section.mismatch != NO_MISMATCH:
         raise ConfigurationError("plant.mismatch: for a cold box alone; set plant.kind to cold-box, or leave it out")
@@ -53,17 +58,17 @@ def make_program(
     seed: int,
     mismatch: MismatchSettings = NO_MISMATCH,
 ) -> PlantProgram:
-    """Return the cold box at the operating point of its model file."""
+    """Return the cold box that a model file describes, at its operating point."""
     with kernels_of("the cold box", about_s=10):
-        box, noise = _box(mismatch), noise_of(sensors, seed)
+        box, noise = mismatched_box(box_of(header), mismatch), noise_of(sensors, seed)
         if mismatch.beside_the_box:
             return MismatchedPlant(box=box, x0=header.x0, u0=header.u0, load=load, noise=noise, mismatch=mismatch)
         return PlantProgram(box=box, x0=header.x0, u0=header.u0, load=load, noise=noise)
 
 
-def _box(mismatch: MismatchSettings) -> ColdBox:
-    box, ua = REFERENCE, mismatch.heat_transfer
-    turbine = box.turbine
+def mismatched_box(box: ColdBox, mismatch: MismatchSettings) -> ColdBox:
+    """Return a cold box whose parameters are off by the factors of a mismatch."""
+    ua, turbine = mismatch.heat_transfer, box.turbine
     return box._replace(
         nef1=box.nef1._replace(UA=ua * box.nef1.UA),
         nef2=box.nef2._replace(UA=ua * box.nef2.UA),

@@ -114,10 +114,16 @@ def find_load(name: str, mean_w: float) -> LoadProfile:
     """Return the load of a name or of a CSV file.
 
     Raises:
-        LoadFileError: There is neither such a name nor a file that can be read.
+        LoadFileError: There is neither such a name nor a file that can be read, or the mean is too low for its steps.
     """
     families = named_families(name)
     if families is not None:
+        lowest = mean_w + min(step for family in families for step in family.steps)
+        if lowest < 0.0:
+            raise LoadFileError(
+                f"load {name}: would go down to {lowest:.0f} W about {mean_w:.0f} W, the load of the model's operating"
+                " point; name a CSV file with loads of this plant"
+            )
         return concatenated([telegraph(family, mean_w) for family in families])
     path = Path(name)
     if not path.exists():

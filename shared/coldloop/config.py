@@ -13,6 +13,7 @@ import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from math import isfinite
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
@@ -24,6 +25,7 @@ from coldloop.errors import ConfigurationError
 PREFIX = "COLDLOOP__"
 DEFAULT = "default"
 DERIVED = "follows from other settings"
+LISTING: Final = "`coldloop config` lists the keys"
 MOST_LEVELS: Final = 32
 """Tables and arrays within one another that a TOML text may have."""
 MOST_BYTES: Final = 1_000_000
@@ -96,6 +98,8 @@ def load_configuration(
     assignments: Iterable[str] = (),
     options: Mapping[str, tuple[object, str]] | None = None,
     others: Iterable[str] = (),
+    option: str = "--config",
+    listing: str = LISTING,
 ) -> Configuration[M]:
     """Return the validated configuration.
 
@@ -106,6 +110,8 @@ def load_configuration(
         assignments: `section.key=value` from the command line.
         options: Values of dedicated command-line options, by dotted key, each with the option's name.
         others: Sections of other services, which the file and the environment may hold and `model` does not know.
+        option: What names the file on the command line.
+        listing: What lists the keys, for messages.
 
     Raises:
         ConfigurationError: One line that names the key, its source and the remedy.
@@ -116,7 +122,7 @@ def load_configuration(
         *((key, value, option) for key, (value, option) in (options or {}).items()),
     ]
     for layer, entries in enumerate(
-        (_from_file(file), _from_environment(os.environ if environment is None else environment), command_line)
+        (_from_file(file, option), _from_environment(os.environ if environment is None else environment), command_line)
     ):
         for entry in entries:
             layers.put(layer, *entry)
@@ -126,7 +132,7 @@ def load_configuration(
     try:
         settings = model.model_validate(layers.values)
     except ValidationError as error:
-        raise ConfigurationError(_explained(error, layers.sources)) from None
+        raise ConfigurationError(explained(error, layers.sources, model, listing)) from None
     for key, value in flattened(settings.model_dump()).items():
         if not _is_finite(value):
             raise ConfigurationError(f"{_where(key, layers.sources)}: input should be finite (got {value!r})")
@@ -168,8 +174,9 @@ Entry = tuple[str, object, str]
 """Dotted key, value, source."""
 
 
-def _from_file(file: Path | None) -> list[Entry]:
-    return [] if file is None else [(key, value, str(file)) for key, value in flattened(_read_toml(file)).items()]
+def _from_file(file: Path | None, option: str) -> list[Entry]:
+    content = {} if file is None else flattened(_read_toml(file, option))
+    return [(key, value, str(file)) for key, value in content.items()]
 
 
 def _from_environment(environment: Mapping[str, str]) -> list[Entry]:
@@ -231,7 +238,7 @@ def _parts(value: object) -> Iterable[object]:
     return value if isinstance(value, list) else ()
 
 
-def _read_toml(file: Path) -> dict[str, Any]:
+def _read_toml(file: Path, option: str) -> dict[str, Any]:
     try:
         with file.open("rb") as content:  # a pipe will do, a device without an end will not
             data = content.read(MOST_BYTES + 1)
@@ -239,7 +246,7 @@ def _read_toml(file: Path) -> dict[str, Any]:
             raise ConfigurationError(f"{file}: not a configuration: more than {MOST_BYTES} bytes")
         return parsed_toml(data.decode("utf-8"))
     except OSError as error:
-        raise ConfigurationError(f"{file}: {error.strerror}; name a readable TOML file with --config") from None
+        raise ConfigurationError(f"{file}: {error.strerror}; name a readable TOML file with {option}") from None
     except UnicodeDecodeError:
         raise ConfigurationError(f"{file}: not UTF-8 text; save it as UTF-8") from None
     except ValueError as error:
@@ -271,11 +278,18 @@ def selected(settings: BaseModel, keys: Iterable[str]) -> dict[str, Any]:
     return {key: value for key, value in values.items() if f"{key}.".startswith(wanted)}
 
 
-def _explained(error: ValidationError, sources: Mapping[str, str]) -> str:
+def explained(
+    error: ValidationError, sources: Mapping[str, str], model: type[BaseModel], listing: str = LISTING
+) -> str:
+    """Return the first of the errors that a model found, in one line: the key, where it comes from, what is wrong."""
     first = error.errors()[0]
-    where = _where(".".join(str(part) for part in first["loc"]), sources)
+    key = ".".join(str(part) for part in first["loc"])
+    where = _where(key, sources)
     if first["type"] == "extra_forbidden":
-        return f"{where}: no such key; `coldloop config` lists the keys"
+        section = key.rpartition(".")[0]
+        known = flattened(model().model_dump()) if section else model.model_fields
+        close = get_close_matches(key, [each for each in known if each.startswith(section)], n=1)
+        return f"{where}: no such key; {f'did you mean {close[0]}? ' if close else ''}{listing}"
     message = first["msg"].removeprefix("Value error, ")
     given = repr(first["input"])
     if len(given) > MOST_SHOWN:

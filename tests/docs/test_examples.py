@@ -157,6 +157,7 @@ class Reader:
         self._runs = 0
         (folder / "short_plan.toml").write_text(PLAN)
         (folder / "my_plan.toml").write_text(PLAN)
+        (folder / "my_box.toml").write_bytes((ROOT / "examples" / "smaller_turbine.toml").read_bytes())
         for name, watts in (("my_hours.csv", 400), ("another.csv", 370)):
             (folder / name).write_text(f"time_s,load_w\n0,384\n5,{watts}\n")
 

@@ -11,6 +11,7 @@ from rig.cli.commands.options import configuration
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
+    parser.add_argument("--plant", type=Path, metavar="FILE", help="plant file (TOML): parameters of another cold box")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the model file, for model.file")
 
 
@@ -19,13 +20,24 @@ def execute(options: argparse.Namespace) -> int:
     from coldloop.errors import UsageError
     from coldloop.process.lti_model import load
     from coldloop.whole_file import require_regular_file
-    from rig.cli.model_listing import describe_model
+    from plant.cold_box.equilibrium import NoEquilibriumError
+    from plant.cold_box.plant_file import PlantFile, read_plant_file
+    from rig.cli.model_listing import describe_model, held_line
 
     if options.out is not None:
         require_regular_file(options.out)
-    in_use = configuration(options).settings.model.file
-    model, text = describe_model(in_use)
+    settings = configuration(options).settings
+    in_use = settings.model.file
+    plant = PlantFile() if options.plant is None else read_plant_file(options.plant, settings.limits)
+    if options.out is not None and options.plant is not None and options.out.resolve() == options.plant.resolve():
+        raise UsageError(f"{options.out}: is the plant file; name another one with --out")
+    try:
+        model, text = describe_model(in_use, plant, settings.optimizer_plc.program.design)
+    except NoEquilibriumError as error:
+        raise UsageError(f"{options.plant or 'the reference plant'}: {error}") from None
     sys.stdout.write(text)
+    if options.plant is not None:
+        sys.stdout.write(held_line(plant, settings.optimizer_plc.program.design, settings.limits))
     if options.out is not None:
         try:
             model.save(options.out)

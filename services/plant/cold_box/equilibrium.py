@@ -45,7 +45,7 @@ def find_equilibrium(u: RealArray, level: float, box: ColdBox, helium: Helium) -
     Raises:
         NoEquilibriumError: Newton's method does not converge, for instance beyond the capacity maximum.
     """
-    x, w = _relaxed(u, level, box, helium)
+    x, w = relaxed(u, level, box, helium)
     return rest_near(x, w, u, box, helium)
 
 
@@ -73,8 +73,8 @@ def rest_near(x: RealArray, w: float, u: RealArray, box: ColdBox, helium: Helium
     raise NoEquilibriumError(f"no equilibrium at u = {u.tolist()}: the residual stays at {residual:.2g} per second")
 
 
-def _relaxed(u: RealArray, level: float, box: ColdBox, helium: Helium) -> tuple[RealArray, float]:
-    """Return a state near the equilibrium, and its load."""
+def relaxed(u: RealArray, level: float, box: ColdBox, helium: Helium) -> tuple[RealArray, float]:
+    """Return a state near the equilibrium under `u` with the bath at `level` (%), and its load (W)."""
     volume = level / 100.0 * box.separator.volume
     nef1 = np.linspace(9.5, 4.5, box.nef1.cells)
     nef2 = np.linspace(18.0, 10.0, box.nef2.cells)

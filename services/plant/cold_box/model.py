@@ -1,7 +1,11 @@
-"""The model file's maker: `python -m plant.cold_box.model FILE` writes the linear model of the reference cold box."""
+"""The model file's maker: `python -m plant.cold_box.model FILE` writes the linear model of the reference cold box.
+
+`coldloop model --plant` makes that of another one.
+"""
 
 import hashlib
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,23 +14,25 @@ import numpy as np
 from coldloop.process import signals as process
 from coldloop.process.lti_model import LtiModel, discretise
 from plant.cold_box import physics as cold_box
-from plant.cold_box.equilibrium import find_equilibrium
+from plant.cold_box.equilibrium import Equilibrium, find_equilibrium
 from plant.cold_box.linearisation import linearise
 from plant.cold_box.physics import REFERENCE, ColdBox
-from plant.helium.properties import Helium, load_helium
-
-OPERATING_INPUTS = (43.0, 75.0, 36.0)  # CV155 %, NCR22_A W, CV156 %; left of the capacity maximum at CV155 = 50 %
-OPERATING_LEVEL = 60.0  # %
+from plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL
+from plant.helium.properties import ISOBAR_PRESSURE, Helium, load_helium
 
 
 def build_model(box: ColdBox = REFERENCE) -> LtiModel:
-    """Return the linear model of `box` at the operating point.
+    """Return the linear model of `box` at the operating point of the reference plant.
 
     Raises:
         plant.cold_box.equilibrium.NoEquilibriumError: the box does not come to rest at the operating inputs.
     """
     helium = load_helium()
-    rest = find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, box, helium)
+    return model_at(find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, box, helium), box, helium)
+
+
+def model_at(rest: Equilibrium, box: ColdBox, helium: Helium, parameters: Mapping[str, Any] | None = None) -> LtiModel:
+    """Return the linear model of `box` at a state of rest; `parameters` are what its file says of the plant."""
     linear = linearise(rest.x, rest.u, rest.w, box, helium)
     tick = discretise(linear.A, linear.B, linear.F, process.TICK_S)
     return LtiModel(
@@ -47,6 +53,7 @@ def build_model(box: ColdBox = REFERENCE) -> LtiModel:
         load_name=cold_box.LOAD_NAME,
         load_unit=cold_box.LOAD_UNIT,
         parameters_digest=parameters_digest(box, helium),
+        plant_parameters=dict(parameters or {}),
     )
 
 
@@ -54,6 +61,8 @@ def parameters_digest(box: ColdBox, helium: Helium) -> str:
     """Return the SHA-256 over every parameter and every table entry that the cold box reads, in hexadecimal."""
     digest = hashlib.sha256()
     _add(digest, (box, helium))
+    if box.P_HP != ISOBAR_PRESSURE:
+        _add(digest, helium.departure.nodes)
     return digest.hexdigest()
 
 
@@ -61,7 +70,7 @@ def _add(digest: Any, part: Any) -> None:  # noqa: ANN401 - hashlib's object and
     if isinstance(part, tuple):
         for name, value in zip(getattr(part, "_fields", ("",) * len(part)), part, strict=True):
             if name == "departure":
-                continue  # from 16 bar, where a cold box alone always is
+                continue  # from 16 bar, where the reference plant is
             digest.update(f"{name}:".encode())
             _add(digest, value)
     elif isinstance(part, np.ndarray):

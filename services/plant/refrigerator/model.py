@@ -12,7 +12,7 @@ from coldloop.config import load_configuration
 from coldloop.service.command_line import add_configuration_options
 from coldloop.service.start import SECTIONS
 from plant.cold_box.equilibrium import find_equilibrium
-from plant.cold_box.model import OPERATING_INPUTS, OPERATING_LEVEL
+from plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL
 from plant.helium.properties import load_helium
 from plant.refrigerator.equilibrium import Rest, find_refrigerator_equilibrium
 from plant.refrigerator.file import RefrigeratorFile, refrigerator_digest

@@ -1,6 +1,6 @@
 """The linear model of the plant, all that the optimiser knows of it: made off line, loaded like a PLC download."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -23,6 +23,8 @@ from coldloop.process.signals import STATE_NAMES
 
 RealArray: TypeAlias = NDArray[np.float64]
 
+UNNAMED: dict[str, Any] = {"plant": COLD_BOX, "note": "", "plant_parameters": {}}
+"""What a model file leaves out."""
 MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
 
 
@@ -90,6 +92,8 @@ class LtiModel:
     """Which plant it is the model of."""
     note: str = ""
     """Where it comes from, if not from the plant's equations."""
+    plant_parameters: dict[str, Any] = field(default_factory=dict)
+    """The plant's parameters by section, as in a plant file; none are those of the reference plant."""
 
     def __post_init__(self) -> None:
         n, m, p = len(self.state_names), len(self.input_names), len(self.output_names)
@@ -133,14 +137,14 @@ class LtiModel:
 
     def _document(self) -> dict[str, Any]:
         document: dict[str, Any] = {"format": FORMAT}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, str) and (field.name, value) in (("plant", COLD_BOX), ("note", "")):
+        for name in (each.name for each in fields(self)):
+            value = getattr(self, name)
+            if name in UNNAMED and value == UNNAMED[name]:
                 continue  # so is any file that names none
             if isinstance(value, np.ndarray):
-                document[field.name] = value.tolist()
+                document[name] = value.tolist()
             else:
-                document[field.name] = list(value) if isinstance(value, tuple) else value
+                document[name] = list(value) if isinstance(value, tuple) else value
         return document
 
 

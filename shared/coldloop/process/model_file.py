@@ -5,7 +5,7 @@ Needs the standard library only, so that the control PLC can check which model i
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,8 @@ class ModelHeader:
     """Which plant the model was made of."""
     note: str = ""
     """Where the model comes from, if not from the plant's equations."""
+    plant_parameters: dict[str, Any] = field(default_factory=dict)
+    """The plant's parameters by section, as in a plant file; none are those of the reference plant."""
 
     @property
     def short_digest(self) -> int:
@@ -69,6 +71,7 @@ def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
         described |= {name: tuple(str(text) for text in document[name]) for name in LISTS_OF_TEXT}
         described |= {name: tuple(float(number) for number in document[name]) for name in VECTORS}
         described |= {"plant": str(document.get("plant", COLD_BOX)), "note": str(document.get("note", ""))}
+        described |= {"plant_parameters": dict(document.get("plant_parameters", {}))}
         header = ModelHeader(w0=float(document["w0"]), **described)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{path}: {error!r} in the model file; {REMEDY}") from error

@@ -20,7 +20,7 @@ CELLS_K: Final = (2.5, 300.0)
 WARMEST_BATH_M3: Final = -6.16
 """V_l of a dry bath that is at 300 K."""
 COLD_BOX_BAR: Final = (16.0, 1.05)
-"""Supply and return of a cold box alone."""
+"""Supply and return of a cold box alone; those of a plant file are within the same ranges."""
 
 FIRST_CELL: Final = STATE_NAMES.index("T_nef1_1")
 HP, LP = STATION_SIGNAL_NAMES.index("P12"), STATION_SIGNAL_NAMES.index("P11")
