@@ -126,10 +126,12 @@ def in_one_process(**changes: Any) -> Callable[[], None]:  # noqa: ANN401 as of 
 def linear_models() -> None:
     """Linearise both plants, which takes kernels of complex numbers."""
     from coldloop.process.model_settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
+    from optimizer_plc.qp.design import ControlDesign  # noqa: PLC0415
+    from plant.cold_box.plant_file import PlantFile  # noqa: PLC0415
     from plant.refrigerator.model import make_refrigerator_file  # noqa: PLC0415
     from rig.cli.model_listing import describe_model  # noqa: PLC0415 not in the images
 
-    describe_model(DEFAULT_MODEL_FILE)
+    describe_model(DEFAULT_MODEL_FILE, PlantFile(), ControlDesign())
     make_refrigerator_file()
 
 
