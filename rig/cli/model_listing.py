@@ -115,7 +115,7 @@ def held_line(plant: PlantFile, design: ControlDesign, limits: InputLimits) -> s
             held = held_loads(plant.box, load_helium(), level, openings[0], heater, openings[1], warmth)
     except ValueError:
         return "holds      no load with T5 within its band\n"
-    loads = f"[{held.least.w:.0f},{held.largest.w:.0f}]"
+    loads = f"[{max(held.least.w, 0.0):.0f},{held.largest.w:.0f}]"
     return f"holds      loads of {loads} W at least: --set optimizer_plc.program.holdable_load_w={loads}\n"
 
 

@@ -15,6 +15,7 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load
 from coldloop.process.model_file import read_document, read_header, write_document
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
+from coldloop.process.signals import T5
 from plant.cold_box.diagnosis import operating_point
 from plant.cold_box.model import build_model, model_at, parameters_digest
 from plant.cold_box.physics import REFERENCE
@@ -137,6 +138,19 @@ def test_a_refrigerator_has_no_parameters_in_its_model_file(tmp_path: Path) -> N
     file = write_model(tmp_path / "box.json", example_with(), digest, "refrigerator")
     with pytest.raises(ModelFileError, match="only a cold box alone"):
         own_header(file)
+
+
+@pytest.mark.parametrize("size", [0.05, 10.0])
+def test_a_box_in_proportion_rests_in_proportion(size: float) -> None:
+    intensive = ("_pct", "_bar", "efficiency", "_k", "per_kg")
+    parts = PlantFile().model_dump()
+    for section in parts.values():
+        for key in section:
+            if key.startswith("nozzle") or key == "ua_w_per_k" or not key.endswith(intensive):
+                section[key] *= size
+    usual, found = (operating_point(PlantFile.model_validate(each), load_helium()) for each in ({}, parts))
+    assert found.w == pytest.approx(size * usual.w, rel=0.15)
+    assert found.y[T5] == pytest.approx(usual.y[T5], abs=0.3)
 
 
 def test_another_supply_pressure_counts_its_tables() -> None:

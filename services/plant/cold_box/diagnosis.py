@@ -9,11 +9,12 @@ from math import isfinite, nan
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coldloop.process.model_range import CELLS_K, SATURATION_BAR, model_range
 from coldloop.process.range_bits import ModelRange
 from coldloop.process.signals import STATE_NAMES, STATE_UNITS, T5
-from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError, relaxed, rest_near
+from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError, first_guess, relaxed, rest_near
 from plant.cold_box.linearisation import state_and_load_jacobian, state_scales
 from plant.cold_box.physics import PA_PER_BAR, ColdBox, derivative, outputs, streams
 from plant.cold_box.plant_file import PlantFile
@@ -34,6 +35,8 @@ LEVERS: Final = (
 STEP: Final = 0.01
 """Share by which a parameter is moved to see what it does."""
 NAMED_LEVERS: Final = 3
+FURTHER_RELAXATIONS: Final = 5
+"""Of 3000 s each: a plant with ten times the metal for its flows takes ten times as long."""
 
 
 def operating_point(file: PlantFile, helium: Helium) -> Equilibrium:
@@ -42,10 +45,12 @@ def operating_point(file: PlantFile, helium: Helium) -> Equilibrium:
     Raises:
         NoEquilibriumError: There is none that the model holds for; one line that names the part, and what would help.
     """
-    u = np.array(file.operating_point.inputs)
+    u, level = np.array(file.operating_point.inputs), file.operating_point.level_pct
     with np.errstate(all="ignore"):  # far from any plant numbers overflow, which is then said
-        x, w = relaxed(u, file.operating_point.level_pct, file.box, helium)
-        found = _settled(x, w, u, file.box, helium)
+        found = _settled(*relaxed(u, level, file.box, helium), u, file.box, helium)
+        for _ in range(FURTHER_RELAXATIONS):
+            if not isfinite(found.residual):  # a slow plant, perhaps
+                found = _settled(*relaxed(u, level, file.box, helium, found.x), u, file.box, helium)
         for obstacle in obstacles(found, file, helium):
             raise NoEquilibriumError(obstacle)
     return found
@@ -64,8 +69,9 @@ def obstacles(found: Equilibrium, file: PlantFile, helium: Helium) -> Iterator[s
     x, u, w, y, residual = found
     box = file.box
     if not (isfinite(w) and np.isfinite(x).all() and np.isfinite(y).all()):
-        part = _stiffest(box)
-        yield f"{part}: its temperatures do not stay finite in steps of a tick; {_slower(part)}"
+        rates, parts = _rates(first_guess(file.operating_point.level_pct, box), u, 0.0, box, helium)
+        part = parts[int(np.argmin(rates.real))]
+        yield f"{part}: does not stay finite in steps of a tick; {_slower(part)}"
         return
     s = streams(x, u, box, helium)
     P_mix, P_nozzle, relief = s.P_mix / PA_PER_BAR, s.P_turbine / PA_PER_BAR, box.separator.relief_pressure
@@ -94,9 +100,12 @@ def obstacles(found: Equilibrium, file: PlantFile, helium: Helium) -> Iterator[s
             " less nef34.ua_w_per_k would help, or more load (a smaller turbine.nozzle_g_sqrt_k_per_s_bar)"
         )
     if w <= 0.0:
+        levers = (
+            _levers(found, file, helium) if isfinite(residual) else "more turbine.efficiency or boundaries.p_hp_bar"
+        )
         yield (
             f"operating_point.ncr22_a_w: the box cools {w + u[1]:.0f} W and its heater takes {u[1]:g} W, which leaves"
-            f" {w:.0f} W for the load; most would help {_levers(found, file, helium)}"
+            f" {w:.0f} W for the load; most would help {levers}"
         )
     if not isfinite(residual):
         k = int(np.argmax(np.abs(derivative(x, u, w, box, helium) / state_scales(box))))
@@ -110,9 +119,7 @@ def obstacles(found: Equilibrium, file: PlantFile, helium: Helium) -> Iterator[s
 
 def _dynamics(rest: Equilibrium, box: ColdBox, helium: Helium) -> Iterator[str]:
     """Yield what is in the way of a plant that rests: it runs away, or is too fast for a tick."""
-    rates, vectors = np.linalg.eig(state_and_load_jacobian(rest.x, rest.u, rest.w, box, helium)[0])
-    scales = state_scales(box)[:, np.newaxis]
-    parts = [_part(int(k)) for k in np.argmax(np.abs(vectors / scales), axis=0)]
+    rates, parts = _rates(rest.x, rest.u, rest.w, box, helium)
     rising, falling = int(np.argmax(rates.real)), int(np.argmin(rates.real))
     if rates[rising].real > GROWTH:
         yield (
@@ -124,6 +131,15 @@ def _dynamics(rest: Equilibrium, box: ColdBox, helium: Helium) -> Iterator[str]:
         yield f"{part}: follows within {-1.0 / rates[falling].real:.2f} s, too fast for a tick; {_slower(part)}"
 
 
+def _rates(
+    x: RealArray, u: RealArray, w: float, box: ColdBox, helium: Helium
+) -> tuple[NDArray[np.complex128], list[str]]:
+    """Return the eigenvalues at a state (1/s), and the part that moves most with each."""
+    rates, vectors = np.linalg.eig(state_and_load_jacobian(x, u, w, box, helium)[0])
+    moves = np.abs(vectors / state_scales(box)[:, np.newaxis])
+    return rates.astype(np.complex128), [_part(int(k)) for k in np.argmax(moves, axis=0)]
+
+
 def _part(state: int) -> str:
     """Return the section of a plant file that a state belongs to."""
     return STATE_NAMES[state].split("_")[1] if STATE_NAMES[state].startswith("T_") else "bath"
@@ -132,12 +148,6 @@ def _part(state: int) -> str:
 def _slower(part: str) -> str:
     """Return what makes a part slower."""
     return "more bath.volume_m3 would help" if part == "bath" else f"more {part}.aluminium_kg or less flow would help"
-
-
-def _stiffest(box: ColdBox) -> str:
-    """Return the exchanger with the most heat transfer for its metal."""
-    exchangers = {"nef1": box.nef1, "nef2": box.nef2, "nef34": box.nef34}
-    return max(exchangers, key=lambda name: exchangers[name].UA / exchangers[name].aluminium)
 
 
 def _levers(found: Equilibrium, file: PlantFile, helium: Helium) -> str:

@@ -5,14 +5,14 @@ from typing import NamedTuple
 import numpy as np
 
 from plant.cold_box.linearisation import state_and_load_jacobian, state_scales
-from plant.cold_box.physics import ColdBox, derivative, outputs
+from plant.cold_box.physics import REFERENCE, ColdBox, derivative, outputs
 from plant.helium.properties import Helium
 from plant.integrator import advance
 from plant.numeric import RealArray
 
 RELAXATION_S = 3000.0
 RELAXATION_STEP_S = 0.5
-LEVEL_GAIN = 100.0  # W of load per % of level, while relaxing
+LEVEL_GAIN = 100.0  # W of load per % of level, while relaxing, for the CV155 of the reference plant
 TOLERANCE = 1e-10  # scaled units per second
 MAX_NEWTON_STEPS = 30
 
@@ -73,16 +73,24 @@ def rest_near(x: RealArray, w: float, u: RealArray, box: ColdBox, helium: Helium
     raise NoEquilibriumError(f"no equilibrium at u = {u.tolist()}: the residual stays at {residual:.2g} per second")
 
 
-def relaxed(u: RealArray, level: float, box: ColdBox, helium: Helium) -> tuple[RealArray, float]:
+def relaxed(
+    u: RealArray, level: float, box: ColdBox, helium: Helium, start: RealArray | None = None
+) -> tuple[RealArray, float]:
     """Return a state near the equilibrium under `u` with the bath at `level` (%), and its load (W)."""
+    x = first_guess(level, box) if start is None else start
     volume = level / 100.0 * box.separator.volume
-    nef1 = np.linspace(9.5, 4.5, box.nef1.cells)
-    nef2 = np.linspace(18.0, 10.0, box.nef2.cells)
-    nef34 = np.linspace(box.T_in - 5.0, 19.0, box.nef34.cells)
-    x = np.concatenate([[box.P_LP + 0.18e5, volume], nef1, nef2, nef34])
+    size = box.jt_valve.flow_area / REFERENCE.jt_valve.flow_area
     w = 0.0
     for _ in range(round(RELAXATION_S / RELAXATION_STEP_S)):
-        w = LEVEL_GAIN * 100.0 * (x[1] - volume) / box.separator.volume + 400.0
+        w = size * (LEVEL_GAIN * 100.0 * (x[1] - volume) / box.separator.volume + 400.0)
         x = advance(x, u, w, RELAXATION_STEP_S, box, helium)
     x[1] = volume
     return x, float(w)
+
+
+def first_guess(level: float, box: ColdBox) -> RealArray:
+    """Return the state from which the search sets out, with the bath at `level` (%)."""
+    nef1 = np.linspace(9.5, 4.5, box.nef1.cells)
+    nef2 = np.linspace(18.0, 10.0, box.nef2.cells)
+    nef34 = np.linspace(box.T_in - 5.0, 19.0, box.nef34.cells)
+    return np.concatenate([[box.P_LP + 0.18e5, level / 100.0 * box.separator.volume], nef1, nef2, nef34])
