@@ -125,12 +125,12 @@ class PlausibilitySettings(BaseModel):
     longest_s: Annotated[float, Field(ge=0)] = 1800.0
     """It is taken back after so long in any case: what the others say of it is then no better."""
     most: Annotated[int, Field(ge=0, le=len(OUTPUT_NAMES) - 1)] = 2
-    """Readings that may be missing or suspected at once; when more contradict the prediction it is the plant: the four
-    gauges of the supply see a compressor trip."""
-    model_sigmas: Annotated[float, Field(ge=0)] = 4.0
+    """Readings that may be suspected at once; when more contradict the prediction it is the plant: the four gauges of
+    the supply see a compressor trip."""
+    model_sigmas: Annotated[float, Field(gt=0)] = 4.0
     """The model holds while no reading's residual is larger, over its standard deviation, as a root mean square over a
     minute (and but for its allowance). While it does not, no other reading is suspected, and suspects are taken back:
-    what contradicts them is wrong itself."""
+    what contradicts them is wrong itself. L1, which has no constant error, is taken back where two or more say so."""
 
     @property
     def allowances(self) -> tuple[float, ...]:

@@ -158,7 +158,8 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
         )  # fmt: skip
     if not np.isfinite(innovation).all():
         innovation = imputed(innovation, J)
-    note_surprise(belief.surprise, innovation, J, real(b.since) * real(TICK_S / MINUTE_S))
+    if b.since <= c.stationary.gains.shape[0]:  # J is for no longer time
+        note_surprise(belief.surprise, innovation, J, real(b.since) * real(TICK_S / MINUTE_S))
     correction = np.zeros(belief.x.size + 1, belief.x.dtype)
     add_transposed_product(c.stationary.gains[period], innovation, correction)
     belief.x[:] = belief.predicted + correction[:-1]

@@ -131,18 +131,20 @@ def judge(
     before. Constant errors in `predicted` are set to what a reading shows that is taken back. There are no new suspects
     after a longer time than J is for.
     """
-    contradicting, contradicts = against_the_model(p, readings, surprise, J)
     believed, returning = innovation.copy(), False
     for i in range(innovation.shape[0]):
         r = readings[i]
+        if r.since_s < p.settled_s <= r.since_s + elapsed_s:
+            surprise[i] = 0.0  # by what it has shown until now nobody is judged
         r.since_s += elapsed_s
         if not np.isfinite(innovation[i]):
             enter(r, MISSING)
         elif r.state != USED:
             believed[i] = np.nan
             returning = True
+    contradicting, contradicts = against_the_model(p, readings, surprise, J)
     if returning:
-        take_back(p, readings, predicted, innovation, believed, J, elapsed_s, contradicting > 0)
+        take_back(p, readings, predicted, innovation, believed, J, elapsed_s, contradicting)
     if elapsed_s <= p.longest_period_s and contradicting < 2:
         suspect_some(p, readings, believed, J, contradicts)
     return believed
@@ -150,11 +152,12 @@ def judge(
 
 @kernel
 def against_the_model(p: Plausibility, readings: Any, surprise: Array, J: Array) -> tuple[int, int]:  # noqa: ANN401
-    """Return how many readings that are believed say that the model does not hold, and one of them, or -1."""
+    """Return how many readings that are believed and judged say that the model does not hold; one of them, or -1."""
     count, one = 0, -1
     for i in range(surprise.shape[0]):
         limit = p.model_sigmas + p.allowance[i] * np.sqrt(J[i, i])
-        if readings[i].state == USED and surprise[i] > limit * limit:
+        judged = readings[i].state == USED and readings[i].since_s >= p.settled_s
+        if judged and surprise[i] > limit * limit:
             count, one = count + 1, i
     return count, one
 
@@ -169,12 +172,13 @@ def enter(r: Any, state: int) -> None:  # noqa: ANN401 a record
 @kernel
 def take_back(
     p: Plausibility, readings: Any, predicted: Array, innovation: Array, believed: Array, J: Array, elapsed_s: float,  # noqa: ANN401
-    model_fails: bool,  # noqa: FBT001 - a kernel takes its arguments by position
+    contradicting: int,
 ) -> None:  # fmt: skip
     """Take back suspects that agree again, or have been out for the longest time, and readings that were missing.
 
-    After a long time, or when the model fails, what the others say of a reading is no better than the reading: its
-    constant error, if it has one, is set so that it agrees.
+    After a long time, or when others contradict the model, what they say of a reading is no better than the reading:
+    its constant error, if it has one, is set so that it agrees. One without (L1) counts again in full, and so only
+    where two or more contradict: one of them may itself be wrong.
     """
     expected = imputed(believed, J)
     for i in range(innovation.shape[0]):
@@ -186,6 +190,7 @@ def take_back(
         else:
             r.agreed_s += elapsed_s
         agrees = r.state == SUSPECT and r.agreed_s >= p.agreeing_s
+        model_fails = contradicting > (0 if p.constants[i] >= 0 else 1)
         if not (agrees or model_fails or r.state == MISSING or r.since_s >= p.longest_s):
             continue
         believed[i] = innovation[i]
@@ -203,8 +208,8 @@ def suspect_some(p: Plausibility, readings: Any, believed: Array, J: Array, only
     """
     before, expected, out = believed.copy(), believed, 0
     for i in range(believed.shape[0]):
-        out += not np.isfinite(believed[i])
-    if out:
+        out += readings[i].state == SUSPECT
+    if not np.isfinite(believed).all():
         expected = imputed(believed, J)
     worst = least_plausible(p, readings, believed, expected, J, only)
     if worst < 0:

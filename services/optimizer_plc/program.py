@@ -43,8 +43,8 @@ from optimizer_plc.solvers import KernelSolver, make_solver
 Array = NDArray[np.float64]
 
 PROVEN: Final = 8
-"""Answers in time, one after the other, after which the next is tried with a tick less: where a tick is needed for
-good, one answer in nine is late."""
+"""Answers in time, one after the other, after which the next is tried with half of what is allowed for late ones: where
+some ticks are needed for good, one answer in nine is late."""
 LONGEST_GAP_TICKS: Final = 4 * SEQUENCE_ROWS
 """After a longer time without an update nothing is predicted from the last one."""
 
@@ -247,15 +247,15 @@ class OptimizerProgram:
         """Note how an answer came: after a late one adaptive periods get longer, after one in time shorter again.
 
         The budget is what the PLC should need; this is what machine and link really take. Each late answer doubles
-        what is allowed for them, `PROVEN` in time take a tick off. Where a period is fixed, or is the longest, there
-        are fewer iterations instead.
+        what is allowed for them, `PROVEN` in time halve it. Where a period is fixed, or is the longest, there are fewer
+        iterations instead.
         """
         now, allowance = self._now, int(self._now["allowance"])
         now["in_time"] = 0 if late else (now["in_time"] + 1) % PROVEN
         if late:
             now["allowance"] = min(max(1, 2 * allowance), int(now["ticks"]))
         elif not now["in_time"]:
-            now["allowance"] = max(0, allowance - 1)
+            now["allowance"] = allowance // 2
 
     # -- diagnostics --------------------------------------------------------------------------------------------------
 

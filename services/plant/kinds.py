@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 from coldloop.errors import ConfigurationError, ModelFileError
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.model_file import COLD_BOX, ModelHeader
-from plant.cold_box.physics import ColdBox
+from plant.cold_box.physics import REFERENCE, ColdBox
 from plant.components.valve import Valve
 from plant.mismatched import MismatchedPlant
 from plant.own_model import box_of
@@ -39,6 +39,8 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
         return partial(make_program, header, section.sensors, mismatch=section.mismatch)
     if section.mismatch != NO_MISMATCH:
         raise ConfigurationError("plant.mismatch: for a cold box alone; set plant.kind to cold-box, or leave it out")
+    if box_of(header) != REFERENCE:
+        raise ModelFileError("model.file: of another cold box than the refrigerator's; set plant.kind to cold-box")
     from plant.refrigerator.file import SHIPPED, read_refrigerator_file  # noqa: PLC0415 a cold box starts without it
 
     path = section.refrigerator.file or SHIPPED

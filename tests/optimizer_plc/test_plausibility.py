@@ -180,6 +180,38 @@ def test_while_the_model_does_not_hold_suspects_are_taken_back_and_no_other_read
     assert world.suspects == ["T5"], "the filter has learnt how the plant is now"
 
 
+def test_one_other_bad_reading_brings_no_wrong_level_back(world: World) -> None:
+    """One that wobbles, too little to be suspected, says that the model fails: L1, which nothing else shows, stays out."""
+    world.error[L1] = 5.0
+    world.updates(5)
+    wobbling = OUTPUT_NAMES.index("T3")
+    for size in (0.09, -0.09) * (2 * MINUTE):
+        world.error[wobbling] = size
+        world.updates(1)
+    assert "L1" in world.suspects
+    assert abs(world.shown()[L1]) < 0.5
+
+
+def test_a_loose_contact_hides_no_other_fault(world: World) -> None:
+    """A reading that is never used for a minute cannot be judged, and does not judge the model either."""
+    loose = OUTPUT_NAMES.index("T8")
+    for k in range(3 * MINUTE):
+        world.error[loose] = np.nan if k % 12 == 0 else 0.6 * (-1) ** k
+        world.updates(1)
+    world.error[L1] = JUMP[L1]
+    world.updates(1)
+    assert world.suspects == ["L1"]
+
+
+def test_sensors_that_are_dead_leave_the_others_judged(world: World) -> None:
+    for name in ("P2", "T10", "P9"):
+        world.error[OUTPUT_NAMES.index(name)] = np.nan
+    world.updates(1)
+    world.error[L1] = JUMP[L1]
+    world.updates(1)
+    assert world.suspects == ["L1"]
+
+
 def test_after_a_longer_gap_than_the_filter_is_for_no_reading_becomes_suspect(world: World) -> None:
     predict(world.c, world.belief, np.zeros(3), 40)
     world.error[T5] = JUMP[T5]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pytest
 
+from coldloop.errors import ModelFileError
 from coldloop.process.limits import T5_BAND
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE, ModelSettings
@@ -51,6 +52,11 @@ def test_the_example_rests_and_stays_within_its_bands(made: Made) -> None:
     assert T5_BAND[0] < made.model.y0[T5] < T5_BAND[1]
     assert made.model.w0 > 200.0
     assert made.run.summary["L1_outside_band_pct"] == made.run.summary["T5_outside_band_pct"] == 0.0
+
+
+def test_a_refrigerator_refuses_the_model_of_another_cold_box(made: Made) -> None:
+    with pytest.raises(ModelFileError, match=r"model\.file: of another cold box .* set plant\.kind to cold-box"):
+        run_in_process(load="a", duration_s=60, model={"file": str(made.file)}, plant={"kind": "refrigerator"})
 
 
 def test_it_is_another_plant_whose_model_predicts_it_better(made: Made) -> None:

@@ -71,7 +71,7 @@ def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
         described |= {name: tuple(str(text) for text in document[name]) for name in LISTS_OF_TEXT}
         described |= {name: tuple(float(number) for number in document[name]) for name in VECTORS}
         described |= {"plant": str(document.get("plant", COLD_BOX)), "note": str(document.get("note", ""))}
-        described |= {"plant_parameters": dict(document.get("plant_parameters", {}))}
+        described["plant_parameters"] = _parameters(document)
         header = ModelHeader(w0=float(document["w0"]), **described)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{path}: {error!r} in the model file; {REMEDY}") from error
@@ -80,6 +80,13 @@ def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
         if not len(names) == len(units) == len(values):
             raise ModelFileError(f"{path}: {kind} names, units and values differ in number; {REMEDY}")
     return header
+
+
+def _parameters(document: dict[str, Any]) -> dict[str, Any]:
+    parameters = document.get("plant_parameters", {})
+    if "plant_parameters" in document and not (isinstance(parameters, dict) and parameters):
+        raise TypeError("plant_parameters are no sections of a plant file")
+    return dict(parameters)
 
 
 def read_document(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
