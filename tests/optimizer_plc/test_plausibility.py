@@ -181,7 +181,7 @@ def test_while_the_model_does_not_hold_suspects_are_taken_back_and_no_other_read
 
 
 def test_one_other_bad_reading_brings_no_wrong_level_back(world: World) -> None:
-    """One that wobbles, too little to be suspected, says that the model fails: L1, which nothing else shows, stays out."""
+    """One that wobbles, too little to be suspected, says that the model fails: L1 stays out."""
     world.error[L1] = 5.0
     world.updates(5)
     wobbling = OUTPUT_NAMES.index("T3")
