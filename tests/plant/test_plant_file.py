@@ -118,7 +118,7 @@ TAMPERED: dict[str, tuple[Callable[[], object], str]] = {
     "a number": (lambda: 5, "plant_parameters|TypeError"),
     "a list": (lambda: ["bath"], "model file"),
     "null": (lambda: None, "TypeError"),
-    "nothing": (dict, "another plant"),
+    "nothing": (dict, "no sections of a plant file"),
 }
 
 
