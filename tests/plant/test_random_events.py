@@ -1,0 +1,150 @@
+"""Helium and energy over random events: valves stuck anywhere, trips, leaks, lost nitrogen and loads."""
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from plant.cold_box.balance import energy_gained, energy_rates
+from plant.cold_box.physics import REFERENCE, cold_box_of, derivative
+from plant.components.phase_separator import content, start_account
+from plant.helium.properties import helium_of, load_helium
+from plant.integrator import advance, plain_tuples
+from plant.numeric import RealArray
+from plant.own_model import own_header
+from plant.refrigerator.balance import refrigerator_energy_rates
+from plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from plant.refrigerator.physics import (
+    REFERENCE_REFRIGERATOR,
+    SIGNAL_NAMES,
+    STATE_NAMES,
+    advance_refrigerator,
+    evaluate_refrigerator,
+    inventory,
+    refrigerator_of,
+)
+
+HELIUM = load_helium()
+PLANT = REFERENCE_REFRIGERATOR
+BATH = REFERENCE.separator
+HEADER = own_header(DEFAULT_MODEL_FILE)
+FILE = read_refrigerator_file(SHIPPED)
+M_LOST = STATE_NAMES.index("M_lost")
+PLAIN, TABLES = plain_tuples(PLANT), plain_tuples(HELIUM)
+
+percent = st.floats(0.0, 100.0)
+inputs = st.tuples(percent, st.floats(0.0, 150.0), percent)
+switch = st.sampled_from([1.0, 1.0, 0.0])
+happenings = st.tuples(st.floats(0.0, 6000.0), st.floats(275.0, 320.0), st.floats(0.0, 0.01), switch, switch, switch)
+pieces = st.tuples(st.integers(40, 1200), inputs, st.tuples(percent, percent, percent, percent), happenings)
+
+
+Course = list[tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]]
+
+
+WEIGHTS = np.array([0.25 / 6.0, 0.25 / 3.0, 0.25 / 3.0, 0.25 / 6.0])
+AHEAD = np.array([0.125, 0.125, 0.25, 0.0])
+"""Of the stages of a tick, s."""
+
+
+@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+def held(
+    x: RealArray, u: RealArray, v: RealArray, d: RealArray, ticks: int, plain: object, tables: object
+) -> tuple[RealArray, RealArray]:
+    """Return the state after some ticks, and sums over their stages.
+
+    What crossed the boundary and its size (J), what the bath's rates brought it (J), and the largest difference between
+    what crosses and what is stored (W).
+    """
+    plant, helium = refrigerator_of(plain), helium_of(tables)
+    sums, slope, y, signals = np.zeros(4), np.empty(x.shape[0]), np.empty(22), np.empty(len(SIGNAL_NAMES))
+    for _ in range(ticks):
+        stage = x
+        for k in range(4):
+            crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
+            stored, inwards = refrigerator_energy_rates(stage, slope, crossing, d[0], plant, helium)
+            sums[0] += WEIGHTS[k] * inwards
+            sums[1] += WEIGHTS[k] * abs(inwards)
+            sums[2] += WEIGHTS[k] * start_account(plant.box.separator, stage, slope, helium).heat
+            sums[3] = max(sums[3], abs(stored - inwards))
+            stage = x + AHEAD[k] * slope
+        x = advance_refrigerator(x, u, v, d, 0.25, plant, helium)
+    return x, sums
+
+
+def balances_over_random_events(course: Course) -> None:
+    """Valves stuck anywhere, trips, leaks, lost nitrogen and loads: helium and energy add up, stage by stage."""
+    x = np.array(FILE.x0)
+    before = inventory(x, PLANT, HELIUM)
+    in_bath = content(BATH, x[0], x[1], HELIUM).energy
+    for ticks, u, v, d in course:
+        x, sums = held(x, np.array(u), np.array(v), np.array(d), ticks, PLAIN, TABLES)
+        assert np.all(np.isfinite(x))
+        assert inventory(x, PLANT, HELIUM) + x[M_LOST] == pytest.approx(before, rel=1e-9)
+        assert sums[3] < 1e-6 * sums[1] / (0.25 * ticks) + 1e-6
+        gained = content(BATH, x[0], x[1], HELIUM).energy - in_bath
+        assert gained == pytest.approx(sums[2], abs=1e-6 * sums[1] + 1e-6)
+        in_bath += gained
+
+
+@given(course=st.lists(pieces, min_size=2, max_size=4))
+@settings(max_examples=3)
+def test_helium_and_energy_are_conserved_whatever_happens(course: Course) -> None:
+    balances_over_random_events(course)
+
+
+@pytest.mark.exhaustive
+@given(course=st.lists(pieces, min_size=24, max_size=24))
+@settings(max_examples=20)
+def test_helium_and_energy_are_conserved_over_hours_of_whatever_happens(course: Course) -> None:
+    balances_over_random_events(course)
+
+
+box_pieces = st.tuples(st.integers(40, 1200), inputs, st.floats(0.0, 6000.0))
+BoxCourse = list[tuple[int, tuple[float, ...], float]]
+BOX = plain_tuples(REFERENCE)
+
+
+@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+def box_held(
+    x: RealArray, u: RealArray, w: float, ticks: int, plain: object, tables: object
+) -> tuple[RealArray, RealArray]:
+    """Return the same for a cold box: what crossed, its size (J), and the largest difference (W)."""
+    box, helium, sums = cold_box_of(plain), helium_of(tables), np.zeros(3)
+    for _ in range(ticks):
+        stage = x
+        for k in range(4):
+            stored, inwards = energy_rates(stage, u, w, box, helium)
+            sums[0] += WEIGHTS[k] * inwards
+            sums[1] += WEIGHTS[k] * abs(inwards)
+            sums[2] = max(sums[2], abs(stored - inwards))
+            stage = x + AHEAD[k] * derivative(stage, u, w, box, helium)
+        x = advance(x, u, w, 0.25, box, helium)
+    return x, sums
+
+
+def energy_over_random_events(course: BoxCourse) -> None:
+    """What a cold box has gained in the end, by its states alone, is what crossed its boundary."""
+    x, crossed, size = np.array(HEADER.x0), 0.0, 0.0
+    start = x
+    for ticks, u, w in course:
+        x, sums = box_held(x, np.array(u), w, ticks, BOX, TABLES)
+        crossed, size = crossed + sums[0], size + sums[1]
+        assert sums[2] < 1e-6
+    assert energy_gained(start, x, REFERENCE, HELIUM) == pytest.approx(crossed, abs=1e-6 * size + 1e-6)
+
+
+@given(course=st.lists(box_pieces, min_size=2, max_size=4))
+@example(course=[(40, (0.0, 0.0, 0.0), 0.0), (134, (0.0, 0.0, 7.0), 1924.0)])  # cells move little, and there and back
+@settings(max_examples=3)
+def test_a_cold_box_has_gained_what_crossed_its_boundary(course: BoxCourse) -> None:
+    energy_over_random_events(course)
+
+
+@pytest.mark.exhaustive
+@given(course=st.lists(box_pieces, min_size=24, max_size=24))
+@settings(max_examples=20)
+def test_a_cold_box_has_gained_what_crossed_its_boundary_in_hours_of_events(course: BoxCourse) -> None:
+    energy_over_random_events(course)
