@@ -14,7 +14,7 @@ CV155, HEATER, CV156 = range(len(INPUT_NAMES))
 PER_CENT_W = (9.48784, -1.0, -0.209227)
 """What a per cent of CV155, a watt of the heater and a per cent of CV156 hold at rest, W."""
 PER_CENT_K = (0.146879, 0.0, -0.0776139)
-"""What they warm T5 by, K; 1.2835 K below the operating point, 0.1 K above the band's end, is its row."""
+"""What they warm T5 by, K; 1.3835 K below the operating point its band ends."""
 RESERVE_W = ProgramSettings().capacity_reserve_w
 LEAST, LARGEST = ProgramSettings().holdable_load_w
 
@@ -72,9 +72,9 @@ def test_an_estimate_below_the_least_load_is_too_little(c: Constants) -> None:
 
 
 def test_a_turbine_that_is_colder_needs_more_load(c: Constants) -> None:
-    """T5 at rest is 2 K colder than the model says: CV156 closes, then CV155 opens, until it is at its row."""
+    """T5 at rest is 2 K colder than the model says: CV156 closes, then CV155 opens, until it is at the end of its band."""
     coldest = c.estimator.w0 - 23.0 * PER_CENT_W[0] - 75.0 + 24.0 * PER_CENT_W[2]
-    lacking = 2.0 - 1.2835 + 23.0 * PER_CENT_K[0] - 24.0 * PER_CENT_K[2]
+    lacking = 2.0 - 1.3835 + 23.0 * PER_CENT_K[0] - 24.0 * PER_CENT_K[2]
     opened = (lacking + 40.0 * PER_CENT_K[2]) / PER_CENT_K[0]
     least = coldest - 40.0 * PER_CENT_W[2] + opened * PER_CENT_W[0] - LEAST_LOAD_ERROR_W
     assert 20.0 < 20.0 + opened < 60.0

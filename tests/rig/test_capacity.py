@@ -114,8 +114,9 @@ def test_a_load_near_the_capacity_is_held_because_cv155_is_not_opened_too_far(tm
     limited, free = (
         with_load(500.0, tmp_path, 50, {"cold_end": {"approach_k": kelvin}}) for kelvin in (0.3, 0.0)
     )  # fmt: skip
-    opening, opening_free = (max(run.trace.to_dict()["CV155"]) for run in (limited, free))
-    assert opening < 55.0 < opening_free
+    opening, opening_free = (run.trace.to_dict()["CV155"] for run in (limited, free))
+    assert max(opening) < 55.0
+    assert min(opening_free[-600:]) == LIMITS.high[0]
     assert limited.summary["L1_outside_band_pct"] == 0.0
-    assert free.summary["L1_outside_band_pct"] > 10.0
+    assert free.summary["L1_outside_band_pct"] > 5.0
     assert limited.summary["J_BF"] < 0.7 * free.summary["J_BF"]

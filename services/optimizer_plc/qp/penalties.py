@@ -59,7 +59,7 @@ PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
     Preset.TUNED: {
         "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
         "cold_end": {"approach_k": 0.3},
-        "design": {"band_margin": (0.1, 0.1)},
+        "design": {"band_margin": (0.1, 0.3)},
         "plausibility": {"sigmas": 6.0},
     },
     Preset.PAPER: {},

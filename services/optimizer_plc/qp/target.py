@@ -57,6 +57,8 @@ class TargetSearch(NamedTuple):
     low: Array
     """Of inputs and T5, shape (4,)."""
     high: Array
+    margin: float
+    """How far inside its band T5's rows are, K."""
     constants: NDArray[np.int64]
     """Which states are the constants of inputs and T5, shape (4,); -1 is none."""
     scale: Array
@@ -102,6 +104,7 @@ def target_search(
     return TargetSearch(
         followed=design.target is not Target.OPERATING_POINT,
         of_load=real(design.target is Target.LOAD),
+        margin=real(margin),
         constants=np.array([places.get(signal, -1) for signal in signals]),
         tolerance=real(TOLERANCES[np.dtype(real).itemsize]),
         **{name: np.ascontiguousarray(array).astype(real, copy=False) for name, array in arrays.items()},
@@ -156,13 +159,13 @@ def loads_held(c: TargetSearch, low: Array, high: Array) -> tuple[float, float]:
 
 @kernel
 def least_warm_load(c: TargetSearch, low: Array, high: Array) -> float:
-    """Return the least load that inputs within these bounds hold at rest with T5 above its lower row, a deviation in W.
+    """Return the least load that inputs within these bounds hold at rest with T5 within its band, a deviation in W.
 
     From the inputs that hold least those move that warm T5 the most for each watt. Where that is not enough it is the
     load with which T5 is warmest.
     """
     last = c.held.shape[0]
-    room, load, lacking = np.empty(last, low.dtype), low.dtype.type(0.0), low[last]
+    room, load, lacking = np.empty(last, low.dtype), low.dtype.type(0.0), low[last] - c.margin
     for i in range(last):
         room[i] = high[i] - low[i]
         at = low[i] if c.held[i] > 0 else high[i]
