@@ -11,25 +11,27 @@ from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import check_detectability
 from optimizer_plc.qp.arithmetic import real_of
-from optimizer_plc.qp.design import Target, trivial_design
+from optimizer_plc.qp.design import ControlDesign, Target, trivial_design
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
 from rig.plc_sizing import operations
-from rig.plc_sizing.memory import Footprint, estimator_memory, footprint, workspaces
+from rig.plc_sizing.memory import estimator_memory, footprint, workspaces
 from rig.plc_sizing.operations import Operations
+from rig.plc_sizing.profile import PlcProfile
 from rig.plc_sizing.reference_plc import (
     ACTIVE_ROWS,
     MEMORY_BYTES,
     WORKING_SET,
     SpeedCurve,
     cholesky_times,
-    fitted,
+    reference_curve,
     residuals,
     slow_down,
 )
 from rig.plc_sizing.sizes import QpSizes, dense_sizes, sizes_without_zeros
 from rig.plc_sizing.solver_counts import SOLVERS
+from rig.plc_sizing.verdict import verdict
 from rig.settings import Settings
 from rig.text_tables import aligned
 
@@ -44,26 +46,62 @@ class CountedSizes(NamedTuple):
     without_zeros: QpSizes
 
 
-def budget_tables(settings: Settings, power: float | None, period_s: float | None) -> str:
-    """Return the tables as text, for one power (default: the configured one) and one updating period or several."""
+def budget_tables(settings: Settings, period_s: float | None) -> str:
+    """Return the tables as text, for the configured power and one updating period or several."""
+    problem, prediction = problem_of(settings)
+    return "\n".join([
+        _speed(reference_curve(), problem.size),
+        _operations(problem, prediction),
+        _iterations(settings.optimizer_plc.program, problem, period_s),
+        _memory(settings, problem, prediction, MEMORY_BYTES),
+    ])  # fmt: skip
+
+
+def plc_tables(settings: Settings, period_s: float | None, profile: PlcProfile, costs: str) -> str:
+    """Return what a PLC can do as text: a sentence, what updating periods cost there, and the tables that differ.
+
+    Args:
+        settings: With the power of this PLC.
+        period_s: One updating period, or None for several.
+        profile: The PLC.
+        costs: A sentence or nothing.
+    """
     program = settings.optimizer_plc.program
-    if power is not None:
-        program = program.model_copy(update={"budget": program.budget.model_copy(update={"power": power})})
+    problem, prediction = problem_of(settings)
+    needed = footprint(problem, estimator_memory(prediction, program.estimator), program.solver)
+    speed = (
+        f"\nP = {program.budget.power:.3g}, {profile.flops_per_s(problem.size) / 1e6:.3g} Mflop/s in loops of length "
+        f"{problem.size}: {profile.source}\n"
+        f"for a run there: --set optimizer_plc.program.budget.power={program.budget.power:.4g}\n"
+    )
+    return "\n".join([
+        verdict(profile, program, problem, needed),
+        *([costs] if costs else []),
+        speed,
+        _iterations(program, problem, period_s),
+        _memory(settings, problem, prediction, profile.memory_bytes),
+    ])  # fmt: skip
+
+
+def problem_of(settings: Settings) -> tuple[PredictiveProblem, PredictionModel]:
+    """Return the configured problem in single precision, and the model it is made from."""
+    program = settings.optimizer_plc.program
     prediction = PredictionModel(load(settings.model.file)).with_disturbances(program.estimator.disturbed)
     check_detectability(prediction)
-    real = real_of(Arithmetic.FLOAT32)
-    problem = PredictiveProblem(prediction, program.design, settings.limits, real, program.penalties)
-    trivial = PredictiveProblem(prediction, trivial_design(program.design), settings.limits, real, program.penalties)
-    curve = fitted(cholesky_times())
-    estimator = estimator_memory(prediction, program.estimator)
-    parts = [
-        _speed(curve, problem.size),
-        _operations(problem, prediction),
-        f"seconds at P = 1, iterations done at P = {program.budget.power:g}\n"
-        + aligned(solver_table(program, problem, PERIODS_S if period_s is None else (period_s,)), numbers=True),
-        _memory([footprint(one, estimator) for one in (problem, trivial)], [problem.size, trivial.size]),
-    ]
-    return "\n".join(parts)
+    return _problem(settings, prediction, program.design), prediction
+
+
+def _problem(settings: Settings, prediction: PredictionModel, design: ControlDesign) -> PredictiveProblem:
+    penalties = settings.optimizer_plc.program.penalties
+    return PredictiveProblem(prediction, design, settings.limits, real_of(Arithmetic.FLOAT32), penalties)
+
+
+def with_power(settings: Settings, power: float) -> Settings:
+    """Return the settings for a PLC of this power."""
+    optimizer = settings.optimizer_plc
+    budget = optimizer.program.budget.model_copy(update={"power": power})
+    program = optimizer.program.model_copy(update={"budget": budget})
+    return settings.model_copy(update={"optimizer_plc": optimizer.model_copy(update={"program": program})})
 
 
 def counted_sizes(problem: PredictiveProblem) -> CountedSizes:
@@ -120,7 +158,7 @@ def solver_table(
 
     The first row is the header.
     """
-    sizes, speed = counted_sizes(problem), fitted(cholesky_times()).flops_per_s(problem.size)
+    sizes, speed = counted_sizes(problem), reference_curve().flops_per_s(problem.size)
     memory = workspaces(problem.size, len(problem.Gamma))
     rows: list[tuple[str, ...]] = [(*SOLVER_COLUMNS, "periods", *(f"in {period:g} s" for period in periods_s), "kB")]
     for name, solver in SOLVERS.items():
@@ -135,11 +173,24 @@ def solver_table(
     return rows
 
 
-def _memory(footprints: Sequence[Footprint], sizes: Sequence[int]) -> str:
-    names = {"hessian": "Phi", "problem": "Gamma and maps", "shift": "shift of the profile", "solver": "ODE solver",
+def _iterations(program: ProgramSettings, problem: PredictiveProblem, period_s: float | None) -> str:
+    table = solver_table(program, problem, PERIODS_S if period_s is None else (period_s,))
+    return f"seconds at P = 1, iterations done at P = {program.budget.power:.3g}\n{aligned(table, numbers=True)}"
+
+
+def _memory(
+    settings: Settings, problem: PredictiveProblem, prediction: PredictionModel, memory_bytes: int
+) -> str:  # fmt: skip
+    program = settings.optimizer_plc.program
+    estimator = estimator_memory(prediction, program.estimator)
+    problems = (problem, _problem(settings, prediction, trivial_design(program.design)))
+    footprints = [footprint(one, estimator, program.solver) for one in problems]
+    names = {"hessian": "Phi", "problem": "Gamma and maps", "shift": "shift of the profile", "solver": "solver",
              "estimator": "estimator", "sequence": "sequence buffers"}  # fmt: skip
-    rows = [("bytes in single precision", *(f"n = {size}" for size in sizes))]
+    rows = [("bytes in single precision", *(f"n = {one.size}" for one in problems))]
     rows += [(text, *(f"{getattr(one, name):,}" for one in footprints)) for name, text in names.items()]
     rows.append(("total", *(f"{one.total:,}" for one in footprints)))
-    rows.append(("share of 2 MB", *(f"{100 * one.total / MEMORY_BYTES:.1f} %" for one in footprints)))
+    rows.append((
+        f"share of {memory_bytes / 1e6:g} MB", *(f"{100 * one.total / memory_bytes:.1f} %" for one in footprints)
+    ))  # fmt: skip
     return aligned(rows, numbers=True)

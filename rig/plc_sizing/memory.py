@@ -62,7 +62,7 @@ class Footprint(NamedTuple):
     shift: int
     """One shift of the profile; its other shifts are computed when they are needed."""
     solver: int
-    """Workspace of the ODE-based solver."""
+    """Its workspace."""
     estimator: int
     """Transitions, Kalman gains and inverse covariances of every updating period, output matrices."""
     sequence: int
@@ -83,15 +83,15 @@ def estimator_memory(prediction: PredictionModel, settings: EstimatorSettings) -
     return sum(M.nbytes for M in (*gains, *transitions, single.C, single.D, single.G))
 
 
-def footprint(problem: PredictiveProblem, estimator: int) -> Footprint:
-    """Return what a problem made in single precision needs in addition to an estimator of so many bytes."""
+def footprint(problem: PredictiveProblem, estimator: int, solver: SolverName) -> Footprint:
+    """Return what a problem made in single precision needs with a solver and an estimator of so many bytes."""
     if problem.Phi.dtype != np.float32:
         raise ValueError("the PLC computes in single precision")
     return Footprint(
         hessian=problem.Phi.nbytes,
         problem=problem.memory() - problem.Phi.nbytes,
         shift=problem.Phi.nbytes,
-        solver=workspaces(problem.size, len(problem.Gamma))[SolverName.ODE],
+        solver=workspaces(problem.size, len(problem.Gamma))[solver],
         estimator=estimator,
         sequence=2 * SEQUENCE_ROWS * N_INPUTS * WORD,
     )

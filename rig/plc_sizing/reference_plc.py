@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from rig.plc_sizing.operations import dense_cholesky
 
@@ -59,11 +60,17 @@ def cholesky_times() -> CholeskyTimes:
     return CholeskyTimes(table[:, 0], table[:, 1] * 1e-3, table[:, 2] * 1e-6)
 
 
-def fitted(times: CholeskyTimes) -> SpeedCurve:
-    """Return the curve with the least sum of squared relative errors."""
-    powers = np.stack([times.size, times.size**2, times.size**3], axis=1) / times.plc_s[:, None]
-    coefficients = np.linalg.lstsq(powers, np.ones(len(times.size)))[0]
+def fitted(size: Array, plc_s: Array) -> SpeedCurve:
+    """Return the curve without negative coefficients that has the least sum of squared relative errors."""
+    powers = np.stack([size, size**2, size**3], axis=1) / plc_s[:, None]
+    coefficients, _ = nnls(powers, np.ones(len(size)))
     return SpeedCurve(*coefficients.tolist())
+
+
+def reference_curve() -> SpeedCurve:
+    """Return the curve of the paper's table."""
+    times = cholesky_times()
+    return fitted(times.size, times.plc_s)
 
 
 def residuals(curve: SpeedCurve, times: CholeskyTimes) -> Array:

@@ -30,7 +30,7 @@ from optimizer_plc.solvers.kernel_solver import solve_by
 Array = NDArray[np.float64]
 
 LEAST_LOAD_ERROR_W: Final = 25.0
-"""Taken off the model's least load with T5 within its band: it is too high until the constant error of T5 has followed."""
+"""Taken off the model's least load with T5 in its band: it is too high until the constant error of T5 has followed."""
 BY_THE_RULE: Final = 0
 """The q that `plan` is given when the rule is to decide it."""
 

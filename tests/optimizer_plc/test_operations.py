@@ -16,7 +16,14 @@ from optimizer_plc.settings import SolverName
 from optimizer_plc.solvers import fast_gradient, interior_point, ode
 from optimizer_plc.solvers.ode import flow_in
 from rig.plc_sizing import operations
-from rig.plc_sizing.reference_plc import ACTIVE_ROWS, QPOASES_ON_LAPTOP_S, cholesky_times, fitted, residuals, slow_down
+from rig.plc_sizing.reference_plc import (
+    ACTIVE_ROWS,
+    QPOASES_ON_LAPTOP_S,
+    cholesky_times,
+    reference_curve,
+    residuals,
+    slow_down,
+)
 from rig.plc_sizing.sizes import Pattern, QpSizes, dense_sizes, sizes_without_zeros
 from rig.plc_sizing.solver_counts import SOLVERS
 
@@ -280,14 +287,14 @@ def test_our_code_leaves_some_zeros_of_the_papers_problem_out(problem: Predictiv
 
 def test_the_curve_fits_the_cholesky_times_within_a_quarter_of_a_percent() -> None:
     times = cholesky_times()
-    curve = fitted(times)
+    curve = reference_curve()
     assert len(times.size) == 25
     assert np.abs(residuals(curve, times)).max() < 0.0025
     assert 0.5e6 < curve.flops_per_s(49) < 0.55e6
 
 
 def test_an_ode_iteration_takes_a_quarter_of_a_second_within_15_percent() -> None:
-    tau_1 = operations.ode(dense_sizes(49, 94, 21), ACTIVE_ROWS.mean).flops / fitted(cholesky_times()).flops_per_s(49)
+    tau_1 = operations.ode(dense_sizes(49, 94, 21), ACTIVE_ROWS.mean).flops / reference_curve().flops_per_s(49)
     assert tau_1 == pytest.approx(0.25, rel=0.15)
 
 

@@ -72,7 +72,7 @@ def test_an_estimate_below_the_least_load_is_too_little(c: Constants) -> None:
 
 
 def test_a_turbine_that_is_colder_needs_more_load(c: Constants) -> None:
-    """T5 at rest is 2 K colder than the model says: CV156 closes, then CV155 opens, until it is at the end of its band."""
+    """T5 at rest is 2 K colder than the model says: CV156 closes, then CV155 opens, until its band begins."""
     coldest = c.estimator.w0 - 23.0 * PER_CENT_W[0] - 75.0 + 24.0 * PER_CENT_W[2]
     lacking = 2.0 - 1.3835 + 23.0 * PER_CENT_K[0] - 24.0 * PER_CENT_K[2]
     opened = (lacking + 40.0 * PER_CENT_K[2]) / PER_CENT_K[0]

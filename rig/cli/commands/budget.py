@@ -1,13 +1,16 @@
-"""`coldloop budget`: what the reference PLC can do in an updating period, and whether its memory holds the problem."""
+"""`coldloop budget`: what a PLC can do in an updating period, and whether its memory holds the problem."""
 
 import argparse
 import math
 import sys
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
 from coldloop.service.command_line import add_configuration_options
-from rig.cli.commands.options import configuration, fixed_updating_period
+from rig.cli.commands.options import check_load, configuration, fixed_updating_period
+
+if TYPE_CHECKING:
+    from rig.settings import Settings
 
 USUAL_SCENARIOS: Final = 100
 
@@ -15,9 +18,17 @@ USUAL_SCENARIOS: Final = 100
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument(
-        "--power", type=_power, metavar="P", help="one power relative to the PLC (default: as configured)"
+    speed = parser.add_mutually_exclusive_group()
+    speed.add_argument(
+        "--power", type=_power, metavar="P", help="one power relative to the paper's PLC (default: as configured)"
     )
+    speed.add_argument("--plc", metavar="PLC",
+                       help="a PLC instead: a profile (TOML) or one that is shipped, and a sentence that says whether "
+                       "the controller runs there; --list names them")  # fmt: skip
+    parser.add_argument("--list", action="store_true", help="list the shipped PLCs")
+    parser.add_argument("--load", dest="loads", nargs="+", metavar="LOAD", default=[],
+                        help="with --plc: whether an adaptive updating period pays there under these loads, against "
+                        "--updating-period or the best fixed one")  # fmt: skip
     parser.add_argument("--updating-period", dest="period", type=fixed_updating_period, metavar="SECONDS",
                         help="one updating period (default: 1, 2.5 and 5 s)")  # fmt: skip
     parser.add_argument("--certify", type=_scenarios, nargs="?", const=USUAL_SCENARIOS, metavar="N",
@@ -58,16 +69,49 @@ def _power(text: str) -> float:
 
 def execute(options: argparse.Namespace) -> int:
     """Print the tables."""
-    if options.certify is not None:
-        from rig.plc_sizing.certification_table import certification_table
-
-        if options.power is not None or options.period is not None:
-            raise UsageError("--certify: uses the configured PLC; leave out --power and "
-                             "--updating-period")  # fmt: skip
-        settings = configuration(options).settings
-        sys.stdout.write(certification_table(settings, options.certify, options.tolerance, options.confidence))
-        return 0
-    from rig.plc_sizing.budget_tables import budget_tables
-
-    sys.stdout.write(budget_tables(configuration(options).settings, options.power, options.period))
+    if options.loads and options.plc is None:
+        raise UsageError("--load: says whether an adaptive period pays on a PLC; name one with --plc")
+    sys.stdout.write(_listing() if options.list else _certified(options) if options.certify else _tables(options))
     return 0
+
+
+def _listing() -> str:
+    from rig.plc_sizing.profile import find_profile, shipped_profiles
+    from rig.text_tables import aligned
+
+    return aligned([(name, find_profile(name).name) for name in shipped_profiles()])
+
+
+def _certified(options: argparse.Namespace) -> str:
+    from rig.plc_sizing.certification_table import certification_table
+
+    if any(value is not None for value in (options.power, options.plc, options.period)):
+        raise UsageError("--certify: uses the configured PLC; leave out --power, --plc and --updating-period")
+    settings = configuration(options).settings
+    return certification_table(settings, options.certify, options.tolerance, options.confidence)
+
+
+def _tables(options: argparse.Namespace) -> str:
+    from rig.plc_sizing.budget_tables import budget_tables, plc_tables, problem_of, with_power
+    from rig.plc_sizing.profile import find_profile
+    from rig.plc_sizing.verdict import power_of
+
+    for name in options.loads:
+        check_load(name)
+    profile = None if options.plc is None else find_profile(options.plc)
+    settings = configuration(options).settings
+    if profile is not None:
+        settings = with_power(settings, power_of(profile, problem_of(settings)[0].size))
+        costs = _costs(settings, options) if options.loads else ""
+        return plc_tables(settings, options.period, profile, costs)
+    return budget_tables(settings if options.power is None else with_power(settings, options.power), options.period)
+
+
+def _costs(settings: "Settings", options: argparse.Namespace) -> str:
+    from rig.progress import make_console
+    from rig.studies.adaptive_gain import adaptive_gain
+
+    with make_console().status("") as status:
+        return adaptive_gain(
+            settings, options.loads, options.period, lambda done, of: status.update(f"{done} of {of} runs")
+        )

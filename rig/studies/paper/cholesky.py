@@ -20,6 +20,7 @@ from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.design import ControlDesign, trivial_design
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem
+from optimizer_plc.settings import SolverName
 from rig.figures.plot import COLOURS
 from rig.plc_sizing import operations
 from rig.plc_sizing.memory import Footprint, estimator_memory, footprint
@@ -30,7 +31,7 @@ from rig.plc_sizing.reference_plc import (
     WORKING_SET,
     SpeedCurve,
     cholesky_times,
-    fitted,
+    reference_curve,
     residuals,
     slow_down,
 )
@@ -64,7 +65,7 @@ class CholeskyStudy:
         """Fit the curve and count."""
         del options, outcomes
         times = cholesky_times()
-        curve = fitted(times)
+        curve = reference_curve()
         here = np.array([_seconds_here(int(n)) for n in times.size])
         rows: list[tuple[Cell, ...]] = [
             (int(n), plc * 1e3, curve.time_s(n) * 1e3, laptop * 1e6, own * 1e6)
@@ -112,7 +113,7 @@ def _footprints() -> tuple[Footprint, Footprint]:
     design, limits, real = ControlDesign(), InputLimits(), real_of(Arithmetic.FLOAT32)
     estimator = estimator_memory(prediction, EstimatorSettings())
     reduced, trivial = (
-        footprint(PredictiveProblem(prediction, one, limits, real), estimator)
+        footprint(PredictiveProblem(prediction, one, limits, real), estimator, SolverName.ODE)
         for one in (design, trivial_design(design))
     )
     return reduced, trivial

@@ -1,0 +1,70 @@
+"""Whether an adaptive updating period pays on a PLC: the closed loop under some loads, against fixed periods."""
+
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import Final
+
+import numpy as np
+
+from coldloop.process.lti_model import load
+from coldloop.process.signals import TICK_S
+from optimizer_plc.budget import PlcBudget
+from plant.load import find_load
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario, natural_ticks
+from rig.plc_sizing.solver_counts import SOLVERS
+from rig.results.indicators import evaluate
+from rig.results.recording import Recorder
+from rig.settings import Settings
+from rig.studies.intervals import Interval, geometric_mean, mean_ratio
+
+ADAPTIVE: Final = 0.0
+FIXED_S: Final = (1.0, 1.5, 2.0, 2.5, 3.5, 5.0)
+"""Updating periods that are compared, unless one is given."""
+
+
+def adaptive_gain(
+    settings: Settings, names: Sequence[str], period_s: float | None, done: Callable[[int, int], None]
+) -> str:
+    """Return, as a sentence, J_BF of the adaptive period over that of the best fixed one.
+
+    The best is chosen on the same loads, which favours it.
+
+    Args:
+        settings: With the power of the PLC.
+        names: Loads, named ones or files.
+        period_s: The fixed period to compare with; None for the best of `FIXED_S` in which an iteration fits.
+        done: Is called with the number of runs done and that of all.
+    """
+    program = settings.optimizer_plc.program
+    budget = PlcBudget(program.budget, SOLVERS[program.solver].tau_1_s(program))
+    fitting = [period for period in FIXED_S if budget.is_enough(round(period / TICK_S))]
+    fixed = fitting or [FIXED_S[-1]] if period_s is None else [period_s]
+    rig, runs = OneProcessRig(settings), list(product((ADAPTIVE, *fixed), names))
+    costs = []
+    for number, (period, name) in enumerate(runs):
+        done(number, len(runs))
+        costs.append(_cost(rig, settings, name, period))
+    by_period = np.array(costs).reshape(-1, len(names))
+    best = min(range(1, len(by_period)), key=lambda which: geometric_mean(by_period[which]))
+    ratio = mean_ratio(by_period[0], by_period[best])
+    which = f"a fixed {fixed[best - 1]:g} s" + (", the best fixed one" if len(fixed) > 1 else "")
+    loads = f"load{'s' if len(names) > 1 else ''} {', '.join(names)}"
+    return f"With {loads} an adaptive period costs {ratio.text()} of {which}: {_pays(ratio)}."
+
+
+def _cost(rig: OneProcessRig, settings: Settings, name: str, period_s: float) -> float:
+    model = load(settings.model.file)
+    profile = find_load(name, model.w0)
+    scenario = Scenario(natural_ticks(name, profile), profile, period_s, settings.plant.seed)
+    recorder = Recorder(scenario.ticks)
+    rig.run(scenario, recorder)
+    return evaluate(recorder.recording(), model, settings.optimizer_plc.program.design).J_BF
+
+
+def _pays(ratio: Interval) -> str:
+    if np.isnan(ratio.low):
+        return "one load has no interval; name several"
+    if ratio.high < 1.0:
+        return "it pays"
+    return "it does not pay" if ratio.low > 1.0 else "no difference is shown"
