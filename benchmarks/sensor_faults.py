@@ -15,6 +15,7 @@ from plant.kinds import plant_maker
 from plant.load import find_load
 from plant.own_model import own_header
 from plant.program import PlantProgram
+from plant.settings import MismatchSettings
 from rig.cosim.compiled.stretches import CompiledStretches
 from rig.cosim.one_process import OneProcessRig, Programs, load_table
 from rig.cosim.scenario import Scenario
@@ -115,7 +116,14 @@ def row(output: int, fault: str, found: Outcome) -> str:
 def off(text: str) -> dict[str, float]:
     """Return the factors of a plant such as `valves=0.9`."""
     name, _, factor = text.partition("=")
-    return dict.fromkeys(VALVES if name == "valves" else (name,), float(factor))
+    known = ("valves", *MismatchSettings.model_fields)
+    try:
+        value = float(factor)
+    except ValueError:
+        value = math.nan
+    if name not in known or not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=FACTOR; names are {', '.join(known)}")
+    return dict.fromkeys(VALVES if name == "valves" else (name,), value)
 
 
 def main() -> None:

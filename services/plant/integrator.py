@@ -7,7 +7,7 @@ import numpy as np
 from coldloop.kernels.compiled import kernel
 from plant.cold_box.physics import ColdBox, cold_box_of, evaluate
 from plant.cold_box.settling import settle_box
-from plant.components.phase_separator import add_to_account, start_account
+from plant.components.phase_separator import add_to_account, content, start_account
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import RealArray
 
@@ -30,23 +30,23 @@ def advance_along(
 ) -> RealArray:
     """Return the state after `dt` seconds, where `slope` (28,), dx/dt at `x`, is known; it is overwritten."""
     n = x.shape[0]
-    y, bath = np.empty(22), box.separator
+    y = np.empty(22)
     stage, total = np.empty(n), np.empty(n)
     stages, slopes = np.empty((4, n)), np.empty((4, n))
-    account = start_account(bath, x, slope, helium)
+    account = start_account(content(box.separator, x[0], x[1], helium), slope)
     for i in range(n):
         stages[0, i], slopes[0, i] = x[i], slope[i]
         total[i] = slope[i]
         stage[i] = x[i] + 0.5 * dt * slope[i]
     for k, fraction in ((1, 0.5), (2, 1.0)):
-        evaluate(stage, u, w, box, helium, slope, y)
-        account = add_to_account(bath, account, stage, slope, 2.0, helium)
+        _, _, _, held = evaluate(stage, u, w, box, helium, slope, y)
+        account = add_to_account(account, held, slope, 2.0)
         for i in range(n):
             stages[k, i], slopes[k, i] = stage[i], slope[i]
             total[i] += 2.0 * slope[i]
             stage[i] = x[i] + fraction * dt * slope[i]
-    evaluate(stage, u, w, box, helium, slope, y)
-    account = add_to_account(bath, account, stage, slope, 1.0, helium)
+    _, _, _, held = evaluate(stage, u, w, box, helium, slope, y)
+    account = add_to_account(account, held, slope, 1.0)
     for i in range(n):
         stages[3, i], slopes[3, i] = stage[i], slope[i]
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])

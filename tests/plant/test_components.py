@@ -137,7 +137,7 @@ def test_the_bath_stores_the_mass_and_energy_that_enter(
 ) -> None:
     V_l, h_in, dt = share * BATH.volume, 7600.0, 1e-2
     h_v = saturation(P, HELIUM).h_v
-    dP, dV = separate(BATH, P, V_l, inflow, h_in, outflow, h_v, heat, HELIUM)
+    dP, dV = separate(content(BATH, P, V_l, HELIUM), inflow, h_in, outflow, h_v, heat)
     after = content(BATH, P + dP * dt / 2, V_l + dV * dt / 2, HELIUM)
     before = content(BATH, P - dP * dt / 2, V_l - dV * dt / 2, HELIUM)
     assert (after.mass - before.mass) / dt == pytest.approx(inflow - outflow, abs=1e-7)

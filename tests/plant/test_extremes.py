@@ -79,8 +79,8 @@ def test_a_bath_stores_what_enters_whatever_it_holds(
     P: float, V_l: float, inflow: float, out: float, heat: float
 ) -> None:
     top = outflow(BATH, P, V_l, saturation(P, HELIUM), HELIUM)
-    dP, dV = separate(BATH, P, V_l, inflow, 7600.0, out, top.h, heat, HELIUM)
     c = content(BATH, P, V_l, HELIUM)
+    dP, dV = separate(c, inflow, 7600.0, out, top.h, heat)
     assert c.M_P * dP + c.M_V * dV == pytest.approx(inflow - out, abs=1e-12)
     assert c.U_P * dP + c.U_V * dV == pytest.approx(inflow * 7600.0 - out * top.h + heat, abs=1e-7)
 

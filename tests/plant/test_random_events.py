@@ -67,7 +67,7 @@ def held(
             stored, inwards = refrigerator_energy_rates(stage, slope, crossing, d[0], plant, helium)
             sums[0] += WEIGHTS[k] * inwards
             sums[1] += WEIGHTS[k] * abs(inwards)
-            sums[2] += WEIGHTS[k] * start_account(plant.box.separator, stage, slope, helium).heat
+            sums[2] += WEIGHTS[k] * start_account(crossing.bath, slope).heat
             sums[3] = max(sums[3], abs(stored - inwards))
             stage = x + AHEAD[k] * slope
         x = advance_refrigerator(x, u, v, d, 0.25, plant, helium)

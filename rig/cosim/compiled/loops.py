@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 import rig.cosim.compiled.portable  # noqa: F401 it lets kernels call what is plain Python
+from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import L1, T5
 from control_plc.output_limits import admit, admits, copy_state, in_range
@@ -88,6 +89,7 @@ def play(
     w: World, alarms: Alarms, scans: Any, guards: Any, rows: Array, plant: PlantState, trace: Trace, until: int  # noqa: ANN401
 ) -> int:  # fmt: skip
     """Play the sequence up to the next updating instant; return DONE at the tick `until`, UNUSUAL or UPDATE."""
+    w, rows, plant, trace = borrowed(w), borrowed(rows), borrowed(plant), borrowed(trace)
     s, guard = scans[0], guards[0]
     while s.tick < until:
         if s.tick == s.next_update:
@@ -117,6 +119,8 @@ def run_block(
     off. One that has not begun when something unusual happens is not reported: it is computed again, with the same
     bits. `rows` (2, 240, 3) are those of the sequence being played, and of the one that was offered.
     """
+    w, o, rows, plant = borrowed(w), borrowed(o), borrowed(rows), borrowed(plant)
+    trace, reports = borrowed(trace), borrowed(reports)
     s, guard, twin = scans[0], guards[0], guards[1]
     u_before, answered = np.empty(3), False
     outcome = DONE

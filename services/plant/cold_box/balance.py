@@ -25,7 +25,7 @@ def energy_rates(x: Array, u: Array, w: float, box: ColdBox, helium: Helium) -> 
     and the heat of heater and load.
     """
     dx = np.empty_like(x)
-    s, warm, relief = evaluate(x, u, w, box, helium, dx, np.empty(22, dtype=x.dtype))
+    s, warm, relief, _ = evaluate(x, u, w, box, helium, dx, np.empty(22, dtype=x.dtype))
     stored = stored_rate(x, dx, box, box.P_HP, helium)
     first34 = 2 + box.nef1.cells + box.nef2.cells
     top = outflow(box.separator, x[0], x[1], saturation(x[0], helium), helium)

@@ -13,10 +13,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coldloop.kernels.compiled import kernel
+from coldloop.kernels.compiled import inlined, kernel
 from plant.components.gas_valve import CRITICAL_RATIO, cold_valve_flow
 from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow, exchange
-from plant.components.phase_separator import PhaseSeparator, bath_relief, level, outflow, separate, thinness
+from plant.components.phase_separator import (
+    Content,
+    PhaseSeparator,
+    bath_relief,
+    content,
+    level,
+    outflow,
+    separate,
+    thinness,
+)
 from plant.components.return_line import ReturnLine, return_flow
 from plant.components.turbine import Back, Expansion, Turbine, expand, throttled_flow, turbine_flow
 from plant.components.valve import Valve
@@ -92,7 +101,7 @@ class Streams(NamedTuple):
     """What leaves the turbine."""
 
 
-@kernel
+@inlined
 def streams(x: Array, u: Array, box: ColdBox, helium: Helium) -> Streams:
     """Return the flows at the state `x` under the inputs `u`."""
     h_jt, rho_jt = supply_enthalpy_and_density(box.P_HP, x[1 + box.nef1.cells], helium)
@@ -109,7 +118,7 @@ def streams(x: Array, u: Array, box: ColdBox, helium: Helium) -> Streams:
     return Streams(m_jt, h_jt, m_v, m_t, P_turbine, P_mix, exhaust)
 
 
-@kernel
+@inlined
 def mix(vapour: LowPressureFlow, s: Streams, helium: Helium) -> LowPressureFlow:
     """Return the low-pressure flow after the turbine's exhaust has joined the vapour from NEF1."""
     flow = s.m_v + s.m_t
@@ -120,11 +129,11 @@ def mix(vapour: LowPressureFlow, s: Streams, helium: Helium) -> LowPressureFlow:
 @kernel
 def evaluate(
     x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Array, y: Array
-) -> tuple[Streams, LowPressureFlow, float]:
+) -> tuple[Streams, LowPressureFlow, float, Content]:
     """Write the rates of the states into `dx` (28, per second) and the outputs into `y` (22, `OUTPUT_UNITS`).
 
-    Returns the flows, what leaves at the warm end of the low-pressure side, and what the bath's relief valve blows into
-    the recovery line (kg/s).
+    Returns the flows, what leaves at the warm end of the low-pressure side, what the bath's relief valve blows into the
+    recovery line (kg/s), and what the bath holds.
     """
     s = streams(x, u, box, helium)
     first2 = 2 + box.nef1.cells
@@ -133,7 +142,8 @@ def evaluate(
     heat = at_least(u[1], 0.0) + w
     top = outflow(box.separator, x[0], x[1], sat, helium)
     relief = bath_relief(box.separator, x[0], top.rho)
-    dx[0], dx[1] = separate(box.separator, x[0], x[1], s.m_jt, s.h_jt, s.m_v + relief, top.h, heat, helium)
+    bath = content(box.separator, x[0], x[1], helium)
+    dx[0], dx[1] = separate(bath, s.m_jt, s.h_jt, s.m_v + relief, top.h, heat)
 
     vapour = LowPressureFlow(s.m_v, x[0], top.T, top.h)
     into_nef1 = HighPressureFlow(s.m_jt, x[first34 - 1], box.P_HP)
@@ -158,7 +168,7 @@ def evaluate(
     y[10] = box.T_in
     y[11] = warm.T
     _write_pressures(x[0], s, box, y[12:])
-    return s, warm, relief
+    return s, warm, relief, bath
 
 
 @kernel

@@ -1,14 +1,14 @@
 """After a step of the integrator the cold box holds what the stages of the step brought it."""
 
-from coldloop.kernels.compiled import kernel
+from coldloop.kernels.compiled import inlined
 from plant.cold_box.physics import ColdBox
-from plant.components.cell_account import settle_cells
+from plant.components.cell_account import COARSE, settle_cells, widest_move
 from plant.components.phase_separator import Account, settle_account
 from plant.helium.properties import Helium
 from plant.numeric import RealArray
 
 
-@kernel
+@inlined
 def settle_box(
     box: ColdBox,
     account: Account,
@@ -33,6 +33,8 @@ def settle_box(
     """
     settle_account(box.separator, account, dt / 6.0, x, helium)
     first2 = 2 + box.nef1.cells
+    if widest_move(stages, x, 2, first2 + box.nef2.cells + box.nef34.cells) <= COARSE:
+        return  # as nearly always
     settle_cells(box.nef1, 2, P, stages, slopes, dt, x, helium)
     settle_cells(box.nef2, first2, P, stages, slopes, dt, x, helium)
     settle_cells(box.nef34, first2 + box.nef2.cells, P, stages, slopes, dt, x, helium)

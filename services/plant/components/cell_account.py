@@ -7,7 +7,7 @@ stages of a step move cells by less than `COARSE`, and nothing is corrected.
 
 import numpy as np
 
-from coldloop.kernels.compiled import kernel
+from coldloop.kernels.compiled import inlined, kernel
 from plant.components.heat_exchanger import HeatExchanger
 from plant.helium.properties import Helium, supply_cell
 from plant.numeric import RealArray
@@ -26,6 +26,18 @@ def heat_capacity(exchanger: HeatExchanger, P: float, T: float, helium: Helium) 
     """Return the heat capacity of one cell (J/K) at `P` (Pa) and `T` (K)."""
     _, rho_cp, c_wall = supply_cell(P, T, helium)
     return (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
+
+
+@inlined
+def widest_move(stages: RealArray, x: RealArray, first: int, last: int) -> float:
+    """Return how far the states `first` to `last` - 1 go from those of the first stage, at most, up to `x`."""
+    widest: float = 0.0
+    for i in range(first, last):
+        widest = max(widest, abs(x[i] - stages[0, i]))
+    for k in range(1, 4):
+        for i in range(first, last):
+            widest = max(widest, abs(stages[k, i] - stages[0, i]))
+    return widest
 
 
 @kernel

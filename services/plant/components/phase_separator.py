@@ -146,7 +146,7 @@ def outflow(separator: PhaseSeparator, P: float, V_l: float, sat: Saturation, he
     return Outflow(sat.T, sat.h_v - carried * (sat.h_v - sat.h_l), sat.rho_v)
 
 
-@kernel
+@inlined
 def thinness(separator: PhaseSeparator, P: float, V_l: float, helium: Helium) -> float:
     """Return by how much the vapour of a dry vessel is thinner than saturated vapour; 1 in one that is not dry."""
     if V_l.real >= 0.0:
@@ -165,21 +165,12 @@ def bath_relief(separator: PhaseSeparator, P: float, rho: float) -> float:
 
 @inlined
 def separate(
-    separator: PhaseSeparator,
-    P: float,
-    V_l: float,
-    inflow: float,
-    h_in: float,
-    outflow: float,
-    h_out: float,
-    heat: float,
-    helium: Helium,
-) -> tuple[float, float]:
-    """Return dP/dt (Pa/s) and dV_l/dt (m3/s) from the balances of mass and of energy.
+    c: Content, inflow: float, h_in: float, outflow: float, h_out: float, heat: float
+) -> tuple[float, float]:  # fmt: skip
+    """Return dP/dt (Pa/s) and dV_l/dt (m3/s) of a vessel that holds `c`, from the balances of mass and of energy.
 
     `inflow` (kg/s) enters with `h_in` (J/kg), `outflow` (kg/s) leaves with `h_out`, `heat` in W.
     """
-    c = content(separator, P, V_l, helium)
     dM = inflow - outflow
     dU = inflow * h_in - outflow * h_out + heat
     determinant = c.M_P * c.U_V - c.M_V * c.U_P
@@ -205,30 +196,22 @@ class Account(NamedTuple):
     """W."""
 
 
-@kernel
-def start_account(separator: PhaseSeparator, x: Array, slope: Array, helium: Helium) -> Account:
-    """Begin to keep account of a step from the state `x`, whose first two are P and V_l, with their rates `slope`."""
-    c = content(separator, x[0], x[1], helium)
-    return Account(
-        c.mass,
-        c.energy,
-        c.M_P * slope[0] + c.M_V * slope[1],
-        c.U_P * slope[0] + c.U_V * slope[1],
-    )
+@inlined
+def start_account(c: Content, slope: Array) -> Account:
+    """Begin to keep account of a step of a bath that holds `c` and whose P and V_l have the rates `slope[:2]`."""
+    return Account(c.mass, c.energy, c.M_P * slope[0] + c.M_V * slope[1], c.U_P * slope[0] + c.U_V * slope[1])
 
 
-@kernel
-def add_to_account(
-    separator: PhaseSeparator, account: Account, x: Array, slope: Array, weight: float, helium: Helium
-) -> Account:
-    """Add the rates of a stage at `x`."""
-    stage = start_account(separator, x, slope, helium)
+@inlined
+def add_to_account(account: Account, c: Content, slope: Array, weight: float) -> Account:
+    """Add the rates of a stage at which the bath holds `c`."""
+    stage = start_account(c, slope)
     return Account(
         account.mass, account.energy, account.inflow + weight * stage.inflow, account.heat + weight * stage.heat
     )
 
 
-@kernel
+@inlined
 def settle_account(separator: PhaseSeparator, account: Account, dt: float, x: Array, helium: Helium) -> None:
     """Correct P and V_l in `x`, if need be, so that the bath holds what the account says; `dt` (s) is of a weight."""
     mass, energy = account.mass + dt * account.inflow, account.energy + dt * account.heat

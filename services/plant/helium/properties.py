@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from coldloop.kernels.borrowing import borrowed
 from coldloop.kernels.compiled import inlined, kernel
 from plant.helium.interpolation import (
     Curves,
@@ -104,15 +105,16 @@ def load_helium() -> Helium:
 @inlined
 def helium_of(fields: Any) -> Helium:  # noqa: ANN401 - any nesting of tuples
     """Rebuild the tables from nested plain tuples, see `plant.integrator.advance_and_read`."""
+    lent = borrowed(fields)
     return Helium(
-        Curves(*fields[0]),
-        Curves(*fields[1]),
-        Surface(*fields[2]),
-        Surface(*fields[3]),
-        Surface(*fields[4]),
-        Surface(*fields[5]),
-        Curves(*fields[6]),
-        Surface(*fields[7]),
+        Curves(*lent[0]),
+        Curves(*lent[1]),
+        Surface(*lent[2]),
+        Surface(*lent[3]),
+        Surface(*lent[4]),
+        Surface(*lent[5]),
+        Curves(*lent[6]),
+        Surface(*lent[7]),
     )
 
 

@@ -25,7 +25,7 @@ from plant.cold_box.settling import settle_box
 from plant.components.cell_account import settle_cells
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
-from plant.components.phase_separator import add_to_account, content, start_account
+from plant.components.phase_separator import Content, add_to_account, content, start_account
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import Array, RealArray
 from plant.refrigerator.compression_station import (
@@ -84,6 +84,8 @@ class Crossing(NamedTuple):
     """From the cold box to NEF6."""
     relief: float
     """From the bath into the recovery line, kg/s."""
+    bath: Content
+    """What the bath holds."""
     cooling: Precooling
     """What NEF6 and NEF5 do."""
     heater: float
@@ -120,7 +122,7 @@ def evaluate_refrigerator(
         box.separator, box.jt_valve, box.turbine, box.nef1, box.nef2, box.nef34, box.return_line, P.HP, P.LP, x[coil]
     )
     inputs = u if d[4].real + d[5].real > 0.0 else 0.0 * u
-    cold, leaving, relief = evaluate(x[:BOX_STATES], inputs, d[0], joined, helium, dx[:BOX_STATES], y)
+    cold, leaving, relief, bath = evaluate(x[:BOX_STATES], inputs, d[0], joined, helium, dx[:BOX_STATES], y)
     entering = HighPressureFlow(cold.m_jt + cold.m_t, d[1] + station.cooler_approach, P.HP)
     cooling = precooler_rates(
         x[BOX_STATES:STATION], v[3], entering, leaving, d[3], precooler, helium, dx[BOX_STATES:STATION]
@@ -140,7 +142,7 @@ def evaluate_refrigerator(
     signals[16] = inventory(x, plant, helium)
     signals[17] = x[STATION + 3]
     signals[18] = d[1]
-    return Crossing(entering, cold, leaving, relief, cooling, inputs[1])
+    return Crossing(entering, cold, leaving, relief, bath, cooling, inputs[1])
 
 
 @kernel
@@ -188,22 +190,21 @@ def advance_refrigerator(
     slope, y, signals = np.empty(n), np.empty(22), np.empty(SIGNALS)
     stage, total = np.empty(n), np.empty(n)
     stages, slopes = np.empty((4, n)), np.empty((4, n))
-    evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
-    bath = plant.box.separator
-    account = start_account(bath, x, slope, helium)
+    crossing = evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
+    account = start_account(crossing.bath, slope)
     for i in range(n):
         stages[0, i], slopes[0, i] = x[i], slope[i]
         total[i] = slope[i]
         stage[i] = x[i] + 0.5 * dt * slope[i]
     for k, fraction in ((1, 0.5), (2, 1.0)):
-        evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
-        account = add_to_account(bath, account, stage, slope, 2.0, helium)
+        crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
+        account = add_to_account(account, crossing.bath, slope, 2.0)
         for i in range(n):
             stages[k, i], slopes[k, i] = stage[i], slope[i]
             total[i] += 2.0 * slope[i]
             stage[i] = x[i] + fraction * dt * slope[i]
-    evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
-    account = add_to_account(bath, account, stage, slope, 1.0, helium)
+    crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
+    account = add_to_account(account, crossing.bath, slope, 1.0)
     for i in range(n):
         stages[3, i], slopes[3, i] = stage[i], slope[i]
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])

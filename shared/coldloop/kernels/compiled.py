@@ -40,9 +40,9 @@ R = TypeVar("R")
 
 COMPILED_PACKAGES = ("plant", "optimizer_plc")
 COMPILED_MODULES = (
-    "coldloop.kernels.compiled", "coldloop.kernels.single_precision", "coldloop.process.signals",
-    "control_plc.output_limits", "control_plc.sensors", "rig.cosim.compiled.loops", "rig.cosim.compiled.plants",
-    "rig.cosim.compiled.portable", "rig.cosim.compiled.records",
+    "coldloop.kernels.borrowing", "coldloop.kernels.compiled", "coldloop.kernels.single_precision",
+    "coldloop.process.signals", "control_plc.output_limits", "control_plc.sensors", "rig.cosim.compiled.loops",
+    "rig.cosim.compiled.plants", "rig.cosim.compiled.portable", "rig.cosim.compiled.records",
 )  # fmt: skip
 """What kernels call from other packages."""
 
