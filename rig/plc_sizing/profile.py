@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Final, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from coldloop.config import load_configuration
 from coldloop.errors import ConfigurationError, UsageError
@@ -40,6 +40,13 @@ class PlcProfile(BaseModel):
     """Time of a floating-point operation by its data sheet, if no factorisation has been timed."""
     overhead: Annotated[float, Field(strict=True, ge=1.0, le=1000.0)] = 1.0
     """Times as long as that which an operation takes in a program: indices, loops, loads and stores."""
+
+    @field_validator("name", "source")
+    @classmethod
+    def _on_one_line(cls, value: str) -> str:
+        if not value.isprintable():
+            raise ValueError("has a line end or a control character; write it on one line")
+        return value
 
     @model_validator(mode="after")
     def _one_speed(self) -> Self:

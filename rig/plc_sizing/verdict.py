@@ -73,8 +73,8 @@ def verdict(profile: PlcProfile, program: ProgramSettings, problem: PredictivePr
     return (
         f"{profile.name}: {problem_text} fits, in {memory_text}; it updates every {shortest * TICK_S:g} s at the "
         f"soonest ({_iterations(budget, shortest)}), {_iterations(budget, longest)} in {longest * TICK_S:g} s; "
-        f"{first[0]} gives way first, beyond {_variables(first[1])} variables ({then[0]} beyond "
-        f"{_variables(then[1])}){_calls(profile, budget)}."
+        f"{first[0]} gives way first, with more than {_variables(first[1])} variables ({then[0]} with "
+        f"more than {_variables(then[1])}){_calls(profile, budget)}."
     )
 
 

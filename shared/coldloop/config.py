@@ -132,7 +132,9 @@ def load_configuration(
     try:
         settings = model.model_validate(layers.values)
     except ValidationError as error:
-        raise ConfigurationError(explained(error, layers.sources, model, listing)) from None
+        missing = file is not None and error.errors()[0]["type"] == "missing"
+        where = f"{file}: " if missing else ""
+        raise ConfigurationError(where + explained(error, layers.sources, model, listing)) from None
     for key, value in flattened(settings.model_dump()).items():
         if not _is_finite(value):
             raise ConfigurationError(f"{_where(key, layers.sources)}: input should be finite (got {value!r})")
@@ -290,6 +292,8 @@ def explained(
         known = flattened(model().model_dump()) if section else model.model_fields
         close = get_close_matches(key, [each for each in known if each.startswith(section)], n=1)
         return f"{where}: no such key; {f'did you mean {close[0]}? ' if close else ''}{listing}"
+    if first["type"] == "missing":
+        return f"{where}: is missing; {listing}"
     message = first["msg"].removeprefix("Value error, ")
     given = repr(first["input"])
     if len(given) > MOST_SHOWN:
