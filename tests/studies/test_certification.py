@@ -144,7 +144,7 @@ def test_the_command_prints_a_row_for_each_solver(coldloop: "Coldloop", monkeypa
         (("--certify", "0"), "'0' is not a whole number of at least 1"),
         (("--certify", "2", "--confidence", "100"), "'100' is not a percentage"),
         (("--certify", "2", "--tolerance", "much"), "'much' is not a percentage"),
-        (("--certify", "2", "--power", "2"), "leave out --power and --updating-period"),
+        (("--certify", "2", "--power", "2"), "leave out --power, --plc and --updating-period"),
     ],
 )
 def test_certificates_asked_for_wrongly_are_one_line(

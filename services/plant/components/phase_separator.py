@@ -32,7 +32,7 @@ CARRY_OVER = 0.97  # share of the vessel from which on the vapour carries liquid
 COLD_WALL = 4.0  # K, the wall's temperature where the vapour is saturated; it has next to no heat capacity there
 ALUMINIUM_ENTHALPY = 4  # its place in `Helium.isobar`
 LEAST_MASS, LEAST_ENERGY = 2e-12, 1e-7  # kg and J in a step: what is less is left alone
-ROUNDING = 1e-14  # share of mass to which `holding` solves
+ROUNDING = 1e-14  # share of mass and energy to which `holding` solves: a hot wall has 1e7 J
 MAX_NEWTON_STEPS = 30
 JUST_DRY = 1e-16  # m3
 LEAST_PRESSURE, CRITICAL_PRESSURE = 0.05e5, 2.28e5  # Pa
@@ -233,7 +233,7 @@ def holding(
     for _ in range(MAX_NEWTON_STEPS):
         c = content(separator, P, V_l, helium)
         more, hotter = mass - c.mass, energy - c.energy
-        if abs(more) <= ROUNDING * mass and abs(hotter) <= 0.1 * LEAST_ENERGY:
+        if abs(more) <= ROUNDING * mass and abs(hotter) <= 0.1 * LEAST_ENERGY + ROUNDING * abs(energy):
             return LEAST_PRESSURE < P < CRITICAL_PRESSURE, P, V_l
         determinant = c.M_P * c.U_V - c.M_V * c.U_P
         dP = (more * c.U_V - c.M_V * hotter) / determinant
