@@ -50,7 +50,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     AlarmKind.LEVEL_BAND: AlarmRule(HIGH),  # the bath may run dry or flood; on-delay: `band_delay_s`
     AlarmKind.T5_BAND: AlarmRule(HIGH),  # the turbines leave their range; on-delay: `band_delay_s`
     AlarmKind.PLANT_FROZEN: AlarmRule(HIGH),  # measurements are old
-    AlarmKind.CAPACITY: AlarmRule(HIGH, on_delay_s=30.0, off_delay_s=30.0),  # no control holds this load
+    AlarmKind.CAPACITY: AlarmRule(HIGH, on_delay_s=20.0, off_delay_s=30.0),  # no control holds this load
     # Control is degraded, or a protection is lost: act within the shift.
     AlarmKind.MODE: AlarmRule(MEDIUM),  # the ladder has left MPC
     AlarmKind.SEQUENCE_EXHAUSTED: AlarmRule(MEDIUM),  # outputs are held, then the classical loops control

@@ -32,11 +32,11 @@ def raised(bench: "Bench") -> list[float]:
 @pytest.mark.parametrize(
     ("sign", "cause"), [(1.0, CapacityCause.TOO_MUCH), (-1.0, CapacityCause.TOO_LITTLE)], ids=["too much", "too little"]
 )
-def test_it_is_raised_once_after_half_a_minute_with_the_watts_of_then(
+def test_it_is_raised_once_after_twenty_seconds_with_the_watts_of_then(
     sign: float, cause: CapacityCause, bench: "Bench", at: At
 ) -> None:
     bench.steady = bench.moving = True
-    assert not after(bench, at, [sign * (1.0 + i) for i in range(12)]).active
+    assert not after(bench, at, [sign * (1.0 + i) for i in range(8)]).active
     alarm = after(bench, at, [sign * 30.5] * 2)
     assert (alarm.active, alarm.times, alarm.cause) == (1, 1, cause)
     assert raised(bench) == [30.5]
@@ -56,7 +56,7 @@ def test_too_little_after_too_much_is_another_alarm(bench: "Bench", at: At) -> N
 
 def test_a_shortage_that_does_not_last_is_none(bench: "Bench", at: At) -> None:
     bench.steady = bench.moving = True
-    assert after(bench, at, [40.0] * 11 + [0.0] + [40.0] * 11).times == 0
+    assert after(bench, at, [40.0] * 7 + [0.0] + [40.0] * 7).times == 0
 
 
 def test_it_returns_when_others_drive(bench: "Bench", at: At) -> None:

@@ -92,7 +92,7 @@ def test_a_load_with_which_a_better_turbine_gets_too_cold_is_said(tmp_path: Path
     alarm, columns = raised(run), run.trace.to_dict()
     assert min(columns["T5"]) < T5_BAND[0]
     assert alarm is not None
-    assert STEP_S <= float(str(alarm["time_s"])) < STEP_S + 40.0, "with its delay of 30 s"
+    assert STEP_S <= float(str(alarm["time_s"])) < STEP_S + 30.0, "with its delay of 20 s"
     assert "raise it" in str(alarm["cause"])
 
 
