@@ -31,7 +31,7 @@ from rig.plc_sizing.reference_plc import (
 )
 from rig.plc_sizing.sizes import QpSizes, dense_sizes, sizes_without_zeros
 from rig.plc_sizing.solver_counts import SOLVERS
-from rig.plc_sizing.verdict import verdict
+from rig.plc_sizing.verdict import fits, verdict
 from rig.settings import Settings
 from rig.text_tables import aligned
 
@@ -81,6 +81,14 @@ def plc_tables(settings: Settings, period_s: float | None, profile: PlcProfile, 
         _iterations(program, problem, period_s),
         _memory(settings, problem, prediction, profile.memory_bytes),
     ])  # fmt: skip
+
+
+def runs_on(settings: Settings, profile: PlcProfile) -> bool:
+    """Return whether the configured problem fits a PLC, whose power is configured."""
+    program = settings.optimizer_plc.program
+    problem, prediction = problem_of(settings)
+    needed = footprint(problem, estimator_memory(prediction, program.estimator), program.solver)
+    return fits(profile, program, problem, needed)
 
 
 def problem_of(settings: Settings) -> tuple[PredictiveProblem, PredictionModel]:

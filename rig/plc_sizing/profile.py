@@ -1,6 +1,7 @@
 """A PLC as a profile: a TOML file with its memory, its speed and where the figures are from (`docs/budget.md`)."""
 
 import math
+import os
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Annotated, Final, Self
@@ -19,7 +20,10 @@ FEWEST_SIZES: Final = 3
 TIMES_HEADER: Final = ("size", "plc_ms")
 """First columns of a file of factorisation times."""
 
-_Positive = Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)]
+LARGEST_FILE: Final = 1_000_000
+"""Bytes of a file of times."""
+LARGEST_SIZE: Final = 10_000
+SHORTEST_MS, LONGEST_MS = 1e-6, 1e9
 
 
 class PlcProfile(BaseModel):
@@ -30,13 +34,13 @@ class PlcProfile(BaseModel):
     name: Annotated[str, Field(min_length=1, max_length=80)]
     source: Annotated[str, Field(min_length=1)]
     """Where the figures are from."""
-    memory_bytes: Annotated[int, Field(strict=True, ge=1)]
+    memory_bytes: Annotated[int, Field(strict=True, ge=1, le=10**15)]
     """For the data of the optimiser; numbers are of single precision."""
-    cycle_s: _Positive | None = None
+    cycle_s: Annotated[float, Field(strict=True, ge=1e-4, le=1e3)] | None = None
     """Time after which its cycle monitoring stops a program."""
     factorisations: Path | None = None
     """CSV of measured times of the Cholesky factorisation: size, plc_ms; beside the profile."""
-    operation_ns: _Positive | None = None
+    operation_ns: Annotated[float, Field(strict=True, ge=1e-3, le=1e9)] | None = None
     """Time of a floating-point operation by its data sheet, if no factorisation has been timed."""
     overhead: Annotated[float, Field(strict=True, ge=1.0, le=1000.0)] = 1.0
     """Times as long as that which an operation takes in a program: indices, loops, loads and stores."""
@@ -78,11 +82,10 @@ def find_profile(name: str) -> PlcProfile:
     Raises:
         UsageError: There is none of this name, or something in it is wrong; one line that says what.
     """
-    shipped = SHIPPED / f"{name}.toml"
-    if "/" not in name and shipped.is_file():
+    if name in shipped_profiles():
         with as_file(SHIPPED) as folder:
             return _read(folder / f"{name}.toml")
-    if not Path(name).exists():
+    if not os.path.exists(name):  # noqa: PTH110 a path raises an error where a name is too long
         raise UsageError(f"--plc {name}: neither a file nor one of {', '.join(shipped_profiles())}")
     return _read(Path(name))
 
@@ -95,25 +98,47 @@ def _read(path: Path) -> PlcProfile:
 
 
 def _times(path: Path) -> tuple[Array, Array]:
-    """Return sizes and times in seconds."""
+    """Return sizes, in rising order, and times in seconds."""
+    rows = _rows(path)
+    if not rows or tuple(cell.strip() for cell in rows[0][1][:2]) != TIMES_HEADER:
+        raise ConfigurationError(f"{path}: the first line must be the header {','.join(TIMES_HEADER)}")
+    found: dict[float, float] = {}
+    for number, cells in rows[1:]:
+        size, plc_ms = _pair(f"{path}: line {number}", cells)
+        if size in found:
+            raise ConfigurationError(f"{path}: line {number}: the size {size:g} is there twice; leave one time of it")
+        found[size] = plc_ms * 1e-3
+    if len(found) < FEWEST_SIZES:
+        raise ConfigurationError(f"{path}: {len(found)} sizes; the curve needs {FEWEST_SIZES} or more")
+    sizes, times = np.array(sorted(found)), np.array([found[size] for size in sorted(found)])
+    if (np.diff(times) <= 0.0).any():
+        raise ConfigurationError(f"{path}: a larger size takes no longer than a smaller one; times have to rise")
+    return sizes, times
+
+
+def _rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Return the lines that are no comments, with their numbers."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        with path.open("rb") as file:  # a device has no end
+            content = file.read(LARGEST_FILE + 1)
+        if len(content) > LARGEST_FILE:
+            raise ConfigurationError(f"{path}: not a file of times: more than {LARGEST_FILE} bytes")
+        lines = content.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise ConfigurationError(f"{path}: not UTF-8 text; save it as UTF-8") from None
     except OSError as error:
         raise ConfigurationError(f"{path}: {error.strerror}; name a CSV file with `factorisations`") from None
-    rows = [(number, line.split(",")) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
-    if not rows or tuple(cell.strip() for cell in rows[0][1][:2]) != TIMES_HEADER:
-        raise ConfigurationError(f"{path}: the first line must be the header {','.join(TIMES_HEADER)}")
-    found = {}
-    for number, cells in rows[1:]:
-        try:
-            size, plc_ms = (float(cell) for cell in cells[:2])
-        except ValueError:
-            raise ConfigurationError(f"{path}: line {number}: not a size and a time in milliseconds") from None
-        if not (1.0 <= size < np.inf and 0.0 < plc_ms < np.inf):
-            raise ConfigurationError(f"{path}: line {number}: a size of at least 1 and a time above 0 are needed")
-        found[size] = plc_ms * 1e-3
-    if len(found) < FEWEST_SIZES:
-        raise ConfigurationError(f"{path}: {len(found)} sizes; the curve needs {FEWEST_SIZES} or more")
-    return np.array(list(found)), np.array(list(found.values()))
+    return [(number, line.split(",")) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
+
+
+def _pair(where: str, cells: list[str]) -> tuple[float, float]:
+    """Return a size and its time in milliseconds."""
+    try:
+        size, plc_ms = (float(cell) for cell in cells[:2])
+    except ValueError:
+        raise ConfigurationError(f"{where}: not a size and a time in milliseconds") from None
+    if not (1.0 <= size <= LARGEST_SIZE and SHORTEST_MS <= plc_ms <= LONGEST_MS):
+        raise ConfigurationError(
+            f"{where}: sizes are from 1 to {LARGEST_SIZE}, times from {SHORTEST_MS:g} to {LONGEST_MS:g} ms"
+        )
+    return size, plc_ms

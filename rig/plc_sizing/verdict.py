@@ -1,5 +1,6 @@
 """Whether a controller runs on a PLC and how often it may update, in one sentence."""
 
+from math import floor
 from typing import NamedTuple
 
 from coldloop.process.signals import TICK_S
@@ -11,6 +12,7 @@ from rig.plc_sizing.profile import PlcProfile
 from rig.plc_sizing.reference_plc import reference_curve
 from rig.plc_sizing.solver_counts import SOLVERS
 
+ROUNDING = 1e-9
 MANY = 1000
 """Variables from which on their number is not said."""
 
@@ -47,6 +49,12 @@ def capacity(size: int, needed: Footprint, memory_bytes: int, budget: PlcBudget)
     )
 
 
+def fits(profile: PlcProfile, program: ProgramSettings, problem: PredictiveProblem, needed: Footprint) -> bool:
+    """Return whether a PLC has memory and time for a problem; as `verdict`."""
+    budget = PlcBudget(program.budget, SOLVERS[program.solver].tau_1_s(program))
+    return min(capacity(problem.size, needed, profile.memory_bytes, budget)) + ROUNDING >= problem.size
+
+
 def verdict(profile: PlcProfile, program: ProgramSettings, problem: PredictiveProblem, needed: Footprint) -> str:
     """Return what a PLC can do with a problem; `program` has the power of this PLC.
 
@@ -59,19 +67,22 @@ def verdict(profile: PlcProfile, program: ProgramSettings, problem: PredictivePr
     budget = PlcBudget(program.budget, SOLVERS[program.solver].tau_1_s(program))
     limits = capacity(problem.size, needed, profile.memory_bytes, budget)
     problem_text = f"the problem ({problem.size} variables, {len(problem.Gamma)} rows) with {program.solver}"
-    memory_text = f"{needed.total / 1e3:,.0f} of {profile.memory_bytes / 1e3:,.0f} kB"
-    if min(limits) < problem.size:
-        lacks = [f"it takes {memory_text}"] if limits.by_memory < problem.size else []
+    if not fits(profile, program, problem, needed):
+        lacks = []
+        if limits.by_memory < problem.size:
+            lacks.append(f"it takes {needed.total:,} of {profile.memory_bytes:,} bytes")
         if limits.by_time < problem.size:
+            needed_s, longest_s = budget.times.slots + budget.times.iteration, MAX_PERIOD_TICKS * TICK_S
             lacks.append(
-                f"preparation and an iteration take {budget.answer_after_s(1):.3g} s, and the longest updating period "
-                f"is {MAX_PERIOD_TICKS * TICK_S:g} s"
+                f"the slot of the preparation and an iteration take {needed_s:.3g} s, and the longest updating period "
+                f"is {longest_s:g} s"
             )
         return f"{profile.name}: {problem_text} does not fit: {', and '.join(lacks)}."
+    memory = f"{needed.total / 1e3:,.0f} of {profile.memory_bytes / 1e3:,.0f} kB"
     longest, shortest = budget.ladder[-1], budget.ladder[0]
     first, then = sorted((("memory", limits.by_memory), ("time", limits.by_time)), key=lambda one: one[1])
     return (
-        f"{profile.name}: {problem_text} fits, in {memory_text}; it updates every {shortest * TICK_S:g} s at the "
+        f"{profile.name}: {problem_text} fits, in {memory}; it updates every {shortest * TICK_S:g} s at the "
         f"soonest ({_iterations(budget, shortest)}), {_iterations(budget, longest)} in {longest * TICK_S:g} s; "
         f"{first[0]} gives way first, with more than {_variables(first[1])} variables ({then[0]} with "
         f"more than {_variables(then[1])}){_calls(profile, budget)}."
@@ -84,14 +95,15 @@ def _iterations(budget: PlcBudget, ticks: int) -> str:
 
 
 def _variables(count: float) -> str:
-    return f"{count:.0f}" if count < MANY else f"{MANY}"
+    return f"{floor(count + ROUNDING)}" if count < MANY else f"{MANY}"
 
 
 def _calls(profile: PlcProfile, budget: PlcBudget) -> str:
-    if profile.cycle_s is None or budget.times.iteration <= profile.cycle_s:
+    longest_s, what = max((budget.times.iteration, "an iteration"), (budget.times.preparation, "the preparation"))
+    if profile.cycle_s is None or longest_s <= profile.cycle_s:
         return ""
-    calls = -int(-budget.times.iteration // profile.cycle_s)
+    calls = -int(-longest_s // profile.cycle_s)
     return (
-        f"; an iteration takes {budget.times.iteration:.3g} s and its cycle monitoring stops a program after "
+        f"; {what} takes {longest_s:.3g} s and its cycle monitoring stops a program after "
         f"{profile.cycle_s:g} s: divide it over {calls} calls, or set that higher"
     )

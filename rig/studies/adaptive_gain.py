@@ -38,7 +38,7 @@ def adaptive_gain(
     """
     program = settings.optimizer_plc.program
     budget = PlcBudget(program.budget, SOLVERS[program.solver].tau_1_s(program))
-    fitting = [period for period in FIXED_S if budget.is_enough(round(period / TICK_S))]
+    fitting = [period for period in FIXED_S if budget.times.holds(round(period / TICK_S))]
     fixed = fitting or [FIXED_S[-1]] if period_s is None else [period_s]
     rig, runs = OneProcessRig(settings), list(product((ADAPTIVE, *fixed), names))
     costs = []

@@ -132,7 +132,8 @@ def load_configuration(
     try:
         settings = model.model_validate(layers.values)
     except ValidationError as error:
-        missing = file is not None and error.errors()[0]["type"] == "missing"
+        alone = all(source == str(file) for source in layers.sources.values())
+        missing = file is not None and alone and error.errors()[0]["type"] == "missing"
         where = f"{file}: " if missing else ""
         raise ConfigurationError(where + explained(error, layers.sources, model, listing)) from None
     for key, value in flattened(settings.model_dump()).items():

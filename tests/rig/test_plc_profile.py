@@ -67,8 +67,8 @@ def test_a_plc_that_fits_is_said_so_with_what_it_does(coldloop: "Coldloop", tmp_
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("1_000_000", "300_000"), "does not fit: it takes 428 of 300 kB."),
-        (("overhead = 5", "overhead = 150"), "preparation and an iteration take 13.3 s"),
+        (("1_000_000", "300_000"), "does not fit: it takes 427,612 of 300,000 bytes."),
+        (("overhead = 5", "overhead = 150"), "the slot of the preparation and an iteration take 15.9 s"),
     ],
 )
 def test_a_plc_that_does_not_fit_is_said_so_with_what_it_lacks(
@@ -115,12 +115,16 @@ def test_whether_an_adaptive_period_pays_is_the_ratio_of_the_runs(coldloop: "Col
         ("times.csv", "5,1\n", "the first line must be the header size,plc_ms"),
         ("times.csv", "size,plc_ms\n5,1\n10,much\n", "line 3: not a size and a time"),
         ("times.csv", "size,plc_ms\n5,1\n10\n", "line 3: not a size and a time"),
-        ("times.csv", "size,plc_ms\n5,1\n10,-3\n", "line 3: a size of at least 1 and a time above 0"),
+        ("times.csv", "size,plc_ms\n5,1\n10,-3\n", "line 3: sizes are from 1 to 10000"),
         ("times.csv", "size,plc_ms\n5,1\n10,3\n", "2 sizes; the curve needs 3 or more"),
+        ("times.csv", "size,plc_ms\n5,1\n10,3\n10,4\n", "line 4: the size 10 is there twice"),
+        ("times.csv", "size,plc_ms\n5,1\n10,3\n20,2\n", "times have to rise"),
+        ("/dev/zero", "", "more than 1000000 bytes"),
+        (WHOLE.replace("400", "1e-300"), "", "operation_ns"),
     ],
 )
 def test_a_profile_that_is_wrong_is_one_line_that_says_where(tmp_path: Path, text: str, times: str, says: str) -> None:
-    if text.endswith(".csv"):
+    if text.endswith((".csv", "zero")):
         text = WHOLE.replace("operation_ns = 400\noverhead = 5", f'factorisations = "{text}"')
     with pytest.raises(ColdloopError) as refused:
         find_profile(written(tmp_path, text, times)).flops_per_s(49)
@@ -134,6 +138,8 @@ def test_a_profile_that_is_wrong_is_one_line_that_says_where(tmp_path: Path, tex
         (("--plc", "wago"), "neither a file nor one of schneider-tsx-p574634m, siemens-s7-1511-1-pn"),
         (("--plc", "siemens-s7-1511-1-pn", "--power", "2"), "not allowed with"),
         (("--load", "a"), "name one with --plc"),
+        (("--plc", "x" * 300), "neither a file nor one of"),
+        (("--plc", "siemens-s7-1511-1-pn", "--load", "a", "a"), "a load is named twice"),
         (("--plc", "siemens-s7-1511-1-pn", "--load", "z"), "load 'z'"),
         (("--plc", "siemens-s7-1511-1-pn", "--certify"), "leave out --power, --plc"),
     ],

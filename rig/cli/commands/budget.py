@@ -92,17 +92,19 @@ def _certified(options: argparse.Namespace) -> str:
 
 
 def _tables(options: argparse.Namespace) -> str:
-    from rig.plc_sizing.budget_tables import budget_tables, plc_tables, problem_of, with_power
+    from rig.plc_sizing.budget_tables import budget_tables, plc_tables, problem_of, runs_on, with_power
     from rig.plc_sizing.profile import find_profile
     from rig.plc_sizing.verdict import power_of
 
+    if len(set(options.loads)) < len(options.loads):
+        raise UsageError("--load: a load is named twice; two of the same are no evidence")
     for name in options.loads:
         check_load(name)
     profile = None if options.plc is None else find_profile(options.plc)
     settings = configuration(options).settings
     if profile is not None:
         settings = with_power(settings, power_of(profile, problem_of(settings)[0].size))
-        costs = _costs(settings, options) if options.loads else ""
+        costs = _costs(settings, options) if options.loads and runs_on(settings, profile) else ""
         return plc_tables(settings, options.period, profile, costs)
     return budget_tables(settings if options.power is None else with_power(settings, options.power), options.period)
 

@@ -8,6 +8,7 @@ be counted.
 from typing import Any, TypeVar
 
 from numba.core import cgutils, types
+from numba.core.errors import TypingError
 from numba.extending import intrinsic, overload
 
 T = TypeVar("T")
@@ -43,4 +44,6 @@ def _without_references(context: Any, builder: Any, kind: Any, value: Any) -> An
         for place, part in enumerate(kind.types):  # type: ignore[attr-defined]
             inner = builder.extract_value(value, place)
             value = builder.insert_value(value, _without_references(context, builder, part, inner), place)
+    elif context.data_model_manager[kind].contains_nrt_meminfo():
+        raise TypingError(f"{kind} cannot be borrowed")
     return value
