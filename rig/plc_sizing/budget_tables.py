@@ -31,7 +31,7 @@ from rig.plc_sizing.reference_plc import (
 )
 from rig.plc_sizing.sizes import QpSizes, dense_sizes, sizes_without_zeros
 from rig.plc_sizing.solver_counts import SOLVERS
-from rig.plc_sizing.verdict import fits, verdict
+from rig.plc_sizing.verdict import fits, power_of, verdict
 from rig.settings import Settings
 from rig.text_tables import aligned
 
@@ -57,38 +57,35 @@ def budget_tables(settings: Settings, period_s: float | None) -> str:
     ])  # fmt: skip
 
 
-def plc_tables(settings: Settings, period_s: float | None, profile: PlcProfile, costs: str) -> str:
+def plc_tables(
+    settings: Settings, period_s: float | None, profile: PlcProfile, costs: Callable[[Settings], str]
+) -> str:
     """Return what a PLC can do as text: a sentence, what updating periods cost there, and the tables that differ.
 
     Args:
-        settings: With the power of this PLC.
+        settings: With any power: it becomes this PLC's.
         period_s: One updating period, or None for several.
         profile: The PLC.
-        costs: A sentence or nothing.
+        costs: Returns a sentence or nothing; it is asked where the controller runs there.
     """
-    program = settings.optimizer_plc.program
     problem, prediction = problem_of(settings)
+    settings = with_power(settings, power_of(profile, problem.size))
+    program = settings.optimizer_plc.program
     needed = footprint(problem, estimator_memory(prediction, program.estimator), program.solver)
+    sentences = [verdict(profile, program, problem, needed)]
+    if fits(profile, program, problem, needed):
+        sentences += [costs(settings)]
     speed = (
         f"\nP = {program.budget.power:.3g}, {profile.flops_per_s(problem.size) / 1e6:.3g} Mflop/s in loops of length "
         f"{problem.size}: {profile.source}\n"
         f"for a run there: --set optimizer_plc.program.budget.power={program.budget.power:.4g}\n"
     )
     return "\n".join([
-        verdict(profile, program, problem, needed),
-        *([costs] if costs else []),
+        *filter(None, sentences),
         speed,
         _iterations(program, problem, period_s),
         _memory(settings, problem, prediction, profile.memory_bytes),
     ])  # fmt: skip
-
-
-def runs_on(settings: Settings, profile: PlcProfile) -> bool:
-    """Return whether the configured problem fits a PLC, whose power is configured."""
-    program = settings.optimizer_plc.program
-    problem, prediction = problem_of(settings)
-    needed = footprint(problem, estimator_memory(prediction, program.estimator), program.solver)
-    return fits(profile, program, problem, needed)
 
 
 def problem_of(settings: Settings) -> tuple[PredictiveProblem, PredictionModel]:

@@ -92,9 +92,8 @@ def _certified(options: argparse.Namespace) -> str:
 
 
 def _tables(options: argparse.Namespace) -> str:
-    from rig.plc_sizing.budget_tables import budget_tables, plc_tables, problem_of, runs_on, with_power
+    from rig.plc_sizing.budget_tables import budget_tables, plc_tables, with_power
     from rig.plc_sizing.profile import find_profile
-    from rig.plc_sizing.verdict import power_of
 
     if len(set(options.loads)) < len(options.loads):
         raise UsageError("--load: a load is named twice; two of the same are no evidence")
@@ -103,13 +102,13 @@ def _tables(options: argparse.Namespace) -> str:
     profile = None if options.plc is None else find_profile(options.plc)
     settings = configuration(options).settings
     if profile is not None:
-        settings = with_power(settings, power_of(profile, problem_of(settings)[0].size))
-        costs = _costs(settings, options) if options.loads and runs_on(settings, profile) else ""
-        return plc_tables(settings, options.period, profile, costs)
+        return plc_tables(settings, options.period, profile, lambda there: _costs(there, options))
     return budget_tables(settings if options.power is None else with_power(settings, options.power), options.period)
 
 
 def _costs(settings: "Settings", options: argparse.Namespace) -> str:
+    if not options.loads:
+        return ""
     from rig.progress import make_console
     from rig.studies.adaptive_gain import adaptive_gain
 
