@@ -1,8 +1,8 @@
 """Arrays that a kernel borrows from its caller, without counting references to them.
 
 numba counts the references to each array that a kernel is given, for every call that passes it on, by atomic
-operations: with records of many arrays this took a third of a run. What the caller holds for the whole call need not
-be counted.
+operations; with records of many arrays a third of the samples of a run's compiled code were there. What the caller
+holds for the whole call need not be counted.
 """
 
 from typing import Any, TypeVar
