@@ -11,7 +11,8 @@ from importlib import import_module
 from typing import Final, NoReturn
 
 from coldloop import __version__
-from coldloop.errors import ColdloopError, printable
+from coldloop.errors import ColdloopError, UsageError, printable
+from rig.cli.process_option import OPTION, load_named_process
 from rig.interruption import INTERRUPTION
 
 COMMANDS: Final = {
@@ -37,6 +38,7 @@ COMMANDS: Final = {
     "registers": "the register maps",
     "certificates": "certificates for Modbus/TCP Security on a test site",
     "model": "the prediction model",
+    "process": "a process file: checked, linearised, judged, made into a model file",
     "identify": "by how much the gains of the prediction model should be scaled to predict a recorded run",
     "config": "the effective configuration and where each value comes from",
     "completion": "a script that completes commands and options in a shell",
@@ -56,6 +58,8 @@ def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     """Return the parser of all commands, with the options of the chosen one; other commands are not imported."""
     parser = OneLineParser(prog="coldloop", description="A networked PLC rig for fast MPC on a helium refrigerator.")
     parser.add_argument("--version", action="version", version=_version())
+    parser.add_argument(OPTION, metavar="FILE", help="another process than the cold box: a process file, or a model file"
+                        " made from one")  # fmt: skip
     parser.set_defaults(execute=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=OneLineParser)
     for name, summary in COMMANDS.items():
@@ -85,10 +89,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with INTERRUPTION:
         if "_ARGCOMPLETE" in os.environ:
             _complete()
-        parser = make_parser(given[0] if given else None)
         try:
-            code = _execute(parser, given)
+            given = load_named_process(given)
+            code = _execute(make_parser(given[0] if given else None), given)
             sys.stdout.flush()
+        except UsageError as error:
+            sys.stderr.write(f"coldloop: {error}\n")
+            return error.exit_code
         except BrokenPipeError:
             _discard_output()
             return 0

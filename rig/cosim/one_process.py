@@ -1,25 +1,28 @@
 """The three programs in one process, by direct calls; what would cross the bus is rounded as the bus would round it."""
 
 from contextlib import AbstractContextManager
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.load_profile import LoadProfile
+from coldloop.process.loaded import IS_COLD_BOX
 from coldloop.process.lti_model import load as load_model
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import LoadStep, Measurement, PlantSample, StationSample
+from coldloop.registers.plant import LoadStep, Measurement, PlantSample, StationSample, inputs_of
 from control_plc.program import ControlProgram
 from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
 from plant.kinds import plant_maker
 from plant.own_model import own_header
 from plant.program import PlantProgram
-from rig.cosim.compiled.stretches import CompiledStretches
 from rig.cosim.scenario import Scenario
 from rig.results.recording import Recorder
 from rig.settings import Settings
+
+if TYPE_CHECKING:
+    from rig.cosim.compiled.stretches import CompiledStretches
 
 
 class Listener(Protocol):
@@ -58,7 +61,7 @@ class Programs(NamedTuple):
     def _scan(self, listener: Listener) -> Update | None:
         plant = self.plant
         actuators = as_transmitted(self.control.begin_scan())
-        u = actuators[1:4]
+        u = inputs_of(actuators)
         plant.apply(u)
         measurement = as_transmitted(
             Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session)
@@ -107,6 +110,14 @@ class OneProcessRig:
     def _plant(self, load: LoadProfile, seed: int) -> PlantProgram:
         return plant_maker(self._header, self._settings.plant)(load, seed)
 
+    def _stretches(self, plant: PlantProgram, load: LoadProfile) -> "CompiledStretches | None":
+        """Return what runs ahead in compiled loops, where there are any: of the cold box and the refrigerator."""
+        if not (self._compiled and IS_COLD_BOX) or self._settings.plant.mismatch.beside_the_box:
+            return None
+        from rig.cosim.compiled.stretches import CompiledStretches  # noqa: PLC0415 not for other processes
+
+        return CompiledStretches(plant, self.control, self.optimizer, load)
+
     def _run(self, scenario: Scenario, recorder: Recorder) -> None:
         load = load_table(scenario.load)
         plant = self._plant(load, scenario.seed)
@@ -114,9 +125,7 @@ class OneProcessRig:
         self.optimizer.restart(scenario.updating_period_s)
         noted = self.control.journal.count
         self.control.restart(session=1)
-        stretches = None
-        if self._compiled and not self._settings.plant.mismatch.beside_the_box:
-            stretches = CompiledStretches(plant, self.control, self.optimizer, load)
+        stretches = self._stretches(plant, load)
         recorder.begin()
         while self.control.tick < scenario.ticks:
             stretch = stretches.ahead(scenario.ticks) if stretches else None

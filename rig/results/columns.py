@@ -19,7 +19,7 @@ from coldloop.registers.audit import Event
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import Actuators, ModelRangeStatus, PlantSample, StationMode, StationSample
+from coldloop.registers.plant import Actuators, ModelRangeStatus, PlantSample, StationMode, StationSample, inputs_of
 from rig.results.driving import SHOWN
 
 FORMAT: Final = 2
@@ -54,7 +54,7 @@ PHYSICAL_COLUMNS: Final = (
     Column("load_w", pa.float32(), "W", fields_of(PlantSample)["load"].description),
     *(
         Column(name, pa.float32(), field.unit, f"{field.description}; applied from this tick on")
-        for name, field in zip(INPUT_NAMES, list(fields_of(Actuators).values())[1:4], strict=True)
+        for name, field in zip(INPUT_NAMES, inputs_of(tuple(fields_of(Actuators).values())), strict=True)
     ),
     *(
         Column(name, pa.float32(), unit, f"Output {name}: with the noise of its sensor, without a sensor fault")

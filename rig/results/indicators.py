@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import L1, STATE_NAMES, T5, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.loaded import PROCESS
+from coldloop.process.signals import CONTROLLED, STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.optimizer_plc import Optimization
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.prediction import state_weights
@@ -49,7 +50,9 @@ class StageCost:
 
     def __init__(self, model: LtiModel, design: ControlDesign) -> None:
         n = len(STATE_NAMES)  # a model of the whole refrigerator has further ones, which weigh nothing
-        self._x0, self._u0 = model.x0[:n], model.u0
+        self._x0, self._u0, self._y0 = model.x0[:n], model.u0, model.y0
+        self._output_weights = np.array([output.weight for output in PROCESS.outputs])
+        self._outputs_weigh = bool(self._output_weights.any())
         self._state_weights = state_weights(model, design)[:n]
         self._design = design
 
@@ -58,13 +61,15 @@ class StageCost:
         design = self._design
         x = block.x.astype(float) - self._x0
         u = block.u.astype(float) - self._u0
-        constrained = block.y[:, [L1, T5]].astype(float)
+        constrained = block.y[:, CONTROLLED].astype(float)
         violation = np.maximum(constrained - design.output_high, 0) + np.maximum(design.output_low - constrained, 0)
         cost: NDArray[np.float64] = (
             (x**2 * self._state_weights).sum(axis=1)
             + (u**2 * design.input_weight).sum(axis=1)
             + (violation**2 * design.violation_weight).sum(axis=1)
         )
+        if self._outputs_weigh:
+            cost += ((block.y - self._y0) ** 2 * self._output_weights).sum(axis=1)
         return cost
 
 
@@ -75,7 +80,7 @@ class RunEvaluation(Sink):
         self._cost = StageCost(model, design)
         self._design = design
         self._digest = hashlib.sha256()
-        self._outside = np.zeros(2, dtype=int)
+        self._outside = np.zeros(len(CONTROLLED), dtype=int)
         self._stage_costs = 0.0
         self._j_dev = self._j_cst = self._weighted = self._violations = self._largest = 0.0
         self._taus = self._squared_taus = self._delivered = self._known = 0
@@ -83,7 +88,7 @@ class RunEvaluation(Sink):
 
     def block(self, block: SampleBlock) -> None:
         """Take ticks."""
-        constrained = block.y[:, [L1, T5]]
+        constrained = block.y[:, CONTROLLED]
         outside = (constrained < self._design.output_low) | (constrained > self._design.output_high)
         self._outside += outside.sum(axis=0)
         self._known += int(np.isfinite(block.load).sum())

@@ -7,7 +7,8 @@ from typing import Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process.limits import LEVEL_BAND, T5_BAND
+from coldloop.process.cold_box import LEVEL_BAND, T5_BAND
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.signals import TICK_S
 from coldloop.registers.safety import AlarmKind, AlarmPriority
 
@@ -107,7 +108,7 @@ class AlarmSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     level_band: tuple[FiniteFloat, FiniteFloat] = LEVEL_BAND
-    """L1, %."""
+    """L1, %, of the cold box, as the next."""
     t5_band: tuple[FiniteFloat, FiniteFloat] = T5_BAND
     """T5, K."""
     band_delay_s: Delay = 5.0
@@ -127,6 +128,13 @@ class AlarmSettings(BaseModel):
         if delayed:
             raise ValueError(f"{delayed[0]} happens at an instant and would never be raised; leave out its on_delay_s")
         return self
+
+    @property
+    def bands(self) -> tuple[tuple[float, float], ...]:
+        """Band of each output that has one."""
+        if IS_COLD_BOX:
+            return self.level_band, self.t5_band
+        return tuple((band.low, band.high) for band in PROCESS.bands)
 
     @property
     def band_ticks(self) -> int:

@@ -1,7 +1,7 @@
-"""The classical control of the cold box: two PI loops and a valve held constant (paper, section IV-A).
+"""The classical control: a PI loop for each output that has one; other inputs are held (paper, section IV-A).
 
-T5 is controlled by the turbine valve CV156, the level L1 by the actuator part of the heater NCR22, and CV155 is fixed
-where it is. Pure: measured outputs and applied inputs in, wanted inputs out. The output guard has the last word.
+Of the cold box T5 is controlled by the turbine valve CV156, the level L1 by the actuator part of the heater NCR22, and
+CV155 is fixed where it is. The loops of another process come with it. Pure: measured outputs and applied inputs in, wanted inputs out. The output guard has the last word.
 """
 
 import math
@@ -11,11 +11,10 @@ from typing import Annotated, Self
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 
 from coldloop.process.limits import InputLimits
-from coldloop.process.signals import INPUT_NAMES, L1, SAMPLING_PERIOD_S, T5, TICK_S
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.control_plc import SequenceRow
 
-NCR22 = INPUT_NAMES.index("NCR22_A")
-CV156 = INPUT_NAMES.index("CV156")
 
 
 class PiSettings(BaseModel):
@@ -46,7 +45,7 @@ class LevelLoop(PiSettings):
 
 
 class ClassicalSettings(BaseModel):
-    """The classical loops; `docs/science.md` says how they were tuned."""
+    """The classical loops of the cold box; `docs/science.md` says how they were tuned. Other processes bring theirs."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -54,6 +53,17 @@ class ClassicalSettings(BaseModel):
     level: LevelLoop = LevelLoop()
     period_s: Annotated[float, Field(ge=TICK_S, le=SAMPLING_PERIOD_S)] = SAMPLING_PERIOD_S
     """How often the loops are executed: a whole number of ticks, and no longer than the window of the rate limits."""
+
+    @property
+    def pairs(self) -> "tuple[tuple[str, str, PiSettings], ...]":
+        """Output, input and tuning of each loop."""
+        if IS_COLD_BOX:
+            return (("L1", "NCR22_A", self.level), ("T5", "CV156", self.temperature))
+        return tuple(
+            (output.name, loop.input, PiSettings(gain=loop.gain, integral_time_s=loop.integral_time_s))
+            for output in PROCESS.banded
+            if output.band is not None and (loop := output.band.loop) is not None
+        )
 
     @property
     def period_ticks(self) -> int:
@@ -124,12 +134,12 @@ class PiController:
 
 
 class ClassicalLoops:
-    """Both loops, and CV155 held.
+    """The loops; inputs that none moves are held.
 
     Args:
         settings: Tuning.
         limits: Bounds and rates of the inputs.
-        operating_outputs: The 22 outputs at the operating point, from which setpoints count.
+        operating_outputs: The outputs at the operating point, from which setpoints count.
     """
 
     def __init__(self, settings: ClassicalSettings, limits: InputLimits, operating_outputs: Sequence[float]) -> None:
@@ -146,19 +156,19 @@ class ClassicalLoops:
         self._period = settings.period_ticks
         self._seen: int | None = None
         self._executed: int | None = None
-        self._level = loop(settings.level, L1, NCR22)
-        self._temperature = loop(settings.temperature, T5, CV156)
+        places = ((OUTPUT_NAMES.index(y), INPUT_NAMES.index(u), tuning) for y, u, tuning in settings.pairs)
+        self._loops = [(output, actuator, loop(tuning, output, actuator)) for output, actuator, tuning in places]
 
     def restart(self) -> None:
         """Forget what was measured: the loops take over from whatever is applied next."""
         self._seen = self._executed = None
-        self._level.restart()
-        self._temperature.restart()
+        for _, _, loop in self._loops:
+            loop.restart()
 
     def wanted(
         self, tick: int, y: Sequence[float], applied: SequenceRow, *, without: Collection[int] = ()
     ) -> SequenceRow:
-        """Return the inputs wanted at `tick`, from the newest outputs y (22) and the inputs applied until now.
+        """Return the inputs wanted at `tick`, from the newest outputs y and the inputs applied until now.
 
         A loop whose output is among those to do `without` is left: its input stays.
 
@@ -170,11 +180,11 @@ class ClassicalLoops:
             return applied
         elapsed_s = None if self._executed is None else min(tick - self._executed, LONGEST_GAP * self._period) * TICK_S
         self._executed = tick
-        level, temperature = (math.nan if output in without else y[output] for output in (L1, T5))
-        return applied._replace(
-            ncr22=self._level.execute(level, applied.ncr22, elapsed_s),
-            cv156=self._temperature.execute(temperature, applied.cv156, elapsed_s),
-        )
+        inputs = list(applied)
+        for output, actuator, loop in self._loops:
+            measured = math.nan if output in without else y[output]
+            inputs[actuator] = loop.execute(measured, applied[actuator], elapsed_s)
+        return SequenceRow(*inputs)
 
     def _is_due(self, tick: int) -> bool:
         seen, self._seen = self._seen, tick

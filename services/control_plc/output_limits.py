@@ -1,7 +1,7 @@
 """The arithmetic of the output guard: bounds, rate window, slew limit, on numbers and sequences of numbers.
 
-Plain Python, for the control PLC has no numba; the rig compiles these very functions. Outputs are in the order
-(CV155 %, NCR22_A W, CV156 %).
+Plain Python, for the control PLC has no numba; the rig compiles these very functions. Outputs are in the order of the
+inputs of the process.
 """
 
 import math
@@ -11,9 +11,10 @@ from typing import Final, NamedTuple
 
 from coldloop.kernels.single_precision import neighbour, single
 from coldloop.process.limits import InputLimits, RateReference
-from coldloop.process.signals import TICKS_PER_SAMPLE
+from coldloop.process.signals import INPUT_NAMES, TICKS_PER_SAMPLE
 from control_plc.numbers import Numbers, Rows
 
+N_INPUTS: Final = len(INPUT_NAMES)
 TOLERANCE: Final = 1e-5
 """Share of an input's range by which a sequence may miss a limit: single precision cannot tell it apart. The guard
 itself allows nothing."""
@@ -26,11 +27,11 @@ NEVER: Final = -(2**40)
 class Limits(NamedTuple):
     """`InputLimits` as plain numbers."""
 
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    rate: tuple[float, float, float]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    rate: tuple[float, ...]
     """Largest change in a sampling period of 5 s."""
-    slack: tuple[float, float, float]
+    slack: tuple[float, ...]
     """By which a sequence may miss a bound or a rate."""
     slew_ticks: int
     """Within fewer ticks than this an output moves by at most its rate."""
@@ -40,9 +41,9 @@ class Limits(NamedTuple):
 
 def plain(limits: InputLimits) -> Limits:
     """Return limits as plain numbers."""
-    slack = [TOLERANCE * (high - low) for low, high in zip(limits.low, limits.high, strict=True)]
+    slack = tuple(TOLERANCE * (high - low) for low, high in zip(limits.low, limits.high, strict=True))
     elapsed = limits.rate_reference is RateReference.ELAPSED
-    return Limits(limits.low, limits.high, limits.rate, (slack[0], slack[1], slack[2]), limits.slew_ticks, elapsed)
+    return Limits(limits.low, limits.high, limits.rate, slack, limits.slew_ticks, elapsed)
 
 
 @dataclass(slots=True)
@@ -54,13 +55,15 @@ class GuardState:
     """
 
     applied: MutableSequence[float]
-    """Outputs applied, shape (3,)."""
+    """Outputs applied, shape (inputs,)."""
     anchor: MutableSequence[float]
-    """Outputs applied before the window began, shape (3,)."""
+    """Outputs applied before the window began, shape (inputs,)."""
+    coming: MutableSequence[float]
+    """Room for what is about to be applied, shape (inputs,)."""
     moves: MutableSequence[int]
     """Tick of each of the last changes, in turn, shape (slew_ticks,)."""
     before: MutableSequence[MutableSequence[float]]
-    """Outputs applied before each of them, shape (slew_ticks, 3)."""
+    """Outputs applied before each of them, shape (slew_ticks, inputs)."""
     start: int = 0
     share: float = 1.0
     """Depends on how long before the window the outputs last moved."""
@@ -75,16 +78,16 @@ class GuardState:
 def beginning(limits: Limits, applied: Numbers) -> GuardState:
     """Return the state after `applied` has been constant for ever."""
     slots = range(limits.slew_ticks)
-    return GuardState(list(applied), list(applied), [NEVER for _ in slots], [list(applied) for _ in slots])
+    return GuardState(list(applied), list(applied), list(applied), [NEVER for _ in slots], [list(applied) for _ in slots])
 
 
 def copy_state(source: GuardState, target: GuardState, limits: Limits) -> None:
     """Make `target` the same as `source`."""
-    for i in range(3):
+    for i in range(N_INPUTS):
         target.applied[i], target.anchor[i] = source.applied[i], source.anchor[i]
     for slot in range(limits.slew_ticks):
         target.moves[slot] = source.moves[slot]
-        for i in range(3):
+        for i in range(N_INPUTS):
             target.before[slot][i] = source.before[slot][i]
     target.start, target.share = source.start, source.share
     target.moved, target.changes, target.out_of_bounds = source.moved, source.changes, source.out_of_bounds
@@ -96,30 +99,41 @@ def rate_share(limits: Limits, elapsed_ticks: int) -> float:
 
 
 def admit(state: GuardState, limits: Limits, tick: int, wanted: Numbers, update: bool) -> None:  # noqa: FBT001 compiled
-    """Apply `wanted` (3) at `tick` as far as the limits allow; `update`: a sequence begins there."""
+    """Apply `wanted` (inputs,) at `tick` as far as the limits allow; `update`: a sequence begins there."""
     applied = state.applied
     if update or tick - state.start >= TICKS_PER_SAMPLE:
         state.share = rate_share(limits, tick - state.moved)
         state.start = tick
-        for i in range(3):
+        for i in range(N_INPUTS):
             state.anchor[i] = applied[i]
-    same = wanted[0] == applied[0] and wanted[1] == applied[1] and wanted[2] == applied[2]
-    if same and not state.out_of_bounds:  # it was admitted before, and a new window begins with it
+    if same(wanted, applied) and not state.out_of_bounds:  # it was admitted before, and a new window begins with it
         return
-    a, b, c = (
-        nearest(state, limits, tick, wanted[0], 0),
-        nearest(state, limits, tick, wanted[1], 1),
-        nearest(state, limits, tick, wanted[2], 2),
-    )
-    if not (a == applied[0] and b == applied[1] and c == applied[2]):
-        slot = state.changes % limits.slew_ticks
-        state.moves[slot] = state.moved = tick
-        for i in range(3):
-            state.before[slot][i] = applied[i]
-        state.changes += 1
-        applied[0], applied[1], applied[2] = a, b, c
+    change(state, limits, tick, wanted)
     if state.out_of_bounds:
         state.out_of_bounds = not in_range(limits, applied)
+
+
+def change(state: GuardState, limits: Limits, tick: int, wanted: Numbers) -> None:
+    """Apply what is nearest to `wanted`, and remember what was applied before if that is another."""
+    applied, slot = state.applied, state.changes % limits.slew_ticks
+    for i in range(N_INPUTS):  # of this slot too, which is the oldest, each is still limited by what it held
+        state.coming[i] = nearest(state, limits, tick, wanted[i], i)
+    if same(state.coming, applied):
+        return
+    state.moves[slot] = state.moved = tick
+    for i in range(N_INPUTS):
+        state.before[slot][i] = applied[i]
+    state.changes += 1
+    for i in range(N_INPUTS):
+        applied[i] = state.coming[i]
+
+
+def same(one: Numbers, other: Numbers) -> bool:
+    """Return whether two rows of outputs are the same."""
+    for i in range(N_INPUTS):
+        if one[i] != other[i]:
+            return False
+    return True
 
 
 def nearest(state: GuardState, limits: Limits, tick: int, wanted: float, i: int) -> float:
@@ -158,9 +172,9 @@ def is_reached(state: GuardState, limits: Limits, tick: int, value: float, i: in
 
 
 def in_range(limits: Limits, row: Numbers) -> bool:
-    """Return whether the outputs (3) are finite and inside the bounds, but for the slack."""
+    """Return whether the outputs are finite and inside the bounds, but for the slack."""
     inside = True
-    for i in range(3):
+    for i in range(N_INPUTS):
         inside = inside and limits.low[i] - limits.slack[i] <= row[i] <= limits.high[i] + limits.slack[i]
     return inside
 
@@ -169,7 +183,7 @@ def admits(state: GuardState, limits: Limits, first_tick: int, rows: Rows, lengt
     """Return whether a sequence of `length` rows, one per tick, would be applied unchanged; `state` advances."""
     for k in range(length):
         admit(state, limits, first_tick + k, rows[k], k == 0)
-        for i in range(3):
+        for i in range(N_INPUTS):
             if abs(state.applied[i] - rows[k][i]) > limits.slack[i]:
                 return False
     return True

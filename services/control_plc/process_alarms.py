@@ -3,12 +3,11 @@
 from collections.abc import Collection, Sequence
 from typing import Final
 
-from coldloop.process.signals import L1, T5
+from coldloop.process.signals import CONTROLLED
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.safety import AlarmKind, CapacityCause
 from coldloop.service.journal import Journal
-from control_plc.alarm_settings import AlarmSettings
 from control_plc.alarms import AlarmPanel
 from control_plc.ladder import Ladder
 
@@ -24,10 +23,10 @@ class ProcessAlarms:
     Args:
         panel: Whose alarms they are.
         journal: Where sensors that became bad or good are noted.
-        bands: Has the bands of L1 and T5.
+        bands: Of the outputs that have one: L1 and T5 of the cold box.
     """
 
-    def __init__(self, panel: AlarmPanel, journal: Journal, bands: AlarmSettings) -> None:
+    def __init__(self, panel: AlarmPanel, journal: Journal, bands: Sequence[tuple[float, float]]) -> None:
         self._panel = panel
         self._journal = journal
         self._bands = bands
@@ -58,11 +57,9 @@ class ProcessAlarms:
             suspects: Outputs that the optimiser does without: bit i is output i.
         """
         report = self._panel.report
-        for kind, value, (low, high) in (
-            (AlarmKind.LEVEL_BAND, y[L1], self._bands.level_band),
-            (AlarmKind.T5_BAND, y[T5], self._bands.t5_band),
-        ):
-            report(kind, condition=not low <= value <= high)
+        outside = [not low <= y[output] <= high for output, (low, high) in zip(CONTROLLED, self._bands, strict=True)]
+        report(AlarmKind.LEVEL_BAND, condition=outside[0])
+        report(AlarmKind.T5_BAND, condition=any(outside[1:]))
         mode, cause = ladder.mode, ladder.cause
         fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR)
         report(AlarmKind.MODE, condition=fallen, cause=cause)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from coldloop.errors import ConfigurationError
 from coldloop.process.limits import InputLimits
-from coldloop.process.load_profile import MAX_LOAD_W
+from coldloop.process.load_profile import LOAD_SPAN
 from coldloop.process.model_file import ModelHeader
 from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.audit import EventKind
@@ -171,7 +171,7 @@ class ControlProgram:
         self._in_scan = False
         self.watchdog.set(self.watchdog.time, tick)
         self._loops.restart()
-        self._process_alarms = ProcessAlarms(self.alarms, self.journal, self.alarm_settings)
+        self._process_alarms = ProcessAlarms(self.alarms, self.journal, self.alarm_settings.bands)
         self.alarms.begin_at(tick)
 
     # -- what others see -----------------------------------------------------------------------------------------------
@@ -305,7 +305,7 @@ class ControlProgram:
         applied = tuple(self.guard.applied)
         y = tuple(self.sensors.check(self.tick, measurement.y, applied, measurement.x, (measurement.load,)))
         self.process = Process(self.tick, measurement.load, applied, y)
-        self._unknown = not (0.0 <= measurement.load <= MAX_LOAD_W and _are_states(measurement.x))
+        self._unknown = not (LOAD_SPAN[0] <= measurement.load <= LOAD_SPAN[1] and _are_states(measurement.x))
         self._let_play(usable=self._usable)
         latched = None
         if self.player.latches(self.tick, measurement.load):

@@ -10,13 +10,13 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process.signals import L1, OUTPUT_NAMES, T1, T5, TICK_S
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, T1, TICK_S
 from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
-CONTROLLED = (L1, T5)
-P1 = OUTPUT_NAMES.index("P1")
-"""First of the pressures, which are the last outputs; the temperatures, from T1 on, are before them."""
+FIRST_OF_KIND, P1 = (T1, OUTPUT_NAMES.index("P1")) if IS_COLD_BOX else (0, 0)
+"""First of the pressures, which are the last outputs; the temperatures are before them. Other outputs have one kind."""
 MOVES = 240
 """Ticks in which an output that is not controlled must have moved before it can be frozen."""
 FIRST_RESTS = [0 if output in CONTROLLED else -MOVES for output in range(len(OUTPUT_NAMES))]
@@ -55,7 +55,9 @@ class SensorCheckSettings(BaseModel):
     @property
     def ranges(self) -> tuple[Range, ...]:
         """Range of each output."""
-        return (self.level, self.speed, *[self.temperature] * 10, *[self.pressure] * 10)
+        return tuple(
+            getattr(self, output.quantity) if output.quantity else output.range for output in PROCESS.outputs
+        )
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -90,8 +92,8 @@ def count_unchanged(
     moves that are missing until they count.
     """
     most = 2 * moved(before, y, 0, len(y)) > len(y)
-    temperatures, pressures = moved(before, y, T1, P1), moved(before, y, P1, len(y))
-    most_of_each = 2 * temperatures > P1 - T1 and 2 * pressures > len(y) - P1
+    temperatures, pressures = moved(before, y, FIRST_OF_KIND, P1), moved(before, y, P1, len(y))
+    most_of_each = (P1 == 0 or 2 * temperatures > P1 - FIRST_OF_KIND) and 2 * pressures > len(y) - P1
     for output in range(len(y)):
         if y[output] == before[output]:
             unchanged[output] += elapsed * (most if output in CONTROLLED else most_of_each)

@@ -20,6 +20,7 @@ from coldloop.registers.optimizer_plc import (
     ModelDeviation,
     Optimization,
     Prediction,
+    outputs_of,
 )
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriority, AlarmState
 from coldloop.service.event_text import alarm_cause, word
@@ -217,8 +218,7 @@ def prediction_document(prediction: Prediction) -> Document:
     return {
         "update": prediction.update,
         "time": [start + sample * SAMPLING_PERIOD_S for sample in PREDICTED_SAMPLES],
-        "L1": [rounded(value) for value in prediction.l1],
-        "T5": [rounded(value) for value in prediction.t5],
+        **{name: list(map(rounded, ahead)) for name, ahead in zip(BANDED_OUTPUTS, outputs_of(prediction), strict=True)},
         "input_time": [start + sample * SAMPLING_PERIOD_S for sample in INPUT_SAMPLES],
         **{name: [rounded(value) for value in one] for name, one in zip(INPUT_NAMES, inputs, strict=True)},
     }

@@ -10,10 +10,13 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import TICK_S
 from coldloop.process.updating_periods import LONGEST_TICKS, ComputingTimes
 
 MAX_PERIOD_TICKS = LONGEST_TICKS
+SLOT_S = 0.25 * PROCESS.share("preparation")
+"""Of the reference PLC."""
 
 
 class BudgetSettings(BaseModel):
@@ -25,7 +28,7 @@ class BudgetSettings(BaseModel):
     """P, relative to the reference PLC."""
     preparation_slots: Annotated[int, Field(ge=0, le=20)] = 1
     """Slots of 0.25 s / P that the preparation is given in an updating period."""
-    preparation_s: Annotated[float, Field(ge=0)] = 0.17
+    preparation_s: Annotated[float, Field(ge=0)] = 0.17 * PROCESS.share("preparation")
     """Time that it takes at P = 1: 89,000 operations at 0.53 Mflop/s (`docs/budget.md`)."""
 
 
@@ -33,7 +36,7 @@ class PlcBudget:
     """Converts between iterations and updating periods for one solver."""
 
     def __init__(self, settings: BudgetSettings, tau_1_s: float) -> None:
-        slots_s = settings.preparation_slots * TICK_S
+        slots_s = settings.preparation_slots * SLOT_S
         self.times = ComputingTimes(*(time / settings.power for time in (slots_s, settings.preparation_s, tau_1_s)))
 
     @cached_property

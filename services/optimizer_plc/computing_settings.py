@@ -1,11 +1,14 @@
 """Settings of what the optimiser computes with: arithmetic, estimator, solvers. It imports nothing that takes time."""
 
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
 
-from coldloop.process.signals import INPUT_NAMES, L1, OUTPUT_NAMES
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.per_signal import PositivePerInput
+from coldloop.process.signals import CONTROLLED, INPUT_NAMES, OUTPUT_NAMES
 
 PENALTY_WEIGHT = 3000.0
 """alpha that all solvers are judged by with the default weights. In a program's settings it follows from `penalties`
@@ -14,11 +17,12 @@ and `design.violation_weight` wherever it is not set."""
 
 SIGNALS: Final = (*OUTPUT_NAMES, *INPUT_NAMES)
 GROUPS: Final = {
-    "outputs": tuple(name for name in OUTPUT_NAMES if name != OUTPUT_NAMES[L1]),
-    "inputs": ("CV155", "CV156"),
+    "outputs": tuple(name for name in OUTPUT_NAMES if name != OUTPUT_NAMES[CONTROLLED[0]]),
+    "inputs": ("CV155", "CV156") if IS_COLD_BOX else INPUT_NAMES,
 }
-"""What `estimator.disturbances` calls all outputs, or inputs, that may have one: no sensor tells a constant error of L1
-from liquid helium, nor one of the heater from the load."""
+"""What `estimator.disturbances` calls all outputs, or inputs, that may have one. The first output with a band has none:
+no sensor tells a constant error of L1 from liquid helium, or of another from the load; nor one of the heater from it.
+"""
 
 
 class Arithmetic(StrEnum):
@@ -50,7 +54,7 @@ class EstimatorSettings(BaseModel):
     kind: EstimatorKind = EstimatorKind.KALMAN
     load_known: bool = True
     """Whether the heat load is measured; where it is not, all of it is load mismatch, and no period is interrupted."""
-    load_walk_w: PositiveFloat = 3.0
+    load_walk_w: PositiveFloat = PROCESS.load.walk
     """Random walk of the load mismatch, W; for a load that is not measured, of the size of its steps."""
     pressure_noise_pa: PositiveFloat = 50.0
     volume_noise_m3: PositiveFloat = 1e-5
@@ -72,8 +76,8 @@ class EstimatorSettings(BaseModel):
     plant that is not the model. That of an output is added to its reading, that of an input acts like more of it."""
     disturbance_walk: PositiveFloat = 3.0
     """Random walk of an output's constant over its sensor's standard deviation."""
-    input_walk: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (0.05, 0.5, 0.05)
-    """Random walk of an input's constant: %, W, %."""
+    input_walk: PositivePerInput = tuple(one.walk for one in PROCESS.inputs)
+    """Random walk of an input's constant, in its unit."""
     longest_riccati: Annotated[int, Field(ge=1)] = 2000
     """Longest run of the Riccati recursion for a stationary gain, in periods."""
 
@@ -89,6 +93,11 @@ class EstimatorSettings(BaseModel):
         if any(name not in SIGNALS for name in found) or len(set(found)) < len(found):
             raise ValueError(f"disturbances are a list, each once, of {', '.join((*GROUPS, *SIGNALS))}")
         return names
+
+    @property
+    def sensors(self) -> tuple[float, ...]:
+        """Standard deviation of each output's sensor, in its unit."""
+        return _by_quantity(self, "sensor", [output.noise for output in PROCESS.outputs])
 
     @property
     def disturbed(self) -> tuple[int, ...]:
@@ -124,7 +133,7 @@ class PlausibilitySettings(BaseModel):
     """A suspect that agrees with the others for so long is taken back."""
     longest_s: Annotated[float, Field(ge=0)] = 1800.0
     """It is taken back after so long in any case: what the others say of it is then no better."""
-    most: Annotated[int, Field(ge=0, le=len(OUTPUT_NAMES) - 1)] = 2
+    most: Annotated[int, Field(ge=0, le=len(OUTPUT_NAMES) - 1)] = min(2, len(OUTPUT_NAMES) - 1)
     """Readings that may be suspected at once; when more contradict the prediction it is the plant: the four gauges of
     the supply see a compressor trip."""
     model_sigmas: Annotated[float, Field(gt=0)] = 4.0
@@ -135,10 +144,15 @@ class PlausibilitySettings(BaseModel):
     @property
     def allowances(self) -> tuple[float, ...]:
         """Of each output."""
-        return (
-            self.level_allowance, self.speed_allowance, *[self.temperature_allowance] * 10,
-            *[self.pressure_allowance] * 10,
-        )  # fmt: skip
+        return _by_quantity(self, "allowance", [output.allowance for output in PROCESS.outputs])
+
+
+def _by_quantity(settings: BaseModel, what: str, declared: Sequence[float]) -> tuple[float, ...]:
+    """Return what a section sets for the quantity of each output; what is `declared` where it has none."""
+    return tuple(
+        getattr(settings, f"{output.quantity}_{what}") if output.quantity else value
+        for output, value in zip(PROCESS.outputs, declared, strict=True)
+    )
 
 
 def _members(names: tuple[str, ...]) -> list[str]:
@@ -166,7 +180,7 @@ class OdeSettings(BaseModel):
     hold_at_bounds: bool = True
     """Whether variables pressed against a bound are held during a step, instead of being projected after it only. Not
     in the paper."""
-    tau_1_s: PositiveFloat = 0.25
+    tau_1_s: PositiveFloat = 0.25 * PROCESS.share("ode")
 
 
 class QpoasesSettings(BaseModel):
@@ -176,7 +190,7 @@ class QpoasesSettings(BaseModel):
 
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Weight that its answers are judged with; qpOASES itself knows no penalty."""
-    tau_1_s: PositiveFloat = 0.475
+    tau_1_s: PositiveFloat = 0.475 * PROCESS.share("qpoases")
     """120 us a recalculation, slowed down by 4000 (paper, section VI), are 0.48 s; with a slot of 0.25 s for the
     preparation the paper's 10 iterations in 5 s at P = 1 need this."""
 
@@ -192,7 +206,7 @@ class OsqpSettings(BaseModel):
     """Step size of the multipliers: with less, truncated answers are worse, with more, convergence is slower."""
     relaxation: Annotated[float, Field(gt=0.0, lt=2.0)] = 1.6
     """What OSQP calls alpha."""
-    tau_1_s: PositiveFloat = 0.05
+    tau_1_s: PositiveFloat = 0.05 * PROCESS.share("osqp")
     """25,763 operations, dense, at 0.529 Mflop/s (`docs/budget.md`)."""
 
 
@@ -204,7 +218,7 @@ class FastGradientSettings(BaseModel):
     alpha: PositiveFloat = PENALTY_WEIGHT
     adaptive_restart: bool = True
     """Whether the momentum is dropped when it points uphill."""
-    tau_1_s: PositiveFloat = 0.03
+    tau_1_s: PositiveFloat = 0.03 * PROCESS.share("fast-gradient")
     """14,811 operations, dense, at 0.529 Mflop/s are 0.028 s (`docs/budget.md`)."""
 
 
@@ -216,7 +230,7 @@ class DaqpSettings(BaseModel):
     alpha: PositiveFloat = PENALTY_WEIGHT
     """Weight that its answers are judged with; DAQP itself knows no penalty."""
     primal_tolerance: PositiveFloat = 1e-9
-    tau_1_s: PositiveFloat = 4.75
+    tau_1_s: PositiveFloat = 4.75 * PROCESS.share("daqp")
     """One solve in an updating period of 5 s at P = 1: an oracle's time, not a measured one."""
 
 
@@ -233,7 +247,7 @@ class InteriorPointSettings(BaseModel):
     """It is never less than this."""
     margin: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1
     """Share of the box's width by which the guess is at least moved away from its bounds."""
-    tau_1_s: PositiveFloat = 0.17
+    tau_1_s: PositiveFloat = 0.17 * PROCESS.share("interior-point")
     """From an upper bound of our code's 78,769 operations, 0.149 s at 0.529 Mflop/s (`docs/budget.md`)."""
 
 

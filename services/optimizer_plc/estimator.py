@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.signals import OUTPUT_NAMES, SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
 from optimizer_plc.computing_settings import (
     SIGNALS,
@@ -212,19 +213,25 @@ def check_detectability(prediction: PredictionModel) -> None:
     )
 
 
-def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> StationaryGains:
-    """Return what the Kalman filter corrects with after every updating period."""
-    nx = prediction.n_states
-    C = np.ascontiguousarray(np.hstack([prediction.C, prediction.G]))
+def state_walks(prediction: PredictionModel, settings: EstimatorSettings) -> list[float]:
+    """Return the process noise of each state of the plant's model."""
+    if not IS_COLD_BOX:
+        return [state.walk for state in PROCESS.states]
     by_unit = {
         "Pa": settings.pressure_noise_pa, "m3": settings.volume_noise_m3, "K": settings.temperature_noise_k,
         "kg": settings.mass_noise_kg, "kg/s": settings.flow_noise_kg_s, "bar s": settings.integral_noise_bar_s,
     }  # fmt: skip
-    sensors = np.full(C.shape[0], settings.temperature_sensor)
-    sensors[0], sensors[1], sensors[12:] = settings.level_sensor, settings.speed_sensor, settings.pressure_sensor
+    return [by_unit[unit] for unit in prediction.model.state_units]
+
+
+def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> StationaryGains:
+    """Return what the Kalman filter corrects with after every updating period."""
+    nx = prediction.n_states
+    C = np.ascontiguousarray(np.hstack([prediction.C, prediction.G]))
+    sensors = np.array(settings.sensors)
     walks = np.concatenate([settings.disturbance_walk * sensors, settings.input_walk])
     drift = np.array([
-        *(by_unit[unit] for unit in prediction.model.state_units),
+        *state_walks(prediction, settings),
         *walks[list(prediction.disturbances)],
         settings.load_walk_w,
     ])  # fmt: skip

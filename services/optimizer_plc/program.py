@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import INPUT_NAMES, L1, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.signals import CONTROLLED, INPUT_NAMES, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import (
     INPUT_SAMPLES,
@@ -165,7 +165,8 @@ class OptimizerProgram:
         """
         estimator = self.constants.estimator
         load = update.load - estimator.w0 if estimator.load_known else None
-        level = update.y[L1] - estimator.y0[L1] if math.isfinite(update.y[L1]) else 0.0
+        first = CONTROLLED[0]
+        level = update.y[first] - estimator.y0[first] if math.isfinite(update.y[first]) else 0.0
         self.state.belief.begin_at_rest(self._rest_map, u, load, level)
         playing = self.state.playing
         playing.z[:], playing.u_before[:] = self.problem.hold(u), u
@@ -270,8 +271,8 @@ class OptimizerProgram:
         shown = outputs[[min(sample, horizon) - 1 for sample in PREDICTED_SAMPLES]]
         planned = inputs[[min(sample, horizon) - 1 for sample in INPUT_SAMPLES]]
         return Prediction(
-            int(self._now["update"]), int(header["first_tick"]), tuple(shown[:, 0].tolist()),
-            tuple(shown[:, 1].tolist()), tuple(planned.ravel().tolist()),
+            int(self._now["update"]), int(header["first_tick"]), *map(tuple, shown.T.tolist()),
+            tuple(planned.ravel().tolist()),
         )  # fmt: skip
 
     def model_deviation(self) -> ModelDeviation:

@@ -164,8 +164,11 @@ def row_at(tick: int, first_tick: int, length: int) -> int:
 
 @kernel
 def same_inputs(one: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
-    """Return whether two rows (3) are the same."""
-    return bool(one[0] == other[0] and one[1] == other[1] and one[2] == other[2])
+    """Return whether two rows (inputs,) are the same."""
+    for i in range(one.shape[0]):
+        if one[i] != other[i]:
+            return False
+    return True
 
 
 @kernel
@@ -244,6 +247,8 @@ def shortage(c: Constants, x: Array, w: float, load: float, most_open: float, no
     T5 getting too cold, by the constant error of T5. The load itself (W), where it is measured, is compared with what
     the plant holds that is as its model.
     """
+    if not c.target.limited:
+        return none
     measured = load - c.estimator.w0 if c.estimator.load_known else w
     low, high = bounds_at(c.target, x, most_open)
     _, most = loads_held(c.target, low, high)
@@ -256,6 +261,8 @@ def shortage(c: Constants, x: Array, w: float, load: float, most_open: float, no
 @kernel
 def most_open(c: Constants, u: Array, y: Array) -> float:
     """Return how far CV155 may be opened, a scaled deviation, by the inputs (3,), deviations, and the outputs (22,)."""
+    if np.isinf(c.approach):
+        return c.approach
     approach = y[T2] - y[T1]
     if math.isnan(approach):
         approach = y.dtype.type(0.0)

@@ -156,7 +156,7 @@ class ProgramSettings(BaseModel):
     @classmethod
     def _whole_ticks(cls, value: float) -> float:
         if value % TICK_S or 0 < value < SHORTEST_TICKS * TICK_S:
-            raise ValueError("an updating period is a multiple of 0.25 s from 0.5 s on, or 0 for adaptive")
+            raise ValueError(f"an updating period is a multiple of {TICK_S:g} s from {SHORTEST_TICKS * TICK_S:g} s on, or 0 for adaptive")
         return value
 
     @model_validator(mode="after")

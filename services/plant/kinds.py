@@ -7,6 +7,7 @@ from coldloop.errors import ConfigurationError, ModelFileError
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.model_file import COLD_BOX, ModelHeader
 from plant.cold_box.physics import REFERENCE, ColdBox
+from plant.cold_box.program import ColdBoxProgram
 from plant.components.valve import Valve
 from plant.mismatched import MismatchedPlant
 from plant.own_model import box_of
@@ -30,6 +31,10 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
         ConfigurationError: Its gains are not of the configured weights, or it is to differ from its model in what it
             cannot.
     """
+    if header.process:
+        from plant.own.maker import own_plant_maker  # noqa: PLC0415 a cold box starts without it
+
+        return own_plant_maker(header, partial(noise_of, section.sensors))
     if section.kind is PlantKind.COLD_BOX:
         if header.plant != COLD_BOX:
             raise ModelFileError(f"model.file: a model of the {header.plant}; set plant.kind to that, or take another")
@@ -65,7 +70,7 @@ def make_program(
         box, noise = mismatched_box(box_of(header), mismatch), noise_of(sensors, seed)
         if mismatch.beside_the_box:
             return MismatchedPlant(box=box, x0=header.x0, u0=header.u0, load=load, noise=noise, mismatch=mismatch)
-        return PlantProgram(box=box, x0=header.x0, u0=header.u0, load=load, noise=noise)
+        return ColdBoxProgram(box=box, x0=header.x0, u0=header.u0, load=load, noise=noise)
 
 
 def mismatched_box(box: ColdBox, mismatch: MismatchSettings) -> ColdBox:

@@ -3,6 +3,9 @@
 The paper does not print its load profiles. The six hours a to f are random telegraphs about the load of the operating
 point, each of another family; `docs/science.md` says how they were chosen. `a@2` is a second
 draw of the family of hour a.
+
+For other processes than the cold box the same telegraphs are stretched: in time as their tick is longer, in size so
+that 200 W are the way from the operating point's load to the nearer end of its span.
 """
 
 import random
@@ -10,10 +13,15 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.errors import LoadFileError
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile, read_load_file
-from coldloop.process.signals import TICK_S
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 
-HOUR_TICKS: Final = int(3600 / TICK_S)
+SECOND_TICKS: Final = int(1.0 / COLD_BOX.tick_s)
+"""Ticks of what is a second in the families below: of the cold box it is one."""
+HOUR_TICKS: Final = 3600 * SECOND_TICKS
+LARGEST_STEP: Final = 200.0
+"""Of the six families, W."""
 
 
 class LoadFamily(NamedTuple):
@@ -61,25 +69,25 @@ def telegraph(family: LoadFamily, mean_w: float) -> LoadProfile:
     if family.in_turn:
         return _pulses(family, mean_w, draw())
     times, watts = [0], [mean_w]
-    tick = round(family.longest_s / TICK_S)
+    tick = round(family.longest_s * SECOND_TICKS)
     while tick < HOUR_TICKS:
         step = mean_w + family.steps[int(draw() * len(family.steps))]
         if step != watts[-1]:
             times.append(tick)
             watts.append(step)
-        tick += round((family.shortest_s + draw() * (family.longest_s - family.shortest_s)) / TICK_S)
+        tick += round((family.shortest_s + draw() * (family.longest_s - family.shortest_s)) * SECOND_TICKS)
     return LoadProfile(tuple(times), tuple(watts))
 
 
 def _pulses(family: LoadFamily, mean_w: float, phase: float) -> LoadProfile:
     """Return an hour of pulses that begins at the mean for a share `phase` (0 to 1) of the longest time."""
     (low, high), times, watts = family.steps, [0], [mean_w]
-    tick = 1 + round(phase * family.longest_s / TICK_S)
+    tick = 1 + round(phase * family.longest_s * SECOND_TICKS)
     while tick < HOUR_TICKS:
         rising = watts[-1] == mean_w + low
         times.append(tick)
         watts.append(mean_w + (high if rising else low))
-        tick += round((family.shortest_s if rising else family.longest_s) / TICK_S)
+        tick += round((family.shortest_s if rising else family.longest_s) * SECOND_TICKS)
     return LoadProfile(tuple(times), tuple(watts))
 
 
@@ -110,6 +118,19 @@ def named_families(name: str) -> list[LoadFamily] | None:
     return [HOURS[hour]._replace(seed=HOURS[hour].seed + seeds) for hour in NAMED[base]]
 
 
+def _stretched(family: LoadFamily, name: str, mean: float) -> LoadFamily:
+    """Return a family whose largest step is the way from the mean to the nearer end of the load's span.
+
+    Raises:
+        LoadFileError: Its steps are larger than those of the six hours.
+    """
+    low, high = PROCESS.load.span
+    if max(map(abs, family.steps)) > LARGEST_STEP:
+        raise LoadFileError(f"load {name}: of a refrigerator; name another, or a CSV file with loads of this plant")
+    scale = min(mean - low, high - mean) / LARGEST_STEP
+    return family._replace(steps=tuple(scale * step for step in family.steps))
+
+
 def find_load(name: str, mean_w: float) -> LoadProfile:
     """Return the load of a name or of a CSV file.
 
@@ -117,6 +138,8 @@ def find_load(name: str, mean_w: float) -> LoadProfile:
         LoadFileError: There is neither such a name nor a file that can be read, or the mean is too low for its steps.
     """
     families = named_families(name)
+    if families is not None and not IS_COLD_BOX:
+        return concatenated([telegraph(_stretched(family, name, mean_w), mean_w) for family in families])
     if families is not None:
         lowest = mean_w + min(step for family in families for step in family.steps)
         if lowest < 0.0:

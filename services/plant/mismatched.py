@@ -1,21 +1,24 @@
 """A cold box whose heater, load, level gauge or actuators are not as the optimiser believes."""
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
-from coldloop.process.signals import INPUT_NAMES, L1
+from coldloop.process.signals import L1
 from plant.cold_box.physics import ColdBox
+from plant.cold_box.program import ColdBoxProgram
 from plant.numeric import RealArray
-from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+from plant.program import HeatLoad, MeasurementNoise
 from plant.settings import MismatchSettings
 
-HEATER: Final = INPUT_NAMES.index("NCR22_A")
+HEATER: Final = 1
+"""NCR22_A."""
 
 
-class MismatchedPlant(PlantProgram):
+class MismatchedPlant(ColdBoxProgram):
     """Inputs act later and the heater otherwise, the load is another than is announced, L1 is shown by a wrong scale.
 
     Args:
@@ -52,12 +55,13 @@ class MismatchedPlant(PlantProgram):
         """Return inputs on their way that are all the same."""
         return deque([np.array(u, dtype=float)] * self._mismatch.delay_ticks)
 
-    def _step(self, w: float, *, held: bool) -> tuple[RealArray, RealArray]:  # noqa: ARG002 what acts may move on
+    def _step(self, w: float) -> tuple[RealArray, RealArray]:
         self._on_their_way.append(self._u)
         u = self._on_their_way.popleft().copy()
         u[HEATER] *= self._mismatch.heater
         asked, self._u = self._u, u
-        reached = super()._step(w * self._mismatch.load, held=False)
+        self._held = (math.nan,) * 4  # what acts may have moved on
+        reached = super()._step(w * self._mismatch.load)
         self._u = asked
         return reached
 

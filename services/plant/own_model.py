@@ -23,6 +23,11 @@ def own_header(file: Path) -> ModelHeader:
         ModelFileError: The file cannot be read, its parameters cannot be used, or the model was made from others.
     """
     header = read_header(file)
+    if header.process:
+        from plant.own.maker import check_signals  # noqa: PLC0415 a cold box starts without it
+
+        check_signals(header)
+        return header
     names = (header.state_names[: len(STATE_NAMES)], header.input_names, header.output_names)
     own = _own_parameters_digest(header.plant, box_of(header, str(file)))
     if header.parameters_digest != own or names != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):

@@ -4,12 +4,14 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Final
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
 from coldloop.modbus.endpoints import PLANT_PORT
 from coldloop.modbus.settings import ServerSettings
 from coldloop.process.limits import InputLimits
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.model_settings import ModelSettings
+from coldloop.process.per_signal import PerInput
 from coldloop.process.signals import TICK_S
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
@@ -26,9 +28,6 @@ SHOWN: Final = (
 """What of the configuration decides results: shown in the registers. Load and seed are those of a session."""
 
 Deviation = Annotated[float, Field(ge=0)]
-Percent = Annotated[float, Field(ge=0, le=100)]
-Power = Annotated[float, Field(ge=0, le=1000)]
-
 
 Factor = Annotated[float, Field(ge=0.5, le=1.4)]
 
@@ -73,6 +72,8 @@ class SensorSettings(BaseModel):
     """K."""
     pressure: Deviation = 0.0
     """bar."""
+    declared: Deviation = 0.0
+    """Of other processes than the cold box: over the noise that the process declares."""
     level_bias: FiniteFloat = 0.0
     """%: that much is shown too much, as by the next two."""
     temperature_bias: FiniteFloat = 0.0
@@ -83,12 +84,15 @@ class SensorSettings(BaseModel):
     @property
     def deviations(self) -> tuple[float, ...]:
         """Standard deviation of each output."""
-        return (self.level, self.speed, *[self.temperature] * 10, *[self.pressure] * 10)
+        return tuple(
+            getattr(self, output.quantity) if output.quantity else self.declared * output.noise
+            for output in PROCESS.outputs
+        )
 
     @property
     def biases(self) -> tuple[float, ...]:
         """Bias of each output."""
-        return (self.level_bias, 0.0, *[self.temperature_bias] * 10, *[self.pressure_bias] * 10)
+        return tuple(getattr(self, f"{output.quantity}_bias", 0.0) for output in PROCESS.outputs)
 
 
 class SafeAction(StrEnum):
@@ -108,8 +112,17 @@ class WatchdogSettings(BaseModel):
     timeout_s: Annotated[float, Field(ge=0, le=16_000)] = 10.0
     """Plant time without new outputs after which it expires; 0 is never. In lock-step plant time then stops."""
     action: SafeAction = SafeAction.HOLD
-    safe_state: tuple[Percent, Power, Percent] = (43.0, 75.0, 36.0)
-    """CV155 %, NCR22_A W, CV156 %."""
+    safe_state: PerInput = tuple(one.safe for one in PROCESS.inputs)
+    """Of each input: of the cold box CV155 %, NCR22_A W, CV156 %."""
+
+    @field_validator("safe_state")
+    @classmethod
+    def _within_registers(cls, values: tuple[float, ...]) -> tuple[float, ...]:
+        for one, value in zip(PROCESS.inputs, values, strict=True):
+            low, high = one.span
+            if not low <= value <= high:
+                raise ValueError(f"{one.name} = {value:g} is outside {low:g} to {high:g} {one.unit}".rstrip())
+        return values
 
     @property
     def ticks(self) -> int:
@@ -130,6 +143,8 @@ class PlantKind(StrEnum):
     """S1 and S2; pressures and inlet temperature are constant."""
     REFRIGERATOR = "refrigerator"
     """S1 to S4: with nitrogen pre-cooler and compression station."""
+    OF_PROCESS = "of-process"
+    """That of the process which programs are loaded with."""
 
 
 class RefrigeratorSettings(BaseModel):
@@ -152,7 +167,7 @@ class PlantSection(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    kind: PlantKind = PlantKind.COLD_BOX
+    kind: PlantKind = PlantKind.COLD_BOX if IS_COLD_BOX else PlantKind.OF_PROCESS
     refrigerator: RefrigeratorSettings = RefrigeratorSettings()
     """Read by the refrigerator only, as is `station`."""
     station: StationSettings = StationSettings()

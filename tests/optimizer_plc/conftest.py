@@ -137,7 +137,7 @@ def recorded_jumps(model: LtiModel, hour: str, minutes: float) -> list[Jump]:
         optimizer = OptimizerProgram(model, settings, InputLimits())
     control = make_program(read_header(DEFAULT_MODEL_FILE), ControlSection(), InputLimits())
     control.restart(session=1)
-    plant = PlantProgram(
+    plant = ColdBoxProgram(
         box=REFERENCE, x0=model.x0.tolist(), u0=model.u0.tolist(), load=find_load(hour, model.w0), noise=None
     )
     jumps: list[Jump] = []

@@ -23,7 +23,7 @@ def program(model: LtiModel, **changes: Any) -> PlantProgram:  # noqa: ANN401
         "u0": model.u0.tolist(),
         "load": LoadProfile((0,), (model.w0,)),
     }
-    return PlantProgram(**(arguments | changes))
+    return ColdBoxProgram(**(arguments | changes))
 
 
 def test_at_the_operating_point_nothing_moves(model: LtiModel) -> None:

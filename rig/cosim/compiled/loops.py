@@ -36,7 +36,7 @@ def look(w: World, alarms: Alarms, s: Any, plant: PlantState, trace: Trace) -> b
     load = w.load_watts[s.load_index]
     trace.load[row], trace.y[row], trace.x[row], trace.station[row] = load, plant.y, plant.x, plant.station
     y, x = trace.y[row], trace.x[row]
-    known = 0.0 <= load <= w.largest_load
+    known = w.least_load <= load <= w.largest_load
     for i in range(x.shape[0]):
         known = known and np.isfinite(x[i])
     interrupted = s.load_step > 0.0 and abs(load - s.update_load) > s.load_step

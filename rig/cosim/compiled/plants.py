@@ -11,9 +11,9 @@ from numba.extending import overload
 from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import TICK_S
 from plant.cold_box.physics import evaluate
+from plant.cold_box.program import ColdBoxProgram
 from plant.helium.properties import load_helium
 from plant.integrator import advance_along
-from plant.program import PlantProgram
 from plant.refrigerator.physics import BOX_STATES, REFERENCE_REFRIGERATOR, SIGNALS
 from plant.refrigerator.program import RefrigeratorProgram
 from plant.refrigerator.tick import ALARMS, MODE, RefrigeratorMemory, advance_tick
@@ -74,14 +74,14 @@ def show_station(m: RefrigeratorMemory, station: Array) -> None:
     station[SIGNALS + 1] = m.status[ALARMS]
 
 
-def constants_of(program: PlantProgram) -> PlantConstants:
+def constants_of(program: ColdBoxProgram) -> PlantConstants:
     """Return what does not change in a session."""
     if isinstance(program, RefrigeratorProgram):
         return RefrigeratorConstants(REFERENCE_REFRIGERATOR, load_helium(), program.law)
     return BoxConstants(program.box, load_helium())
 
 
-def state_of(program: PlantProgram, noise: Array, ticks: int) -> PlantState:
+def state_of(program: ColdBoxProgram, noise: Array, ticks: int) -> PlantState:
     """Return the present state, and what the next `ticks` ticks bring."""
     y = np.array(program.measure())
     if isinstance(program, RefrigeratorProgram):
@@ -93,7 +93,7 @@ def state_of(program: PlantProgram, noise: Array, ticks: int) -> PlantState:
     return BoxState(x, y, np.empty(0), noise, slope, held)
 
 
-def restore(program: PlantProgram, state: PlantState, tick: int, u: Array) -> None:
+def restore(program: ColdBoxProgram, state: PlantState, tick: int, u: Array) -> None:
     """Resume the program at `tick`, up to which the inputs `u` were held."""
     if isinstance(state, BoxState):
         program.take_over(tick, state.x, state.slope, state.held, state.y)

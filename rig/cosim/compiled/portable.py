@@ -16,11 +16,13 @@ from control_plc import output_limits, sensors
 PORTABLE: Final[tuple[Callable[..., Any], ...]] = (
     output_limits.admit,
     output_limits.admits,
+    output_limits.change,
     output_limits.copy_state,
     output_limits.in_range,
     output_limits.is_reached,
     output_limits.nearest,
     output_limits.rate_share,
+    output_limits.same,
     sensors.are_inside,
     sensors.is_frozen,
     sensors.moved,

@@ -25,7 +25,7 @@ NOT: Final = -1
 """Tick of what is not."""
 
 GUARD: Final = np.dtype([
-    ("applied", "f8", 3), ("anchor", "f8", 3),
+    ("applied", "f8", 3), ("anchor", "f8", 3), ("coming", "f8", 3),
     ("moves", "i8", TICKS_PER_SAMPLE), ("before", "f8", (TICKS_PER_SAMPLE, 3)),
     ("start", "i8"), ("share", "f8"), ("moved", "i8"), ("changes", "i8"), ("out_of_bounds", "?"),
 ])  # fmt: skip
@@ -118,6 +118,7 @@ class World(NamedTuple):
     high: Array
     least: NDArray[np.int64]
     """Ticks for which each output is at least unchanged before it is frozen, shape (22,)."""
+    least_load: float
     largest_load: float
     watchdog: int
     """Time-out, ticks; 0 is off."""

@@ -4,7 +4,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.load_profile import MAX_LOAD_W, LoadProfile
+from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from control_plc.program import ControlProgram
@@ -47,7 +47,7 @@ class CompiledStretches:
         self._world = World(
             plants.constants_of(plant), plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
             control_plc.guard.limits, np.array(sensors.low), np.array(sensors.high), np.array(sensors.least),
-            MAX_LOAD_W, control_plc.watchdog.time, optimizer_plc.settings.interrupting_load_step_w,
+            *LOAD_SPAN, control_plc.watchdog.time, optimizer_plc.settings.interrupting_load_step_w,
         )  # fmt: skip
 
     def ahead(self, until: int) -> Stretch | None:

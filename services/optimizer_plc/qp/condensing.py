@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from optimizer_plc.qp.design import N_INPUTS, N_SLACKS, ControlDesign
 from optimizer_plc.qp.linear_algebra import multiply
-from optimizer_plc.qp.prediction import PredictionModel, state_weights
+from optimizer_plc.qp.prediction import PredictionModel, state_cost
 
 Array = NDArray[np.float64]
 
@@ -40,8 +40,8 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
     A, B, F = prediction.sample
     to_z = np.zeros((nx, n))
     to_s = np.hstack([np.eye(nx), np.zeros((nx, 1))])
-    Q = np.zeros(nx)  # disturbances weigh nothing
-    Q[: len(prediction.model.x0)] = state_weights(prediction.model, design)
+    Q, n_x = np.zeros((nx, nx)), len(prediction.model.x0)  # disturbances weigh nothing
+    Q[:n_x, :n_x] = state_cost(prediction.model, design)
     R = np.asarray(design.input_weight)
     resting = np.hstack([prediction.resting_inputs, np.zeros((N_INPUTS, 1))])
     weighted_resting = multiply(transposed(resting), np.diag(R))
@@ -53,7 +53,7 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
         to_z = multiply(A, to_z) + multiply(B, u_of_z)
         to_s = multiply(A, to_s)
         to_s[:, -1] += F[:, 0]
-        weighted_z, weighted_s = Q[:, None] * to_z, Q[:, None] * to_s
+        weighted_z, weighted_s = multiply(Q, to_z), multiply(Q, to_s)
         Phi += multiply(transposed(to_z), weighted_z) + multiply(transposed(u_of_z), R[:, None] * u_of_z)
         cross += 2.0 * (multiply(transposed(to_s), weighted_z) - multiply(weighted_resting, u_of_z))
         constant += multiply(transposed(to_s), weighted_s) + multiply(weighted_resting, resting)
@@ -66,7 +66,7 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
 
 
 def input_map(of_knots: Array, design: ControlDesign) -> Array:
-    """Return the matrix (3, n) from z to the input deviation at a sample with these knot weights (knots,)."""
+    """Return the matrix (inputs, n) from z to the input deviation at a sample with these knot weights (knots,)."""
     u_of_z = np.zeros((N_INPUTS, (N_INPUTS + N_SLACKS) * len(of_knots)))
     for knot, weight in enumerate(of_knots):
         for i in range(N_INPUTS):
@@ -75,7 +75,7 @@ def input_map(of_knots: Array, design: ControlDesign) -> Array:
 
 
 def slack_map(of_knots: Array) -> Array:
-    """Return the matrix (4, n) from z to the slacks at a sample with these knot weights (knots,)."""
+    """Return the matrix (slacks, n) from z to the slacks at a sample with these knot weights (knots,)."""
     n_inputs = N_INPUTS * len(of_knots)
     slack_of_z = np.zeros((N_SLACKS, n_inputs + N_SLACKS * len(of_knots)))
     for knot, weight in enumerate(of_knots):
@@ -85,8 +85,7 @@ def slack_map(of_knots: Array) -> Array:
 
 
 def _slack_weights(weights: Array, design: ControlDesign) -> Array:
-    level, temperature = design.violation_weight
-    rho = np.array([level, level, temperature, temperature])
+    rho = np.repeat(design.violation_weight, 2)
     n = (N_INPUTS + N_SLACKS) * weights.shape[1]
     total = np.zeros((n, n))
     for of_knots in weights:

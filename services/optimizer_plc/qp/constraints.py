@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 class OutputRows(NamedTuple):
-    """Rows -y_j - s <= -low and y_j - s <= high at each constraint instant, for L1 and then T5."""
+    """Rows -y_j - s <= -low and y_j - s <= high at each constraint instant, output by output."""
 
     Gamma: Array
     """Shape (rows, n)."""
@@ -39,18 +39,18 @@ class RateRows(NamedTuple):
     first: Array
     """1.0 for the rows of the first interval, shape (rows,)."""
     before: Array
-    """How gamma depends on the input before, shape (3, rows)."""
+    """How gamma depends on the input before, shape (inputs, rows)."""
     gains: Array
     """What the rows were multiplied by, shape (rows,)."""
 
 
 def output_rows(condensed: Condensed, design: ControlDesign, weights: Array, y0: Array) -> OutputRows:
-    """Return the rows of the bands; `weights` (N, knots) are those of the knots, `y0` L1 and T5 at rest."""
+    """Return the rows of the bands; `weights` (N, knots) are those of the knots, `y0` the outputs at rest."""
     rho = np.array(design.violation_weight)
     rows, states, bounds, gains = [], [], [], []
     for instant in design.constraint_instants:
         slack_of_z = slack_map(weights[instant - 1])
-        for output in range(2):
+        for output in range(len(rho)):
             y_z, y_s = condensed.outputs_z[instant - 1][output], condensed.outputs_s[instant - 1][output]
             margin = design.band_margin[output]
             low = design.output_low[output] + margin - y0[output]

@@ -135,15 +135,15 @@ class OutputMaps(NamedTuple):
     """How the constrained outputs over the horizon of N samples follow from a profile and the parameters."""
 
     resting: Array
-    """L1 and T5 in turn at the operating point, shape (2 N,)."""
+    """The b outputs with a band in turn at the operating point, shape (b N,)."""
     of_z: Array
-    """Shape (n, 2 N)."""
+    """Shape (n, b N)."""
     of_x: Array
-    """Shape (n_x, 2 N)."""
+    """Shape (n_x, b N)."""
     of_w: Array
-    """Shape (2 N,)."""
+    """Shape (b N,)."""
     bands: Array
-    """Low, high and weight of L1 and T5, shape (3, 2)."""
+    """Low, high and weight of each, shape (3, b)."""
     row_gains: Array
     """What the rows of Gamma were multiplied by, shape (m,)."""
 
@@ -189,14 +189,14 @@ def deviation_cost(qp: QuadraticProblem, z: Array, n_inputs: int) -> float:
 def violation_cost(outputs: Array, through_w: Array, w: float, bands: Array) -> float:
     """Return the weighted squares of what outputs + through_w w miss their bands by.
 
-    Outputs (2 N) are L1 and T5 in turn; bands (3, 2) are low, high and weight.
+    Outputs (b N) are the b that have a band, in turn; bands (3, b) are low, high and weight.
     """
-    zero = outputs.dtype.type(0.0)
+    zero, count = outputs.dtype.type(0.0), bands.shape[1]
     total = zero
     for i in range(outputs.shape[0]):
-        y = outputs[i] + through_w[i] * w
-        miss = max(y - bands[1, i % 2], zero) + max(bands[0, i % 2] - y, zero)
-        total += bands[2, i % 2] * miss * miss
+        y, band = outputs[i] + through_w[i] * w, i % count
+        miss = max(y - bands[1, band], zero) + max(bands[0, band] - y, zero)
+        total += bands[2, band] * miss * miss
     return total
 
 

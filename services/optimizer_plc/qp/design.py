@@ -9,14 +9,12 @@ from typing import Annotated, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 
-from coldloop.process.limits import LEVEL_BAND, T5_BAND
+from coldloop.process.loaded import PROCESS
+from coldloop.process.per_signal import PerBand, PerInput, PositivePerBand
 
-N_INPUTS = 3
-N_SLACKS = 4
-"""Slack inputs of the paper: L1 low, L1 high, T5 low, T5 high."""
-
-Triple = tuple[float, float, float]
-Pair = tuple[float, float]
+N_INPUTS = len(PROCESS.inputs)
+N_SLACKS = 2 * len(PROCESS.bands)
+"""Slack inputs: below and above each band; of the paper L1 low, L1 high, T5 low, T5 high."""
 
 
 def _rising_instants(instants: tuple[int, ...]) -> tuple[int, ...]:
@@ -39,27 +37,27 @@ class Target(StrEnum):
 
 
 class ControlDesign(BaseModel):
-    """The constrained control problem. Inputs are in the order (CV155 %, NCR22_A W, CV156 %)."""
+    """The constrained control problem: what has a number for each input or band is in their order in the process."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    decision_instants: Instants = (1, 2, 4, 8, 16, 50, 100)
-    constraint_instants: Instants = (1, 2, 3, 4, 6, 8, 16, 24, 32, 48, 60, 72, 84, 100)
-    output_low: Pair = (LEVEL_BAND[0], T5_BAND[0])
-    """Bands of L1 (%) and T5 (K)."""
-    output_high: Pair = (LEVEL_BAND[1], T5_BAND[1])
-    band_margin: Pair = (0.0, 0.0)
-    """How far inside the bands the rows of the problem are, % and K: soft rows let an output rest beyond them."""
-    input_scale: Triple = (10.0, 50.0, 10.0)
-    input_weight: Triple = (1e-2, 4e-4, 1e-2)
+    decision_instants: Instants = PROCESS.decision_instants
+    constraint_instants: Instants = PROCESS.constraint_instants
+    output_low: PerBand = tuple(band.low for band in PROCESS.bands)
+    """Bands: of the cold box those of L1 (%) and T5 (K)."""
+    output_high: PerBand = tuple(band.high for band in PROCESS.bands)
+    band_margin: PerBand = (0.0,) * len(PROCESS.bands)
+    """How far inside the bands the rows of the problem are: soft rows let an output rest beyond them."""
+    input_scale: PerInput = tuple(one.scale for one in PROCESS.inputs)
+    input_weight: PerInput = tuple(one.weight for one in PROCESS.inputs)
     """Diagonal of R, on deviations from the operating point."""
     pressure_scale: PositiveFloat = 2000.0
     level_scale: PositiveFloat = 1.0
     """In % of the vessel."""
     temperature_scale: PositiveFloat = 1.0
     state_weight: PositiveFloat = 0.1
-    violation_weight: tuple[PositiveFloat, PositiveFloat] = (100.0, 100.0)
-    """rho, per %^2 of L1 and K^2 of T5 and sample."""
+    violation_weight: PositivePerBand = tuple(band.weight for band in PROCESS.bands)
+    """rho, per sample and square of what a band is missed by: of the cold box per %^2 of L1 and K^2 of T5."""
     target: Target = Target.OPERATING_POINT
 
     @property

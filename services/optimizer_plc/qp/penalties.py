@@ -10,9 +10,9 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
-from optimizer_plc.qp.design import ControlDesign
-
-Triple = tuple[PositiveFloat, PositiveFloat, PositiveFloat]
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.per_signal import PositivePerInput
+from optimizer_plc.qp.design import N_INPUTS, ControlDesign
 
 
 class PenaltySettings(BaseModel):
@@ -23,7 +23,7 @@ class PenaltySettings(BaseModel):
     output_rows: PositiveFloat = 30.0
     """alpha over rho, the weight of a band violation. A violation v is shared between its slack and its row: the row
     keeps v / (1 + output_rows), and J has output_rows / (1 + output_rows) rho v^2 for it."""
-    rate_rows: Triple = (16.0, 16.0, 16.0)
+    rate_rows: PositivePerInput = (16.0,) * N_INPUTS
     """Weight of the rate rows over alpha, per square of `design.input_scale`. With the squares of `input_scale` the
     rows are in % and W, all with the same alpha, as the paper prints it."""
     box: Annotated[float, Field(ge=0.0)] = 0.0
@@ -55,16 +55,17 @@ class Preset(StrEnum):
     in their own units, and cost_scale is the one whose costs come down with the iterations as in the paper's figure."""
 
 
+_TUNED_COLD_BOX: Final[Mapping[str, Mapping[str, Any]]] = {
+    "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
+    "cold_end": {"approach_k": 0.3},
+    "design": {"band_margin": (0.1, 0.3)},
+    "plausibility": {"sigmas": 6.0},
+}
 PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
-    Preset.TUNED: {
-        "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
-        "cold_end": {"approach_k": 0.3},
-        "design": {"band_margin": (0.1, 0.3)},
-        "plausibility": {"sigmas": 6.0},
-    },
+    Preset.TUNED: _TUNED_COLD_BOX if IS_COLD_BOX else {"estimator": {"disturbances": ("outputs",)}},
     Preset.PAPER: {},
     Preset.AS_PRINTED: {
-        "penalties": {"output_rows": 1.0, "rate_rows": (100.0, 2500.0, 100.0), "box": 1.0, "first_knot_in_box": False},
+        "penalties": {"output_rows": 1.0, "rate_rows": tuple(one.scale**2 for one in PROCESS.inputs), "box": 1.0, "first_knot_in_box": False},
         "ode": {"cost_scale": 1e-8, "look_ahead_rows": False, "hold_at_bounds": False},
     },
 }

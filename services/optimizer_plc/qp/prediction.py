@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import L1, STATE_NAMES, T5, TICKS_PER_SAMPLE
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.signals import CONTROLLED, L1, STATE_NAMES, TICKS_PER_SAMPLE
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.linear_algebra import multiply
@@ -40,10 +41,10 @@ class PredictionModel:
     """LTI model of the plant around its operating point.
 
     `transitions[k]` spans k ticks, k = 1..ticks of a sampling period. Outputs are y = C x + D u + G w, of which
-    `constrained` are the rows of L1 and T5.
+    `constrained` are those that have a band.
     """
 
-    constrained = (L1, T5)
+    constrained = CONTROLLED
 
     def __init__(self, model: LtiModel) -> None:
         self.model = model
@@ -118,11 +119,20 @@ class PredictionModel:
         return Transition(self.C, self.D, self.G)
 
 
-def state_weights(model: LtiModel, design: ControlDesign) -> Array:
-    """Return the diagonal of Q, shape (n,): pressure, level and the mean of the cold box's temperatures weigh alike.
+def state_cost(model: LtiModel, design: ControlDesign) -> Array:
+    """Return Q, shape (n, n): what the states, and the outputs through them, weigh."""
+    weights = np.array([output.weight for output in PROCESS.outputs])
+    through_outputs: Array = model.C.T @ (weights[:, None] * model.C)
+    return through_outputs + np.diag(state_weights(model, design))
 
-    States beyond those of the cold box weigh nothing.
+
+def state_weights(model: LtiModel, design: ControlDesign) -> Array:
+    """Return what states weigh themselves, shape (n,): those of the cold box.
+
+    Pressure, level and the mean of the temperatures weigh alike; further states and those of other processes nothing.
     """
+    if not IS_COLD_BOX:
+        return np.zeros(len(model.x0))
     n = len(STATE_NAMES)
     scales = np.full(n, design.temperature_scale)
     scales[0] = design.pressure_scale

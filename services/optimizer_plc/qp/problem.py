@@ -1,7 +1,7 @@
 """The condensed quadratic problem: min z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high.
 
-z holds, knot by knot, the 3 inputs (deviations from the operating point over `input_scale`) and then, knot by knot,
-the 4 slacks of the output bands. phi and gamma are affine in the predicted state, the load and the input applied
+z holds, knot by knot, the inputs (deviations from the operating point over `input_scale`) and then, knot by knot, the
+slacks of the output bands. phi and gamma are affine in the predicted state, the load and the input applied
 before the first knot; Phi and Gamma are constant. There is no factor 1/2 before Phi (`docs/science.md`, ruling 11).
 """
 
@@ -59,7 +59,8 @@ class PredictiveProblem:
 
     Penalties scale the rows: a problem that is solved exactly is the same whatever they are.
 
-    Sizes: n = 7 decision instants x 7 = 49 variables; m = 56 output rows and 38 rate rows with the paper's instants.
+    Sizes: of the cold box n = 7 decision instants x 7 = 49 variables; m = 56 output rows and 38 rate rows with the
+    paper's instants.
     """
 
     def __init__(
@@ -182,7 +183,7 @@ class PredictiveProblem:
         return inputs_of(self.knots_to_samples[:samples], z, self.input_scale, self._u0, self.rate)
 
     def outputs(self, z: Array, parameters: QpParameters) -> Array:
-        """Return L1 and T5 predicted for a profile at the end of each sampling period, shape (horizon, 2)."""
+        """Return the outputs with a band predicted at the end of each sampling period, shape (horizon, bands)."""
         self._check(parameters)
         outputs = self.resting_outputs.copy()
         add_transposed_product(self.stacked_outputs_z, z, outputs)

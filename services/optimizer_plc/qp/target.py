@@ -5,6 +5,8 @@ deviations from the operating point. They are within their bounds; within these 
 they can; then they have T5 within its rows, or as near as they can.
 
 Inputs are deviations over `input_scale`, and those that act: with the estimated constants of inputs added.
+
+For the cold box alone: of other processes the target is the operating point, and what they hold is not known.
 """
 
 from typing import NamedTuple
@@ -14,15 +16,16 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process.limits import InputLimits
+from coldloop.process.loaded import IS_COLD_BOX
 from coldloop.process.signals import INPUT_NAMES, T5
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.design import N_INPUTS, ControlDesign, Target
-from optimizer_plc.qp.prediction import PredictionModel, state_weights
+from optimizer_plc.qp.prediction import PredictionModel, state_cost
 from optimizer_plc.qp.rest import rest_map
 
 Array = NDArray[np.float64]
 
-CV155 = INPUT_NAMES.index("CV155")
+CV155 = INPUT_NAMES.index("CV155") if IS_COLD_BOX else 0
 TOLERANCES = {8: 1e-8, 4: 1e-4}
 """What a bound may be missed by, scaled, by the bytes of a number: in single precision a corner of bounds is met no
 better than within 1e-5."""
@@ -42,6 +45,8 @@ class TargetSearch(NamedTuple):
 
     followed: bool
     """Whether there is a target other than the operating point."""
+    limited: bool
+    """Whether it is known what can be held."""
     of_load: float
     """1 where the load counts, 0 where only its mismatch does."""
     held: Array
@@ -81,9 +86,11 @@ def target_search(
     prediction: PredictionModel, design: ControlDesign, limits: InputLimits, real: Real = DOUBLE
 ) -> TargetSearch:
     """Return what targets of this problem are found with."""
+    if not IS_COLD_BOX:
+        return no_target_search(real)
     rest, n, scale = rest_of(prediction, design), len(prediction.model.x0), np.array(design.input_scale)
     held, states = rest.states[:, -1], rest.states[:, :n]
-    cost = states * state_weights(prediction.model, design) @ states.T + np.diag(scale**2 * design.input_weight)
+    cost = states @ state_cost(prediction.model, design) @ states.T + np.diag(scale**2 * design.input_weight)
     inverse = np.linalg.inv(cost)
     across = np.linalg.svd(held[None])[2][1:].T
     root = np.linalg.cholesky(across.T @ cost @ across)
@@ -103,12 +110,23 @@ def target_search(
     }
     return TargetSearch(
         followed=design.target is not Target.OPERATING_POINT,
+        limited=True,
         of_load=real(design.target is Target.LOAD),
         margin=real(margin),
         constants=np.array([places.get(signal, -1) for signal in signals]),
         tolerance=real(TOLERANCES[np.dtype(real).itemsize]),
         **{name: np.ascontiguousarray(array).astype(real, copy=False) for name, array in arrays.items()},
     )
+
+
+def no_target_search(real: Real) -> TargetSearch:
+    """Return the search of a process that has no target but its operating point."""
+    inputs, rows = np.zeros(N_INPUTS, real), np.zeros(N_INPUTS + 1, real)
+    return TargetSearch(
+        followed=False, limited=False, of_load=real(0.0), held=inputs, cheapest=inputs,
+        plane=np.zeros((N_INPUTS, 2), real), rows=np.zeros((N_INPUTS + 1, 2), real), temperature=inputs, low=rows,
+        high=rows, margin=real(0.0), constants=np.full(N_INPUTS + 1, -1), scale=rows, tolerance=real(0.0),
+    )  # fmt: skip
 
 
 @kernel

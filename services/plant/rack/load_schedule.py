@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
-from coldloop.process.load_profile import MAX_LOAD_W, LoadProfile
+from coldloop.process.load_profile import LOAD_SPAN, LoadProfile
+from coldloop.process.loaded import PROCESS
 from coldloop.registers.plant import LOAD_ROWS, LoadStatus, LoadStep
 
 MOST_UPCOMING: Final = 2 * LOAD_ROWS
@@ -46,8 +47,9 @@ class LoadSchedule:
             if step.tick <= before.tick:
                 raise ValueError(f"tick {step.tick} does not come after {before.tick}")
         for step in steps:
-            if not 0.0 <= step.watts <= MAX_LOAD_W:
-                raise ValueError(f"{step.watts:g} W is outside 0 to {MAX_LOAD_W:g} W")
+            if not LOAD_SPAN[0] <= step.watts <= LOAD_SPAN[1]:
+                unit = PROCESS.load.unit
+                raise ValueError(f"{step.watts:g} {unit} is outside {LOAD_SPAN[0]:g} to {LOAD_SPAN[1]:g} {unit}")
         kept = max(0, bisect_left(self._times, steps[0].tick) - 1 - self._place(now))
         if kept + len(steps) > MOST_UPCOMING:
             raise ValueError(f"{kept} of at most {MOST_UPCOMING} steps are scheduled already: write these later")

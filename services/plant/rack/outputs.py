@@ -4,7 +4,7 @@ from typing import Final
 
 from coldloop.kernels.single_precision import single
 from coldloop.registers.bank import Caller
-from coldloop.registers.plant import Actuators, OutputVerdict
+from coldloop.registers.plant import Actuators, OutputVerdict, inputs_of
 from coldloop.safety.lease import SIMPLE_CLIENT
 
 STALE_TICKS: Final = 8
@@ -13,7 +13,7 @@ STALE_TICKS: Final = 8
 ROUNDING: Final = 1e-6
 """Share of a value that single precision may add to a change."""
 
-Inputs = tuple[float, float, float]
+Inputs = tuple[float, ...]
 
 
 class AppliedOutputs:
@@ -27,7 +27,7 @@ class AppliedOutputs:
     For all writers together: in one tick of the rack no output moves further than its rate.
 
     Args:
-        u: CV155 %, NCR22_A W, CV156 %.
+        u: Outputs, in the order of the inputs of the process.
         rate: Largest change of each in one tick; None does not limit.
         holder: Number of the client whose outputs these are; `SIMPLE_CLIENT` is also that of the safe state, and of
             what a session begins with.
@@ -77,7 +77,7 @@ class AppliedOutputs:
             self._begin_generation()
         if asked.generation not in (0, self.generation):
             return OutputVerdict.CHANGED
-        wanted = asked.cv155, asked.ncr22, asked.cv156
+        wanted = inputs_of(asked)
         self.u, self.holder = self._within_reach(wanted), asked.holder
         taken = self.u == wanted
         if not taken:
@@ -89,8 +89,7 @@ class AppliedOutputs:
         """Return outputs as far as they may move in the present tick."""
         if self._rate is None:
             return wanted
-        cv155, ncr22, cv156 = map(_limited, wanted, self._at_beginning, self._rate)
-        return cv155, ncr22, cv156
+        return tuple(map(_limited, wanted, self._at_beginning, self._rate))
 
     def _is_writer(self, holder: int, caller: Caller) -> bool:
         """Return whether the writer of this generation writes: its number says so, or the connection of one without."""

@@ -150,13 +150,12 @@ class Rack:
         _try_a_tick(self._make_plant(schedule, state.seed), state)
         program = self._make_plant(schedule, state.seed)
         program.resume(**state.program)
-        cv155, ncr22, cv156 = state.program["u"]
         self._set_up(Session(state.session, state.pace, load, state.seed))
         self._program, self.load = program, schedule
         self.model_range = ModelRangeStatus(program.model_range, program.tick)
         self.watchdog.set(state.watchdog, program.tick)
         self.outputs = AppliedOutputs(
-            (cv155, ncr22, cv156), rate=self._rate, holder=state.holder, generation=next_generation(state.generation)
+            tuple(state.program["u"]), rate=self._rate, holder=state.holder, generation=next_generation(state.generation)
         )
         self.moving = state.pace.realtime and program.tick > 0 and not self.has_ended
 

@@ -118,9 +118,8 @@ class RackRegisters:
             else Journal(boot=state.boot % 0xFFFF_FFFF + 1, count=state.events, now=utc)
         )
         generation = first_generation if state is None else next_generation(state.generation)
-        cv155, ncr22, cv156 = header.u0
         rack = Rack(
-            section.watchdog, (cv155, ncr22, cv156), make_plant, session, journal=journal,
+            section.watchdog, header.u0, make_plant, session, journal=journal,
             rate=settings.limits.rate if section.rate_limited else None, generation=generation,
         )  # fmt: skip
         if state is None or not state.session:

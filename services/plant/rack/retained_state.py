@@ -6,7 +6,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from coldloop.process.load_profile import MAX_LOAD_W
+from coldloop.process.load_profile import LOAD_SPAN
 from coldloop.process.signals import LAST_TICK
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
@@ -37,7 +37,7 @@ class RetainedPlantState(BaseModel):
     """Its time-out, in ticks."""
     times: tuple[Annotated[int, Field(ge=0, le=LAST_TICK)], ...]
     """Ticks of the load's steps."""
-    watts: tuple[Annotated[float, Field(ge=0, le=MAX_LOAD_W)], ...]
+    watts: tuple[Annotated[float, Field(ge=LOAD_SPAN[0], le=LOAD_SPAN[1])], ...]
     seed: Count
     program: dict[str, Any]
     """What `PlantProgram.resume` takes."""

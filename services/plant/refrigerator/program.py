@@ -10,7 +10,8 @@ from coldloop.registers.plant import StationAlarm, StationMode, StationSample, S
 from plant.helium.properties import load_helium
 from plant.integrator import plain_tuples
 from plant.numeric import RealArray
-from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+from plant.cold_box.program import ColdBoxProgram
+from plant.program import HeatLoad, MeasurementNoise
 from plant.refrigerator.events import EventSchedule
 from plant.refrigerator.file import RefrigeratorFile
 from plant.refrigerator.physics import (
@@ -25,7 +26,7 @@ from plant.refrigerator.station_settings import StationSettings
 from plant.refrigerator.tick import ALARMS, HP, LP, MODE, RefrigeratorMemory, advance_program_tick, control_tick
 
 
-class RefrigeratorProgram(PlantProgram):
+class RefrigeratorProgram(ColdBoxProgram):
     """The simulated refrigerator with its station's controller, advanced tick by tick.
 
     `state` and `measure` are those of the cold box, so that all who know a cold box know this plant; `station` is the

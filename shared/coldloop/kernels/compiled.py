@@ -12,6 +12,7 @@ Processes that need the same kernel at once compile it once: one does, the other
 
 import contextlib
 import hashlib
+import json
 import os
 import stat
 import sys
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.first_use import needs_compiling
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 
 try:
     import fcntl
@@ -120,6 +122,8 @@ def _sources_digest() -> str:
         package, *path = module.split(".")
         for folder in _folders(package):
             digest.update(folder.joinpath(*path).with_suffix(".py").read_bytes())
+    if not IS_COLD_BOX:  # kernels hold its sizes and its time
+        digest.update(json.dumps(PROCESS.document(), sort_keys=True).encode())
     return digest.hexdigest()[:16]
 
 

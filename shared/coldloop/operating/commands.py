@@ -5,7 +5,7 @@ from typing import Annotated, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
 from coldloop.errors import LoadFileError, UsageError
-from coldloop.process.load_profile import MAX_LOAD_W, LoadProfile, load_profile_of
+from coldloop.process.load_profile import LOAD_SPAN, LoadProfile, load_profile_of
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, LAST_TICK, OUTPUT_NAMES, TICK_S
 from coldloop.registers.plant import SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
@@ -69,7 +69,7 @@ class SetLoad(_Command):
     """The heat load from a tick on."""
 
     kind: Literal["load"]
-    watts: Annotated[float, Field(ge=0, le=MAX_LOAD_W)]
+    watts: Annotated[float, Field(ge=LOAD_SPAN[0], le=LOAD_SPAN[1])]
     tick: Annotated[int, Field(ge=0, le=LAST_TICK)] = 0
     """0 is the next one."""
 

@@ -1,18 +1,13 @@
-"""What the actuators allow, one setting that the QP, its solvers and the control PLC's guard share; and the bands."""
+"""What the actuators allow: one setting that the QP, its solvers and the control PLC's guard share."""
 
 from enum import StrEnum
-from typing import Annotated, Final, Self
+from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from coldloop.process.loaded import PROCESS
+from coldloop.process.per_signal import PerInput
 from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
-
-Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-
-LEVEL_BAND: Final = (59.0, 61.0)
-"""Band of L1, % (paper, section IV)."""
-T5_BAND: Final = (9.0, 16.0)
-"""Band of T5, K (paper, section IV)."""
 
 
 class RateReference(StrEnum):
@@ -25,16 +20,16 @@ class RateReference(StrEnum):
 
 
 class InputLimits(BaseModel):
-    """Bounds and rates of the inputs, in the order (CV155 %, NCR22_A W, CV156 %) (paper, table I)."""
+    """Bounds and rates of the inputs, in their order: of the cold box CV155 %, NCR22_A W, CV156 % (paper, table I)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    low: Triple = (20.0, 0.0, 20.0)
-    high: Triple = (60.0, 150.0, 60.0)
-    rate: Triple = (0.5, 10.0, 0.1)
-    """Largest change in one sampling period of 5 s, up or down."""
+    low: PerInput = tuple(one.low for one in PROCESS.inputs)
+    high: PerInput = tuple(one.high for one in PROCESS.inputs)
+    rate: PerInput = tuple(one.rate for one in PROCESS.inputs)
+    """Largest change in one sampling period, up or down."""
     rate_reference: RateReference = RateReference.PER_UPDATE
-    slew_s: Annotated[float, Field(ge=TICK_S, le=TICKS_PER_SAMPLE * TICK_S)] = 0.5
+    slew_s: Annotated[float, Field(ge=TICK_S, le=TICKS_PER_SAMPLE * TICK_S)] = 2 * TICK_S
     """Absolute slew limit, however often updates follow one another: within any time shorter than this an input moves
     by at most `rate`. The default is the shortest updating period that there is: it never binds on our optimiser."""
 

@@ -1,4 +1,4 @@
-"""The heat load over time, and the CSV files that hold it."""
+"""The load over time, and the CSV files that hold it."""
 
 import csv
 import math
@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import LoadFileError
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.signals import LAST_TICK, TICK_S
 
-MAX_LOAD_W: Final = 10_000.0
+LOAD_SPAN: Final = PROCESS.load.span
+"""Lowest and highest load."""
 COLUMNS: Final = ("time_s", "load_w")
 
 
@@ -20,7 +22,7 @@ class LoadProfile:
 
     Raises:
         ValueError: times do not start at 0, do not increase or are after the last tick of a session, lengths differ, or
-            a load is negative or not finite.
+            a load is not finite, or negative where it is heat into the bath.
     """
 
     times: tuple[int, ...]
@@ -35,8 +37,10 @@ class LoadProfile:
             raise ValueError("the times of a load profile must increase")
         if self.times[-1] > LAST_TICK:
             raise ValueError(f"tick {self.times[-1]} is after the last one of a session, {LAST_TICK}")
-        if not all(0.0 <= load < math.inf for load in self.watts):
-            raise ValueError("loads must be finite and not negative")
+        if not all(map(math.isfinite, self.watts)):
+            raise ValueError("loads must be finite")
+        if IS_COLD_BOX and min(self.watts) < 0.0:
+            raise ValueError("loads must not be negative")
 
     def value(self, tick: int) -> float:
         """Return the load (W) that is held from `tick` (0 or later) to the next."""
@@ -87,8 +91,11 @@ def _step(row: dict[str, str | None], before: list[int], where: str) -> tuple[in
     time, load = (_number(row[column], f"{where}, {column}") for column in COLUMNS)
     if not 0 <= time < LAST_TICK * TICK_S:
         raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * TICK_S:g} s")
-    if not 0 <= load <= MAX_LOAD_W:
-        raise LoadFileError(f"{where}: {load:g} W is outside 0 to {MAX_LOAD_W:g} W; loads are heat into the bath")
+    low, high = LOAD_SPAN
+    if not low <= load <= high:
+        unit = PROCESS.load.unit
+        meaning = "; loads are heat into the bath" if IS_COLD_BOX else ""
+        raise LoadFileError(f"{where}: {load:g} {unit} is outside {low:g} to {high:g} {unit}{meaning}")
     tick = round(time / TICK_S)
     if abs(tick * TICK_S - time) > 1e-6:
         raise LoadFileError(f"{where}: {time:g} s is not a multiple of {TICK_S} s")

@@ -19,11 +19,12 @@ from coldloop.process.model_file import (
     short_digest_of,
     write_document,
 )
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import STATE_NAMES
 
 RealArray: TypeAlias = NDArray[np.float64]
 
-UNNAMED: dict[str, Any] = {"plant": COLD_BOX, "note": "", "plant_parameters": {}}
+UNNAMED: dict[str, Any] = {"plant": COLD_BOX, "note": "", "plant_parameters": {}, "process": {}}
 """What a model file leaves out."""
 MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
 
@@ -94,6 +95,8 @@ class LtiModel:
     """Where it comes from, if not from the plant's equations."""
     plant_parameters: dict[str, Any] = field(default_factory=dict)
     """The plant's parameters by section, as in a plant file; none are those of the reference plant."""
+    process: dict[str, Any] = field(default_factory=dict)
+    """`coldloop.process.declaration.Process` as plain data; none is the cold box."""
 
     def __post_init__(self) -> None:
         n, m, p = len(self.state_names), len(self.input_names), len(self.output_names)
@@ -174,7 +177,7 @@ def load(path: Path) -> LtiModel:
     document = read_document(path)
     header = header_of(document, path)
     described: dict[str, Any] = {
-        name: value for name, value in vars(header).items() if name not in ("digest", *VECTORS)
+        name: value for name, value in vars(header).items() if name not in ("digest", "file", *VECTORS)
     }
     try:
         arrays: dict[str, Any] = {name: np.array(document[name], dtype=np.float64) for name in (*MATRICES, *VECTORS)}
@@ -183,6 +186,7 @@ def load(path: Path) -> LtiModel:
         raise ModelFileError(f"{path}: {error} in the model file; {REMEDY}") from error
     if len(model.state_names) < len(STATE_NAMES):
         raise ModelFileError(
-            f"{path}: {len(model.state_names)} states in the model file, a cold box has {len(STATE_NAMES)}; {REMEDY}"
+            f"{path}: {len(model.state_names)} states in the model file, a {PROCESS.name} has {len(STATE_NAMES)}; "
+            f"{REMEDY}"
         )
     return model

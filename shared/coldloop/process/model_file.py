@@ -48,6 +48,10 @@ class ModelHeader:
     """Where the model comes from, if not from the plant's equations."""
     plant_parameters: dict[str, Any] = field(default_factory=dict)
     """The plant's parameters by section, as in a plant file; none are those of the reference plant."""
+    process: dict[str, Any] = field(default_factory=dict)
+    """The process that the plant is; none is the cold box."""
+    file: Path = Path()
+    """Where it was read from."""
 
     @property
     def short_digest(self) -> int:
@@ -72,7 +76,8 @@ def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
         described |= {name: tuple(float(number) for number in document[name]) for name in VECTORS}
         described |= {"plant": str(document.get("plant", COLD_BOX)), "note": str(document.get("note", ""))}
         described["plant_parameters"] = _parameters(document)
-        header = ModelHeader(w0=float(document["w0"]), **described)
+        described["process"] = dict(document.get("process", {}))
+        header = ModelHeader(w0=float(document["w0"]), file=path, **described)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{path}: {error!r} in the model file; {REMEDY}") from error
     for kind, values in zip(KINDS, (header.x0, header.u0, header.y0), strict=True):

@@ -8,8 +8,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.range_bits import ModelRange
-from coldloop.process.signals import STATE_NAMES, STATION_SIGNAL_NAMES
+from coldloop.process.signals import STATION_SIGNAL_NAMES
 
 SATURATION_BAR: Final = (0.3, 2.25)
 """Of bath and return; helium's critical point is at 2.28 bar."""
@@ -22,7 +23,7 @@ WARMEST_BATH_M3: Final = -6.16
 COLD_BOX_BAR: Final = (16.0, 1.05)
 """Supply and return of a cold box alone; those of a plant file are within the same ranges."""
 
-FIRST_CELL: Final = STATE_NAMES.index("T_nef1_1")
+FIRST_CELL: Final = [state.name for state in COLD_BOX.states].index("T_nef1_1")
 HP, LP = STATION_SIGNAL_NAMES.index("P12"), STATION_SIGNAL_NAMES.index("P11")
 
 

@@ -5,9 +5,12 @@ from typing import Annotated, Final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict
 
+from coldloop.process.loaded import FILE as PROCESS_FILE
+
 _DATA: Final = Path(__file__).parent / "data"
-DEFAULT_MODEL_FILE = _DATA / "cold_box_model.json"
-SHIPPED_MODELS: Final = {"cold-box": DEFAULT_MODEL_FILE, "refrigerator": _DATA / "refrigerator_model.json"}
+DEFAULT_MODEL_FILE: Final = PROCESS_FILE or _DATA / "cold_box_model.json"
+"""Of the process that programs are loaded with."""
+SHIPPED_MODELS: Final = {"cold-box": _DATA / "cold_box_model.json", "refrigerator": _DATA / "refrigerator_model.json"}
 """Models that have a name: of the cold box alone, and of the refrigerator with its pressure loop closed."""
 
 

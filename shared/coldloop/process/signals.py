@@ -1,11 +1,17 @@
-"""The signals of the process that cross the link: names, units and order (paper, section IV)."""
+"""The signals of the process that cross the link: names, units and order; and its time (paper, section IV)."""
 
 from typing import Final
 
-TICK_S: Final = 0.25
+from coldloop.process.loaded import PROCESS
+
+TICK_S: Final = PROCESS.tick_s
 """Length of a tick, the basic period tau_1 of the paper, in seconds of plant time."""
 
-SAMPLING_PERIOD_S: Final = 5.0
+TICK_UNIT: Final = f"{TICK_S:g} s"
+
+TICKS_PER_SAMPLE: Final = PROCESS.ticks_per_sample
+
+SAMPLING_PERIOD_S: Final = TICKS_PER_SAMPLE * TICK_S
 """Sampling period of the prediction model, in seconds of plant time."""
 
 LAST_TICK: Final = 2**32 - 2**16 - 1
@@ -14,28 +20,28 @@ LAST_TICK: Final = 2**32 - 2**16 - 1
 LAST_NUMBER: Final = LAST_TICK
 """Largest number of an update, or of a sequence."""
 
-TICKS_PER_SAMPLE: Final = int(SAMPLING_PERIOD_S / TICK_S)
+INPUT_NAMES: Final = tuple(one.name for one in PROCESS.inputs)
+INPUT_UNITS: Final = tuple(one.unit for one in PROCESS.inputs)
 
-INPUT_NAMES: Final = ("CV155", "NCR22_A", "CV156")
-INPUT_UNITS: Final = ("%", "W", "%")
+OUTPUT_NAMES: Final = tuple(one.name for one in PROCESS.outputs)
+OUTPUT_UNITS: Final = tuple(one.unit for one in PROCESS.outputs)
 
-OUTPUT_NAMES: Final = ("L1", "V1", *(f"T{i}" for i in range(1, 11)), *(f"P{i}" for i in range(1, 11)))
-OUTPUT_UNITS: Final = ("%", "Hz", *("K" for _ in range(10)), *("bar" for _ in range(10)))
+STATE_NAMES: Final = tuple(one.name for one in PROCESS.states)
+STATE_UNITS: Final = tuple(one.unit for one in PROCESS.states)
 
-STATE_NAMES: Final = (
-    "P1",
-    "V_l",
-    *(f"T_nef1_{i}" for i in range(1, 9)),
-    *(f"T_nef2_{i}" for i in range(1, 7)),
-    *(f"T_nef34_{i}" for i in range(1, 13)),
-)
-STATE_UNITS: Final = ("Pa", "m3", *("K" for _ in range(26)))
+CONTROLLED: Final = tuple(OUTPUT_NAMES.index(one.name) for one in PROCESS.banded)
+"""Outputs that have a band: L1 and T5 of the cold box."""
 
-L1: Final = OUTPUT_NAMES.index("L1")
-T1: Final = OUTPUT_NAMES.index("T1")
-T2: Final = OUTPUT_NAMES.index("T2")
-T5: Final = OUTPUT_NAMES.index("T5")
 
+def _place(name: str) -> int:
+    """Return which output one of the cold box's is; -1 where the process has none of that name."""
+    return OUTPUT_NAMES.index(name) if name in OUTPUT_NAMES else -1
+
+
+L1: Final = _place("L1")
+T1: Final = _place("T1")
+T2: Final = _place("T2")
+T5: Final = _place("T5")
 STATION_VALVE_NAMES: Final = ("CV956", "CV952", "CV953", "CV167")
 """Bypass, discharge into the buffer, charge out of it, nitrogen feed."""
 STATION_SIGNAL_NAMES: Final = (

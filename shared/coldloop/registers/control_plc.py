@@ -1,9 +1,10 @@
 """Register map of the control PLC: the optimiser's side of the link, and what operators see."""
 
 from enum import IntEnum
-from typing import Annotated, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Self
 
-from coldloop.process.load_profile import MAX_LOAD_W
+from coldloop.process.load_profile import LOAD_SPAN
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import (
     INPUT_NAMES,
     INPUT_UNITS,
@@ -13,12 +14,13 @@ from coldloop.process.signals import (
     OUTPUT_UNITS,
     STATE_NAMES,
     STATE_UNITS,
+    TICK_UNIT,
 )
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
-from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
-from coldloop.registers.plant import MAX_INPUT, MAX_STATE
+from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, placed, record, u16, u32
+from coldloop.registers.plant import MAX_STATE, SPAN_OF_INPUTS
 from coldloop.registers.safety import Alarm, AlarmCommand, AlarmKind, LeaseStatus, WatchdogStatus, WatchdogTime
 
 SEQUENCE_ROWS: Final = 240
@@ -135,7 +137,7 @@ class Process(NamedTuple):
     """The process at the last scan."""
 
     tick: Annotated[int, u32("Tick of the scan")]
-    load: Annotated[float, f32("Heat load NCR22_HL", unit="W", finite=False)]
+    load: Annotated[float, f32(f"Load {PROCESS.load.name}", unit=PROCESS.load.unit, finite=False)]
     u: Annotated[tuple[float, ...], f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS)]
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
 
@@ -185,14 +187,19 @@ class Update(NamedTuple):
     playing: Annotated[
         int, u32("Number of the sequence being played from this instant on; 0 is none", high=LAST_NUMBER)
     ]
-    load: Annotated[float, f32("Heat load NCR22_HL", unit="W", low=0, high=MAX_LOAD_W)]
+    load: Annotated[float, f32(f"Load {PROCESS.load.name}", unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])]
     u_before: Annotated[
         tuple[float, ...],
-        f32_array("Input applied until this instant", INPUT_NAMES, INPUT_UNITS, low=0, high=MAX_INPUT),
+        f32_array(
+            "Input applied until this instant", INPUT_NAMES, INPUT_UNITS, low=SPAN_OF_INPUTS[0], high=SPAN_OF_INPUTS[1]
+        ),
     ]
     u: Annotated[
         tuple[float, ...],
-        f32_array("Input applied from this instant on", INPUT_NAMES, INPUT_UNITS, low=0, high=MAX_INPUT),
+        f32_array(
+            "Input applied from this instant on", INPUT_NAMES, INPUT_UNITS, low=SPAN_OF_INPUTS[0],
+            high=SPAN_OF_INPUTS[1],
+        ),
     ]
     y: Annotated[
         tuple[float, ...],
@@ -227,10 +234,11 @@ class Plan(NamedTuple):
     next_update_tick: Annotated[int, u32("Tick of the next updating instant t_{i+1}")]
     load_step: Annotated[
         float,
-        f32("An update is latched at once when the load has moved by more than this; 0 is never", unit="W", low=0),
+        f32("An update is latched at once when the load has moved by more than this; 0 is never", unit=PROCESS.load.unit,
+            low=0),
     ] = 0.0
     shortage: Annotated[
-        float, f32("Estimated load above what can be held; negative: below what is needed; 0 is neither", unit="W")
+        float, f32("Estimated load above what can be held; negative: below what is needed; 0 is neither", unit=PROCESS.load.unit)
     ] = 0.0
     suspects: Annotated[
         int, u32("Outputs whose reading is not used, as prediction and other readings contradict it: bit i is output i")
@@ -271,13 +279,30 @@ class LatchedUpdate(NamedTuple):
     crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
 
 
-class Operator(NamedTuple):
-    """What an operator wants. Setpoints count in manual mode; they are clamped and rate-limited."""
+if TYPE_CHECKING:
 
-    mode: Annotated[int, u16("0 auto, 1 classical loops, 2 manual", high=2, values=OperatorMode)]
-    cv155: Annotated[float, f32("Setpoint of the Joule-Thomson valve", unit="%", low=0, high=100)]
-    ncr22: Annotated[float, f32("Setpoint of the actuator part of the heater", unit="W", low=0, high=1000)]
-    cv156: Annotated[float, f32("Setpoint of the turbine valve", unit="%", low=0, high=100)]
+    class Operator(tuple[Any, ...]):
+        """What an operator wants: the mode, and a setpoint for each input."""
+
+        mode: int
+
+        def __new__(cls, mode: int, *inputs: float) -> Self: ...  # noqa: D102
+        def _replace(self, **fields: float) -> Self: ...
+
+else:
+    Operator = record(
+        "Operator", __name__,
+        "What an operator wants. Setpoints count in manual mode; they are clamped and rate-limited.",
+        {
+            "mode": Annotated[int, u16("0 auto, 1 classical loops, 2 manual", high=2, values=OperatorMode)],
+            **{
+                one.register: Annotated[
+                    float, f32(f"Setpoint: {one.description}", unit=one.unit, low=one.span[0], high=one.span[1])
+                ]
+                for one in PROCESS.inputs
+            },
+        },
+    )  # fmt: skip
 
 
 class SequenceHeader(NamedTuple):
@@ -290,17 +315,24 @@ class SequenceHeader(NamedTuple):
     update: Annotated[int, u32("Update that the sequence answers")]
     first_tick: Annotated[int, u32("First tick at which it is valid, t_{i+1}")]
     length: Annotated[int, u16("Rows in use", high=SEQUENCE_ROWS)]
-    tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i that it was computed in", unit="0.25 s")]
+    tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i that it was computed in", unit=TICK_UNIT)]
     model_digest: Annotated[int, u32("First 32 bits of the digest of the prediction model")]
     crc: Annotated[int, u32("CRC-32 of the header before this field and of the rows in use, as big-endian words")]
 
 
-class SequenceRow(NamedTuple):
-    """Inputs of one tick."""
+if TYPE_CHECKING:
 
-    cv155: Annotated[float, f32("Opening of the Joule-Thomson valve", unit="%")]
-    ncr22: Annotated[float, f32("Actuator part of the bath heater's power", unit="W")]
-    cv156: Annotated[float, f32("Opening of the turbine valve", unit="%")]
+    class SequenceRow(tuple[float, ...]):
+        """Inputs of one tick, a field each."""
+
+        def __new__(cls, *inputs: float) -> Self: ...  # noqa: D102
+        def _replace(self, **inputs: float) -> Self: ...
+
+else:
+    SequenceRow = record(
+        "SequenceRow", __name__, "Inputs of one tick.",
+        {one.register: Annotated[float, f32(one.description, unit=one.unit)] for one in PROCESS.inputs},
+    )  # fmt: skip
 
 
 class PlantLinkStatus(NamedTuple):
@@ -344,13 +376,13 @@ class ControlSession(NamedTuple):
 class Grant(NamedTuple):
     """How far the control PLC may go in lock-step."""
 
-    until_tick: Annotated[int, u32("The control PLC scans every tick before this one", unit="0.25 s")]
+    until_tick: Annotated[int, u32("The control PLC scans every tick before this one", unit=TICK_UNIT)]
 
 
 CONTROL_MAP: Final = RegisterMap(
     service="control_plc",
     version=4,
-    blocks=(
+    blocks=placed((
         IDENTITY_BLOCK,
         Block("status", 30, Status, "Sequence player and scan cycle"),
         Block("ladder", 50, LadderStatus, "The fail-safe ladder"),
@@ -380,5 +412,5 @@ CONTROL_MAP: Final = RegisterMap(
         Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
         CONFIGURATION_BLOCK,
         CONFIGURATION_LINES_BLOCK,
-    ),
+    )),
 )

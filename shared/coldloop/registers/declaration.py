@@ -8,11 +8,12 @@ and documentation follow from these three.
 import hashlib
 import json
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections import namedtuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, StrEnum
 from functools import cache, cached_property
-from typing import NamedTuple, cast, get_type_hints
+from typing import Any, NamedTuple, cast, get_type_hints
 
 
 class Kind(Enum):
@@ -114,6 +115,21 @@ def f32_array(
     return Field(Kind.F32, description, "", low, high, elements, units, finite=finite)
 
 
+def record(name: str, module: str, description: str, declared: Mapping[str, Any], defaults: Sequence[Any] = ()) -> Any:  # noqa: ANN401 a class
+    """Return a record class whose fields depend on the process: `declared` are their annotations, in order.
+
+    Args:
+        name: Of the class.
+        module: In which it stands under that name.
+        description: Of the class.
+        declared: Annotation of each field, as in a `NamedTuple`.
+        defaults: Of the last fields.
+    """
+    made: Any = namedtuple(name, list(declared), defaults=defaults, module=module)  # noqa: PYI024 the fields vary
+    made.__doc__, made.__annotations__ = description, dict(declared)
+    return made
+
+
 @cache
 def fields_of(record: type[tuple[object, ...]]) -> dict[str, Field]:
     """Return the declared fields of a record class, in their order."""
@@ -182,6 +198,15 @@ class Block:
                     field.values,
                 )  # fmt: skip
                 address += field.kind.words
+
+
+def placed(blocks: Iterable[Block]) -> tuple[Block, ...]:
+    """Return blocks at their addresses, or after the one before where the process has made that one longer."""
+    found: list[Block] = []
+    for block in blocks:
+        end = found[-1].end if found else 0
+        found.append(block if block.address >= end else replace(block, address=end))
+    return tuple(found)
 
 
 @dataclass(frozen=True)

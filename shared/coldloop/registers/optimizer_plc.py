@@ -1,14 +1,23 @@
 """Register map of the optimiser PLC: the results of each update, and the settings of a session."""
 
 from enum import IntEnum
-from typing import Annotated, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Self
 
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, SAMPLING_PERIOD_S
+from coldloop.process.loaded import PROCESS
+from coldloop.process.signals import (
+    INPUT_NAMES,
+    INPUT_UNITS,
+    OUTPUT_NAMES,
+    OUTPUT_UNITS,
+    SAMPLING_PERIOD_S,
+    TICK_UNIT,
+    TICKS_PER_SAMPLE,
+)
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
 from coldloop.registers.control_plc import Verdict
-from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u32
+from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, placed, record, u16, u32
 
 HISTORY_ROWS: Final = 256
 PREDICTED_SAMPLES: Final = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 80, 100)
@@ -16,8 +25,8 @@ PREDICTED_SAMPLES: Final = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 80, 100)
 INPUT_SAMPLES: Final = (1, 2, 4, 8, 16, 50, 100)
 """Sampling periods ahead at which planned inputs are shown."""
 
-BANDED_OUTPUTS: Final = ("L1", "T5")
-BAND_UNITS: Final = ("%", "K")
+BANDED_OUTPUTS: Final = tuple(one.name for one in PROCESS.banded)
+BAND_UNITS: Final = tuple(one.unit for one in PROCESS.banded)
 
 
 def _ahead(samples: tuple[int, ...]) -> tuple[str, ...]:
@@ -30,7 +39,8 @@ class OptimizerSession(NamedTuple):
     session: Annotated[int, u32("Number of the session", low=1)]
     realtime: Annotated[int, u16("0 lock-step, 1 real time: answers are delayed as by the PLC", high=1)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
-    updating_period: Annotated[int, u16("Fixed updating period, 2 or more; 0 is adaptive", unit="0.25 s", high=20)]
+    updating_period: Annotated[int, u16("Fixed updating period, 2 or more; 0 is adaptive", unit=TICK_UNIT,
+                                         high=TICKS_PER_SAMPLE)]
 
 
 class ControlLinkState(IntEnum):
@@ -76,7 +86,7 @@ class Optimization(NamedTuple):
 
     update: Annotated[int, u32("Update")]
     tick: Annotated[int, u32("Tick of the updating instant t_i")]
-    tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i", unit="0.25 s")]
+    tau_u: Annotated[int, u16("Updating period t_{i+1} - t_i", unit=TICK_UNIT)]
     q: Annotated[int, u16("q(t_i): the number of the period that the rule chose in the ladder of periods")]
     iterations: Annotated[int, u16("Iterations done: what fits into that period, or fewer if more change nothing")]
     verdict: Annotated[int, u16("Verdict of the control PLC on the sequence", values=Verdict)]
@@ -121,42 +131,70 @@ class UpdatingRuleStatus(NamedTuple):
     iteration: Annotated[float, f32("Duration of an iteration", unit="s")] = 0.0
 
 
+NO_BANDS: Final = (0.0,) * len(BANDED_OUTPUTS)
+NO_INPUTS: Final = (0.0,) * len(INPUT_NAMES)
+
+
 class OperatingLimits(NamedTuple):
     """What the optimiser keeps the process within: bands of the constrained outputs, bounds and rates of the inputs."""
 
-    output_low: Annotated[tuple[float, ...], f32_array("Low end of the band", BANDED_OUTPUTS, BAND_UNITS)] = (0.0, 0.0)
-    output_high: Annotated[tuple[float, ...], f32_array("High end of the band", BANDED_OUTPUTS, BAND_UNITS)] = (
-        0.0, 0.0,
-    )  # fmt: skip
-    input_low: Annotated[tuple[float, ...], f32_array("Lowest value", INPUT_NAMES, INPUT_UNITS)] = (0.0, 0.0, 0.0)
-    input_high: Annotated[tuple[float, ...], f32_array("Highest value", INPUT_NAMES, INPUT_UNITS)] = (0.0, 0.0, 0.0)
+    output_low: Annotated[tuple[float, ...], f32_array("Low end of the band", BANDED_OUTPUTS, BAND_UNITS)] = NO_BANDS
+    output_high: Annotated[tuple[float, ...], f32_array("High end of the band", BANDED_OUTPUTS, BAND_UNITS)] = NO_BANDS
+    input_low: Annotated[tuple[float, ...], f32_array("Lowest value", INPUT_NAMES, INPUT_UNITS)] = NO_INPUTS
+    input_high: Annotated[tuple[float, ...], f32_array("Highest value", INPUT_NAMES, INPUT_UNITS)] = NO_INPUTS
     input_rate: Annotated[
-        tuple[float, ...], f32_array("Largest change in a sampling period of 5 s", INPUT_NAMES, INPUT_UNITS)
-    ] = (0.0, 0.0, 0.0)
+        tuple[float, ...], f32_array("Largest change in a sampling period", INPUT_NAMES, INPUT_UNITS)
+    ] = NO_INPUTS
 
 
-class Prediction(NamedTuple):
-    """What the last delivered sequence is expected to lead to. Behind the horizon: the value at its end."""
+if TYPE_CHECKING:
 
-    update: Annotated[int, u32("Update that the prediction belongs to")] = 0
-    tick: Annotated[int, u32('Tick at which its sequence begins, t_{i+1}; element "5s" is 5 s later')] = 0
-    l1: Annotated[
-        tuple[float, ...],
-        f32_array("Predicted L1", _ahead(PREDICTED_SAMPLES), ("%",) * len(PREDICTED_SAMPLES)),
-    ] = (0.0,) * len(PREDICTED_SAMPLES)
-    t5: Annotated[
-        tuple[float, ...],
-        f32_array("Predicted T5", _ahead(PREDICTED_SAMPLES), ("K",) * len(PREDICTED_SAMPLES)),
-    ] = (0.0,) * len(PREDICTED_SAMPLES)
-    u: Annotated[
-        tuple[float, ...],
-        f32_array(
-            "Planned input",
-            tuple(f"{name}.{time}" for time in _ahead(INPUT_SAMPLES) for name in INPUT_NAMES),
-            INPUT_UNITS * len(INPUT_SAMPLES),
+    class Prediction(tuple[Any, ...]):
+        """What the last delivered sequence is expected to lead to: an array for each output that has a band."""
+
+        update: int
+        tick: int
+        u: tuple[float, ...]
+        crc: int
+
+        def __new__(cls, update: int = 0, tick: int = 0, *arrays: tuple[float, ...]) -> Self: ...  # noqa: D102
+
+else:
+    Prediction = record(
+        "Prediction", __name__,
+        "What the last delivered sequence is expected to lead to. Behind the horizon: the value at its end.",
+        {
+            "update": Annotated[int, u32("Update that the prediction belongs to")],
+            "tick": Annotated[int, u32('Tick at which its sequence begins, t_{i+1}; element "5s" is 5 s later')],
+            **{
+                one.name.lower(): Annotated[
+                    tuple[float, ...],
+                    f32_array(
+                        f"Predicted {one.name}", _ahead(PREDICTED_SAMPLES), (one.unit,) * len(PREDICTED_SAMPLES)
+                    ),
+                ]
+                for one in PROCESS.banded
+            },
+            "u": Annotated[
+                tuple[float, ...],
+                f32_array(
+                    "Planned input",
+                    tuple(f"{name}.{time}" for time in _ahead(INPUT_SAMPLES) for name in INPUT_NAMES),
+                    INPUT_UNITS * len(INPUT_SAMPLES),
+                ),
+            ],
+            "crc": Annotated[int, u32("CRC-32 of the registers before")],
+        },
+        defaults=(
+            0, 0, *((0.0,) * len(PREDICTED_SAMPLES),) * len(PROCESS.banded),
+            (0.0,) * (len(INPUT_NAMES) * len(INPUT_SAMPLES)), 0,
         ),
-    ] = (0.0,) * (len(INPUT_NAMES) * len(INPUT_SAMPLES))
-    crc: Annotated[int, u32("CRC-32 of the registers before")] = 0
+    )  # fmt: skip
+
+
+def outputs_of(prediction: Prediction) -> tuple[tuple[float, ...], ...]:
+    """Return the prediction of each output that has a band, at `PREDICTED_SAMPLES`."""
+    return prediction[2 : 2 + len(PROCESS.banded)]
 
 
 class ModelDeviation(NamedTuple):
@@ -185,7 +223,7 @@ class ModelDeviation(NamedTuple):
 OPTIMIZER_MAP: Final = RegisterMap(
     service="optimizer_plc",
     version=4,
-    blocks=(
+    blocks=placed((
         IDENTITY_BLOCK,
         Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
         Block("control link", 40, ControlLinkStatus, "Link to the control PLC"),
@@ -202,5 +240,5 @@ OPTIMIZER_MAP: Final = RegisterMap(
         Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
         CONFIGURATION_BLOCK,
         CONFIGURATION_LINES_BLOCK,
-    ),
+    )),
 )

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from enum import IntEnum, IntFlag
 from itertools import accumulate, pairwise
-from typing import Annotated, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Self
 
-from coldloop.process.load_profile import MAX_LOAD_W
+from coldloop.process.load_profile import LOAD_SPAN
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import (
     INPUT_NAMES,
     INPUT_UNITS,
@@ -17,18 +18,30 @@ from coldloop.process.signals import (
     STATION_SIGNAL_NAMES,
     STATION_SIGNAL_UNITS,
     STATION_VALVE_NAMES,
+    TICK_UNIT,
 )
 from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswer, JournalPage, JournalQuery
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
-from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, u16, u16_array, u32
+from coldloop.registers.declaration import (
+    Block,
+    RegisterMap,
+    Role,
+    f32,
+    f32_array,
+    placed,
+    record,
+    u16,
+    u16_array,
+    u32,
+)
 from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 
 HISTORY_ROWS: Final = 256
 STATION_ROWS: Final = 128
 LOAD_ROWS: Final = 2048
-MAX_INPUT: Final = 1000.0
-"""No input, in % or W, is larger."""
+SPAN_OF_INPUTS: Final = (min(one.span[0] for one in PROCESS.inputs), max(one.span[1] for one in PROCESS.inputs))
+"""No input is outside."""
 MAX_STATE: Final = 1e9
 """No number of a simulated state, in Pa, m3 or K, is further from 0."""
 MAX_AGE: Final = 1e5
@@ -54,20 +67,49 @@ class OutputVerdict(IntEnum):
     """Applied as far as the rate of one tick allows: read them back again."""
 
 
-class Actuators(NamedTuple):
-    """Outputs for one tick, of the one control PLC that holds the lease of the rack.
+if TYPE_CHECKING:
 
-    The rack judges them whole; its next measurement shows whether they were accepted.
-    """
+    class Actuators(tuple[Any, ...]):
+        """Outputs for one tick: a field for each input of the process between `tick` and `session`."""
 
-    tick: Annotated[int, u32("Tick of these outputs; in lock-step the present one advances the plant", high=LAST_TICK)]
-    cv155: Annotated[float, f32("Opening of the Joule-Thomson valve", unit="%", low=0, high=100)]
-    ncr22: Annotated[float, f32("Actuator part of the bath heater's power", unit="W", low=0, high=1000)]
-    cv156: Annotated[float, f32("Opening of the turbine valve", unit="%", low=0, high=100)]
-    session: Annotated[int, u32("Session of these outputs")]
-    holder: Annotated[int, u32("Number chosen by the writer; 0 is a simple client")] = 0
-    generation: Annotated[int, u32("Generation that was read back; 0 does not compare")] = 0
-    crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
+        tick: int
+        session: int
+        holder: int
+        generation: int
+        crc: int
+
+        def __new__(cls, tick: int, *rest: float) -> Self: ...  # noqa: D102
+        def _replace(self, **fields: float) -> Self: ...
+
+else:
+    Actuators = record(
+        "Actuators", __name__,
+        """Outputs for one tick, of the one control PLC that holds the lease of the rack.
+
+        The rack judges them whole; its next measurement shows whether they were accepted.
+        """,
+        {
+            "tick": Annotated[
+                int, u32("Tick of these outputs; in lock-step the present one advances the plant", high=LAST_TICK)
+            ],
+            **{
+                one.register: Annotated[
+                    float, f32(one.description, unit=one.unit, low=one.span[0], high=one.span[1])
+                ]
+                for one in PROCESS.inputs
+            },
+            "session": Annotated[int, u32("Session of these outputs")],
+            "holder": Annotated[int, u32("Number chosen by the writer; 0 is a simple client")],
+            "generation": Annotated[int, u32("Generation that was read back; 0 does not compare")],
+            "crc": Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")],
+        },
+        defaults=(0, 0, 0),
+    )  # fmt: skip
+
+
+def inputs_of(asked: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return the outputs of `Actuators`, or what else there is for each field of it, in the order of the inputs."""
+    return asked[1 : 1 + len(INPUT_NAMES)]
 
 
 class Measurement(NamedTuple):
@@ -77,13 +119,15 @@ class Measurement(NamedTuple):
     """
 
     tick: Annotated[int, u32("Tick at which these values were read", high=LAST_TICK)]
-    load: Annotated[float, f32("Heat load NCR22_HL (known, as the heater sets it)", unit="W", finite=False)]
+    load: Annotated[float, f32(f"Load {PROCESS.load.name}, which is known", unit=PROCESS.load.unit, finite=False)]
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS, finite=False)]
     x: Annotated[tuple[float, ...], f32_array("Simulated state, not measured", STATE_NAMES, STATE_UNITS, finite=False)]
     session: Annotated[int, u32("Session")]
     u: Annotated[
-        tuple[float, ...], f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS, low=0, high=MAX_INPUT)
-    ] = (0.0, 0.0, 0.0)
+        tuple[float, ...], f32_array(
+            "Input being applied", INPUT_NAMES, INPUT_UNITS, low=SPAN_OF_INPUTS[0], high=SPAN_OF_INPUTS[1]
+        ),
+    ] = (0.0,) * len(INPUT_NAMES)
     holder: Annotated[int, u32("Holder of these outputs; 0 is a simple client, safe or initial state")] = 0
     generation: Annotated[
         int,
@@ -136,17 +180,17 @@ class PlantSession(NamedTuple):
 class LoadStep(NamedTuple):
     """One step of the load table, held until the next one."""
 
-    tick: Annotated[int, u32("First tick of the step", unit="0.25 s", high=LAST_TICK)]
-    watts: Annotated[float, f32("Heat load", unit="W", low=0, high=MAX_LOAD_W)]
+    tick: Annotated[int, u32("First tick of the step", unit=TICK_UNIT, high=LAST_TICK)]
+    watts: Annotated[float, f32("Load", unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])]
 
 
 class LoadStatus(NamedTuple):
     """The heat load, and what is known of it."""
 
-    watts: Annotated[float, f32("Heat load now", unit="W")] = 0.0
-    next_tick: Annotated[int, u32("Tick of the next step that is known; 0 is none", unit="0.25 s")] = 0
-    next_watts: Annotated[float, f32("Heat load from then on", unit="W")] = 0.0
-    last_tick: Annotated[int, u32("Tick of the last step that is known; it is held from there on", unit="0.25 s")] = 0
+    watts: Annotated[float, f32("Load now", unit=PROCESS.load.unit)] = 0.0
+    next_tick: Annotated[int, u32("Tick of the next step that is known; 0 is none", unit=TICK_UNIT)] = 0
+    next_watts: Annotated[float, f32("Load from then on", unit=PROCESS.load.unit)] = 0.0
+    last_tick: Annotated[int, u32("Tick of the last step that is known; it is held from there on", unit=TICK_UNIT)] = 0
     upcoming: Annotated[int, u16("Known future steps")] = 0
     free: Annotated[int, u16("Further steps that can be accepted now")] = 0
 
@@ -154,8 +198,8 @@ class LoadStatus(NamedTuple):
 class LiveLoad(NamedTuple):
     """Changes the heat load of the session under way; what was known of later ticks is dropped."""
 
-    tick: Annotated[int, u32("First tick, in the future; 0 is the next tick", unit="0.25 s", high=LAST_TICK)] = 0
-    watts: Annotated[float, f32("Heat load", unit="W", low=0, high=MAX_LOAD_W)] = 0.0
+    tick: Annotated[int, u32("First tick, in the future; 0 is the next tick", unit=TICK_UNIT, high=LAST_TICK)] = 0
+    watts: Annotated[float, f32("Load", unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])] = 0.0
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
@@ -163,10 +207,10 @@ class LoadAhead(NamedTuple):
     """Steps of the heat load that are to come, for loads of any length; what was known from the first on is dropped."""
 
     session: Annotated[int, u32("Session of these steps")] = 0
-    tick: Annotated[int, u32("Tick of the first step, in the future", unit="0.25 s", high=LAST_TICK)] = 0
+    tick: Annotated[int, u32("Tick of the first step, in the future", unit=TICK_UNIT, high=LAST_TICK)] = 0
     length: Annotated[int, u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
     watts: Annotated[
-        tuple[float, ...], f32_array("Heat load of step", tuple(map(str, range(AHEAD_STEPS))), ("W",) * AHEAD_STEPS)
+        tuple[float, ...], f32_array("Load of step", tuple(map(str, range(AHEAD_STEPS))), (PROCESS.load.unit,) * AHEAD_STEPS)
     ] = (0.0,) * AHEAD_STEPS
     ticks: Annotated[
         tuple[int, ...],
@@ -213,7 +257,7 @@ class PlantSample(NamedTuple):
     """One row of the history: everything physical at one tick. The row of tick n is n modulo the number of rows."""
 
     tick: Annotated[int, u32("Tick of the row")]
-    load: Annotated[float, f32("Heat load", unit="W")]
+    load: Annotated[float, f32("Load", unit=PROCESS.load.unit)]
     u: Annotated[tuple[float, ...], f32_array("Input applied from this tick on", INPUT_NAMES, INPUT_UNITS)]
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS, finite=False)]
     x: Annotated[tuple[float, ...], f32_array("Simulated state", STATE_NAMES, STATE_UNITS, finite=False)]
@@ -309,7 +353,7 @@ class Surroundings(NamedTuple):
 PLANT_MAP: Final = RegisterMap(
     service="plant",
     version=4,
-    blocks=(
+    blocks=placed((
         IDENTITY_BLOCK,
         STATISTICS_BLOCK,
         Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL, sealed=True),
@@ -320,7 +364,7 @@ PLANT_MAP: Final = RegisterMap(
         Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
         Block("pace", 410, SessionPace, "Time base of the present session", Role.OPERATOR),
         Block("load status", 420, LoadStatus, "The heat load and its known steps"),
-        Block("live load", 440, LiveLoad, "Heat load from a tick on", Role.OPERATOR, sealed=True),
+        Block("live load", 440, LiveLoad, "Load from a tick on", Role.OPERATOR, sealed=True),
         Block(
             "sensor faults",
             500,
@@ -339,7 +383,7 @@ PLANT_MAP: Final = RegisterMap(
             Role.OPERATOR,
         ),
         Block("model range", 780, ModelRangeStatus, "Alarm of the simulation: it has left its property tables"),
-        Block("load table", 1000, LoadStep, "Heat load over the session", Role.OPERATOR, LOAD_ROWS),
+        Block("load table", 1000, LoadStep, "Load over the session", Role.OPERATOR, LOAD_ROWS),
         Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
         Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
         Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
@@ -348,5 +392,5 @@ PLANT_MAP: Final = RegisterMap(
         Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
         CONFIGURATION_BLOCK,
         CONFIGURATION_LINES_BLOCK,
-    ),
+    )),
 )

@@ -3,6 +3,7 @@
 from enum import IntEnum
 from typing import Annotated, Final, NamedTuple, Self
 
+from coldloop.process.signals import TICK_UNIT
 from coldloop.registers.audit import NOBODY, WHO_WORDS
 from coldloop.registers.declaration import text, u16, u32
 
@@ -18,17 +19,17 @@ class WatchdogState(IntEnum):
 class WatchdogStatus(NamedTuple):
     """A watchdog, in the manner of the WAGO 750's block of watchdog registers."""
 
-    time: Annotated[int, u16("Time-out in use; 0 is off", unit="0.25 s")] = 0
+    time: Annotated[int, u16("Time-out in use; 0 is off", unit=TICK_UNIT)] = 0
     state: Annotated[int, u16("0 off, 1 running, 2 expired", values=WatchdogState)] = WatchdogState.OFF
-    remaining: Annotated[int, u16("Time until it expires", unit="0.25 s")] = 0
-    lowest: Annotated[int, u16("Shortest remaining time since it was set", unit="0.25 s")] = 0
+    remaining: Annotated[int, u16("Time until it expires", unit=TICK_UNIT)] = 0
+    lowest: Annotated[int, u16("Shortest remaining time since it was set", unit=TICK_UNIT)] = 0
     trips: Annotated[int, u16("Times that it has expired")] = 0
 
 
 class WatchdogTime(NamedTuple):
     """Sets a watchdog when written."""
 
-    time: Annotated[int, u16("Time-out; 0 switches the watchdog off, a new value restarts it", unit="0.25 s")]
+    time: Annotated[int, u16("Time-out; 0 switches the watchdog off, a new value restarts it", unit=TICK_UNIT)]
 
 
 class LeaseState(IntEnum):

@@ -1,0 +1,35 @@
+"""`coldloop process`: a process file checked, linearised and judged, and made into the model file of all programs."""
+
+import argparse
+import sys
+from pathlib import Path
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="process file (TOML)")
+    parser.add_argument("--out", type=Path, metavar="MODEL",
+                        help="write the model file; then --process MODEL, or COLDLOOP_PROCESS=MODEL")  # fmt: skip
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Make, print; write the model file when there is --out."""
+    from coldloop.errors import UsageError
+    from coldloop.whole_file import require_regular_file
+    from rig.process_file.judgement import described
+    from rig.process_file.making import made_from
+
+    out: Path | None = options.out
+    if out is not None:
+        require_regular_file(out)
+        if out.resolve() == options.file.resolve():
+            raise UsageError(f"{out}: is the process file; name another one with --out")
+    made = made_from(options.file, out or options.file)
+    sys.stdout.write(described(made))
+    if out is not None:
+        try:
+            made.model.save(out)
+        except OSError as error:
+            raise UsageError(f"{out}: {error.strerror}; name a file that can be written with --out") from None
+        sys.stdout.write(f"written to {out}\n")
+    return 0

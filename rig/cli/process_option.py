@@ -1,0 +1,59 @@
+"""The option --process: what it names is what this interpreter, and the services it starts, are loaded with."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from coldloop.errors import UsageError
+
+OPTION: Final = "--process"
+VARIABLE: Final = "COLDLOOP_PROCESS"
+
+
+def load_named_process(arguments: Sequence[str]) -> list[str]:
+    """Load the process that the arguments name, before any module asks for it; return the arguments without it.
+
+    Raises:
+        UsageError: There is no file, or it cannot be made into a model file: what was said then is on standard error.
+    """
+    left, named = _split(arguments)
+    if named is not None:
+        path = Path(named)
+        if not path.is_file():
+            raise UsageError(f"{OPTION} {named}: no such file; name a process file or a model file")
+        os.environ[VARIABLE] = str((_made(path) if path.suffix == ".toml" else path).resolve())
+    return left
+
+
+def _split(arguments: Sequence[str]) -> tuple[list[str], str | None]:
+    left, named, rest = [], None, iter(arguments)
+    for argument in rest:
+        if argument == OPTION:
+            named = next(rest, None)
+            if named is None:
+                raise UsageError(f"{OPTION}: name a process file or a model file")
+        elif argument.startswith(f"{OPTION}="):
+            named = argument.removeprefix(f"{OPTION}=")
+        else:
+            left.append(argument)
+    return left, named
+
+
+def _made(path: Path) -> Path:
+    """Return the model file of a process file, made by a process of its own: this one is loaded with no process yet."""
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coldloop" / "processes"
+    root.mkdir(parents=True, exist_ok=True)
+    place = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
+    out = root / f"{path.stem}-{place}.json"
+    environment = {name: value for name, value in os.environ.items() if name != VARIABLE}
+    made = subprocess.run(
+        [sys.executable, "-m", "rig", "process", str(path), "--out", str(out)], env=environment, capture_output=True,
+        text=True, check=False,
+    )  # fmt: skip
+    if made.returncode:
+        raise UsageError(made.stderr.strip().removeprefix("coldloop: ") or f"{path}: cannot be made into a model file")
+    return out

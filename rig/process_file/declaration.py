@@ -1,0 +1,210 @@
+"""What a process file says, checked when it is read; `docs/your-plant.md` is its reference."""
+
+from pathlib import Path
+from typing import Annotated, Final, Self
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeFloat,
+    PositiveFloat,
+    model_validator,
+)
+
+from coldloop.config import load_configuration
+
+MOST_SIGNALS: Final = 32
+"""Outputs at most: registers have a bit for each."""
+LISTING: Final = "docs/your-plant.md lists all keys"
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$")]
+Span = tuple[FiniteFloat, FiniteFloat]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+def _rising(span: Span, what: str) -> None:
+    if span[0] >= span[1]:
+        raise ValueError(f"{what}: give the lower end first")
+
+
+class LoopSection(_Section):
+    """A PI loop of the fallback, u = gain (e + 1/T_i integral of e) with e = setpoint - y."""
+
+    input: Name
+    gain: FiniteFloat
+    """In the unit of the input per unit of the output, with the sign of the process."""
+    integral_time_s: PositiveFloat
+
+
+class InputSection(_Section):
+    """A manipulated input."""
+
+    name: Name
+    unit: str = ""
+    description: str = ""
+    at: FiniteFloat
+    """At the operating point."""
+    low: FiniteFloat
+    high: FiniteFloat
+    rate: PositiveFloat
+    """Largest change in a sampling period."""
+    safe: FiniteFloat | None = None
+    """What the rack applies when nobody drives it, if so configured; the operating point if not given."""
+    weight: PositiveFloat | None = None
+    """In the cost, per square of its deviation; 0.01 over the square of a quarter of its range if not given."""
+
+    @model_validator(mode="after")
+    def _inside(self) -> Self:
+        _rising((self.low, self.high), f"{self.name}: low, high")
+        for what, value in (("at", self.at), ("safe", self.at if self.safe is None else self.safe)):
+            if not self.low <= value <= self.high:
+                raise ValueError(f"{self.name}: {what} = {value:g} is outside low to high")
+        return self
+
+
+class OutputSection(_Section):
+    """A measured output."""
+
+    name: Name
+    unit: str = ""
+    range: Span
+    """Of its sensor: what is outside is no measurement."""
+    noise: PositiveFloat
+    """Standard deviation of its sensor."""
+    at: FiniteFloat | None = None
+    """At the operating point; found from the equations where the plant has them."""
+    band: Span | None = None
+    """What it is to be kept within."""
+    penalty: PositiveFloat | None = None
+    """rho, per square of what the band is missed by and sample; 1 over the square of a twentieth of it if not given."""
+    weight: NonNegativeFloat = 0.0
+    """In the cost, per square of its deviation from the operating point."""
+    loop: LoopSection | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        _rising(self.range, f"{self.name}: range")
+        if self.band is not None:
+            _rising(self.band, f"{self.name}: band")
+        if self.band is None and (self.loop is not None or self.penalty is not None):
+            raise ValueError(f"{self.name}: a loop or a penalty needs a band")
+        return self
+
+
+class LoadSection(_Section):
+    """The one disturbance, which is measured; leave it out where there is none."""
+
+    name: Name
+    unit: str = ""
+    at: FiniteFloat
+    span: Span
+    walk: PositiveFloat | None = None
+    """Random walk of what of it is not measured, per square root of a sampling period; 1 % of its span if not given."""
+
+    @model_validator(mode="after")
+    def _inside(self) -> Self:
+        _rising(self.span, f"{self.name}: span")
+        if not self.span[0] <= self.at <= self.span[1]:
+            raise ValueError(f"{self.name}: at = {self.at:g} is outside its span")
+        return self
+
+
+class LagSection(_Section):
+    """gain exp(-delay s) / (time constant s + 1) from an input, or from the load, to an output."""
+
+    output: Name
+    source: Name
+    gain: FiniteFloat
+    time_constant_s: PositiveFloat
+    delay_s: NonNegativeFloat = 0.0
+
+
+class PlantSection(_Section):
+    """Where the plant comes from: one of these."""
+
+    python: Annotated[str, Field(pattern=r"^[^:]+\.py:[A-Za-z_]\w*$")] | None = None
+    """`file.py:Class`, the file beside the process file."""
+    matrices: str | None = None
+    """NPZ file with A, B, C and, where there are such, D, F, G: dx/dt = A x + B u + F w, in deviations and seconds."""
+    transfer_functions: tuple[LagSection, ...] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if sum(each is not None for each in (self.python, self.matrices, self.transfer_functions)) != 1:
+            raise ValueError("plant: give one of python, matrices, transfer_functions")
+        return self
+
+
+class StateSection(_Section):
+    """Process noise of a state."""
+
+    name: Name
+    walk: PositiveFloat
+    """Per square root of a sampling period."""
+
+
+class PredictionSection(_Section):
+    """Decision and constraint instants, in sampling periods."""
+
+    decision_instants: tuple[Annotated[int, Field(ge=1, le=400)], ...] = (1, 2, 4, 8, 16, 30, 60)
+    constraint_instants: tuple[Annotated[int, Field(ge=1, le=400)], ...] = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 44, 60)
+
+    @model_validator(mode="after")
+    def _rising(self) -> Self:
+        for name in ("decision_instants", "constraint_instants"):
+            instants = getattr(self, name)
+            if not instants or list(instants) != sorted(set(instants)):
+                raise ValueError(f"prediction.{name}: give rising numbers of sampling periods, from 1")
+        if self.constraint_instants[-1] > self.decision_instants[-1]:
+            raise ValueError("prediction: the last decision instant is the horizon; constraints end within it")
+        return self
+
+
+class ProcessFile(_Section):
+    """A process file."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,31}$")]
+    """Small letters, digits and hyphens."""
+    tick_s: Annotated[float, Field(gt=1e-4, le=3600.0)] = 0.25
+    """The basic period, in which PLCs scan."""
+    ticks_per_sample: Annotated[int, Field(ge=2, le=100)] = 20
+    """Ticks of a sampling period of the prediction model, which is the longest updating period."""
+    plant: PlantSection
+    inputs: Annotated[tuple[InputSection, ...], Field(min_length=1, max_length=MOST_SIGNALS)]
+    outputs: Annotated[tuple[OutputSection, ...], Field(min_length=1, max_length=MOST_SIGNALS)]
+    load: LoadSection | None = None
+    states: tuple[StateSection, ...] = ()
+    """Process noises of states by name; of others 1 % of what they move by with the inputs, a sample."""
+    prediction: PredictionSection = PredictionSection()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        names = [each.name for each in (*self.inputs, *self.outputs)] + [self.load.name] * (self.load is not None)
+        lower = [name.lower() for name in names]
+        twice = next((name for name in names if lower.count(name.lower()) > 1), None)
+        if twice is not None:
+            raise ValueError(f"{twice}: two signals have this name (small and capital letters are the same)")
+        reserved = {"tick", "session", "holder", "generation", "crc", "mode", "update", "u"} & set(lower)
+        if reserved:
+            raise ValueError(f"{sorted(reserved)[0]}: a register has this name already; choose another")
+        if not any(output.band for output in self.outputs):
+            raise ValueError("outputs: none has a band; give at least one a band to be kept within")
+        inputs = {one.name for one in self.inputs}
+        for output in self.outputs:
+            if output.loop is not None and output.loop.input not in inputs:
+                raise ValueError(f"{output.name}: its loop moves {output.loop.input}, which is no input")
+        return self
+
+
+def read_process_file(path: Path) -> ProcessFile:
+    """Return what a process file says.
+
+    Raises:
+        ConfigurationError: One line that names file, key and remedy.
+    """
+    return load_configuration(ProcessFile, file=path, environment={}, option="FILE", listing=LISTING).settings

@@ -1,0 +1,98 @@
+"""What there is to know of a process before it is controlled, as text: rest, modes, gains, and what is wrong."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.process_file.making import Made
+
+Array = NDArray[np.float64]
+
+ROUGH: Final = 1e-4
+"""Error of the derivatives from which on the plant has a kink, or noise, at its operating point."""
+SMALL: Final = 1e-6
+"""Singular value, over the largest, below which a direction counts as none."""
+SETTLED: Final = 3.0
+"""Time constants after which a mode has settled."""
+
+
+def described(made: Made) -> str:
+    """Return the description of a process and its linear model."""
+    lines = [*_rest(made), *_modes(made), *_gains(made), *_warnings(made), f"model      sha256 {made.model.digest}"]
+    return "\n".join(lines) + "\n"
+
+
+def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...]) -> str:
+    triples = zip(names, values, units, strict=True)
+    return "  ".join(f"{name} {value:.5g} {unit}".rstrip() for name, value, unit in triples)
+
+
+def _rest(made: Made) -> list[str]:
+    m, process = made.model, made.process
+    load = "" if not m.F.any() and not m.G.any() else f"; load {m.load_name} {m.w0:.5g} {m.load_unit}".rstrip()
+    problem = len(process.decision_instants) * (len(process.inputs) + 2 * len(process.bands))
+    return [
+        f"{process.name}: {len(m.input_names)} inputs, {len(m.output_names)} outputs, {len(m.state_names)} states; "
+        f"tick {process.tick_s:g} s, sampling period {process.tick_s * process.ticks_per_sample:g} s, horizon "
+        f"{process.decision_instants[-1] * process.tick_s * process.ticks_per_sample:g} s, {problem} variables",
+        f"inputs     {_values(m.input_names, m.u0, m.input_units)}{load}",
+        f"outputs    {_values(m.output_names, m.y0, m.output_units)}",
+        f"states     {_values(m.state_names, m.x0, m.state_units)}",
+    ]
+
+
+def _modes(made: Made) -> list[str]:
+    values = sorted(np.linalg.eigvals(made.model.A), key=lambda value: -value.real)
+    texts = [f"{v.real:.3g}" if abs(v.imag) < 1e-12 else f"{v.real:.3g}{v.imag:+.3g}i" for v in values]
+    lines = [f"modes      {'  '.join(texts[i : i + 8])} /s" for i in range(0, len(texts), 8)]
+    if made.linear.error:
+        lines.append(f"derivatives within {made.linear.error:.1e} of those with steps twice as wide")
+    return lines
+
+
+def _gains(made: Made) -> list[str]:
+    m = made.model
+    horizon_s = made.process.decision_instants[-1] * made.process.tick_s * made.process.ticks_per_sample
+    held = m.discretised(horizon_s)
+    effects = np.column_stack([m.C @ held.B + m.D, m.C @ held.F + m.G])
+    names, units = (*m.input_names, m.load_name), (*m.input_units, m.load_unit)
+    return [
+        f"after {horizon_s:g} s of +1 {unit} {name}: ".replace("  ", " ") + _values(m.output_names, column, m.output_units)
+        for name, unit, column in zip(names, units, effects.T, strict=True)
+        if column.any()
+    ]
+
+
+def _rank_deficit(matrix: Array) -> int:
+    sizes = np.linalg.svd(matrix, compute_uv=False)
+    return int((sizes < SMALL * max(sizes.max(), 1e-300)).sum()) if sizes.size else 0
+
+
+def _warnings(made: Made) -> list[str]:
+    """Return what a control engineer would want to know, in words."""
+    m, process, found = made.model, made.process, list[str]()
+    sample_s = process.tick_s * process.ticks_per_sample
+    poles = np.linalg.eigvals(m.A)
+    fastest, slowest = -poles.real.min(), -poles.real.max()
+    if poles.real.max() > 0:
+        found.append(f"unstable: a mode grows with {poles.real.max():.3g} /s; nothing may be late for longer")
+    elif slowest * SETTLED > 0 and process.decision_instants[-1] * sample_s * slowest < 1.0:
+        found.append(f"horizon: it ends before the slowest mode, {1 / slowest:.3g} s, has moved much")
+    if fastest * sample_s > 20.0:
+        found.append(f"sampling: the fastest mode, {1 / fastest:.2g} s, is over within a sampling period")
+    for band, output in zip(process.bands, process.banded, strict=True):
+        value = float(m.y0[m.output_names.index(output.name)])
+        if not band.low <= value <= band.high:
+            found.append(f"band: {output.name} rests at {value:.5g}, its band is {band.low:g} to {band.high:g}")
+    rows = [m.output_names.index(output.name) for output in process.banded]
+    reach = m.discretised(process.decision_instants[-1] * sample_s).B * [one.scale for one in process.inputs]
+    effect = (m.C[rows] @ reach) / [[band.high - band.low] for band in process.bands]
+    if _rank_deficit(effect):
+        found.append("controllability: the inputs do not move the outputs with a band independently within the horizon")
+    if made.linear.error > ROUGH:
+        found.append(f"kink: derivatives differ by {made.linear.error:.1e} with the step; the model holds for one side")
+    steady = m.A_tick - np.eye(len(m.A))
+    if _rank_deficit(np.vstack([steady, m.C])):
+        found.append("observability: the outputs do not show where some state rests")
+    return [f"warning    {text}" for text in found]

@@ -1,0 +1,232 @@
+"""The linear model of a process file's plant at its operating point, whichever way the plant is given."""
+
+from math import factorial
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.errors import UsageError
+from plant.own.maker import LINEAR, PYTHON, TRANSFER_FUNCTIONS
+from plant.own.python_class import Equations, load_equations, source_digest
+from rig.process_file.declaration import LagSection, PlantSection, ProcessFile
+
+Array = NDArray[np.float64]
+
+AT_REST: Final = 1e-8
+"""Largest change of a state in a second, over its size, that still counts as rest."""
+STEP: Final = 1e-5
+"""Of differences, over the size of the variable."""
+PADE_ORDER: Final = 2
+"""Of the approximation of a dead time in the prediction model; the simulated plant has it exactly."""
+
+
+class Linearised(NamedTuple):
+    """dx/dt = A x + B u + F w, y = C x + D u + G w in deviations from (x0, u0, w0, y0); time in seconds."""
+
+    A: Array
+    B: Array
+    F: Array
+    C: Array
+    D: Array
+    G: Array
+    x0: Array
+    u0: Array
+    w0: float
+    y0: Array
+    states: dict[str, str]
+    """Name and unit of each."""
+    kind: str
+    """Of the plant."""
+    parameters: dict[str, Any]
+    """What the plant is made from, in the model file."""
+    digest: str
+    """Of its source."""
+    error: float
+    """Of the derivatives: largest difference from those with steps twice as wide, over the largest of each column."""
+
+
+def linearised(file: ProcessFile, folder: Path, to_model: str) -> Linearised:
+    """Return the model of a process.
+
+    Args:
+        file: What the process file says.
+        folder: Where it is.
+        to_model: The way from the model file's folder to that one.
+
+    Raises:
+        UsageError: The plant cannot be read, does not rest, or does not fit the signals.
+    """
+    plant = file.plant
+    if plant.python is not None:
+        found = _from_equations(file, folder, plant.python, to_model)
+    elif plant.matrices is not None:
+        found = _from_matrices(file, folder / plant.matrices)
+    else:
+        found = _from_lags(file, plant)
+    for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
+        if not np.isfinite(getattr(found, name)).all():
+            raise UsageError(f"plant: {name} of the linear model is not finite; look at the plant's equations there")
+    return found
+
+
+def _operating(file: ProcessFile) -> tuple[Array, float]:
+    return np.array([one.at for one in file.inputs]), file.load.at if file.load else 0.0
+
+
+def _given_outputs(file: ProcessFile) -> Array:
+    missing = next((one.name for one in file.outputs if one.at is None), None)
+    if missing is not None:
+        raise UsageError(f"outputs: {missing} needs at, its value at the operating point: this plant has no equations")
+    return np.array([one.at for one in file.outputs], dtype=np.float64)
+
+
+# -- a class with equations ------------------------------------------------------------------------------------------
+
+
+def _from_equations(file: ProcessFile, folder: Path, place: str, to_model: str) -> Linearised:
+    source, _, name = place.partition(":")
+    equations = load_equations(folder / source, name)
+    u, w = _operating(file)
+    x = _rest(equations, u, w, place)
+    y = np.asarray(equations.outputs(x, u, w), dtype=np.float64)
+    if y.shape != (len(file.outputs),):
+        raise UsageError(f"{place}: outputs() returns {y.size} numbers, the file declares {len(file.outputs)} outputs")
+
+    def flow(v: Array) -> Array:
+        return np.asarray(equations.derivatives(v[: len(x)], v[len(x) : -1], float(v[-1])), dtype=np.float64)
+
+    def read(v: Array) -> Array:
+        return np.asarray(equations.outputs(v[: len(x)], v[len(x) : -1], float(v[-1])), dtype=np.float64)
+
+    at = np.array([*x, *u, w])
+    (J, one), (H, other) = _jacobian(flow, at), _jacobian(read, at)
+    n = len(x)
+    return Linearised(
+        J[:, :n], J[:, n:-1], J[:, -1], H[:, :n], H[:, n:-1], H[:, -1], x, u, w, y, dict(equations.states), PYTHON,
+        {"file": str(Path(to_model) / source), "class": name}, source_digest(folder / source, name), max(one, other),
+    )  # fmt: skip
+
+
+def _rest(equations: Equations, u: Array, w: float, place: str) -> Array:
+    """Return the state that does not move."""
+    from scipy.optimize import root  # noqa: PLC0415
+
+    guess = np.array(equations.guess, dtype=np.float64)
+    if guess.shape != (len(equations.states),):
+        raise UsageError(f"{place}: guess has {guess.size} numbers, there are {len(equations.states)} states")
+    try:
+        with np.errstate(all="ignore"):
+            found = root(lambda x: np.asarray(equations.derivatives(x, u, w), dtype=np.float64), guess, tol=1e-12)
+            left = np.asarray(equations.derivatives(found.x, u, w), dtype=np.float64)
+    except Exception as error:  # noqa: BLE001 whatever a user's equations do
+        raise UsageError(f"{place}: derivatives() fails near guess: {type(error).__name__}: {error}") from error
+    moving = np.abs(left) / np.maximum(1.0, np.abs(found.x))
+    if not np.all(moving <= AT_REST):
+        worst = list(equations.states)[int(np.nanargmax(np.where(np.isfinite(moving), moving, np.inf)))]
+        raise UsageError(
+            f"{place}: no state of rest with the inputs at their operating point: {worst} keeps moving; give other "
+            "values of at, or a guess nearer to it"
+        )
+    return np.array(found.x, dtype=np.float64)
+
+
+def _jacobian(function: Any, at: Array) -> tuple[Array, float]:  # noqa: ANN401 a function of arrays
+    """Return central differences, shape (k, len(at)), and how far those of twice the step are from them."""
+    columns, errors = [], []
+    for i, value in enumerate(at):
+        step = STEP * max(1.0, abs(value))
+        by_step = []
+        for h in (step, 2 * step):
+            up, down = at.copy(), at.copy()
+            up[i] += h
+            down[i] -= h
+            by_step.append((function(up) - function(down)) / (2 * h))
+        fine, coarse = by_step
+        columns.append(fine)
+        errors.append(np.abs(fine - coarse).max() / max(np.abs(fine).max(), 1e-12))
+    return np.array(columns).T, float(max(errors))
+
+
+# -- matrices and transfer functions ---------------------------------------------------------------------------------
+
+
+def _from_matrices(file: ProcessFile, path: Path) -> Linearised:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            M = {name: np.array(stored[name], dtype=np.float64) for name in stored.files}
+    except (OSError, ValueError, EOFError) as error:
+        raise UsageError(f"{path}: not a readable NPZ file ({error}); write it with numpy.savez(A=..., ...)") from error
+    missing = {"A", "B", "C"} - set(M)
+    if missing:
+        raise UsageError(f"{path}: no {' and '.join(sorted(missing))}; it needs A, B and C")
+    n, m, p = len(np.atleast_2d(M["A"])), len(file.inputs), len(file.outputs)
+    shapes = {"A": (n, n), "B": (n, m), "F": (n,), "C": (p, n), "D": (p, m), "G": (p,)}
+    full = {name: M.get(name, np.zeros(shape)) for name, shape in shapes.items()}
+    full |= {name: full[name].ravel() for name in ("F", "G")}
+    for name, shape in shapes.items():
+        if full[name].shape != shape:
+            raise UsageError(
+                f"{path}: {name} has shape {full[name].shape}, and not {shape} for {n} states, {m} inputs, {p} outputs"
+            )
+    u, w = _operating(file)
+    return Linearised(
+        **full, x0=np.zeros(n), u0=u, w0=w, y0=_given_outputs(file), states={f"x{i}": "" for i in range(1, n + 1)},
+        kind=LINEAR, parameters={}, digest="", error=0.0,
+    )  # fmt: skip
+
+
+def _from_lags(file: ProcessFile, plant: PlantSection) -> Linearised:
+    """Return the lags side by side: a state each, and before it as many as its dead time is approximated with."""
+    lags, m = plant.transfer_functions or (), len(file.inputs)
+    sources = {one.name: i for i, one in enumerate(file.inputs)} | ({file.load.name: m} if file.load else {})
+    outputs = {one.name: i for i, one in enumerate(file.outputs)}
+    for lag in lags:
+        if lag.source not in sources or lag.output not in outputs:
+            unknown = lag.source if lag.source not in sources else lag.output
+            raise UsageError(f"plant.transfer_functions: {unknown} is no signal of this file")
+    parts = [_lag_model(lag) for lag in lags]
+    n = sum(len(a) for a, _, _ in parts)
+    A, B, C = np.zeros((n, n)), np.zeros((n, m + 1)), np.zeros((len(outputs), n))
+    states: dict[str, str] = {}
+    first = 0
+    for lag, (a, b, c) in zip(lags, parts, strict=True):
+        place = slice(first, first + len(a))
+        A[place, place], B[place, sources[lag.source]], C[outputs[lag.output], place] = a, b, c
+        unit = file.outputs[outputs[lag.output]].unit
+        states |= {f"{lag.output}_{lag.source}_{i}": unit for i in range(1, len(a) + 1)}
+        first += len(a)
+    u, w = _operating(file)
+    return Linearised(
+        A, B[:, :m], B[:, m], C, np.zeros((len(outputs), m)), np.zeros(len(outputs)), np.zeros(n), u, w,
+        _given_outputs(file), states, TRANSFER_FUNCTIONS, {"lags": [lag.model_dump() for lag in lags]}, "", 0.0,
+    )  # fmt: skip
+
+
+def _lag_model(lag: LagSection) -> tuple[Array, Array, Array]:
+    """Return A (k, k), b (k,), c (k,) of one lag, its dead time by a Pade approximation, its state last."""
+    rate = 1.0 / lag.time_constant_s
+    if lag.delay_s == 0.0:
+        return np.array([[-rate]]), np.array([lag.gain * rate]), np.ones(1)
+    a, b, c, d = _dead_time(lag.delay_s)
+    k = len(a)
+    A = np.zeros((k + 1, k + 1))
+    A[:k, :k], A[k, :k], A[k, k] = a, lag.gain * rate * c, -rate
+    return A, np.array([*b, lag.gain * rate * d]), np.array([*np.zeros(k), 1.0])
+
+
+def _dead_time(delay_s: float) -> tuple[Array, Array, Array, float]:
+    """Return the state space of the diagonal Pade approximation of exp(-delay s), in companion form, scaled by time.
+
+    Golub and Van Loan, Matrix Computations, section 9.3.
+    """
+    k = PADE_ORDER
+    share = [factorial(2 * k - j) * factorial(k) / (factorial(2 * k) * factorial(j) * factorial(k - j)) for j in range(k + 1)]
+    above = np.array([(-1) ** j * share[j] for j in range(k + 1)]) / share[k]  # rising powers of s times the delay
+    below = np.array(share) / share[k]
+    d = above[k]
+    a = np.zeros((k, k))
+    a[:-1, 1:] = np.eye(k - 1)
+    a[-1] = -below[:k]
+    return a / delay_s, np.array([*np.zeros(k - 1), 1.0]) / delay_s, above[:k] - d * below[:k], d

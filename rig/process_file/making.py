@@ -1,0 +1,135 @@
+"""A process file made into a model file: the linear model, and the process as programs are loaded with it."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.errors import UsageError
+from coldloop.process.declaration import Band, Input, Load, Loop, Output, Process, State
+from coldloop.process.lti_model import LtiModel, discretise
+from rig.plc_sizing.problem_sizes import ProblemSizes, iteration_shares
+from rig.process_file.declaration import OutputSection, ProcessFile, read_process_file
+from rig.process_file.linearised import Linearised, linearised
+
+Array = NDArray[np.float64]
+
+REGISTERS_OF_A_REQUEST: Final = 125
+"""What one read of Modbus carries: the latched update, and the rack's measurement, are one."""
+NO_LOAD: Final = Load(name="none", unit="", span=(0.0, 1.0), walk=1e-6)
+"""The load of a process that has none."""
+USUAL_WALK: Final = 0.01
+"""Process noise of a state over what it moves by when each input makes its largest step, held for the horizon."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What is made from a process file."""
+
+    model: LtiModel
+    process: Process
+    linear: Linearised
+
+
+def made_from(path: Path, out: Path) -> Made:
+    """Return the model of a process file, for a model file at `out`.
+
+    Raises:
+        ColdloopError: One line that names file, key and remedy.
+    """
+    file = read_process_file(path)
+    linear = linearised(file, path.parent, os.path.relpath(path.resolve().parent, out.resolve().parent))
+    process = _process(file, linear)
+    _check_room(process)
+    tick = discretise(linear.A, linear.B, linear.F, file.tick_s)
+    names, units = zip(*linear.states.items(), strict=True)
+    model = LtiModel(
+        A=linear.A, B=linear.B, F=linear.F, C=linear.C, D=linear.D, G=linear.G, A_tick=tick.A, B_tick=tick.B,
+        F_tick=tick.F, x0=linear.x0, u0=linear.u0, w0=linear.w0, y0=linear.y0, state_names=names, state_units=units,
+        input_names=tuple(one.name for one in process.inputs), input_units=tuple(one.unit for one in process.inputs),
+        output_names=tuple(one.name for one in process.outputs),
+        output_units=tuple(one.unit for one in process.outputs), load_name=process.load.name,
+        load_unit=process.load.unit, parameters_digest=linear.digest, plant=linear.kind,
+        note=f"made from {path.name}", plant_parameters=linear.parameters, process=process.document(),
+    )  # fmt: skip
+    return Made(model, process, linear)
+
+
+def _process(file: ProcessFile, linear: Linearised) -> Process:
+    load = file.load
+    return Process(
+        name=file.name, tick_s=file.tick_s, ticks_per_sample=file.ticks_per_sample,
+        inputs=tuple(
+            Input(
+                name=one.name, unit=one.unit, register=one.name.lower(), description=one.description or one.name,
+                span=(min(one.low, 0.0), max(one.high, 0.0)), low=one.low, high=one.high, rate=one.rate,
+                safe=one.at if one.safe is None else one.safe, scale=(one.high - one.low) / 4,
+                weight=one.weight or 0.01 / ((one.high - one.low) / 4) ** 2, walk=one.rate / 10,
+            )
+            for one in file.inputs
+        ),
+        outputs=tuple(map(_output, file.outputs)),
+        states=_states(file, linear),
+        load=NO_LOAD if load is None else Load(
+            name=load.name, unit=load.unit, span=load.span, walk=load.walk or 0.01 * (load.span[1] - load.span[0])
+        ),
+        decision_instants=file.prediction.decision_instants,
+        constraint_instants=file.prediction.constraint_instants,
+        iterations=iteration_shares(_sizes(file, len(linear.states))),
+    )  # fmt: skip
+
+
+def _output(one: OutputSection) -> Output:
+    if one.band is None:
+        band = None
+    else:
+        loop = one.loop
+        band = Band(
+            low=one.band[0], high=one.band[1], weight=one.penalty or 1.0 / ((one.band[1] - one.band[0]) / 20) ** 2,
+            loop=None if loop is None else Loop(
+                input=loop.input, gain=loop.gain, integral_time_s=loop.integral_time_s
+            ),
+        )  # fmt: skip
+    return Output(name=one.name, unit=one.unit, range=one.range, noise=one.noise, weight=one.weight, band=band)
+
+
+def _states(file: ProcessFile, linear: Linearised) -> tuple[State, ...]:
+    given = {state.name: state.walk for state in file.states}
+    unknown = set(given) - set(linear.states)
+    if unknown:
+        raise UsageError(f"states: {sorted(unknown)[0]} is no state of the plant: {', '.join(linear.states)}")
+    sample_s = file.tick_s * file.ticks_per_sample
+    moves = np.abs(discretise(linear.A, linear.B, linear.F, sample_s).B) @ [(one.high - one.low) / 4 for one in file.inputs]
+    usual = USUAL_WALK * np.maximum(moves, 1e-6 * max(moves.max(), 1e-12))
+    return tuple(
+        State(name=name, unit=unit, walk=given.get(name, float(walk)))
+        for (name, unit), walk in zip(linear.states.items(), usual, strict=True)
+    )
+
+
+def _sizes(file: ProcessFile, states: int) -> ProblemSizes:
+    bands = sum(output.band is not None for output in file.outputs)
+    constants = len(file.outputs) - 1  # by default all outputs but one have a constant, and the load a mismatch
+    return ProblemSizes(
+        len(file.prediction.decision_instants), len(file.inputs), len(file.outputs), bands,
+        len(file.prediction.constraint_instants), states + constants,
+    )  # fmt: skip
+
+
+def _check_room(process: Process) -> None:
+    """Check that what the link carries at once fits into one request.
+
+    Raises:
+        UsageError: It does not.
+    """
+    words = 16 + 2 * (len(process.inputs) + len(process.outputs) + len(process.states))
+    latched = 12 + 2 * (2 * len(process.inputs) + len(process.outputs) + len(process.states))
+    if max(words, latched) > REGISTERS_OF_A_REQUEST:
+        most = (REGISTERS_OF_A_REQUEST - 16) // 2
+        raise UsageError(
+            f"{len(process.inputs)} inputs, {len(process.outputs)} outputs and {len(process.states)} states are more "
+            f"than one Modbus request carries: outputs, states and twice the inputs are {most} together at most"
+        )

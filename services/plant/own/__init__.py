@@ -1,0 +1,1 @@
+"""Plants that are not the cold box: a user's Python class, transfer functions with dead times, a linear model."""

@@ -1,0 +1,74 @@
+"""Makes the plant of a process other than the cold box, from what its model file says of it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from coldloop.errors import ModelFileError
+from coldloop.process.lti_model import load as load_model
+from coldloop.process.model_file import ModelHeader
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from plant.own.linear import LinearPlant
+from plant.own.python_class import PythonPlant, load_equations, source_digest
+from plant.own.transfer_functions import TransferFunctionPlant, lags_of
+from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+from plant.rack.rack import MakePlant
+
+NoiseOfSeed = Callable[[int], MeasurementNoise | None]
+
+PYTHON: Final = "python"
+"""Kinds of plants: `ModelHeader.plant`."""
+LINEAR: Final = "linear"
+TRANSFER_FUNCTIONS: Final = "transfer-functions"
+
+
+def check_signals(header: ModelHeader) -> None:
+    """Check that a model file is of the process that this program is loaded with.
+
+    Raises:
+        ModelFileError: It is not, or its plant's source has changed.
+    """
+    if (header.state_names, header.input_names, header.output_names) != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
+        raise ModelFileError(f"{header.file}: a model of another process than COLDLOOP_PROCESS names; name the same for both")
+    if header.plant != PYTHON:
+        return
+    source, name = _source(header)
+    if not source.is_file() or source_digest(source, name) != header.parameters_digest:
+        raise ModelFileError(f"{header.file}: made from another {source} than is there; make it again, `coldloop process`")
+
+
+def _source(header: ModelHeader) -> tuple[Path, str]:
+    return header.file.parent / header.plant_parameters["file"], header.plant_parameters["class"]
+
+
+def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlant:
+    """Return what makes the plant at its operating point.
+
+    Args:
+        header: Of the model file.
+        noise_of_seed: Returns the noise of the sensors.
+
+    Raises:
+        ModelFileError: The plant cannot be made.
+    """
+    if header.plant == PYTHON:
+        equations = load_equations(*_source(header))
+
+        def make(load: HeatLoad, seed: int) -> PlantProgram:
+            return PythonPlant(equations, x0=header.x0, u0=header.u0, load=load, noise=noise_of_seed(seed))
+
+    elif header.plant == TRANSFER_FUNCTIONS:
+        lags = lags_of(header.plant_parameters["lags"])
+
+        def make(load: HeatLoad, seed: int) -> PlantProgram:
+            return TransferFunctionPlant(
+                lags, y0=header.y0, u0=header.u0, w0=header.w0, load=load, noise=noise_of_seed(seed)
+            )
+
+    else:
+        model = load_model(header.file)
+
+        def make(load: HeatLoad, seed: int) -> PlantProgram:
+            return LinearPlant(model, load, noise_of_seed(seed))
+
+    return make

@@ -1,0 +1,56 @@
+"""The cold box of the paper as a process: what the programs are loaded with where nothing else is named."""
+
+from typing import Final
+
+from coldloop.process.declaration import Band, Input, Load, Output, Process, State
+
+LEVEL_BAND: Final = (59.0, 61.0)
+"""Band of L1, % (paper, section IV)."""
+T5_BAND: Final = (9.0, 16.0)
+"""Band of T5, K (paper, section IV)."""
+
+_VALVES: Final = (
+    ("CV155", "cv155", "Opening of the Joule-Thomson valve", 0.5, 43.0),
+    ("CV156", "cv156", "Opening of the turbine valve", 0.1, 36.0),
+)
+_JT_VALVE, _TURBINE_VALVE = (
+    Input(
+        name=name, unit="%", register=register, description=description, span=(0.0, 100.0), low=20.0, high=60.0,
+        rate=rate, safe=safe, scale=10.0, weight=1e-2, walk=0.05,
+    )
+    for name, register, description, rate, safe in _VALVES
+)  # fmt: skip
+_HEATER: Final = Input(
+    name="NCR22_A", unit="W", register="ncr22", description="Actuator part of the bath heater's power",
+    span=(0.0, 1000.0), low=0.0, high=150.0, rate=10.0, safe=75.0, scale=50.0, weight=4e-4, walk=0.5,
+)  # fmt: skip
+
+
+def _output(name: str, unit: str, quantity: str) -> Output:
+    bands = {"L1": LEVEL_BAND, "T5": T5_BAND}
+    band = Band(low=bands[name][0], high=bands[name][1], weight=100.0) if name in bands else None
+    return Output(name=name, unit=unit, quantity=quantity, band=band)
+
+
+COLD_BOX: Final = Process(
+    name="cold-box",
+    tick_s=0.25,
+    ticks_per_sample=20,
+    inputs=(_JT_VALVE, _HEATER, _TURBINE_VALVE),
+    outputs=(
+        _output("L1", "%", "level"),
+        _output("V1", "Hz", "speed"),
+        *(_output(f"T{i}", "K", "temperature") for i in range(1, 11)),
+        *(_output(f"P{i}", "bar", "pressure") for i in range(1, 11)),
+    ),
+    states=(
+        State(name="P1", unit="Pa"),
+        State(name="V_l", unit="m3"),
+        *(State(name=f"T_nef1_{i}", unit="K") for i in range(1, 9)),
+        *(State(name=f"T_nef2_{i}", unit="K") for i in range(1, 7)),
+        *(State(name=f"T_nef34_{i}", unit="K") for i in range(1, 13)),
+    ),
+    load=Load(name="NCR22_HL", unit="W", span=(0.0, 10_000.0), walk=3.0),
+    decision_instants=(1, 2, 4, 8, 16, 50, 100),
+    constraint_instants=(1, 2, 3, 4, 6, 8, 16, 24, 32, 48, 60, 72, 84, 100),
+)

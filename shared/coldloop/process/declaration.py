@@ -1,0 +1,186 @@
+"""What a process is to the PLCs: its signals, its time, what it may and what it should do.
+
+A Coldloop program is loaded with one process, as a PLC is with one project (`coldloop.process.loaded`). The cold box is
+declared in `coldloop.process.cold_box`; others come with their model file, from a process file (`docs/your-plant.md`).
+Needs the standard library only.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from types import MappingProxyType
+from typing import Any, Self, get_args, get_type_hints
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Input:
+    """A manipulated input."""
+
+    name: str
+    unit: str
+    register: str
+    """Its name as a field of registers."""
+    description: str
+    span: Range
+    """What its registers take."""
+    low: float
+    high: float
+    rate: float
+    """Largest change in a sampling period, up or down."""
+    safe: float
+    """What the rack applies by default when nobody drives it."""
+    scale: float
+    """Of its variable in the problem."""
+    weight: float
+    """In the cost, per square of its deviation from the operating point."""
+    walk: float
+    """Random walk of its constant error, per square root of a sampling period."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loop:
+    """A PI loop of the fallback: u = gain (e + 1/T_i integral of e) with e = setpoint - y."""
+
+    input: str
+    gain: float
+    """In the unit of the input per unit of the output."""
+    integral_time_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Band:
+    """What an output is to be kept within."""
+
+    low: float
+    high: float
+    weight: float
+    """rho, per square of what the band is missed by and sample."""
+    loop: Loop | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """A measured output."""
+
+    name: str
+    unit: str
+    quantity: str = ""
+    """What the settings of sensors and estimator call its kind; empty where the three numbers below say it."""
+    range: Range = (0.0, 0.0)
+    """Of its sensor."""
+    noise: float = 0.0
+    """Standard deviation that the estimator expects."""
+    allowance: float = 0.0
+    """What a plant that is not its model adds to a residual."""
+    weight: float = 0.0
+    """In the cost, per square of its deviation from the operating point."""
+    band: Band | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """A state of the model."""
+
+    name: str
+    unit: str
+    walk: float = 0.0
+    """Its process noise, per square root of a sampling period; 0 where the settings of the estimator know its unit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """The one disturbance."""
+
+    name: str
+    unit: str
+    span: Range
+    walk: float
+    """Random walk of what of it is not measured, per square root of a sampling period."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Process:
+    """A process with its time, its signals and its control problem.
+
+    Raises:
+        ValueError: Names are used twice, or a loop has no input.
+    """
+
+    name: str
+    tick_s: float
+    """The basic period tau_1."""
+    ticks_per_sample: int
+    """Ticks of a sampling period of the prediction model, which is the longest updating period."""
+    inputs: tuple[Input, ...]
+    outputs: tuple[Output, ...]
+    states: tuple[State, ...]
+    load: Load
+    decision_instants: tuple[int, ...]
+    constraint_instants: tuple[int, ...]
+    iterations: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    """See `share`; what is not named is 1."""
+
+    def __post_init__(self) -> None:
+        for what in (self.inputs, self.outputs, self.states):
+            names = [each.name for each in what]
+            if len(set(names)) < len(names):
+                raise ValueError(f"{next(name for name in names if names.count(name) > 1)} is declared twice")
+        known = {each.name for each in self.inputs}
+        for output in self.banded:
+            loop = output.band.loop if output.band else None
+            if loop is not None and loop.input not in known:
+                raise ValueError(f"the loop of {output.name} moves {loop.input}, which is no input")
+
+    def share(self, of: str) -> float:
+        """Return the time of a solver's iteration, or of a preparation, over that with the cold box's problem."""
+        return self.iterations.get(of, 1.0)
+
+    @property
+    def banded(self) -> tuple[Output, ...]:
+        """Outputs that have a band."""
+        return tuple(output for output in self.outputs if output.band is not None)
+
+    @property
+    def bands(self) -> tuple[Band, ...]:
+        """Their bands."""
+        return tuple(output.band for output in self.outputs if output.band is not None)
+
+    def document(self) -> dict[str, Any]:
+        """Return this as plain data, tuples as lists."""
+        plain: dict[str, Any] = _plain({each.name: getattr(self, each.name) for each in fields(self)})
+        return plain
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Self:
+        """Return the process of a document.
+
+        Raises:
+            KeyError, TypeError, ValueError: It is not one that `document` makes.
+        """
+        made: Self = _made_of(cls, document)
+        return made
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 of any field
+    if is_dataclass(value) and not isinstance(value, type):
+        return _plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    return [_plain(each) for each in value] if isinstance(value, tuple | list) else value
+
+
+def _made_of(kind: Any, value: Any) -> Any:  # noqa: ANN401 of any field
+    """Return a value of a declared type from plain data."""
+    if is_dataclass(kind):
+        hints = get_type_hints(kind)
+        unknown = set(value) - set(hints)
+        if unknown:
+            raise TypeError(f"{kind.__name__}: {sorted(unknown)[0]} is unknown")
+        return kind(**{name: _made_of(hints[name], each) for name, each in value.items()})  # type: ignore[operator]
+    arguments = get_args(kind)
+    if isinstance(value, list):
+        return tuple(_made_of(arguments[0], each) for each in value)
+    if value is not None and type(None) in arguments:
+        return _made_of(next(each for each in arguments if each is not type(None)), value)
+    return value
