@@ -14,11 +14,14 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from coldloop.process.signals import L1, T5, TICK_S
+from coldloop.process.loaded import PROCESS
+from coldloop.process.signals import CONTROLLED, TICK_S
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import PlantSample
 from rig.results.recording import Sink
 
+SHOWN_OUTPUTS: Final = 3
+"""Outputs of which the bar shows the value, at most."""
 REFRESH_S: Final = 0.1
 NARROW: Final = 72
 """Columns that the bar with speed and remaining time needs."""
@@ -92,11 +95,13 @@ class RunProgress(PlantTimeBar, Sink):
     def _show(self, sample: PlantSample, elapsed_s: float) -> None:
         self._bar.start()  # not before there is something to show: an error is then shown alone
         seconds = self._done * TICK_S
+        values = zip(PROCESS.banded[:SHOWN_OUTPUTS], CONTROLLED, strict=False)
+        outputs = "  ".join(f"{one.name} {sample.y[place]:.2f} {one.unit}".rstrip() for one, place in values)
         self._bar.update(
             self._task,
             completed=self._done,
             clock=clock(seconds),
             speed=f"{seconds / max(elapsed_s, 1e-9):,.0f} x real time",
-            line=f"L1 {sample.y[L1]:.2f} %  T5 {sample.y[T5]:.2f} K{self._updating}",
+            line=f"{outputs}{self._updating}",
         )
         self._bar.refresh()

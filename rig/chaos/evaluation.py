@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.signals import L1, T5, TICK_S
+from coldloop.process.signals import CONTROLLED, TICK_S
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind
@@ -14,8 +14,8 @@ from optimizer_plc.qp.design import ControlDesign
 from rig.chaos.trace import ChaosTrace
 from rig.results.recording import Recording
 
-Triple = tuple[float, float, float]
-Pair = tuple[float, float]
+PerInput = tuple[float, ...]
+PerBand = tuple[float, ...]
 
 
 class RaisedAlarm(NamedTuple):
@@ -38,11 +38,11 @@ class Row(NamedTuple):
     """The mode before, and those passed until the next fault."""
     alarms: tuple[RaisedAlarm, ...]
     """Raised in the window."""
-    largest_steps: Triple
+    largest_steps: PerInput
     """Largest change of each input from a tick to the next, as a share of its limit."""
-    outside_s: Pair
-    """Time in the window that L1 and T5 were outside their bands."""
-    undisturbed_s: Pair
+    outside_s: PerBand
+    """Time in the window that each output with a band was outside."""
+    undisturbed_s: PerBand
     """The same without faults."""
     back_s: float | None
     """From the end of the fault to MPC: 0 when MPC drove then, None when it did not come back in the window."""
@@ -57,13 +57,13 @@ class Evaluation(NamedTuple):
     """A run."""
 
     rows: list[Row]
-    largest_steps: Triple
-    outside_s: Pair
-    undisturbed_s: Pair
+    largest_steps: PerInput
+    outside_s: PerBand
+    undisturbed_s: PerBand
     missing_ticks: int
 
 
-def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: Triple, design: ControlDesign) -> Evaluation:
+def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: PerInput, design: ControlDesign) -> Evaluation:
     """Compute the rows of all faults, and the same for the whole run.
 
     Args:
@@ -127,25 +127,23 @@ def _back_s(end: int | None, before: Sequence[Mode], changes: Sequence[Event]) -
     return (back[0] - end) * TICK_S if back else None
 
 
-def _steps(recording: Recording, rate: Triple) -> NDArray[np.float64]:
+def _steps(recording: Recording, rate: PerInput) -> NDArray[np.float64]:
     """Return the change of each input at each tick as a share of its limit, (N, 3); NaN where it is not known."""
     u = recording.u.astype(float)
     steps: NDArray[np.float64] = np.abs(np.diff(u, axis=0, prepend=u[:1])) / np.array(rate)
     return steps
 
 
-def _largest(steps: NDArray[np.float64]) -> Triple:
-    first, second, third = (float(value) for value in np.max(np.nan_to_num(steps), axis=0, initial=0.0))
-    return first, second, third
+def _largest(steps: NDArray[np.float64]) -> PerInput:
+    return tuple(np.max(np.nan_to_num(steps), axis=0, initial=0.0).tolist())
 
 
 def _outside(recording: Recording, design: ControlDesign) -> NDArray[np.bool_]:
-    """Return for each tick whether L1 and T5 are outside, (N, 2); False for unknown ticks."""
-    y = recording.y[:, [L1, T5]]
+    """Return for each tick whether outputs are outside their bands, (N, bands); False for unknown ticks."""
+    y = recording.y[:, CONTROLLED]
     outside: NDArray[np.bool_] = (y < np.array(design.output_low)) | (y > np.array(design.output_high))
     return outside
 
 
-def _seconds(outside: NDArray[np.bool_]) -> Pair:
-    level, temperature = outside.sum(axis=0) * TICK_S
-    return float(level), float(temperature)
+def _seconds(outside: NDArray[np.bool_]) -> PerBand:
+    return tuple((outside.sum(axis=0) * TICK_S).tolist())

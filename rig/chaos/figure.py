@@ -1,5 +1,7 @@
 """The picture of a run under chaos."""
 
+from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Final
 
@@ -9,12 +11,26 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from coldloop.process.signals import INPUT_NAMES, L1, T5, TICK_S
+from coldloop.process.signals import CONTROLLED, INPUT_NAMES, INPUT_UNITS, TICK_S
 from coldloop.registers.control_plc import Mode
 from coldloop.whole_file import whole_file
 from optimizer_plc.qp.design import ControlDesign
 from rig.chaos.trace import ChaosTrace
-from rig.figures.plot import ACCENT, BAND, INK, THIRD, Series, legend_above, view
+from rig.figures.plot import (
+    ACCENT,
+    BAND,
+    BANDED,
+    INK,
+    LABELS,
+    THIRD,
+    Series,
+    legend_above,
+    view,
+    with_unit,
+)
+from rig.figures.plot import (
+    COLOURS as PLAIN,
+)
 from rig.results.recording import Recording
 
 COLOURS: Final = {
@@ -31,32 +47,45 @@ def plot_chaos(path: Path, trace: ChaosTrace, undisturbed: Recording, design: Co
     bands = list(zip(design.output_low, design.output_high, strict=True))
     with mpl.rc_context({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False}):
         figure = Figure(figsize=(10, 10), layout="constrained")
-        axes: list[Axes] = list(figure.subplots(5, 1, sharex=True, height_ratios=[3, 3, 3, 3, 1]))
-        for place, output, band, label in zip(axes[:2], (L1, T5), bands, ("L1 (%)", "T5 (K)"), strict=True):
+        units = _inputs_by_unit()
+        *panels, ribbon = figure.subplots(
+            len(bands) + len(units) + 1, 1, sharex=True, height_ratios=[*[3] * (len(bands) + len(units)), 1]
+        )
+        axes: list[Axes] = panels
+        labels = [LABELS[name] for name in BANDED]
+        for place, output, band, label in zip(axes[: len(bands)], CONTROLLED, bands, labels, strict=True):
             place.axhspan(*band, color=BAND, alpha=0.35, label=f"band {band[0]:g} to {band[1]:g}")
             place.plot(minutes, undisturbed.y[:, output], color=THIRD, linewidth=0.8, label="undisturbed")
             place.plot(minutes, recording.y[:, output], color=INK, linewidth=1, label="with faults")
             place.set_ylabel(label)
             legend_above(place)
-        _inputs(axes[2], axes[3], minutes, recording)
-        _modes(axes[4], trace)
-        for place in axes[:4]:
+        for place, (unit, inputs) in zip(axes[len(bands) :], units.items(), strict=True):
+            _inputs(place, unit, inputs, minutes, recording)
+        _modes(ribbon, trace)
+        for place in axes:
             _mark_faults(place, trace)
         _name_faults(axes[0], trace)
-        axes[4].set_xlabel("time (min)")
-        axes[4].set_xlim(0, trace.ticks * TICK_S / 60)
+        ribbon.set_xlabel("time (min)")
+        ribbon.set_xlim(0, trace.ticks * TICK_S / 60)
         figure.suptitle(title)
         whole_file(path, lambda draft: figure.savefig(draft, dpi=130, format="png"))
 
 
-def _inputs(valves: Axes, heater: Axes, minutes: Series, recording: Recording) -> None:
-    for i, colour in ((0, INK), (2, THIRD)):
-        valves.plot(minutes, recording.u[:, i], color=colour, linewidth=1, label=INPUT_NAMES[i])
-    valves.set_ylabel("valves (%)")
-    legend_above(valves)
-    heater.plot(minutes, recording.u[:, 1], color=ACCENT, linewidth=1)
-    heater.set_ylim(*view(recording.u[:, 1]))
-    heater.set_ylabel(f"{INPUT_NAMES[1]} (W)")
+def _inputs_by_unit() -> dict[str, list[int]]:
+    """Return which inputs have each unit: they share a panel."""
+    found: dict[str, list[int]] = {}
+    for place, unit in enumerate(INPUT_UNITS):
+        found.setdefault(unit, []).append(place)
+    return found
+
+
+def _inputs(axes: Axes, unit: str, inputs: Sequence[int], minutes: Series, recording: Recording) -> None:
+    for i, colour in zip(inputs, cycle(PLAIN), strict=False):
+        axes.plot(minutes, recording.u[:, i], color=colour, linewidth=1, label=INPUT_NAMES[i])
+    axes.set_ylim(*view(recording.u[:, inputs]))
+    axes.set_ylabel(with_unit(INPUT_NAMES[inputs[0]] if len(inputs) == 1 else "inputs", unit))
+    if len(inputs) > 1:
+        legend_above(axes)
 
 
 def _modes(axes: Axes, trace: ChaosTrace) -> None:

@@ -19,9 +19,16 @@ MOVED_INPUTS: Final = (-3.0, -15.0, 2.0)
 """From those of the right model: CV155 %, NCR22_A W, CV156 %."""
 
 
+GAIN: Final = 0.9
+"""Of other processes: over those of the right model."""
+
+
 def save_wrong_model(right: Path, wrong: Path) -> None:
-    """Write the linear model of the same plant with its inputs moved by `MOVED_INPUTS`."""
+    """Write the model of the same plant with its inputs moved by `MOVED_INPUTS`; of another process with less gain."""
     model, helium = load(right), load_helium()
+    if model.process:
+        replace(model, B=GAIN * model.B, D=GAIN * model.D, B_tick=GAIN * model.B_tick).save(wrong)
+        return
     box = box_of(model)
     rest = find_equilibrium(model.u0 + np.array(MOVED_INPUTS), float(model.y0[L1]), box, helium)
     linear = linearise(rest.x, rest.u, rest.w, box, helium)

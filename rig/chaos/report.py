@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind, AlarmState
@@ -17,7 +18,8 @@ from rig.results.folders import write_json
 from rig.text_tables import aligned, markdown_table
 
 HEADINGS: Final = (
-    "fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit", "L1 out s (was)", "T5 out s (was)",
+    "fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit",
+    *(f"{one.name} out s (was)" for one in PROCESS.banded),
     "back to MPC s",
 )  # fmt: skip
 
@@ -70,7 +72,11 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
     outside, was = evaluation.outside_s, evaluation.undisturbed_s
     lines = [
         f"largest step/limit: {steps}",
-        f"outside the bands: L1 {outside[0]:g} s (undisturbed {was[0]:g} s), T5 {outside[1]:g} s ({was[1]:g} s)",
+        "outside the bands: "
+        + ", ".join(
+            f"{one.name} {seconds:g} s ({'undisturbed ' if one is PROCESS.banded[0] else ''}{before:g} s)"
+            for one, seconds, before in zip(PROCESS.banded, outside, was, strict=True)
+        ),
         f"ticks not seen: {evaluation.missing_ticks} of {trace.ticks}",
     ]
     if trace.ladder is not None:
@@ -116,8 +122,7 @@ def _cells(row: Row) -> list[str]:
         _modes(row.modes),
         _alarms(row.alarms),
         f"{row.largest_step:.3f}",
-        f"{row.outside_s[0]:g} ({row.undisturbed_s[0]:g})",
-        f"{row.outside_s[1]:g} ({row.undisturbed_s[1]:g})",
+        *(f"{outside:g} ({was:g})" for outside, was in zip(row.outside_s, row.undisturbed_s, strict=True)),
         "not" if row.back_s is None else f"{row.back_s:g}",
     ]
 

@@ -58,8 +58,8 @@ def make_parser(chosen: str | None) -> argparse.ArgumentParser:
     """Return the parser of all commands, with the options of the chosen one; other commands are not imported."""
     parser = OneLineParser(prog="coldloop", description="A networked PLC rig for fast MPC on a helium refrigerator.")
     parser.add_argument("--version", action="version", version=_version())
-    parser.add_argument(OPTION, metavar="FILE", help="another process than the cold box: a process file, or a model file"
-                        " made from one")  # fmt: skip
+    parser.add_argument(OPTION, metavar="FILE", help="another process than the cold box: a process file, or a"
+                        " model file made from one")  # fmt: skip
     parser.set_defaults(execute=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=OneLineParser)
     for name, summary in COMMANDS.items():

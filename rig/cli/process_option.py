@@ -50,7 +50,7 @@ def _made(path: Path) -> Path:
     place = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
     out = root / f"{path.stem}-{place}.json"
     environment = {name: value for name, value in os.environ.items() if name != VARIABLE}
-    made = subprocess.run(
+    made = subprocess.run(  # noqa: S603 our own program
         [sys.executable, "-m", "rig", "process", str(path), "--out", str(out)], env=environment, capture_output=True,
         text=True, check=False,
     )  # fmt: skip

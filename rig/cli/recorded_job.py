@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from coldloop.process.loaded import PROCESS
 from rig.cosim.job import Job
 from rig.figures.worker import FigureProcess
 from rig.results.folders import claim_folder, claim_folder_of_now
@@ -50,9 +51,10 @@ def _tell(out: Path, summary: dict[str, Any]) -> None:
     updates = "no updates"
     if summary["updates"]:
         updates = f"{summary['updates']} updates, tau_u {summary['tau_u_mean']:.2f} s on average over time"
+    outside = ", ".join(f"{one.name} {summary[f'{one.name}_outside_band_pct']:.2f} %" for one in PROCESS.banded)
     sys.stdout.write(
         f"{summary['ticks']} ticks, {updates}, {summary['realtime_factor'] or 0:,.0f} x real time\n"
-        f"outside the bands: L1 {summary['L1_outside_band_pct']:.2f} %, T5 {summary['T5_outside_band_pct']:.2f} %; "
+        f"outside the bands: {outside}; "
         f"J_BF {summary['J_BF']:.4g}; deadline misses {summary['deadline_misses']}\n"
         f"trace {summary['trace_sha256']}\n"
         f"results in {out}\n"

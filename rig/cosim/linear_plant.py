@@ -5,35 +5,13 @@ What a setting gains on the plant and not here, it gains by what the model has w
 
 from coldloop.errors import ConfigurationError
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import LtiModel
 from coldloop.process.lti_model import load as load_model
 from plant.kinds import NO_MISMATCH, noise_of
-from plant.numeric import RealArray
-from plant.own_model import box_of
-from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+from plant.own.linear import LinearPlant
+from plant.program import PlantProgram
 from plant.settings import PlantKind
 from rig.cosim.one_process import OneProcessRig
 from rig.settings import Settings
-
-
-class LinearPlant(PlantProgram):
-    """x moves by the model's matrices from tick to tick, and y follows from it; valves do not saturate.
-
-    Args:
-        model: The linear model.
-        load: The heat load over time.
-        noise: Noise on the measurements; None measures exactly.
-    """
-
-    def __init__(self, model: LtiModel, load: HeatLoad, noise: MeasurementNoise | None = None) -> None:
-        self._model = model
-        super().__init__(box=box_of(model), x0=model.x0.tolist(), u0=model.u0.tolist(), load=load, noise=noise)
-
-    def _step(self, w: float, *, held: bool) -> tuple[RealArray, RealArray]:  # noqa: ARG002 nothing is kept
-        m = self._model
-        u, w = self._u - m.u0, w - m.w0
-        x = m.A_tick @ (self._x - m.x0) + m.B_tick @ u + m.F_tick * w
-        return m.x0 + x, m.y0 + m.C @ x + m.D @ u + m.G * w
 
 
 class LinearRig(OneProcessRig):

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.loaded import IS_COLD_BOX
 from coldloop.process.lti_model import load as load_model
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
@@ -14,6 +13,7 @@ from coldloop.registers.plant import LoadStep, Measurement, PlantSample, Station
 from control_plc.program import ControlProgram
 from control_plc.program import make_program as make_control_program
 from optimizer_plc.program import OptimizerProgram
+from plant.cold_box.program import ColdBoxProgram
 from plant.kinds import plant_maker
 from plant.own_model import own_header
 from plant.program import PlantProgram
@@ -112,7 +112,7 @@ class OneProcessRig:
 
     def _stretches(self, plant: PlantProgram, load: LoadProfile) -> "CompiledStretches | None":
         """Return what runs ahead in compiled loops, where there are any: of the cold box and the refrigerator."""
-        if not (self._compiled and IS_COLD_BOX) or self._settings.plant.mismatch.beside_the_box:
+        if not (self._compiled and isinstance(plant, ColdBoxProgram)) or self._settings.plant.mismatch.beside_the_box:
             return None
         from rig.cosim.compiled.stretches import CompiledStretches  # noqa: PLC0415 not for other processes
 

@@ -9,10 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS
 from rig.figures.plot import (
+    BANDED,
     COLOURS,
     DRAWN,
+    LABELS,
     LONGEST_TAU_U_S,
     STYLE,
     Bounds,
@@ -28,13 +29,8 @@ from rig.text_tables import aligned
 
 FIGURES: Final = (
     "complete", "ticks", "updates", "J_BF", "J_open_mean", "J_dev", "J_cst", "c1", "c2", "tau_u_mean",
-    "tau_u_mean_per_update", "iterations_total", "L1_outside_band_pct", "T5_outside_band_pct", "deadline_misses",
+    "tau_u_mean_per_update", "iterations_total", *(f"{name}_outside_band_pct" for name in BANDED), "deadline_misses",
     "trace_sha256",
-)  # fmt: skip
-PANELS: Final = (
-    ("load_w", "heat load (W)"), ("L1", "L1 (%)"), ("T5", "T5 (K)"),
-    *((name, f"{name} ({unit})") for name, unit in zip(INPUT_NAMES, INPUT_UNITS, strict=True)),
-    ("tau_u_s", "tau_u (s)"), ("stage_cost", "stage cost (1)"),
 )  # fmt: skip
 
 
@@ -83,7 +79,7 @@ def draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.5, 13), layout="constrained")
         axes: dict[str, Axes] = dict(
-            zip(dict(PANELS), figure.subplots(len(PANELS), 1, sharex=True), strict=True)
+            zip(DRAWN, figure.subplots(len(DRAWN), 1, sharex=True), strict=True)
         )  # fmt: skip
         for one, label, colour in zip(curves, labels, _colours(len(runs)), strict=True):
             for name, place in axes.items():
@@ -92,7 +88,7 @@ def draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure:
                 else:
                     place.plot(one["time_s"] / scale_s, one[name], color=colour, linewidth=0.9, label=label)
         _scale(axes, runs[0], curves)
-        for name, label in PANELS:
+        for name, label in LABELS.items():
             axes[name].set_ylabel(label)
             legend_above(axes[name])
         axes["stage_cost"].set_xlabel(f"plant time ({unit})")

@@ -1,6 +1,7 @@
 """The picture of a run, in the manner of the paper's time figures."""
 
 from collections.abc import Mapping, Sequence
+from string import ascii_lowercase, ascii_uppercase
 from typing import Any, Final, NamedTuple
 
 import matplotlib as mpl
@@ -10,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
 
 Series = NDArray[np.floating]
 
@@ -22,17 +24,36 @@ STYLE: Final[Any] = {
     "font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False,
     "legend.frameon": False, "legend.fontsize": 8, "svg.hashsalt": "coldloop", "axes.formatter.useoffset": False,
 }  # fmt: skip
-DRAWN: Final = ("load_w", "L1", "T5", *INPUT_NAMES, "tau_u_s", "stage_cost")
-"""Columns of the trace that are drawn."""
+BANDED: Final = {one.name: one.unit for one in PROCESS.banded}
+"""Outputs that are drawn, those that have a band, and their units."""
+MOVED: Final = dict(zip(INPUT_NAMES, INPUT_UNITS, strict=True))
+"""Inputs and their units."""
+
+
+def with_unit(name: str, unit: str) -> str:
+    """Return the label of an axis."""
+    return f"{name} ({unit})" if unit else name
+
+
+LABELS: Final[Mapping[str, str]] = {
+    "load_w": with_unit("heat load" if IS_COLD_BOX else PROCESS.load.name, PROCESS.load.unit),
+    **{name: with_unit(name, unit) for name, unit in {**BANDED, **MOVED}.items()},
+    "tau_u_s": "tau_u (s)",
+    "stage_cost": "stage cost (1)",
+}
+"""Columns of the trace that are drawn, and the labels of their axes."""
+DRAWN: Final = tuple(LABELS)
 LEAST_COST: Final = 1e-6
 """Stage costs below it are drawn as it: at rest the cost is rounding."""
 NARROWEST: Final = 1 / 2000
 """Share of the whole time that can be seen."""
 SMOOTHING_S: Final = 60.0
 """Window of the mean of tau_u: adaptive periods change at nearly every update."""
-LONGEST_TAU_U_S: Final = 5.0
+LONGEST_TAU_U_S: Final = SAMPLING_PERIOD_S
 PANELS: Final = {"left": 0.083, "right": 0.993, "top": 0.962, "bottom": 0.048, "hspace": 0.3}
 """Where the panels are, in shares of the figure. Matplotlib's layout engine would draw the figure three times more."""
+LETTERS: Final = ascii_lowercase + ascii_uppercase
+"""Of panels."""
 LABEL_AT: Final = -0.068
 """Where letters and labels of panels are, in widths of a panel: beside numbers of six characters."""
 
@@ -49,7 +70,7 @@ class Bounds(NamedTuple):
         design = "optimizer_plc.program.design.output_"
         bands = zip(configuration[f"{design}low"], configuration[f"{design}high"], strict=True)
         inputs = zip(configuration["limits.low"], configuration["limits.high"], strict=True)
-        return cls(dict(zip(("L1", "T5"), bands, strict=True)), dict(zip(INPUT_NAMES, inputs, strict=True)))
+        return cls(dict(zip(BANDED, bands, strict=True)), dict(zip(INPUT_NAMES, inputs, strict=True)))
 
 
 class RunCurves(NamedTuple):
@@ -70,27 +91,29 @@ def draw_run(curves: RunCurves) -> Figure:
     """Return load, outputs with their bands, inputs with their bounds, updating period, cost, modes and alarms."""
     scale_s, unit = time_unit(curves.series["time_s"])
     time = curves.series["time_s"] / scale_s
-    heights = [1.0] * (8 + len(curves.pressures)) + ([0.45] if curves.events else [])
+    heights = [1.0] * (len(DRAWN) + len(curves.pressures)) + ([0.45] if curves.events else [])
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 13.5 + 1.6 * len(curves.pressures)))
+        figure = Figure(figsize=(9.5, 13.5 + 1.6 * (len(DRAWN) + len(curves.pressures) - 8)))
         axes: list[Axes] = list(
             figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, gridspec_kw=PANELS)
         )
-        _curve(axes[0], time, curves.series["load_w"], "heat load (W)", "NCR22_HL")
-        for place, (name, band), unit_ in zip(axes[1:3], curves.bounds.bands.items(), ("%", "K"), strict=True):
-            _curve(place, time, curves.series[name], f"{name} ({unit_})", name)
-            limit(place, curves.series[name], band, f"band {band[0]:g} to {band[1]:g} {unit_}")
-        for place, (name, bound), unit_ in zip(axes[3:6], curves.bounds.inputs.items(), INPUT_UNITS, strict=True):
-            _curve(place, time, curves.series[name], f"{name} ({unit_})", name)
-            limit(place, curves.series[name], bound, f"bounds {bound[0]:g} to {bound[1]:g} {unit_}")
-        for place, (name, ends) in zip(axes[6:], curves.pressures.items(), strict=False):
+        _curve(axes[0], time, curves.series["load_w"], LABELS["load_w"], PROCESS.load.name)
+        first = 1 + len(BANDED)
+        for place, (name, band) in zip(axes[1:first], curves.bounds.bands.items(), strict=True):
+            _curve(place, time, curves.series[name], LABELS[name], name)
+            limit(place, curves.series[name], band, f"band {band[0]:g} to {band[1]:g} {BANDED[name]}".rstrip())
+        behind = first + len(MOVED)
+        for place, (name, bound) in zip(axes[first:behind], curves.bounds.inputs.items(), strict=True):
+            _curve(place, time, curves.series[name], LABELS[name], name)
+            limit(place, curves.series[name], bound, f"bounds {bound[0]:g} to {bound[1]:g} {MOVED[name]}".rstrip())
+        for place, (name, ends) in zip(axes[behind:], curves.pressures.items(), strict=False):
             _curve(place, time, curves.series[name], f"{name} (bar)", name)
             limit(place, curves.series[name], ends, f"no alarm from {ends[0]:g} to {ends[1]:g} bar")
-        _updating_period(axes[len(curves.pressures) + 6], time, curves.series)
-        _cost(axes[len(curves.pressures) + 7], time, curves.series["stage_cost"])
+        _updating_period(axes[behind + len(curves.pressures)], time, curves.series)
+        _cost(axes[behind + len(curves.pressures) + 1], time, curves.series["stage_cost"])
         if curves.events:
             _ribbons(axes[-1], curves.events, scale_s, float(time[-1]))
-        for place, letter in zip(axes, "abcdefghijk", strict=False):
+        for place, letter in zip(axes, LETTERS, strict=False):
             legend_above(place)
             place.text(LABEL_AT, 1.03, f"({letter})", transform=place.transAxes, fontsize=8, ha="center")
             place.yaxis.set_label_coords(LABEL_AT, 0.5)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from coldloop.process.signals import INPUT_NAMES
 from coldloop.whole_file import whole_file
-from rig.figures.plot import DRAWN, Bounds, RunCurves, draw_run
+from rig.figures.plot import BANDED, DRAWN, Bounds, RunCurves, draw_run
 from rig.results.columns import STATION_FILE
 from rig.results.run_folder import Curves, RunFolder
 from rig.results.way import Way
@@ -36,7 +36,7 @@ def plot_run(folder: Path, formats: Sequence[str]) -> list[Path]:
 def draw_nothing() -> None:
     """Draw one tick into memory: fonts, and what else the first figure of a process needs, are loaded then."""
     series = {name: np.zeros(1) for name in ("time_s", *DRAWN)}
-    bounds = Bounds(dict.fromkeys(("L1", "T5"), (0.0, 1.0)), dict.fromkeys(INPUT_NAMES, (0.0, 1.0)))
+    bounds = Bounds(dict.fromkeys(BANDED, (0.0, 1.0)), dict.fromkeys(INPUT_NAMES, (0.0, 1.0)))
     draw_run(RunCurves(series, [], bounds, "", "")).savefig(BytesIO(), dpi=DPI)
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coldloop.process.lti_model import load
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import check_detectability
@@ -35,7 +35,7 @@ from rig.plc_sizing.verdict import fits, power_of, verdict
 from rig.settings import Settings
 from rig.text_tables import aligned
 
-PERIODS_S = (1.0, 2.5, 5.0)
+PERIODS_S = tuple(share * SAMPLING_PERIOD_S for share in (0.2, 0.5, 1.0))
 SOLVER_COLUMNS = ("solver", "paper s", "dense s", "without zeros s", "tau_1_s", "default follows")
 
 

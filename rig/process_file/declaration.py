@@ -184,14 +184,16 @@ class ProcessFile(_Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        names = [each.name for each in (*self.inputs, *self.outputs)] + [self.load.name] * (self.load is not None)
+        names = [one.name for one in self.inputs] + [one.name for one in self.outputs]
+        if self.load is not None:
+            names.append(self.load.name)
         lower = [name.lower() for name in names]
         twice = next((name for name in names if lower.count(name.lower()) > 1), None)
         if twice is not None:
             raise ValueError(f"{twice}: two signals have this name (small and capital letters are the same)")
         reserved = {"tick", "session", "holder", "generation", "crc", "mode", "update", "u"} & set(lower)
         if reserved:
-            raise ValueError(f"{sorted(reserved)[0]}: a register has this name already; choose another")
+            raise ValueError(f"{min(reserved)}: a register has this name already; choose another")
         if not any(output.band for output in self.outputs):
             raise ValueError("outputs: none has a band; give at least one a band to be kept within")
         inputs = {one.name for one in self.inputs}

@@ -32,10 +32,13 @@ def _rest(made: Made) -> list[str]:
     m, process = made.model, made.process
     load = "" if not m.F.any() and not m.G.any() else f"; load {m.load_name} {m.w0:.5g} {m.load_unit}".rstrip()
     problem = len(process.decision_instants) * (len(process.inputs) + 2 * len(process.bands))
-    return [
+    sizes = (
         f"{process.name}: {len(m.input_names)} inputs, {len(m.output_names)} outputs, {len(m.state_names)} states; "
         f"tick {process.tick_s:g} s, sampling period {process.tick_s * process.ticks_per_sample:g} s, horizon "
-        f"{process.decision_instants[-1] * process.tick_s * process.ticks_per_sample:g} s, {problem} variables",
+        f"{process.decision_instants[-1] * process.tick_s * process.ticks_per_sample:g} s, {problem} variables"
+    )
+    return [
+        sizes,
         f"inputs     {_values(m.input_names, m.u0, m.input_units)}{load}",
         f"outputs    {_values(m.output_names, m.y0, m.output_units)}",
         f"states     {_values(m.state_names, m.x0, m.state_units)}",
@@ -58,7 +61,8 @@ def _gains(made: Made) -> list[str]:
     effects = np.column_stack([m.C @ held.B + m.D, m.C @ held.F + m.G])
     names, units = (*m.input_names, m.load_name), (*m.input_units, m.load_unit)
     return [
-        f"after {horizon_s:g} s of +1 {unit} {name}: ".replace("  ", " ") + _values(m.output_names, column, m.output_units)
+        f"after {horizon_s:g} s of +1 {unit} {name}: ".replace("  ", " ")
+        + _values(m.output_names, column, m.output_units)
         for name, unit, column in zip(names, units, effects.T, strict=True)
         if column.any()
     ]

@@ -120,7 +120,7 @@ def _rest(equations: Equations, u: Array, w: float, place: str) -> Array:
         with np.errstate(all="ignore"):
             found = root(lambda x: np.asarray(equations.derivatives(x, u, w), dtype=np.float64), guess, tol=1e-12)
             left = np.asarray(equations.derivatives(found.x, u, w), dtype=np.float64)
-    except Exception as error:  # noqa: BLE001 whatever a user's equations do
+    except Exception as error:
         raise UsageError(f"{place}: derivatives() fails near guess: {type(error).__name__}: {error}") from error
     moving = np.abs(left) / np.maximum(1.0, np.abs(found.x))
     if not np.all(moving <= AT_REST):
@@ -222,7 +222,9 @@ def _dead_time(delay_s: float) -> tuple[Array, Array, Array, float]:
     Golub and Van Loan, Matrix Computations, section 9.3.
     """
     k = PADE_ORDER
-    share = [factorial(2 * k - j) * factorial(k) / (factorial(2 * k) * factorial(j) * factorial(k - j)) for j in range(k + 1)]
+    share = [
+        factorial(2 * k - j) * factorial(k) / (factorial(2 * k) * factorial(j) * factorial(k - j)) for j in range(k + 1)
+    ]
     above = np.array([(-1) ** j * share[j] for j in range(k + 1)]) / share[k]  # rising powers of s times the delay
     below = np.array(share) / share[k]
     d = above[k]

@@ -100,9 +100,10 @@ def _states(file: ProcessFile, linear: Linearised) -> tuple[State, ...]:
     given = {state.name: state.walk for state in file.states}
     unknown = set(given) - set(linear.states)
     if unknown:
-        raise UsageError(f"states: {sorted(unknown)[0]} is no state of the plant: {', '.join(linear.states)}")
+        raise UsageError(f"states: {min(unknown)} is no state of the plant: {', '.join(linear.states)}")
     sample_s = file.tick_s * file.ticks_per_sample
-    moves = np.abs(discretise(linear.A, linear.B, linear.F, sample_s).B) @ [(one.high - one.low) / 4 for one in file.inputs]
+    steps = [(one.high - one.low) / 4 for one in file.inputs]
+    moves = np.abs(discretise(linear.A, linear.B, linear.F, sample_s).B) @ steps
     usual = USUAL_WALK * np.maximum(moves, 1e-6 * max(moves.max(), 1e-12))
     return tuple(
         State(name=name, unit=unit, walk=given.get(name, float(walk)))

@@ -9,12 +9,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
-from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS
 from rig.figures.plot import (
     ACCENT,
     BAND,
     DRAWN,
     INK,
+    LABELS,
     LEAST_COST,
     LONGEST_TAU_U_S,
     Bounds,
@@ -31,11 +31,6 @@ from rig.results.run_folder import Curves, RunFolder
 DRAWN_TICKS: Final = 20_000
 """A longer trace is reduced, so that the page stays small and quick."""
 MOST_EVENTS: Final = 500
-PANELS: Final = (
-    ("load_w", "heat load (W)"), ("L1", "L1 (%)"), ("T5", "T5 (K)"),
-    *((name, f"{name} ({unit})") for name, unit in zip(INPUT_NAMES, INPUT_UNITS, strict=True)),
-    ("tau_u_s", "tau_u (s)"), ("stage_cost", "stage cost (1)"),
-)  # fmt: skip
 
 
 def run_page(folder: Path) -> str:
@@ -76,17 +71,17 @@ def _plot(run: RunFolder) -> str:
     """Return the curves as an HTML element."""
     curves = run.series(DRAWN, DRAWN_TICKS)
     scale_s, unit = time_unit(curves["time_s"])
-    figure = make_subplots(rows=len(PANELS), cols=1, shared_xaxes=True, vertical_spacing=0.02)
-    for row, (name, label) in enumerate(PANELS, start=1):
+    figure = make_subplots(rows=len(LABELS), cols=1, shared_xaxes=True, vertical_spacing=0.02)
+    for row, (name, label) in enumerate(LABELS.items(), start=1):
         _add_curve(figure, row, curves, name, scale_s)
         figure.update_yaxes(title_text=label, row=row, col=1)
     _add_bounds(figure, curves, Bounds.of(run.configuration))
     if len(curves["time_s"]):
         for begin, end in alarm_times(run.events(), scale_s, float(curves["time_s"][-1]) / scale_s):
             figure.add_vrect(x0=begin, x1=end, fillcolor="#b3261e", opacity=0.12, line_width=0)
-    figure.update_xaxes(title_text=f"plant time ({unit})", row=len(PANELS), col=1)
+    figure.update_xaxes(title_text=f"plant time ({unit})", row=len(LABELS), col=1)
     figure.update_layout(
-        height=190 * len(PANELS), template="plotly_white", hovermode="x", margin={"l": 70, "r": 20, "t": 20, "b": 50},
+        height=190 * len(LABELS), template="plotly_white", hovermode="x", margin={"l": 70, "r": 20, "t": 20, "b": 50},
         showlegend=False,
     )  # fmt: skip
     html: str = figure.to_html(full_html=False, include_plotlyjs=False, config={"displaylogo": False})
@@ -110,7 +105,7 @@ def _add_curve(figure: Any, row: int, curves: Curves, name: str, scale_s: float)
 
 def _add_bounds(figure: Any, curves: Mapping[str, Series], bounds: Bounds) -> None:  # noqa: ANN401 plotly has no types
     """Draw bands and bounds; those that are far from the curve stay outside the view, until it is zoomed out."""
-    rows = {name: row for row, (name, _) in enumerate(PANELS, start=1)}
+    rows = {name: row for row, name in enumerate(LABELS, start=1)}
     edges: Mapping[str, tuple[float, float]] = {**bounds.bands, **bounds.inputs}
     for name, (low, high) in edges.items():
         figure.add_hrect(y0=low, y1=high, fillcolor=BAND, opacity=0.2, line_width=0, row=rows[name], col=1)

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from coldloop.process.signals import L1, OUTPUT_NAMES, T5
+from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES
 from coldloop.registers.audit import Event, EventKind
 from coldloop.registers.control_plc import Cause, Mode
 from coldloop.registers.plant import SensorFaultKind
@@ -27,7 +27,7 @@ DRIVERS: Final[Mapping[int, str]] = {
     Mode.MANUAL: "operator",
 }
 """Source of the applied inputs in each mode; "nobody" while the last ones are held."""
-SHOWN: Final = (L1, T5)
+SHOWN: Final = CONTROLLED
 """Outputs of which the trace has what the sensor showed."""
 
 

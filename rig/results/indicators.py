@@ -2,13 +2,14 @@
 
 import hashlib
 import math
-from typing import NamedTuple
+from collections import namedtuple
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.lti_model import LtiModel
 from coldloop.process.loaded import PROCESS
+from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import CONTROLLED, STATE_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.optimizer_plc import Optimization
 from optimizer_plc.qp.design import ControlDesign
@@ -16,7 +17,7 @@ from optimizer_plc.qp.prediction import state_weights
 from rig.results.recording import BLOCK_TICKS, Recording, SampleBlock, Sink
 
 
-class Indicators(NamedTuple):
+class _Indicators(NamedTuple):
     """Costs are in the units of the predictive problem's J; sums run over the problems solved, as in the paper.
 
     What does not exist is NaN: without updates all that is predicted, without ticks all that is measured.
@@ -40,9 +41,25 @@ class Indicators(NamedTuple):
     tau_u_mean_per_update: float
     """Mean updating period over the updates, s, in which short periods count more often."""
     iterations_total: int
-    L1_outside_band_pct: float
-    """Share of the ticks that are known."""
-    T5_outside_band_pct: float
+
+
+if TYPE_CHECKING:
+
+    class Indicators(_Indicators):
+        """Those, and for each output that has a band the share of the ticks that are known, %, in which it was outside.
+
+        Their names are made of the outputs'; those of the cold box are here.
+        """
+
+        L1_outside_band_pct: float
+        T5_outside_band_pct: float
+
+        def __new__(cls, *values: float, **named: float) -> Self: ...  # noqa: D102
+
+else:
+    Indicators = namedtuple(  # noqa: PYI024 the fields vary
+        "Indicators", (*_Indicators._fields, *(f"{one.name}_outside_band_pct" for one in PROCESS.banded))
+    )
 
 
 class StageCost:
@@ -120,7 +137,7 @@ class RunEvaluation(Sink):
         """The indicators of what was taken so far."""
         count, known = self.updates or math.nan, self._known or math.nan
         exists = 1.0 if self.updates else math.nan
-        level, temperature = 100.0 * self._outside / known
+        names, shares = Indicators._fields[-len(CONTROLLED) :], (100.0 * self._outside / known).tolist()
         return Indicators(
             J_dev=self._j_dev * exists,
             J_cst=self._j_cst * exists,
@@ -131,8 +148,7 @@ class RunEvaluation(Sink):
             tau_u_mean=self._squared_taus * TICK_S / (self._taus or math.nan),
             tau_u_mean_per_update=self._taus * TICK_S / count,
             iterations_total=self.iterations,
-            L1_outside_band_pct=float(level),
-            T5_outside_band_pct=float(temperature),
+            **dict(zip(names, shares, strict=True)),
         )
 
 

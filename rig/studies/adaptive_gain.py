@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from coldloop.process.lti_model import load
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from optimizer_plc.budget import PlcBudget
 from plant.load import find_load
 from rig.cosim.one_process import OneProcessRig
@@ -19,8 +19,8 @@ from rig.settings import Settings
 from rig.studies.intervals import Interval, geometric_mean, mean_ratio
 
 ADAPTIVE: Final = 0.0
-FIXED_S: Final = (1.0, 1.5, 2.0, 2.5, 3.5, 5.0)
-"""Updating periods that are compared, unless one is given."""
+FIXED_S: Final = tuple(share * SAMPLING_PERIOD_S for share in (0.2, 0.3, 0.4, 0.5, 0.7, 1.0))
+"""Updating periods, s, that are compared, unless one is given."""
 
 
 def adaptive_gain(

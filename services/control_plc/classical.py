@@ -1,7 +1,9 @@
 """The classical control: a PI loop for each output that has one; other inputs are held (paper, section IV-A).
 
 Of the cold box T5 is controlled by the turbine valve CV156, the level L1 by the actuator part of the heater NCR22, and
-CV155 is fixed where it is. The loops of another process come with it. Pure: measured outputs and applied inputs in, wanted inputs out. The output guard has the last word.
+CV155 is fixed where it is. The loops of another process come with it.
+
+Pure: measured outputs and applied inputs in, wanted inputs out. The output guard has the last word.
 """
 
 import math
@@ -14,7 +16,6 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.registers.control_plc import SequenceRow
-
 
 
 class PiSettings(BaseModel):

@@ -78,7 +78,9 @@ class GuardState:
 def beginning(limits: Limits, applied: Numbers) -> GuardState:
     """Return the state after `applied` has been constant for ever."""
     slots = range(limits.slew_ticks)
-    return GuardState(list(applied), list(applied), list(applied), [NEVER for _ in slots], [list(applied) for _ in slots])
+    return GuardState(
+        list(applied), list(applied), list(applied), [NEVER for _ in slots], [list(applied) for _ in slots]
+    )
 
 
 def copy_state(source: GuardState, target: GuardState, limits: Limits) -> None:
@@ -130,10 +132,10 @@ def change(state: GuardState, limits: Limits, tick: int, wanted: Numbers) -> Non
 
 def same(one: Numbers, other: Numbers) -> bool:
     """Return whether two rows of outputs are the same."""
+    found = True
     for i in range(N_INPUTS):
-        if one[i] != other[i]:
-            return False
-    return True
+        found = found and one[i] == other[i]
+    return found
 
 
 def nearest(state: GuardState, limits: Limits, tick: int, wanted: float, i: int) -> float:

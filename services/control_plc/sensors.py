@@ -55,9 +55,7 @@ class SensorCheckSettings(BaseModel):
     @property
     def ranges(self) -> tuple[Range, ...]:
         """Range of each output."""
-        return tuple(
-            getattr(self, output.quantity) if output.quantity else output.range for output in PROCESS.outputs
-        )
+        return tuple(getattr(self, output.quantity) if output.quantity else output.range for output in PROCESS.outputs)
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -165,10 +165,10 @@ def row_at(tick: int, first_tick: int, length: int) -> int:
 @kernel
 def same_inputs(one: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
     """Return whether two rows (inputs,) are the same."""
+    same = True
     for i in range(one.shape[0]):
-        if one[i] != other[i]:
-            return False
-    return True
+        same = same and one[i] == other[i]
+    return same
 
 
 @kernel

@@ -156,7 +156,8 @@ class ProgramSettings(BaseModel):
     @classmethod
     def _whole_ticks(cls, value: float) -> float:
         if value % TICK_S or 0 < value < SHORTEST_TICKS * TICK_S:
-            raise ValueError(f"an updating period is a multiple of {TICK_S:g} s from {SHORTEST_TICKS * TICK_S:g} s on, or 0 for adaptive")
+            shortest = f"{SHORTEST_TICKS * TICK_S:g} s"
+            raise ValueError(f"an updating period is a multiple of {TICK_S:g} s from {shortest} on, or 0 for adaptive")
         return value
 
     @model_validator(mode="after")

@@ -113,9 +113,9 @@ class PlantProgram:
 
     @contextmanager
     def noise(self, ticks: int) -> Iterator[RealArray]:
-        """Lend the draws of the next `ticks` ticks, shape (ticks, outputs), or (0, outputs) without noise; those used are gone.
+        """Lend the draws of the next `ticks` ticks, shape (ticks, outputs), or (0, outputs) without.
 
-        The tick afterwards shows how many were used.
+        Those used are gone: the tick afterwards shows how many they were.
         """
         before, start = self._generator.bit_generator.state, self.tick
         outputs = len(OUTPUT_NAMES)

@@ -10,7 +10,7 @@ from coldloop.registers.optimizer_plc import Optimization
 from control_plc.program import ControlProgram
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.solvers import KernelSolver
-from plant.program import PlantProgram
+from plant.cold_box.program import ColdBoxProgram
 from rig.cosim.compiled import control, loops, plants
 from rig.cosim.compiled.records import BLOCK_TICKS, Optimizer, PlantState, Reports, World, empty_reports, empty_trace
 from rig.results.recorded import NO_STATION, STATION_COLUMNS, SampleBlock
@@ -37,7 +37,7 @@ class CompiledStretches:
     """
 
     def __init__(
-        self, plant: PlantProgram, control_plc: ControlProgram, optimizer_plc: OptimizerProgram, load: LoadProfile
+        self, plant: ColdBoxProgram, control_plc: ControlProgram, optimizer_plc: OptimizerProgram, load: LoadProfile
     ) -> None:  # fmt: skip
         self._plant, self._control, self._optimizer = plant, control_plc, optimizer_plc
         self._is_compiled = _is_compiled(optimizer_plc)

@@ -65,7 +65,12 @@ PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
     Preset.TUNED: _TUNED_COLD_BOX if IS_COLD_BOX else {"estimator": {"disturbances": ("outputs",)}},
     Preset.PAPER: {},
     Preset.AS_PRINTED: {
-        "penalties": {"output_rows": 1.0, "rate_rows": tuple(one.scale**2 for one in PROCESS.inputs), "box": 1.0, "first_knot_in_box": False},
+        "penalties": {
+            "output_rows": 1.0,
+            "rate_rows": tuple(one.scale**2 for one in PROCESS.inputs),
+            "box": 1.0,
+            "first_knot_in_box": False,
+        },
         "ode": {"cost_scale": 1e-8, "look_ahead_rows": False, "hold_at_bounds": False},
     },
 }

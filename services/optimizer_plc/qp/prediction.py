@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.lti_model import LtiModel
 from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import CONTROLLED, L1, STATE_NAMES, TICKS_PER_SAMPLE
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.design import ControlDesign

@@ -29,12 +29,16 @@ def check_signals(header: ModelHeader) -> None:
         ModelFileError: It is not, or its plant's source has changed.
     """
     if (header.state_names, header.input_names, header.output_names) != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
-        raise ModelFileError(f"{header.file}: a model of another process than COLDLOOP_PROCESS names; name the same for both")
+        raise ModelFileError(
+            f"{header.file}: a model of another process than COLDLOOP_PROCESS names; name the same for both"
+        )
     if header.plant != PYTHON:
         return
     source, name = _source(header)
     if not source.is_file() or source_digest(source, name) != header.parameters_digest:
-        raise ModelFileError(f"{header.file}: made from another {source} than is there; make it again, `coldloop process`")
+        raise ModelFileError(
+            f"{header.file}: made from another {source} than is there; make it again, `coldloop process`"
+        )
 
 
 def _source(header: ModelHeader) -> tuple[Path, str]:

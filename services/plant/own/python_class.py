@@ -44,7 +44,7 @@ def load_equations(file: Path, name: str) -> Equations:
     try:
         spec.loader.exec_module(module)
         made: Any = getattr(module, name)()
-    except Exception as error:  # noqa: BLE001 whatever a user's file does
+    except Exception as error:
         raise ModelFileError(f"{file}: {name} cannot be made: {type(error).__name__}: {error}") from error
     for needed in ("states", "guess", "derivatives", "outputs"):
         if not hasattr(made, needed):

@@ -155,7 +155,10 @@ class Rack:
         self.model_range = ModelRangeStatus(program.model_range, program.tick)
         self.watchdog.set(state.watchdog, program.tick)
         self.outputs = AppliedOutputs(
-            tuple(state.program["u"]), rate=self._rate, holder=state.holder, generation=next_generation(state.generation)
+            tuple(state.program["u"]),
+            rate=self._rate,
+            holder=state.holder,
+            generation=next_generation(state.generation),
         )
         self.moving = state.pace.realtime and program.tick > 0 and not self.has_ended
 

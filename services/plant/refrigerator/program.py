@@ -7,10 +7,10 @@ import numpy as np
 
 from coldloop.process.model_range import model_range
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
+from plant.cold_box.program import ColdBoxProgram
 from plant.helium.properties import load_helium
 from plant.integrator import plain_tuples
 from plant.numeric import RealArray
-from plant.cold_box.program import ColdBoxProgram
 from plant.program import HeatLoad, MeasurementNoise
 from plant.refrigerator.events import EventSchedule
 from plant.refrigerator.file import RefrigeratorFile

@@ -176,7 +176,7 @@ def _made_of(kind: Any, value: Any) -> Any:  # noqa: ANN401 of any field
         hints = get_type_hints(kind)
         unknown = set(value) - set(hints)
         if unknown:
-            raise TypeError(f"{kind.__name__}: {sorted(unknown)[0]} is unknown")
+            raise TypeError(f"{getattr(kind, '__name__', kind)}: {min(unknown)} is unknown")
         return kind(**{name: _made_of(hints[name], each) for name, each in value.items()})  # type: ignore[operator]
     arguments = get_args(kind)
     if isinstance(value, list):

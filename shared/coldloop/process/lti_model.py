@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ModelFileError
+from coldloop.process.loaded import PROCESS
 from coldloop.process.model_file import (
     COLD_BOX,
     FORMAT,
@@ -19,7 +20,6 @@ from coldloop.process.model_file import (
     short_digest_of,
     write_document,
 )
-from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import STATE_NAMES
 
 RealArray: TypeAlias = NDArray[np.float64]

@@ -187,7 +187,9 @@ class Update(NamedTuple):
     playing: Annotated[
         int, u32("Number of the sequence being played from this instant on; 0 is none", high=LAST_NUMBER)
     ]
-    load: Annotated[float, f32(f"Load {PROCESS.load.name}", unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])]
+    load: Annotated[
+        float, f32(f"Load {PROCESS.load.name}", unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])
+    ]
     u_before: Annotated[
         tuple[float, ...],
         f32_array(
@@ -197,7 +199,10 @@ class Update(NamedTuple):
     u: Annotated[
         tuple[float, ...],
         f32_array(
-            "Input applied from this instant on", INPUT_NAMES, INPUT_UNITS, low=SPAN_OF_INPUTS[0],
+            "Input applied from this instant on",
+            INPUT_NAMES,
+            INPUT_UNITS,
+            low=SPAN_OF_INPUTS[0],
             high=SPAN_OF_INPUTS[1],
         ),
     ]
@@ -234,11 +239,18 @@ class Plan(NamedTuple):
     next_update_tick: Annotated[int, u32("Tick of the next updating instant t_{i+1}")]
     load_step: Annotated[
         float,
-        f32("An update is latched at once when the load has moved by more than this; 0 is never", unit=PROCESS.load.unit,
-            low=0),
+        f32(
+            "An update is latched at once when the load has moved by more than this; 0 is never",
+            unit=PROCESS.load.unit,
+            low=0,
+        ),
     ] = 0.0
     shortage: Annotated[
-        float, f32("Estimated load above what can be held; negative: below what is needed; 0 is neither", unit=PROCESS.load.unit)
+        float,
+        f32(
+            "Estimated load above what can be held; negative: below what is needed; 0 is neither",
+            unit=PROCESS.load.unit,
+        ),
     ] = 0.0
     suspects: Annotated[
         int, u32("Outputs whose reading is not used, as prediction and other readings contradict it: bit i is output i")
@@ -284,6 +296,8 @@ if TYPE_CHECKING:
     class Operator(tuple[Any, ...]):
         """What an operator wants: the mode, and a setpoint for each input."""
 
+        __slots__ = ()
+
         mode: int
 
         def __new__(cls, mode: int, *inputs: float) -> Self: ...  # noqa: D102
@@ -324,6 +338,8 @@ if TYPE_CHECKING:
 
     class SequenceRow(tuple[float, ...]):
         """Inputs of one tick, a field each."""
+
+        __slots__ = ()
 
         def __new__(cls, *inputs: float) -> Self: ...  # noqa: D102
         def _replace(self, **inputs: float) -> Self: ...
@@ -382,35 +398,37 @@ class Grant(NamedTuple):
 CONTROL_MAP: Final = RegisterMap(
     service="control_plc",
     version=4,
-    blocks=placed((
-        IDENTITY_BLOCK,
-        Block("status", 30, Status, "Sequence player and scan cycle"),
-        Block("ladder", 50, LadderStatus, "The fail-safe ladder"),
-        STATISTICS_BLOCK,
-        Block("process", 100, Process, "The process at the last scan"),
-        Block("update", 200, Update, "Latched at the last updating instant", sealed=True),
-        Block("plant link", 330, PlantLinkStatus, "Link to the rack, and the clocks of both"),
-        Block("optimiser lease", 360, LeaseStatus, "Who may write as the optimiser"),
-        Block("await update", 400, AwaitUpdate, "Makes a read of the latch wait", Role.OPTIMIZER, sealed=True),
-        Block("plan", 408, Plan, "Decided updating period", Role.OPTIMIZER, sealed=True),
-        Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence", sealed=True),
-        Block("heartbeat", 430, Heartbeat, "Heartbeat of the optimiser", Role.OPTIMIZER, sealed=True),
-        Block("watchdog", 440, WatchdogStatus, "Watches the optimiser"),
-        Block("watchdog time", 446, WatchdogTime, "Sets that watchdog", Role.OPERATOR),
-        Block("session", 450, ControlSession, "Start of a session", Role.OPERATOR),
-        Block("grant", 460, Grant, "Ticks granted in lock-step", Role.OPERATOR),
-        Block("latched update", 462, LatchedUpdate, "The newest update", sealed=True),
-        Block("operator", 470, Operator, "Operating mode and manual setpoints", Role.OPERATOR),
-        Block("alarm command", 480, AlarmCommand, "Command for an alarm", Role.OPERATOR),
-        Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
-        Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
-        Block("pace", 1950, SessionPace, "Time base of the present session", Role.OPERATOR),
-        Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(AlarmKind)),
-        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
-        Block("journal page", 45010, JournalPage, "State of the journal"),
-        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
-        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
-        CONFIGURATION_BLOCK,
-        CONFIGURATION_LINES_BLOCK,
-    )),
+    blocks=placed(
+        (
+            IDENTITY_BLOCK,
+            Block("status", 30, Status, "Sequence player and scan cycle"),
+            Block("ladder", 50, LadderStatus, "The fail-safe ladder"),
+            STATISTICS_BLOCK,
+            Block("process", 100, Process, "The process at the last scan"),
+            Block("update", 200, Update, "Latched at the last updating instant", sealed=True),
+            Block("plant link", 330, PlantLinkStatus, "Link to the rack, and the clocks of both"),
+            Block("optimiser lease", 360, LeaseStatus, "Who may write as the optimiser"),
+            Block("await update", 400, AwaitUpdate, "Makes a read of the latch wait", Role.OPTIMIZER, sealed=True),
+            Block("plan", 408, Plan, "Decided updating period", Role.OPTIMIZER, sealed=True),
+            Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence", sealed=True),
+            Block("heartbeat", 430, Heartbeat, "Heartbeat of the optimiser", Role.OPTIMIZER, sealed=True),
+            Block("watchdog", 440, WatchdogStatus, "Watches the optimiser"),
+            Block("watchdog time", 446, WatchdogTime, "Sets that watchdog", Role.OPERATOR),
+            Block("session", 450, ControlSession, "Start of a session", Role.OPERATOR),
+            Block("grant", 460, Grant, "Ticks granted in lock-step", Role.OPERATOR),
+            Block("latched update", 462, LatchedUpdate, "The newest update", sealed=True),
+            Block("operator", 470, Operator, "Operating mode and manual setpoints", Role.OPERATOR),
+            Block("alarm command", 480, AlarmCommand, "Command for an alarm", Role.OPERATOR),
+            Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
+            Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
+            Block("pace", 1950, SessionPace, "Time base of the present session", Role.OPERATOR),
+            Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(AlarmKind)),
+            Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
+            Block("journal page", 45010, JournalPage, "State of the journal"),
+            Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
+            Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+            CONFIGURATION_BLOCK,
+            CONFIGURATION_LINES_BLOCK,
+        )
+    ),
 )

@@ -125,7 +125,8 @@ def record(name: str, module: str, description: str, declared: Mapping[str, Any]
         declared: Annotation of each field, as in a `NamedTuple`.
         defaults: Of the last fields.
     """
-    made: Any = namedtuple(name, list(declared), defaults=defaults, module=module)  # noqa: PYI024 the fields vary
+    make: Any = namedtuple  # noqa: PYI024 the fields vary
+    made = make(name, list(declared), defaults=defaults, module=module)
     made.__doc__, made.__annotations__ = description, dict(declared)
     return made
 

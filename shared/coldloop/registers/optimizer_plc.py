@@ -39,8 +39,9 @@ class OptimizerSession(NamedTuple):
     session: Annotated[int, u32("Number of the session", low=1)]
     realtime: Annotated[int, u16("0 lock-step, 1 real time: answers are delayed as by the PLC", high=1)]
     factor: Annotated[float, f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
-    updating_period: Annotated[int, u16("Fixed updating period, 2 or more; 0 is adaptive", unit=TICK_UNIT,
-                                         high=TICKS_PER_SAMPLE)]
+    updating_period: Annotated[
+        int, u16("Fixed updating period, 2 or more; 0 is adaptive", unit=TICK_UNIT, high=TICKS_PER_SAMPLE)
+    ]
 
 
 class ControlLinkState(IntEnum):
@@ -152,6 +153,8 @@ if TYPE_CHECKING:
     class Prediction(tuple[Any, ...]):
         """What the last delivered sequence is expected to lead to: an array for each output that has a band."""
 
+        __slots__ = ()
+
         update: int
         tick: int
         u: tuple[float, ...]
@@ -223,22 +226,24 @@ class ModelDeviation(NamedTuple):
 OPTIMIZER_MAP: Final = RegisterMap(
     service="optimizer_plc",
     version=4,
-    blocks=placed((
-        IDENTITY_BLOCK,
-        Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
-        Block("control link", 40, ControlLinkStatus, "Link to the control PLC"),
-        STATISTICS_BLOCK,
-        Block("pace", 100, SessionPace, "Time base of the present session", Role.OPERATOR),
-        Block("updating rule", 120, UpdatingRuleStatus, "What decides the updating period"),
-        Block("operating limits", 140, OperatingLimits, "Bands of the outputs, bounds and rates of the inputs"),
-        Block("prediction", 200, Prediction, "Predicted result of the last sequence", sealed=True),
-        Block("model deviation", 320, ModelDeviation, "How the plant differs from the prediction model"),
-        Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
-        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
-        Block("journal page", 45010, JournalPage, "State of the journal"),
-        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
-        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
-        CONFIGURATION_BLOCK,
-        CONFIGURATION_LINES_BLOCK,
-    )),
+    blocks=placed(
+        (
+            IDENTITY_BLOCK,
+            Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
+            Block("control link", 40, ControlLinkStatus, "Link to the control PLC"),
+            STATISTICS_BLOCK,
+            Block("pace", 100, SessionPace, "Time base of the present session", Role.OPERATOR),
+            Block("updating rule", 120, UpdatingRuleStatus, "What decides the updating period"),
+            Block("operating limits", 140, OperatingLimits, "Bands of the outputs, bounds and rates of the inputs"),
+            Block("prediction", 200, Prediction, "Predicted result of the last sequence", sealed=True),
+            Block("model deviation", 320, ModelDeviation, "How the plant differs from the prediction model"),
+            Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS),
+            Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
+            Block("journal page", 45010, JournalPage, "State of the journal"),
+            Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
+            Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+            CONFIGURATION_BLOCK,
+            CONFIGURATION_LINES_BLOCK,
+        )
+    ),
 )

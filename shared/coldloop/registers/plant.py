@@ -72,6 +72,8 @@ if TYPE_CHECKING:
     class Actuators(tuple[Any, ...]):
         """Outputs for one tick: a field for each input of the process between `tick` and `session`."""
 
+        __slots__ = ()
+
         tick: int
         session: int
         holder: int
@@ -124,9 +126,8 @@ class Measurement(NamedTuple):
     x: Annotated[tuple[float, ...], f32_array("Simulated state, not measured", STATE_NAMES, STATE_UNITS, finite=False)]
     session: Annotated[int, u32("Session")]
     u: Annotated[
-        tuple[float, ...], f32_array(
-            "Input being applied", INPUT_NAMES, INPUT_UNITS, low=SPAN_OF_INPUTS[0], high=SPAN_OF_INPUTS[1]
-        ),
+        tuple[float, ...],
+        f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS, low=SPAN_OF_INPUTS[0], high=SPAN_OF_INPUTS[1]),
     ] = (0.0,) * len(INPUT_NAMES)
     holder: Annotated[int, u32("Holder of these outputs; 0 is a simple client, safe or initial state")] = 0
     generation: Annotated[
@@ -210,7 +211,8 @@ class LoadAhead(NamedTuple):
     tick: Annotated[int, u32("Tick of the first step, in the future", unit=TICK_UNIT, high=LAST_TICK)] = 0
     length: Annotated[int, u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
     watts: Annotated[
-        tuple[float, ...], f32_array("Load of step", tuple(map(str, range(AHEAD_STEPS))), (PROCESS.load.unit,) * AHEAD_STEPS)
+        tuple[float, ...],
+        f32_array("Load of step", tuple(map(str, range(AHEAD_STEPS))), (PROCESS.load.unit,) * AHEAD_STEPS),
     ] = (0.0,) * AHEAD_STEPS
     ticks: Annotated[
         tuple[int, ...],
@@ -353,44 +355,46 @@ class Surroundings(NamedTuple):
 PLANT_MAP: Final = RegisterMap(
     service="plant",
     version=4,
-    blocks=placed((
-        IDENTITY_BLOCK,
-        STATISTICS_BLOCK,
-        Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL, sealed=True),
-        Block("measurement", 200, Measurement, "Inputs of the control PLC", sealed=True),
-        Block("watchdog", 330, WatchdogStatus, "Watches the control PLC; applies the safe state when it expires"),
-        Block("watchdog time", 340, WatchdogTime, "Sets that watchdog", Role.CONTROL),
-        Block("lease", 350, LeaseStatus, "Who may write outputs"),
-        Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
-        Block("pace", 410, SessionPace, "Time base of the present session", Role.OPERATOR),
-        Block("load status", 420, LoadStatus, "The heat load and its known steps"),
-        Block("live load", 440, LiveLoad, "Load from a tick on", Role.OPERATOR, sealed=True),
-        Block(
-            "sensor faults",
-            500,
-            SensorFault,
-            "Faults injected into the measured outputs",
-            Role.OPERATOR,
-            len(OUTPUT_NAMES),
-        ),
-        Block("load ahead", 600, LoadAhead, "Future steps of the heat load", Role.OPERATOR, sealed=True),
-        Block("station", 700, StationStatus, "Compression station and nitrogen pre-cooler of a whole refrigerator"),
-        Block(
-            "surroundings",
-            760,
-            Surroundings,
-            "Trips, nitrogen, leak and weather of a whole refrigerator",
-            Role.OPERATOR,
-        ),
-        Block("model range", 780, ModelRangeStatus, "Alarm of the simulation: it has left its property tables"),
-        Block("load table", 1000, LoadStep, "Load over the session", Role.OPERATOR, LOAD_ROWS),
-        Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
-        Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
-        Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
-        Block("journal page", 45010, JournalPage, "State of the journal"),
-        Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
-        Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
-        CONFIGURATION_BLOCK,
-        CONFIGURATION_LINES_BLOCK,
-    )),
+    blocks=placed(
+        (
+            IDENTITY_BLOCK,
+            STATISTICS_BLOCK,
+            Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL, sealed=True),
+            Block("measurement", 200, Measurement, "Inputs of the control PLC", sealed=True),
+            Block("watchdog", 330, WatchdogStatus, "Watches the control PLC; applies the safe state when it expires"),
+            Block("watchdog time", 340, WatchdogTime, "Sets that watchdog", Role.CONTROL),
+            Block("lease", 350, LeaseStatus, "Who may write outputs"),
+            Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
+            Block("pace", 410, SessionPace, "Time base of the present session", Role.OPERATOR),
+            Block("load status", 420, LoadStatus, "The heat load and its known steps"),
+            Block("live load", 440, LiveLoad, "Load from a tick on", Role.OPERATOR, sealed=True),
+            Block(
+                "sensor faults",
+                500,
+                SensorFault,
+                "Faults injected into the measured outputs",
+                Role.OPERATOR,
+                len(OUTPUT_NAMES),
+            ),
+            Block("load ahead", 600, LoadAhead, "Future steps of the heat load", Role.OPERATOR, sealed=True),
+            Block("station", 700, StationStatus, "Compression station and nitrogen pre-cooler of a whole refrigerator"),
+            Block(
+                "surroundings",
+                760,
+                Surroundings,
+                "Trips, nitrogen, leak and weather of a whole refrigerator",
+                Role.OPERATOR,
+            ),
+            Block("model range", 780, ModelRangeStatus, "Alarm of the simulation: it has left its property tables"),
+            Block("load table", 1000, LoadStep, "Load over the session", Role.OPERATOR, LOAD_ROWS),
+            Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
+            Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
+            Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
+            Block("journal page", 45010, JournalPage, "State of the journal"),
+            Block("journal answer", 45017, JournalAnswer, "The events that were selected", rows=QUERY_ROWS),
+            Block("events", 45200, Event, "The last events", rows=EVENT_ROWS),
+            CONFIGURATION_BLOCK,
+            CONFIGURATION_LINES_BLOCK,
+        )
+    ),
 )
