@@ -9,13 +9,13 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FLOORS = {
     "shared/coldloop": [
-        ["kernels", "process"], ["session"], ["registers"], ["safety", "modbus"], ["service"], ["operating"],
+        ["process"], ["kernels", "session"], ["registers"], ["safety", "modbus"], ["service"], ["operating"],
     ],
-    "services/plant": [["helium"], ["components"], ["cold_box"], ["refrigerator", "rack"]],
+    "services/plant": [["helium"], ["components"], ["cold_box"], ["refrigerator", "rack"], ["own"]],
     "services/optimizer_plc": [["qp"], ["solvers", "rules"]],
     "rig": [
-        ["results"], ["figures", "cosim"], ["runs", "plc_sizing", "plc_export"], ["studies", "chaos"], ["live"],
-        ["testing", "report"], ["cli"],
+        ["results"], ["figures", "cosim"], ["runs", "plc_sizing", "plc_export"], ["studies", "chaos", "process_file"],
+        ["live"], ["testing", "report"], ["cli"],
     ],
 }  # fmt: skip
 """Rooms from the ground up. A room uses those below it; files beside the rooms are not looked at."""

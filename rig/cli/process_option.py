@@ -12,6 +12,8 @@ from coldloop.errors import UsageError
 
 OPTION: Final = "--process"
 VARIABLE: Final = "COLDLOOP_PROCESS"
+LOADED: Final = "coldloop.process.loaded"
+"""The module that reads it, once."""
 
 
 def load_named_process(arguments: Sequence[str]) -> list[str]:
@@ -25,7 +27,10 @@ def load_named_process(arguments: Sequence[str]) -> list[str]:
         path = Path(named)
         if not path.is_file():
             raise UsageError(f"{OPTION} {named}: no such file; name a process file or a model file")
-        os.environ[VARIABLE] = str((_made(path) if path.suffix == ".toml" else path).resolve())
+        model = str((_made(path) if path.suffix == ".toml" else path).resolve())
+        if LOADED in sys.modules and os.environ.get(VARIABLE) != model:
+            raise UsageError(f"{OPTION} {named}: this interpreter is loaded with another process; begin a new one")
+        os.environ[VARIABLE] = model
     return left
 
 

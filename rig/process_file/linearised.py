@@ -186,7 +186,7 @@ def _from_lags(file: ProcessFile, plant: PlantSection) -> Linearised:
         if lag.source not in sources or lag.output not in outputs:
             unknown = lag.source if lag.source not in sources else lag.output
             raise UsageError(f"plant.transfer_functions: {unknown} is no signal of this file")
-    parts = [_lag_model(lag) for lag in lags]
+    parts = [lag_model(lag) for lag in lags]
     n = sum(len(a) for a, _, _ in parts)
     A, B, C = np.zeros((n, n)), np.zeros((n, m + 1)), np.zeros((len(outputs), n))
     states: dict[str, str] = {}
@@ -204,7 +204,7 @@ def _from_lags(file: ProcessFile, plant: PlantSection) -> Linearised:
     )  # fmt: skip
 
 
-def _lag_model(lag: LagSection) -> tuple[Array, Array, Array]:
+def lag_model(lag: LagSection) -> tuple[Array, Array, Array]:
     """Return A (k, k), b (k,), c (k,) of one lag, its dead time by a Pade approximation, its state last."""
     rate = 1.0 / lag.time_constant_s
     if lag.delay_s == 0.0:

@@ -54,6 +54,7 @@ class Estimator(NamedTuple):
     u0: Array
     y0: Array
     w0: float
+    tick_s: float
     kalman: bool
     """Kalman filter, or else state feedback."""
     load_known: bool
@@ -119,7 +120,7 @@ def estimator_of(
     stationary = stationary_gains(prediction, settings) if kalman else StationaryGains(*np.zeros((2, 1, 1, 1)))
     return Estimator(
         Transition(*(np.array(M) for M in zip(*m.transitions.values(), strict=True))),
-        m.outputs, np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, kalman, settings.load_known,
+        m.outputs, np.array(m.x0), np.array(m.u0), np.array(m.y0), m.w0, real(TICK_S), kalman, settings.load_known,
         StationaryGains(*(array.astype(real, copy=False) for array in stationary)),
         plausibility_of(plausibility, prediction, len(prediction.transitions) * TICK_S, real),
     )  # fmt: skip
@@ -155,12 +156,12 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     if c.plausible.sigmas > 0.0:
         innovation = judge(
             c.plausible, belief.readings, belief.surprise, belief.predicted, innovation, J,
-            real(b.since) * real(TICK_S),
+            real(b.since) * c.tick_s,
         )  # fmt: skip
     if not np.isfinite(innovation).all():
         innovation = imputed(innovation, J)
     if b.since <= c.stationary.gains.shape[0]:  # J is for no longer time
-        note_surprise(belief.surprise, innovation, J, real(b.since) * real(TICK_S / MINUTE_S))
+        note_surprise(belief.surprise, innovation, J, real(b.since) * (c.tick_s / real(MINUTE_S)))
     correction = np.zeros(belief.x.size + 1, belief.x.dtype)
     add_transposed_product(c.stationary.gains[period], innovation, correction)
     belief.x[:] = belief.predicted + correction[:-1]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import T1, T2, TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.signals import T1, T2
 from optimizer_plc.budget import MAX_PERIOD_TICKS, PlcBudget
 from optimizer_plc.estimator import Estimator, begin_prediction, correct, predict
 from optimizer_plc.plausibility import suspects_of
@@ -77,7 +77,7 @@ class Constants(NamedTuple):
     periods: NDArray[np.int64]
     """Updating period in ticks for each q, shape (most + 1,); there is no q = 0."""
     fitting: NDArray[np.int64]
-    """Iterations that fit into each number of ticks, shape (ticks + 1,)."""
+    """Iterations that fit into each number of ticks up to the longest period, a sampling period; shape (ticks + 1,)."""
 
 
 def constants_of(
@@ -180,7 +180,7 @@ def pose(c: Constants, m: OptimizerState) -> tuple[QuadraticProblem, Array]:
     s = sent.numbers[0]
     s.w, s.share, s.ticks = m.belief.numbers[0].w, c.rate_shares[ticks], ticks
     qp = problem_at(c, sent.x, s.w, sent.u_before, s.share, m.target, m.numbers[0].most_open)
-    return qp, shifted(c.shifts[ticks], m.playing.z)
+    return qp, shifted(c.shifts[ticks], m.playing.z, c.n_inputs)
 
 
 @kernel
@@ -213,11 +213,12 @@ def solve(c: Constants, method: Any, m: OptimizerState) -> None:  # noqa: ANN401
 def write_rows(c: Constants, z: Array, ticks: int, rows: NDArray[np.float32]) -> int:
     """Write the sequence of a profile, in single precision and a row a tick, into `rows`; return its length."""
     length = max(c.sequence_ticks, 2 * ticks)
-    samples = (length + TICKS_PER_SAMPLE - 1) // TICKS_PER_SAMPLE
+    per_sample = c.fitting.shape[0] - 1
+    samples = (length + per_sample - 1) // per_sample
     inputs = inputs_of(c.weights[:samples], z, c.input_scale, c.estimator.u0, c.rate)
     for tick in range(length):
         for i in range(inputs.shape[1]):
-            rows[tick, i] = inputs[tick // TICKS_PER_SAMPLE, i]
+            rows[tick, i] = inputs[tick // per_sample, i]
     return length
 
 
@@ -304,13 +305,13 @@ def plan(
     now.gamma = real(0.0)
     if wanted == BY_THE_RULE:  # step (4): q(t_{k+1}) from the costs
         o = Observation(
-            now.q, now.iterations, real(now.ticks) * real(TICK_S), now.effective, played.hot_start, played.last_but_one,
-            played.delivered, effective,
+            now.q, now.iterations, real(now.ticks) * c.estimator.tick_s, now.effective, played.hot_start,
+            played.last_but_one, played.delivered, effective,
         )  # fmt: skip
         a = assessed(o)
         wanted = decide_by(rule, m.rule, o, a)
         now.efficiency, now.mismatch, now.contraction, now.gamma = a.efficiency, a.mismatch, a.contraction, a.gamma
     now.q = min(wanted, c.most)  # step (5): its period, and what fits; then step (2), what was sent is played
-    now.ticks = c.fixed_ticks or min(c.periods[now.q] + now.allowance, MAX_PERIOD_TICKS)
+    now.ticks = c.fixed_ticks or min(c.periods[now.q] + now.allowance, c.fitting.shape[0] - 1)
     now.iterations = c.fitting[max(now.ticks - now.allowance, 0)]  # where a period cannot grow, they are fewer
     now.update, now.tick, now.load, now.effective, now.planned = update, tick, load, effective, True

@@ -290,7 +290,8 @@ def explained(
     where = _where(key, sources)
     if first["type"] == "extra_forbidden":
         section = key.rpartition(".")[0]
-        known = flattened(model().model_dump()) if section else model.model_fields
+        complete = not any(field.is_required() for field in model.model_fields.values())
+        known = flattened(model().model_dump()) if section and complete else model.model_fields
         close = get_close_matches(key, [each for each in known if each.startswith(section)], n=1)
         return f"{where}: no such key; {f'did you mean {close[0]}? ' if close else ''}{listing}"
     if first["type"] == "missing":

@@ -28,8 +28,8 @@ from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticP
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import Answer, Solver, make_solver
 from plant.cold_box.physics import REFERENCE
+from plant.cold_box.program import ColdBoxProgram
 from plant.load import find_load
-from plant.program import PlantProgram
 
 Array = NDArray[np.float64]
 Situations = Callable[[np.random.Generator], QpParameters]

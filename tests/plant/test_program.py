@@ -11,6 +11,7 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.physics import REFERENCE
+from plant.cold_box.program import ColdBoxProgram
 from plant.program import MeasurementNoise, PlantProgram
 
 LEVEL_AND_T5 = tuple(0.01 if name in ("L1", "T5") else 0.0 for name in OUTPUT_NAMES)

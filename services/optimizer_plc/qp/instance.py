@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from optimizer_plc.qp.design import N_INPUTS, N_SLACKS
 from optimizer_plc.qp.linear_algebra import add_transposed_product
 
 Array = NDArray[np.float64]
@@ -89,8 +88,10 @@ def instance(
     constant = zero
     for i in range(s.shape[0]):
         constant += deviation[i] * weighted[i]
-    inputs = phi.shape[0] * N_INPUTS // (N_INPUTS + N_SLACKS)
+    inputs = 0
+    while inputs < phi.shape[0] and np.isfinite(maps.high[inputs]):  # slacks have no upper bound
+        inputs += 1
     for i in range(maps.holding.shape[0]):
-        for j in range(i, inputs, N_INPUTS):
+        for j in range(i, inputs, u_before.shape[0]):
             constant -= half * (about_rest[j] + phi[j]) * target[i]
     return phi, gamma, low, high, constant

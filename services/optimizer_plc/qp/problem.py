@@ -165,8 +165,8 @@ class PredictiveProblem:
     def shifted(self, z: Array, ticks: int) -> Array:
         """Return the profile z shifted by `ticks` ticks."""
         if ticks <= SHIFTS:
-            return shifted(self.shifts[ticks], z)
-        return shifted(self._rounded(shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE)), z)
+            return shifted(self.shifts[ticks], z, self.n_inputs)
+        return shifted(self._rounded(shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE)), z, self.n_inputs)
 
     def within_first_rate(self, z: Array, parameters: QpParameters) -> Array:
         """Return the profile z with its first knot within the rate of the input before it, as it can be sent."""

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from optimizer_plc.qp.design import N_INPUTS, N_SLACKS
 
 Array = NDArray[np.float64]
 
@@ -36,11 +35,14 @@ def shift(knots: tuple[int, ...], periods: float) -> Array:
 
 
 @kernel
-def shifted(S: Array, z: Array) -> Array:
-    """Return the profile z (n,) whose values at the knots are combined by S (knots, knots), inputs and slacks alike."""
+def shifted(S: Array, z: Array, n_inputs: int) -> Array:
+    """Return the profile z (n,) whose values at the knots are combined by S (knots, knots), inputs and slacks alike.
+
+    The first `n_inputs` variables are inputs at all knots.
+    """
     result = np.zeros_like(z)
     knots, start = S.shape[0], 0
-    for width in (N_INPUTS, N_SLACKS):
+    for width in (n_inputs // knots, (z.shape[0] - n_inputs) // knots):
         for old in range(knots):
             for new in range(knots):
                 if S[new, old] != z.dtype.type(0.0):

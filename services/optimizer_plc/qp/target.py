@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import IS_COLD_BOX
-from coldloop.process.signals import INPUT_NAMES, T5
+from coldloop.process.signals import T5
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.design import N_INPUTS, ControlDesign, Target
 from optimizer_plc.qp.prediction import PredictionModel, state_cost
@@ -25,7 +26,7 @@ from optimizer_plc.qp.rest import rest_map
 
 Array = NDArray[np.float64]
 
-CV155 = INPUT_NAMES.index("CV155") if IS_COLD_BOX else 0
+CV155 = [one.name for one in COLD_BOX.inputs].index("CV155")
 TOLERANCES = {8: 1e-8, 4: 1e-4}
 """What a bound may be missed by, scaled, by the bytes of a number: in single precision a corner of bounds is met no
 better than within 1e-5."""

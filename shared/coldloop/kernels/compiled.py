@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.first_use import needs_compiling
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 
 try:
     import fcntl
@@ -42,7 +41,8 @@ R = TypeVar("R")
 COMPILED_PACKAGES = ("plant", "optimizer_plc")
 COMPILED_MODULES = (
     "coldloop.kernels.borrowing", "coldloop.kernels.compiled", "coldloop.kernels.single_precision",
-    "coldloop.process.signals", "control_plc.output_limits", "control_plc.sensors", "rig.cosim.compiled.loops",
+    "coldloop.process.cold_box", "coldloop.process.signals", "control_plc.output_limits",
+    "control_plc.sensors", "rig.cosim.compiled.loops",
     "rig.cosim.compiled.plants", "rig.cosim.compiled.portable", "rig.cosim.compiled.records",
 )  # fmt: skip
 """What kernels call from other packages."""
@@ -121,9 +121,6 @@ def _sources_digest() -> str:
         package, *path = module.split(".")
         for folder in _folders(package):
             digest.update(folder.joinpath(*path).with_suffix(".py").read_bytes())
-    if not IS_COLD_BOX:  # what kernels hold of it
-        sizes = (len(PROCESS.inputs), len(PROCESS.bands), PROCESS.tick_s, PROCESS.ticks_per_sample)
-        digest.update(repr(sizes).encode())
     return digest.hexdigest()[:16]
 
 

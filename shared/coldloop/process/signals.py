@@ -2,6 +2,7 @@
 
 from typing import Final
 
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.loaded import PROCESS
 
 TICK_S: Final = PROCESS.tick_s
@@ -33,15 +34,10 @@ CONTROLLED: Final = tuple(OUTPUT_NAMES.index(one.name) for one in PROCESS.banded
 """Outputs that have a band: L1 and T5 of the cold box."""
 
 
-def _place(name: str) -> int:
-    """Return which output one of the cold box's is; -1 where the process has none of that name."""
-    return OUTPUT_NAMES.index(name) if name in OUTPUT_NAMES else -1
+_OF_THE_COLD_BOX: Final = [one.name for one in COLD_BOX.outputs]
+L1, T1, T2, T5 = (_OF_THE_COLD_BOX.index(name) for name in ("L1", "T1", "T2", "T5"))
+"""Outputs of the cold box: for what there is nowhere else."""
 
-
-L1: Final = _place("L1")
-T1: Final = _place("T1")
-T2: Final = _place("T2")
-T5: Final = _place("T5")
 STATION_VALVE_NAMES: Final = ("CV956", "CV952", "CV953", "CV167")
 """Bypass, discharge into the buffer, charge out of it, nitrogen feed."""
 STATION_SIGNAL_NAMES: Final = (

@@ -1,0 +1,191 @@
+"""A process file: what it is made into, against closed forms, and what it refuses, in one line each."""
+
+from math import sqrt
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from coldloop.errors import ColdloopError
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.declaration import Process
+from rig.process_file.declaration import LagSection
+from rig.process_file.judgement import described
+from rig.process_file.linearised import lag_model
+from rig.process_file.making import Made, made_from
+
+if TYPE_CHECKING:
+    from tests.conftest import Coldloop
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "processes"
+ONE_BY_ONE = """
+name = "heater"
+[plant]
+python = "heater.py:Heater"
+[[inputs]]
+name = "power"
+unit = "W"
+at = 50.0
+low = 0.0
+high = 100.0
+rate = 10.0
+[[outputs]]
+name = "temperature"
+unit = "K"
+range = [200.0, 500.0]
+noise = 0.1
+band = [320.0, 330.0]
+"""
+HEATER = """
+class Heater:
+    states = {"T": "K"}
+    guess = [300.0]
+    def derivatives(self, x, u, w):
+        return [(u[0] - 2.0 * (x[0] - 300.0)) / 100.0]
+    def outputs(self, x, u, w):
+        return [x[0]]
+"""
+
+
+def made(folder: Path, text: str = ONE_BY_ONE, plant: str = HEATER) -> Made:
+    """Return what is made from a process file and a plant beside it."""
+    (folder / "process.toml").write_text(text, encoding="utf-8")
+    (folder / "heater.py").write_text(plant, encoding="utf-8")
+    return made_from(folder / "process.toml", folder / "model.json")
+
+
+def test_the_cold_box_is_a_process_like_others_and_survives_a_journey_as_data() -> None:
+    assert Process.of(COLD_BOX.document()) == COLD_BOX
+
+
+def test_a_heater_by_hand(tmp_path: Path) -> None:
+    """100 J/K that lose 2 W/K to 300 K: with 50 W 325 K, a time constant of 50 s, 0.5 K for each W."""
+    model = made(tmp_path).model
+    assert model.x0 == pytest.approx([325.0])
+    assert pytest.approx(np.array([[-0.02]]), rel=1e-6) == model.A
+    assert model.A_tick == pytest.approx(np.array([[np.exp(-0.02 * 0.25)]]), rel=1e-9)
+    assert (model.C @ model.discretised(1e4).B)[0, 0] == pytest.approx(0.5, rel=1e-6)
+
+
+def test_the_quadruple_tank_has_the_time_constants_that_its_author_gives(tmp_path: Path) -> None:
+    """T_i = A_i / a_i sqrt(2 h_i / g): a mode each (Johansson 2000, equation 7)."""
+    model = made_from(EXAMPLES / "quadruple_tank.toml", tmp_path / "model.json").model
+    assert model.x0 == pytest.approx([12.26, 12.78, 1.63, 1.41], abs=0.01)
+    area, outlet = (28.0, 32.0, 28.0, 32.0), (0.071, 0.057, 0.071, 0.057)
+    constants = [A / a * sqrt(2 * h / 981.0) for A, a, h in zip(area, outlet, model.x0, strict=True)]
+    assert sorted(-1 / np.linalg.eigvals(model.A).real) == pytest.approx(sorted(constants), rel=1e-6)
+
+
+def test_a_dead_time_has_the_phase_of_a_dead_time_well_below_its_reciprocal() -> None:
+    lag = LagSection(output="y", source="u", gain=2.0, time_constant_s=100.0, delay_s=30.0)
+    a, b, c = lag_model(lag)
+    for w in (1e-4, 1e-3, 1e-2, 1 / 30.0):
+        found = c @ np.linalg.solve(1j * w * np.eye(len(a)) - a, b)
+        assert found == pytest.approx(2.0 * np.exp(-30j * w) / (1 + 100j * w), rel=2e-3)
+    assert c @ np.linalg.solve(-a, b) == pytest.approx(2.0)
+
+
+def test_matrices_of_a_file_are_the_model(tmp_path: Path) -> None:
+    A, B, C = np.array([[-0.1, 0.0], [0.05, -0.2]]), np.array([[1.0], [0.0]]), np.array([[0.0, 1.0]])
+    np.savez(tmp_path / "matrices.npz", A=A, B=B, C=C)
+    text = ONE_BY_ONE.replace('python = "heater.py:Heater"', 'matrices = "matrices.npz"')
+    model = made(tmp_path, text.replace("noise = 0.1", "noise = 0.1\nat = 325.0")).model
+    assert np.array_equal(model.A, A)
+    assert np.array_equal(model.C, C)
+    assert not model.F.any()
+
+
+def test_what_is_wrong_with_a_process_is_said_in_words(tmp_path: Path) -> None:
+    unstable = HEATER.replace("- 2.0 * (x[0] - 300.0)", "- 50.0 + 2.0 * (x[0] - 325.0)")
+    assert "unstable: a mode grows" in described(made(tmp_path, plant=unstable))
+    assert "band: temperature rests at" in described(made(tmp_path, ONE_BY_ONE.replace("320.0, 330.0", "340.0, 350.0")))
+    kink = HEATER.replace("(u[0] -", "(abs(u[0] - 50.0) + 50.0 -")
+    assert "kink" in described(made(tmp_path, plant=kink)) or "controllability" in described(made(tmp_path, plant=kink))
+
+
+def changed(before: str, after: str) -> str:
+    """Return the file with a line changed."""
+    assert before in ONE_BY_ONE
+    return ONE_BY_ONE.replace(before, after)
+
+
+BAD_FILES = {
+    "no table": ("name = 3 = 4", "process.toml"),
+    "no inputs": (changed("[[inputs]]", "[[input]]"), "input"),
+    "a name with spaces": (changed('name = "power"', 'name = "the power"'), "inputs"),
+    "a name twice": (changed('name = "temperature"', 'name = "POWER"'), "POWER"),
+    "a name of registers": (changed('name = "power"', 'name = "session"'), "session"),
+    "bounds the wrong way round": (changed("high = 100.0", "high = -1.0"), "power"),
+    "an operating point outside": (changed("at = 50.0", "at = 150.0"), "power"),
+    "no rate": (changed("rate = 10.0", "rate = 0.0"), "rate"),
+    "a bound that is infinite": (changed("high = 100.0", "high = inf"), "high"),
+    "a band the wrong way round": (changed("[320.0, 330.0]", "[330.0, 320.0]"), "band"),
+    "no band at all": (changed("band = [320.0, 330.0]", ""), "band"),
+    "noise below nothing": (changed("noise = 0.1", "noise = -0.1"), "noise"),
+    "a loop to nowhere": (
+        changed("band = [320.0, 330.0]",
+                'band = [320.0, 330.0]\nloop = { input = "valve", gain = 1.0, integral_time_s = 1.0 }'),
+        "valve",
+    ),
+    "an unknown key": (changed("rate = 10.0", "rate = 10.0\nspeed = 1.0"), "speed"),
+    "a class that is not there": (changed("heater.py:Heater", "heater.py:Cooler"), "Cooler"),
+    "a file that is not there": (changed("heater.py:Heater", "cooler.py:Heater"), "cooler.py"),
+    "no class named": (changed("heater.py:Heater", "heater.py"), "python"),
+    "two plants": (changed("[plant]", '[plant]\nmatrices = "x.npz"'), "plant"),
+    "no plant": (changed('python = "heater.py:Heater"', ""), "plant"),
+    "a tick of no time": ("tick_s = 0.0\n" + ONE_BY_ONE, "tick_s"),
+    "instants that fall": (ONE_BY_ONE + "[prediction]\ndecision_instants = [4, 2]\n", "decision_instants"),
+    "constraints behind the horizon": (ONE_BY_ONE + "[prediction]\ndecision_instants = [1, 2]\n", "constraint"),
+    "a state that is none": (ONE_BY_ONE + '[[states]]\nname = "pressure"\nwalk = 1.0\n', "pressure"),
+    "a load outside its span": (ONE_BY_ONE + '[load]\nname = "d"\nat = 5.0\nspan = [0.0, 1.0]\n', "d"),
+}  # fmt: skip
+BAD_PLANTS = {
+    "does not run": ("this is no Python", "SyntaxError"),
+    "no guess": (HEATER.replace("guess", "gues"), "guess"),
+    "too short a guess": (HEATER.replace("[300.0]", "[]"), "guess"),
+    "raises": (HEATER.replace("return [(u[0]", "return [(u[7]"), "IndexError"),
+    "divides by zero": (HEATER.replace("return [(u[0]", "1 / 0\n        return [(u[0]"), "ZeroDivisionError"),
+    "never rests": (HEATER.replace("- 2.0 * (x[0] - 300.0)", "+ 1.0"), "T keeps moving"),
+    "too many outputs": (HEATER.replace("return [x[0]]", "return [x[0], x[0]]"), "outputs()"),
+    "an output that is no number": (HEATER.replace("return [x[0]]", "return [x[0] * float('nan')]"), "not finite"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_a_bad_file_gets_one_line_that_names_the_place(case: str, tmp_path: Path) -> None:
+    text, place = BAD_FILES[case]
+    with pytest.raises(ColdloopError) as refused:
+        made(tmp_path, text)
+    assert "\n" not in str(refused.value)
+    assert place in str(refused.value)
+
+
+@pytest.mark.parametrize("case", BAD_PLANTS)
+def test_a_bad_plant_gets_one_line_that_says_why(case: str, tmp_path: Path) -> None:
+    plant, why = BAD_PLANTS[case]
+    with pytest.raises(ColdloopError) as refused:
+        made(tmp_path, plant=plant)
+    assert "\n" not in str(refused.value)
+    assert why in str(refused.value)
+
+
+def test_more_signals_than_a_request_carries_are_refused(tmp_path: Path) -> None:
+    n = 60
+    np.savez(tmp_path / "matrices.npz", A=-np.eye(n), B=np.ones((n, 1)), C=np.eye(1, n))
+    text = ONE_BY_ONE.replace('python = "heater.py:Heater"', 'matrices = "matrices.npz"')
+    with pytest.raises(ColdloopError, match="60 states are more than one Modbus request carries"):
+        made(tmp_path, text.replace("noise = 0.1", "noise = 0.1\nat = 325.0"))
+
+
+def test_the_command_prints_it_and_writes_nothing_that_is_half_made(tmp_path: Path, coldloop: "Coldloop") -> None:
+    made(tmp_path)
+    done = coldloop("process", tmp_path / "process.toml", "--out", tmp_path / "model.json")
+    assert done.code == 0, done.complaints
+    assert "heater: 1 inputs, 1 outputs, 1 states" in done.out
+    assert Process.of(made(tmp_path).model.process).inputs[0].name == "power"
+    (tmp_path / "process.toml").write_text("name = 3", encoding="utf-8")
+    failed = coldloop("process", tmp_path / "process.toml", "--out", tmp_path / "other.json")
+    assert failed.code != 0
+    assert len(failed.complaints) == 1
+    assert not (tmp_path / "other.json").exists()

@@ -1,0 +1,98 @@
+"""Other processes through the whole rig: over the link as in one process, adaptive and fixed, under faults.
+
+An interpreter is loaded with one process, so each of these runs is a process of its own.
+"""
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+
+from tests.harness.processes import PROGRAM_S, Ended, Processes
+
+EXAMPLES: Final = Path(__file__).parents[2] / "examples" / "processes"
+TANK, COLUMN = EXAMPLES / "quadruple_tank.toml", EXAMPLES / "wood_berry.toml"
+
+
+def started(processes: Processes, *arguments: object) -> Ended:
+    """Run `coldloop` to its end."""
+    return processes.coldloop(*arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE).ended(PROGRAM_S)
+
+
+def run(processes: Processes, file: Path, out: Path, *options: str) -> dict[str, Any]:
+    """Return the summary of a run of a process file."""
+    code, _, complaints = started(processes, "--process", file, "run", "--out", out, *options)
+    assert code == 0, complaints
+    summary: dict[str, Any] = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    return summary
+
+
+def made(folder: Path, *, inputs: int, outputs: int, tick_s: float, load: bool, states: int = 6) -> Path:
+    """Write a process of random stable matrices with so many signals; each output of an even place has a band."""
+    random = np.random.default_rng(inputs + 10 * outputs)
+    time_s = 40.0 * tick_s * (1.0 + np.arange(states))
+    A = -np.diag(1.0 / time_s)
+    B = random.uniform(0.5, 1.5, (states, inputs)) / time_s[:, None]
+    C = random.uniform(0.2, 1.0, (outputs, states))
+    np.savez(folder / "matrices.npz", A=A, B=B, C=C, F=(1.0 / time_s) * load)
+    lines = [f'name = "made-{inputs}-{outputs}"', f"tick_s = {tick_s}", "[plant]", 'matrices = "matrices.npz"']
+    for i in range(inputs):
+        lines += ["[[inputs]]", f'name = "u{i}"', "at = 1.0", "low = 0.0", "high = 2.0", "rate = 0.1"]
+    for i in range(outputs):
+        lines += ["[[outputs]]", f'name = "y{i}"', "at = 5.0", "range = [-50.0, 50.0]", "noise = 0.01", "weight = 0.1"]
+        lines += ["band = [4.5, 5.5]"] * (i % 2 == 0)
+    if load:
+        lines += ["[load]", 'name = "d"', "at = 0.0", "span = [-1.0, 1.0]"]
+    (folder / "process.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder / "process.toml"
+
+
+@pytest.mark.parametrize("period", ["adaptive", "2.5"])
+def test_the_quadruple_tank_is_the_same_over_the_link_and_in_one_process(
+    period: str, processes: Processes, tmp_path: Path
+) -> None:
+    options = ("--load", "a", "--duration", "15min", "--updating-period", period)
+    here = run(processes, TANK, tmp_path / "here", "--in-process", *options)
+    there = run(processes, TANK, tmp_path / "there", *options)
+    assert here["trace_sha256"] == there["trace_sha256"]
+    assert here["h1_outside_band_pct"] == here["h2_outside_band_pct"] == 0.0
+    assert here["updates"] > 100
+    assert (tmp_path / "there" / "run.png").is_file()
+
+
+def test_the_column_has_other_time_and_dead_times_that_its_model_approximates(
+    processes: Processes, tmp_path: Path
+) -> None:
+    options = ("--load", "c", "--duration", "2h")
+    here = run(processes, COLUMN, tmp_path / "here", "--in-process", *options)
+    there = run(processes, COLUMN, tmp_path / "there", *options)
+    assert here["trace_sha256"] == there["trace_sha256"]
+    assert here["ticks"] == 2 * 3600 / 3
+    assert 6.0 <= here["tau_u_mean"] <= 60.0
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "tick_s", "load"), [(1, 1, 0.01, False), (6, 10, 60.0, True)], ids=["small", "large"]
+)
+def test_any_number_of_signals_and_any_tick(
+    inputs: int, outputs: int, tick_s: float, load: bool, processes: Processes, tmp_path: Path  # noqa: FBT001
+) -> None:  # fmt: skip
+    file = made(tmp_path, inputs=inputs, outputs=outputs, tick_s=tick_s, load=load)
+    options = ("--load", "a", "--duration", f"{1000 * tick_s:g}s")
+    here = run(processes, file, tmp_path / "here", "--in-process", *options)
+    there = run(processes, file, tmp_path / "there", *options)
+    assert here["trace_sha256"] == there["trace_sha256"]
+    assert here["ticks"] == 1000
+    assert all(here[f"y{i}_outside_band_pct"] <= 5.0 for i in range(0, outputs, 2))
+
+
+def test_a_model_of_another_process_is_refused_in_one_line(processes: Processes, tmp_path: Path) -> None:
+    code, _, complaints = started(
+        processes, "--process", TANK, "run", "--in-process", "--set", "model.file=cold-box", "--out", tmp_path / "run"
+    )
+    assert code != 0
+    assert "a model of another" in complaints
+    assert len(complaints.splitlines()) == 1
