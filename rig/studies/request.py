@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
+from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.signals import L1, OUTPUT_NAMES, STATION_SIGNAL_NAMES, T5, TICK_S
+from coldloop.process.signals import L1, STATION_SIGNAL_NAMES, T5, TICK_S
 from optimizer_plc.solvers import make_solver
 from rig.cosim.linear_plant import LinearRig
 from rig.cosim.local_services import run_on_localhost
@@ -56,7 +57,7 @@ RIG_MODULES = (
     "rig.studies.settings",
 )
 SUFFIXES = (".py", ".json", ".npz", ".csv")
-T9 = OUTPUT_NAMES.index("T9")
+T9 = [one.name for one in COLD_BOX.outputs].index("T9")
 DECISIVE = {"limits", "model", "session", "plant", "control_plc", "optimizer_plc"}
 """Sections of the configuration that a run reads."""
 LIBRARIES = ("casadi", "daqp", "numba", "numpy", "osqp")

@@ -1,0 +1,40 @@
+"""Sets of decision and constraint instants: how they are spread, and which is proposed, by hand."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from optimizer_plc.qp.design import ControlDesign
+from rig.studies.instants import Judged, candidates, losses, proposed, spread
+
+
+@given(st.integers(1, 30), st.integers(1, 400))
+def test_instants_rise_from_one_to_the_horizon(count: int, horizon: int) -> None:
+    instants = spread(count, horizon)
+    assert list(instants) == sorted(set(instants))
+    assert 1 <= len(instants) <= min(count, horizon)
+    assert instants[0] >= 1
+    assert instants[-1] == (1 if count == 1 else horizon)
+
+
+def test_instants_by_hand() -> None:
+    assert spread(3, 100) == (1, 10, 100)
+    assert spread(4, 4) == (1, 2, 3, 4)
+
+
+def test_each_candidate_is_a_design_with_the_horizon_of_the_configured_one() -> None:
+    found = candidates(ControlDesign())
+    assert next(iter(found)) == "configured"
+    assert all(design.horizon == 100 for design in found.values())
+    assert [len(design.decision_instants) for design in found.values()][-1] == 24
+
+
+def test_the_smallest_set_that_loses_little_is_proposed() -> None:
+    def one(label: str, variables: int, *costs: float) -> Judged:
+        return Judged(label, ControlDesign(), variables, 2 * variables, 1.0, 1.0, 1, costs)
+
+    sets = [one("configured", 49, 100.0, 400.0), one("small", 14, 102.0, 408.0), one("middle", 28, 100.5, 402.0),
+            one("fullest", 168, 100.0, 400.0)]  # fmt: skip
+    assert losses(sets) == pytest.approx([1.0, 1.02, 1.005, 1.0])
+    assert proposed(sets).label == "middle"
+    assert proposed([sets[1], sets[3]]).label == "fullest"
