@@ -27,7 +27,7 @@ def test_each_number_is_a_gauge_with_its_description_and_unit() -> None:
     lines = exposition(bank_families(bank())).decode().splitlines()
     assert 'coldloop_plant_measurement_y{element="T5"} 6.0' in lines
     assert "# TYPE coldloop_plant_measurement_load gauge" in lines
-    assert "# HELP coldloop_plant_measurement_load Heat load NCR22_HL (known, as the heater sets it) (W)" in lines
+    assert "# HELP coldloop_plant_measurement_load Heat load NCR22_HL, which is known (W)" in lines
     assert "coldloop_plant_measurement_load 400.0" in lines
     assert not [line for line in lines if "actuators" in line], "what a client writes is no state of the service"
     assert not [line for line in lines if "_who" in line], "texts are no numbers"

@@ -16,12 +16,14 @@ from coldloop.process.signals import L1, T5, TICK_S
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Mode, SequenceRow
 from coldloop.registers.plant import Measurement
-from control_plc.classical import CV156, NCR22, ClassicalLoops, ClassicalSettings, LevelLoop, PiController, PiSettings
+from control_plc.classical import ClassicalLoops, ClassicalSettings, LevelLoop, PiController, PiSettings
 from control_plc.program import ControlProgram, make_program
 from control_plc.settings import ControlSection, ControlStrategy
 from plant.kinds import make_program as make_plant
 from plant.load import find_load
 from plant.settings import SensorSettings
+
+NCR22, CV156 = 1, 2
 
 HEADER = read_header(DEFAULT_MODEL_FILE)
 REST = SequenceRow(*HEADER.u0)

@@ -15,14 +15,14 @@ _VALVES: Final = (
 )
 _JT_VALVE, _TURBINE_VALVE = (
     Input(
-        name=name, unit="%", register=register, description=description, span=(0.0, 100.0), low=20.0, high=60.0,
+        name=name, unit="%", register=register, description=description, span=(0, 100), low=20.0, high=60.0,
         rate=rate, safe=safe, scale=10.0, weight=1e-2, walk=0.05,
     )
     for name, register, description, rate, safe in _VALVES
 )  # fmt: skip
 _HEATER: Final = Input(
     name="NCR22_A", unit="W", register="ncr22", description="Actuator part of the bath heater's power",
-    span=(0.0, 1000.0), low=0.0, high=150.0, rate=10.0, safe=75.0, scale=50.0, weight=4e-4, walk=0.5,
+    span=(0, 1000), low=0.0, high=150.0, rate=10.0, safe=75.0, scale=50.0, weight=4e-4, walk=0.5,
 )  # fmt: skip
 
 
@@ -50,7 +50,7 @@ COLD_BOX: Final = Process(
         *(State(name=f"T_nef2_{i}", unit="K") for i in range(1, 7)),
         *(State(name=f"T_nef34_{i}", unit="K") for i in range(1, 13)),
     ),
-    load=Load(name="NCR22_HL", unit="W", span=(0.0, 10_000.0), walk=3.0),
+    load=Load(name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load"),
     decision_instants=(1, 2, 4, 8, 16, 50, 100),
     constraint_instants=(1, 2, 3, 4, 6, 8, 16, 24, 32, 48, 60, 72, 84, 100),
 )

@@ -97,6 +97,8 @@ class Load:
     span: Range
     walk: float
     """Random walk of what of it is not measured, per square root of a sampling period."""
+    noun: str = "Load"
+    """What descriptions call it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from coldloop.registers.audit import EVENT_ROWS, QUERY_ROWS, Event, JournalAnswe
 from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionPace
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
 from coldloop.registers.declaration import Block, RegisterMap, Role, f32, f32_array, placed, record, u16, u32
-from coldloop.registers.plant import MAX_STATE, SPAN_OF_INPUTS
+from coldloop.registers.plant import MAX_STATE, NOUN, SPAN_OF_INPUTS
 from coldloop.registers.safety import Alarm, AlarmCommand, AlarmKind, LeaseStatus, WatchdogStatus, WatchdogTime
 
 SEQUENCE_ROWS: Final = 240
@@ -137,7 +137,7 @@ class Process(NamedTuple):
     """The process at the last scan."""
 
     tick: Annotated[int, u32("Tick of the scan")]
-    load: Annotated[float, f32(f"Load {PROCESS.load.name}", unit=PROCESS.load.unit, finite=False)]
+    load: Annotated[float, f32(f"{NOUN} {PROCESS.load.name}", unit=PROCESS.load.unit, finite=False)]
     u: Annotated[tuple[float, ...], f32_array("Input being applied", INPUT_NAMES, INPUT_UNITS)]
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS)]
 
@@ -188,7 +188,8 @@ class Update(NamedTuple):
         int, u32("Number of the sequence being played from this instant on; 0 is none", high=LAST_NUMBER)
     ]
     load: Annotated[
-        float, f32(f"Load {PROCESS.load.name}", unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])
+        float,
+        f32(f"{NOUN} {PROCESS.load.name}", unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1]),
     ]
     u_before: Annotated[
         tuple[float, ...],

@@ -40,7 +40,8 @@ from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 HISTORY_ROWS: Final = 256
 STATION_ROWS: Final = 128
 LOAD_ROWS: Final = 2048
-SPAN_OF_INPUTS: Final = (min(one.span[0] for one in PROCESS.inputs), max(one.span[1] for one in PROCESS.inputs))
+NOUN: Final = PROCESS.load.noun
+SPAN_OF_INPUTS: Final = (min(one.span[0] for one in PROCESS.inputs), float(max(one.span[1] for one in PROCESS.inputs)))
 """No input is outside."""
 MAX_STATE: Final = 1e9
 """No number of a simulated state, in Pa, m3 or K, is further from 0."""
@@ -121,7 +122,7 @@ class Measurement(NamedTuple):
     """
 
     tick: Annotated[int, u32("Tick at which these values were read", high=LAST_TICK)]
-    load: Annotated[float, f32(f"Load {PROCESS.load.name}, which is known", unit=PROCESS.load.unit, finite=False)]
+    load: Annotated[float, f32(f"{NOUN} {PROCESS.load.name}, which is known", unit=PROCESS.load.unit, finite=False)]
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS, finite=False)]
     x: Annotated[tuple[float, ...], f32_array("Simulated state, not measured", STATE_NAMES, STATE_UNITS, finite=False)]
     session: Annotated[int, u32("Session")]
@@ -182,15 +183,15 @@ class LoadStep(NamedTuple):
     """One step of the load table, held until the next one."""
 
     tick: Annotated[int, u32("First tick of the step", unit=TICK_UNIT, high=LAST_TICK)]
-    watts: Annotated[float, f32("Load", unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])]
+    watts: Annotated[float, f32(NOUN, unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])]
 
 
 class LoadStatus(NamedTuple):
     """The heat load, and what is known of it."""
 
-    watts: Annotated[float, f32("Load now", unit=PROCESS.load.unit)] = 0.0
+    watts: Annotated[float, f32(f"{NOUN} now", unit=PROCESS.load.unit)] = 0.0
     next_tick: Annotated[int, u32("Tick of the next step that is known; 0 is none", unit=TICK_UNIT)] = 0
-    next_watts: Annotated[float, f32("Load from then on", unit=PROCESS.load.unit)] = 0.0
+    next_watts: Annotated[float, f32(f"{NOUN} from then on", unit=PROCESS.load.unit)] = 0.0
     last_tick: Annotated[int, u32("Tick of the last step that is known; it is held from there on", unit=TICK_UNIT)] = 0
     upcoming: Annotated[int, u16("Known future steps")] = 0
     free: Annotated[int, u16("Further steps that can be accepted now")] = 0
@@ -200,7 +201,7 @@ class LiveLoad(NamedTuple):
     """Changes the heat load of the session under way; what was known of later ticks is dropped."""
 
     tick: Annotated[int, u32("First tick, in the future; 0 is the next tick", unit=TICK_UNIT, high=LAST_TICK)] = 0
-    watts: Annotated[float, f32("Load", unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])] = 0.0
+    watts: Annotated[float, f32(NOUN, unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])] = 0.0
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
@@ -212,7 +213,7 @@ class LoadAhead(NamedTuple):
     length: Annotated[int, u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
     watts: Annotated[
         tuple[float, ...],
-        f32_array("Load of step", tuple(map(str, range(AHEAD_STEPS))), (PROCESS.load.unit,) * AHEAD_STEPS),
+        f32_array(f"{NOUN} of step", tuple(map(str, range(AHEAD_STEPS))), (PROCESS.load.unit,) * AHEAD_STEPS),
     ] = (0.0,) * AHEAD_STEPS
     ticks: Annotated[
         tuple[int, ...],
@@ -259,7 +260,7 @@ class PlantSample(NamedTuple):
     """One row of the history: everything physical at one tick. The row of tick n is n modulo the number of rows."""
 
     tick: Annotated[int, u32("Tick of the row")]
-    load: Annotated[float, f32("Load", unit=PROCESS.load.unit)]
+    load: Annotated[float, f32(NOUN, unit=PROCESS.load.unit)]
     u: Annotated[tuple[float, ...], f32_array("Input applied from this tick on", INPUT_NAMES, INPUT_UNITS)]
     y: Annotated[tuple[float, ...], f32_array("Measured output", OUTPUT_NAMES, OUTPUT_UNITS, finite=False)]
     x: Annotated[tuple[float, ...], f32_array("Simulated state", STATE_NAMES, STATE_UNITS, finite=False)]
@@ -367,7 +368,7 @@ PLANT_MAP: Final = RegisterMap(
             Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
             Block("pace", 410, SessionPace, "Time base of the present session", Role.OPERATOR),
             Block("load status", 420, LoadStatus, "The heat load and its known steps"),
-            Block("live load", 440, LiveLoad, "Load from a tick on", Role.OPERATOR, sealed=True),
+            Block("live load", 440, LiveLoad, f"{NOUN} from a tick on", Role.OPERATOR, sealed=True),
             Block(
                 "sensor faults",
                 500,
@@ -386,7 +387,7 @@ PLANT_MAP: Final = RegisterMap(
                 Role.OPERATOR,
             ),
             Block("model range", 780, ModelRangeStatus, "Alarm of the simulation: it has left its property tables"),
-            Block("load table", 1000, LoadStep, "Load over the session", Role.OPERATOR, LOAD_ROWS),
+            Block("load table", 1000, LoadStep, f"{NOUN} over the session", Role.OPERATOR, LOAD_ROWS),
             Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
             Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
             Block("journal query", 45000, JournalQuery, "Selects events of the journal", Role.OPERATOR),
