@@ -104,7 +104,7 @@ class OneProcessRig:
 
     def _kernels(self) -> AbstractContextManager[None]:
         """Announce what is compiled as the kernels of a run like this one."""
-        plant, solver = self._settings.plant.kind.replace("-", " "), self._settings.optimizer_plc.program.solver
+        plant, solver = self._settings.plant.kind.replace("-", " "), self._settings.optimizer_plc.program.solver_name
         return kernels_of(f"the {plant} and the {solver} solver in one process", about_s=50)
 
     def _plant(self, load: LoadProfile, seed: int) -> PlantProgram:

@@ -84,7 +84,8 @@ def title_of(configuration: Mapping[str, Any], way: str = "") -> str:
         return f"{load}, classical loops"
     period = configuration["optimizer_plc.program.updating_period_s"]
     updating = f"tau_u {period:g} s" if period else "tau_u adaptive"
-    return f"{load}, solver {configuration['optimizer_plc.program.solver']}, {updating}"
+    solver = configuration.get("optimizer_plc.program.outside.solver") or configuration["optimizer_plc.program.solver"]
+    return f"{load}, solver {solver}, {updating}"
 
 
 def identity_of(manifest: Mapping[str, Any]) -> str:

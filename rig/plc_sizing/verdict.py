@@ -10,7 +10,7 @@ from optimizer_plc.settings import ProgramSettings
 from rig.plc_sizing.memory import Footprint
 from rig.plc_sizing.profile import PlcProfile
 from rig.plc_sizing.reference_plc import reference_curve
-from rig.plc_sizing.solver_counts import SOLVERS
+from rig.plc_sizing.solver_counts import iteration_s
 
 ROUNDING = 1e-9
 MANY = 1000
@@ -51,7 +51,7 @@ def capacity(size: int, needed: Footprint, memory_bytes: int, budget: PlcBudget)
 
 def fits(profile: PlcProfile, program: ProgramSettings, problem: PredictiveProblem, needed: Footprint) -> bool:
     """Return whether a PLC has memory and time for a problem; as `verdict`."""
-    budget = PlcBudget(program.budget, SOLVERS[program.solver].tau_1_s(program))
+    budget = PlcBudget(program.budget, iteration_s(program))
     return min(capacity(problem.size, needed, profile.memory_bytes, budget)) + ROUNDING >= problem.size
 
 
@@ -64,9 +64,9 @@ def verdict(profile: PlcProfile, program: ProgramSettings, problem: PredictivePr
         problem: The problem in single precision.
         needed: What it takes in memory.
     """
-    budget = PlcBudget(program.budget, SOLVERS[program.solver].tau_1_s(program))
+    budget = PlcBudget(program.budget, iteration_s(program))
     limits = capacity(problem.size, needed, profile.memory_bytes, budget)
-    problem_text = f"the problem ({problem.size} variables, {len(problem.Gamma)} rows) with {program.solver}"
+    problem_text = f"the problem ({problem.size} variables, {len(problem.Gamma)} rows) with {program.solver_name}"
     if not fits(profile, program, problem, needed):
         lacks = []
         if limits.by_memory < problem.size:

@@ -12,7 +12,7 @@ from optimizer_plc.budget import PlcBudget
 from plant.load import find_load
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario, natural_ticks
-from rig.plc_sizing.solver_counts import SOLVERS
+from rig.plc_sizing.solver_counts import iteration_s
 from rig.results.indicators import evaluate
 from rig.results.recording import Recorder
 from rig.settings import Settings
@@ -37,7 +37,7 @@ def adaptive_gain(
         done: Is called with the number of runs done and that of all.
     """
     program = settings.optimizer_plc.program
-    budget = PlcBudget(program.budget, SOLVERS[program.solver].tau_1_s(program))
+    budget = PlcBudget(program.budget, iteration_s(program))
     fitting = [period for period in FIXED_S if budget.times.holds(round(period / TICK_S))]
     fixed = fitting or [FIXED_S[-1]] if period_s is None else [period_s]
     rig, runs = OneProcessRig(settings), list(product((ADAPTIVE, *fixed), names))

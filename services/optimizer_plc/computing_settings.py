@@ -234,6 +234,19 @@ class DaqpSettings(BaseModel):
     """One solve in an updating period of 5 s at P = 1: an oracle's time, not a measured one."""
 
 
+class OutsideSettings(BaseModel):
+    """Settings of a solver that is installed beside this package."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    solver: str = ""
+    """Name of its entry point in the group `coldloop.solvers`."""
+    alpha: PositiveFloat = PENALTY_WEIGHT
+    """Weight that its answers are judged with."""
+    tau_1_s: PositiveFloat = 0.25
+    """Time of an iteration at P = 1: measured or counted by its author."""
+
+
 class InteriorPointSettings(BaseModel):
     """Settings of the interior-point method."""
 

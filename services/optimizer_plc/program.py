@@ -50,7 +50,7 @@ LONGEST_GAP_TICKS: Final = 4 * SEQUENCE_ROWS
 
 
 def _described(settings: ProgramSettings) -> str:
-    return f"the {settings.solver} solver{' in single precision' * (settings.arithmetic is Arithmetic.FLOAT32)}"
+    return f"the {settings.solver_name} solver{' in single precision' * (settings.arithmetic is Arithmetic.FLOAT32)}"
 
 
 class OptimizerProgram:

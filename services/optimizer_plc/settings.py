@@ -28,6 +28,7 @@ from optimizer_plc.computing_settings import (
     InteriorPointSettings,
     OdeSettings,
     OsqpSettings,
+    OutsideSettings,
     PlausibilitySettings,
     QpoasesSettings,
 )
@@ -148,6 +149,8 @@ class ProgramSettings(BaseModel):
     interior_point: InteriorPointSettings = InteriorPointSettings()
     hybrid: HybridSettings = HybridSettings()
     daqp: DaqpSettings = DaqpSettings()
+    outside: OutsideSettings = OutsideSettings()
+    """Where it names a solver, that is used instead of `solver`."""
 
     decides: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """What follows from other settings, for `coldloop.config`; filled in below, from the fields."""
@@ -193,11 +196,17 @@ class ProgramSettings(BaseModel):
             raise ValueError("hybrid needs one cost for both of its solvers: set ode.alpha = interior_point.alpha")
         return self
 
+    @property
+    def solver_name(self) -> str:
+        """Name of the solver in use."""
+        return self.outside.solver or self.solver
+
     @model_validator(mode="after")
     def _own_arithmetic(self) -> Self:
-        if self.arithmetic is Arithmetic.FLOAT32 and self.solver not in SINGLE_PRECISION_SOLVERS:
+        double_only = self.outside.solver or self.solver not in SINGLE_PRECISION_SOLVERS
+        if self.arithmetic is Arithmetic.FLOAT32 and double_only:
             raise ValueError(
-                f"{self.solver} computes in double precision; choose one of {', '.join(SINGLE_PRECISION_SOLVERS)}"
+                f"{self.solver_name} computes in double precision; choose one of {', '.join(SINGLE_PRECISION_SOLVERS)}"
             )
         return self
 

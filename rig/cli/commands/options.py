@@ -22,6 +22,7 @@ KEYS = {
     "load": ("plant.load", "--load"),
     "seed": ("plant.seed", "--seed"),
     "solver": ("optimizer_plc.program.solver", "--solver"),
+    "outside_solver": ("optimizer_plc.program.outside.solver", "--outside-solver"),
     "preset": ("optimizer_plc.program.preset", "--preset"),
     "updating_period": ("optimizer_plc.program.updating_period_s", "--updating-period"),
     "mode": ("session.mode", "--mode"),
@@ -112,6 +113,8 @@ def add_loop_options(parser: argparse.ArgumentParser, loads: str) -> None:
     load = parser.add_argument("--load", help=f"{', '.join(LOADS)}, {loads} (default: 2h)")
     load.completer = lambda **_: LOADS  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--solver", choices=SOLVERS, help="default: ode")
+    parser.add_argument("--outside-solver", metavar="NAME",
+                        help="a solver that is installed beside, by its entry point (`docs/extending.md`)")  # fmt: skip
     parser.add_argument("--preset", choices=PRESETS, help="of solver and estimator (default: tuned)")
     parser.add_argument("--updating-period", type=updating_period, metavar="adaptive|SECONDS",
                         help="default: adaptive")  # fmt: skip

@@ -11,6 +11,7 @@ from optimizer_plc.solvers.interior_point import interior_point_solver
 from optimizer_plc.solvers.kernel_solver import KernelSolver
 from optimizer_plc.solvers.ode import ode_solver
 from optimizer_plc.solvers.osqp import OsqpSolver
+from optimizer_plc.solvers.outside import OutsideSolver
 from optimizer_plc.solvers.qpoases import QpoasesSolver
 
 if TYPE_CHECKING:
@@ -33,4 +34,4 @@ _MAKERS: "dict[str, Callable[[ProgramSettings], Solver]]" = {
 
 def make_solver(settings: "ProgramSettings") -> Solver:
     """Return the solver that the settings name."""
-    return _MAKERS[settings.solver](settings)
+    return OutsideSolver(settings.outside) if settings.outside.solver else _MAKERS[settings.solver](settings)

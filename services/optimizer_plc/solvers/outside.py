@@ -1,0 +1,89 @@
+"""Somebody else's solver, by an entry point of the group `coldloop.solvers`: nothing is edited here to use it.
+
+The entry point is a class without arguments that follows `OutsideMethod`; `docs/extending.md` has one of a few lines.
+"""
+
+from collections.abc import Sequence
+from importlib.metadata import entry_points
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.errors import ConfigurationError
+from optimizer_plc.computing_settings import OutsideSettings
+from optimizer_plc.qp.problem import QuadraticProblem
+from optimizer_plc.solvers.interface import Answer, collected
+
+Array = NDArray[np.float64]
+
+GROUP: Final = "coldloop.solvers"
+
+
+class OutsideMethod(Protocol):
+    """What an entry point makes: min z' Phi z + z' phi under Gamma z <= gamma and low <= z <= high, cut off anywhere.
+
+    There is no factor 1/2 before Phi. The same problem, guess and count give the same bits.
+    """
+
+    def solve(self, problem: QuadraticProblem, guess: Array, iterations: int) -> tuple[Array, int]:
+        """Return the point (n,) after so many iterations from `guess` (n,), and how many were done; 0 is the guess."""
+
+
+class OutsideSolver:
+    """One of these as a solver: what it returns is checked, put into the box and judged by the augmented cost."""
+
+    def __init__(self, settings: OutsideSettings) -> None:
+        self.alpha = settings.alpha
+        self.tau_1_s = settings.tau_1_s
+        self.name = settings.solver
+        self._method = find_method(settings.solver)
+
+    def reset(self) -> None:
+        """Forget earlier problems, where the method has something to forget."""
+        reset = getattr(self._method, "reset", None)
+        if reset is not None:
+            reset()
+
+    def solve(self, problem: QuadraticProblem, guess: Array, counts: Sequence[int]) -> Answer:
+        """Return the answer after each count; a point that is no profile, or not finite, is as good as the guess.
+
+        Raises:
+            ConfigurationError: The method raises, or returns something else than a point and a count.
+        """
+        guess = np.clip(guess, problem.low, problem.high)
+        answers = [self._point(problem, guess, int(count)) for count in counts]
+        points, done = [point for point, _ in answers], [count for _, count in answers]
+        return collected(problem, self.alpha, guess, points, done, np.zeros_like(problem.gamma))
+
+    def _point(self, problem: QuadraticProblem, guess: Array, count: int) -> tuple[Array, int]:
+        if not count:
+            return guess, 0
+        try:
+            point, done = self._method.solve(problem, guess.copy(), count)
+            found = np.asarray(point, dtype=np.float64)
+            done = min(int(done), count)
+        except Exception as error:
+            raise ConfigurationError(f"solver {self.name}: {type(error).__name__}: {error}") from error
+        if found.shape != guess.shape or not np.isfinite(found).all():
+            return guess, done
+        return np.clip(found, problem.low, problem.high), done
+
+
+def find_method(name: str) -> OutsideMethod:
+    """Return what the entry point of this name makes.
+
+    Raises:
+        ConfigurationError: There is none, or it cannot be made.
+    """
+    there = entry_points(group=GROUP)
+    known = ", ".join(sorted(there.names)) or "none is installed"
+    if name not in there.names:
+        raise ConfigurationError(
+            f"optimizer_plc.program.outside.solver: no solver '{name}' among the entry points {GROUP}: {known}"
+        )
+    try:
+        made: OutsideMethod = there[name].load()()
+    except Exception as error:
+        raise ConfigurationError(f"solver {name}: cannot be made: {type(error).__name__}: {error}") from error
+    return made
