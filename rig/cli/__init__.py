@@ -12,7 +12,7 @@ from typing import Final, NoReturn
 
 from coldloop import __version__
 from coldloop.errors import ColdloopError, UsageError, printable
-from rig.cli.process_option import OPTION, load_named_process
+from rig.cli.process_option import OPTION, VARIABLE, load_named_process
 from rig.interruption import INTERRUPTION
 
 COMMANDS: Final = {
@@ -46,6 +46,8 @@ COMMANDS: Final = {
     "completion": "a script that completes commands and options in a shell",
 }
 INTERRUPTED = 130
+OF_THE_COLD_BOX: Final = ("study", "reproduce", "model")
+"""Commands that are about its equations, its loads or the paper's figures."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -110,6 +112,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
     options = parser.parse_args(given)
+    if os.environ.get(VARIABLE) and given[:1] and given[0] in OF_THE_COLD_BOX:
+        sys.stderr.write(f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset {VARIABLE}\n")
+        return UsageError.exit_code
     if options.execute is None:
         parser.print_help()
         return 0

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
-from coldloop.process.declaration import Band, Input, Load, Loop, Output, Process, State
+from coldloop.process.declaration import NO_LOAD, Band, Input, Load, Loop, Output, Process, State
 from coldloop.process.lti_model import LtiModel, discretise
 from rig.plc_sizing.problem_sizes import ProblemSizes, iteration_shares
 from rig.process_file.declaration import OutputSection, ProcessFile, read_process_file
@@ -19,8 +19,6 @@ Array = NDArray[np.float64]
 
 REGISTERS_OF_A_REQUEST: Final = 125
 """What one read of Modbus carries: the latched update, and the rack's measurement, are one."""
-NO_LOAD: Final = Load(name="none", unit="", span=(0.0, 1.0), walk=1e-6)
-"""The load of a process that has none."""
 USUAL_WALK: Final = 0.01
 """Process noise of a state over what it moves by when each input makes its largest step, held for the horizon."""
 

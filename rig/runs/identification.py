@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from coldloop.errors import UsageError
+from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel, RealArray
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S, TICKS_PER_SAMPLE
 from rig.durations import LONGEST_TICKS
@@ -29,8 +30,6 @@ LEAST_S: Final = 1800.0
 MOST_ERROR: Final = 0.05
 """Largest standard error of a factor that is taken."""
 TAIL: Final = 0.025
-
-_SENSORS: Final = {"L": "level_sensor", "V": "speed_sensor", "T": "temperature_sensor", "P": "pressure_sensor"}
 
 
 class Record(NamedTuple):
@@ -98,7 +97,11 @@ def read_record(run: RunFolder, model: LtiModel) -> Record:
     if gaps:
         raise UsageError(f"{run.path}: {gaps} ticks of the trace are not known; name a run without them")
     key = "optimizer_plc.program.estimator."
-    return Record(inputs, y, np.array([run.configuration[key + _SENSORS[name[0]]] for name in OUTPUT_NAMES]))
+    sensors = [
+        run.configuration[f"{key}{output.quantity}_sensor"] if output.quantity else output.noise
+        for output in PROCESS.outputs
+    ]
+    return Record(inputs, y, np.array(sensors))
 
 
 def responses(model: LtiModel, inputs: RealArray) -> RealArray:

@@ -1,6 +1,6 @@
 """What a solver that is installed beside this package keeps, and how good it is.
 
-`python -m rig.testing.conformance NAME` prints it. Its problems are those of the process that is loaded, at random states, loads and inputs.
+`python -m rig.testing.conformance NAME` prints it.
 """
 
 import sys

@@ -17,11 +17,12 @@ and `design.violation_weight` wherever it is not set."""
 
 SIGNALS: Final = (*OUTPUT_NAMES, *INPUT_NAMES)
 GROUPS: Final = {
-    "outputs": tuple(name for name in OUTPUT_NAMES if name != OUTPUT_NAMES[CONTROLLED[0]]),
+    "outputs": tuple(name for name in OUTPUT_NAMES if not PROCESS.has_load or name != OUTPUT_NAMES[CONTROLLED[0]]),
     "inputs": ("CV155", "CV156") if IS_COLD_BOX else INPUT_NAMES,
 }
-"""What `estimator.disturbances` calls all outputs, or inputs, that may have one. The first output with a band has none:
-no sensor tells a constant error of L1 from liquid helium, or of another from the load; nor one of the heater from it.
+"""What `estimator.disturbances` calls all outputs, or inputs, that may have one. With a load the first
+output with a band has none: no sensor tells a constant error of L1 from liquid helium, or of another from the load; nor
+one of the heater from it.
 """
 
 

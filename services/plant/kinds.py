@@ -31,7 +31,12 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
         ConfigurationError: Its gains are not of the configured weights, or it is to differ from its model in what it
             cannot.
     """
+    if bool(header.process) != (section.kind is PlantKind.OF_PROCESS):
+        kinds = "of-process" if header.process else "cold-box or refrigerator"
+        raise ConfigurationError(f"plant.kind={section.kind}: with this model file it is {kinds}")
     if header.process:
+        if section.mismatch != NO_MISMATCH:
+            raise ConfigurationError("plant.mismatch: for a cold box alone; leave it out")
         from plant.own.maker import own_plant_maker  # noqa: PLC0415 a cold box starts without it
 
         return own_plant_maker(header, partial(noise_of, section.sensors))

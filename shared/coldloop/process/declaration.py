@@ -8,7 +8,7 @@ Needs the standard library only.
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from types import MappingProxyType
-from typing import Any, Self, get_args, get_type_hints
+from typing import Any, Final, Self, get_args, get_type_hints
 
 Range = tuple[float, float]
 
@@ -101,6 +101,10 @@ class Load:
     """What descriptions call it."""
 
 
+NO_LOAD: Final = Load(name="none", unit="", span=(0.0, 1.0), walk=1e-6)
+"""The load of a process that has none."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Process:
     """A process with its time, its signals and its control problem.
@@ -133,6 +137,11 @@ class Process:
             loop = output.band.loop if output.band else None
             if loop is not None and loop.input not in known:
                 raise ValueError(f"the loop of {output.name} moves {loop.input}, which is no input")
+
+    @property
+    def has_load(self) -> bool:
+        """Whether there is a disturbance."""
+        return self.load.name != NO_LOAD.name
 
     def share(self, of: str) -> float:
         """Return the time of a solver's iteration, or of a preparation, over that with the cold box's problem."""
