@@ -5,6 +5,7 @@ from argparse import ArgumentTypeError
 from typing import Final
 
 from coldloop.process.signals import TICK_S
+from coldloop.process.whole_ticks import whole_ticks
 
 LONGEST_TICKS: Final = 2**32 - 1
 """Ticks are 32-bit numbers on the bus."""
@@ -16,11 +17,12 @@ def duration(text: str) -> int:
     match = re.fullmatch(r"([+-]?\d+(?:\.\d+)?)\s*([a-z]*)", text.strip().lower())
     if match is None or match[2] not in _UNITS:
         raise ArgumentTypeError(f"'{text}' is not a duration; write 90s, 15min or 2h")
-    ticks = float(match[1]) * _UNITS[match[2]] / TICK_S
-    if ticks <= 0:
+    seconds = float(match[1]) * _UNITS[match[2]]
+    if seconds <= 0:
         raise ArgumentTypeError(f"'{text}' is not positive; write 90s, 15min or 2h")
-    if not ticks < LONGEST_TICKS:
+    if not seconds < LONGEST_TICKS * TICK_S:
         raise ArgumentTypeError(f"'{text}' is longer than a session can be, {LONGEST_TICKS * TICK_S:g} s")
-    if not ticks.is_integer():
-        raise ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s")
-    return int(ticks)
+    try:
+        return whole_ticks(seconds)
+    except ValueError:
+        raise ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s") from None

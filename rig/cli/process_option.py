@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import UsageError
+from rig.interpreter import PYTHON
 
 OPTION: Final = "--process"
 VARIABLE: Final = "COLDLOOP_PROCESS"
@@ -56,9 +57,12 @@ def _made(path: Path) -> Path:
     out = root / f"{path.stem}-{place}.json"
     environment = {name: value for name, value in os.environ.items() if name != VARIABLE}
     made = subprocess.run(  # noqa: S603 our own program
-        [sys.executable, "-m", "rig", "process", str(path), "--out", str(out)], env=environment, capture_output=True,
+        [*PYTHON, "-m", "rig", "process", str(path), "--out", str(out)], env=environment, capture_output=True,
         text=True, check=False,
     )  # fmt: skip
     if made.returncode:
-        raise UsageError(made.stderr.strip().removeprefix("coldloop: ") or f"{path}: cannot be made into a model file")
+        last = made.stderr.strip().rpartition("\n")[2].removeprefix("coldloop: ")
+        raise UsageError(last or f"{path}: cannot be made into a model file")
+    warnings = (line for line in made.stdout.splitlines() if line.startswith("warning"))
+    sys.stderr.writelines(f"coldloop: {path}: {line}\n" for line in warnings)
     return out

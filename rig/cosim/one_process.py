@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.load_profile import LoadProfile
+from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import load as load_model
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Update, Verdict
@@ -17,6 +18,7 @@ from plant.cold_box.program import ColdBoxProgram
 from plant.kinds import plant_maker
 from plant.own_model import own_header
 from plant.program import PlantProgram
+from plant.settings import PlantKind
 from rig.cosim.scenario import Scenario
 from rig.results.recording import Recorder
 from rig.settings import Settings
@@ -104,8 +106,9 @@ class OneProcessRig:
 
     def _kernels(self) -> AbstractContextManager[None]:
         """Announce what is compiled as the kernels of a run like this one."""
-        plant, solver = self._settings.plant.kind.replace("-", " "), self._settings.optimizer_plc.program.solver_name
-        return kernels_of(f"the {plant} and the {solver} solver in one process", about_s=50)
+        kind, solver = self._settings.plant.kind, self._settings.optimizer_plc.program.solver_name
+        plant = kind if kind is PlantKind.REFRIGERATOR else PROCESS.name
+        return kernels_of(f"the {plant.replace('-', ' ')} and the {solver} solver in one process", about_s=50)
 
     def _plant(self, load: LoadProfile, seed: int) -> PlantProgram:
         return plant_maker(self._header, self._settings.plant)(load, seed)

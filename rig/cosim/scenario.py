@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.signals import TICK_S
 from plant.load import HOUR_TICKS, named_families
 
-BEHIND_LAST_STEP = round(300 / TICK_S)
+BEHIND_LAST_STEP = 1200
 """Default time that a run continues after the last step of a load file."""
 
 

@@ -1,5 +1,6 @@
 """What a process file says, checked when it is read; `docs/your-plant.md` is its reference."""
 
+from keyword import iskeyword
 from pathlib import Path
 from typing import Annotated, Final, Self
 
@@ -18,6 +19,12 @@ from coldloop.config import load_configuration
 MOST_SIGNALS: Final = 32
 """Outputs at most: registers have a bit for each."""
 LISTING: Final = "docs/your-plant.md lists all keys"
+
+RESERVED: Final = frozenset((
+    "tick", "session", "holder", "generation", "crc", "mode", "update", "u", "time_s", "load", "load_w", "cause",
+    "driver", "bad_sensors", "stage_cost", "tau_u_s", "iterations", "j", "model_range", "none",
+))  # fmt: skip
+"""Fields of registers and columns of a trace, in small letters."""
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$")]
 Span = tuple[FiniteFloat, FiniteFloat]
@@ -89,6 +96,8 @@ class OutputSection(_Section):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         _rising(self.range, f"{self.name}: range")
+        if self.at is not None and not self.range[0] <= self.at <= self.range[1]:
+            raise ValueError(f"{self.name}: at = {self.at:g} is outside its range")
         if self.band is not None:
             _rising(self.band, f"{self.name}: band")
         if self.band is None and (self.loop is not None or self.penalty is not None):
@@ -191,15 +200,19 @@ class ProcessFile(_Section):
         twice = next((name for name in names if lower.count(name.lower()) > 1), None)
         if twice is not None:
             raise ValueError(f"{twice}: two signals have this name (small and capital letters are the same)")
-        reserved = {"tick", "session", "holder", "generation", "crc", "mode", "update", "u"} & set(lower)
+        reserved = RESERVED.intersection(lower) | {name for name in names if iskeyword(name) or iskeyword(name.lower())}
         if reserved:
-            raise ValueError(f"{min(reserved)}: a register has this name already; choose another")
+            raise ValueError(f"{min(reserved)}: a register, a column or Python has this name already; choose another")
         if not any(output.band for output in self.outputs):
             raise ValueError("outputs: none has a band; give at least one a band to be kept within")
         inputs = {one.name for one in self.inputs}
         for output in self.outputs:
             if output.loop is not None and output.loop.input not in inputs:
                 raise ValueError(f"{output.name}: its loop moves {output.loop.input}, which is no input")
+        moved = [output.loop.input for output in self.outputs if output.loop is not None]
+        shared = next((name for name in moved if moved.count(name) > 1), None)
+        if shared is not None:
+            raise ValueError(f"{shared}: two loops move this input; give each one of its own")
         return self
 
 

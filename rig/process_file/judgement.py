@@ -13,6 +13,8 @@ ROUGH: Final = 1e-4
 """Error of the derivatives from which on the plant has a kink, or noise, at its operating point."""
 SMALL: Final = 1e-6
 """Singular value, over the largest, below which a direction counts as none."""
+NOTHING: Final = 1e-12
+"""What is smaller is rounding."""
 SETTLED: Final = 3.0
 """Time constants after which a mode has settled."""
 
@@ -25,7 +27,9 @@ def described(made: Made) -> str:
 
 def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...]) -> str:
     triples = zip(names, values, units, strict=True)
-    return "  ".join(f"{name} {value:.5g} {unit}".rstrip() for name, value, unit in triples)
+    return "  ".join(
+        f"{name} {value if abs(value) > NOTHING else 0.0:.5g} {unit}".rstrip() for name, value, unit in triples
+    )
 
 
 def _rest(made: Made) -> list[str]:
@@ -73,6 +77,26 @@ def _rank_deficit(matrix: Array) -> int:
     return int((sizes < SMALL * max(sizes.max(), 1e-300)).sum()) if sizes.size else 0
 
 
+def _loops(made: Made, effect: Array) -> list[str]:
+    """Return what is wrong with the loops of the fallback; `effect` is what inputs do to the outputs with a band."""
+    inputs, found = [one.name for one in made.process.inputs], list[str]()
+    for row, output in zip(effect, made.process.banded, strict=True):
+        loop = output.band.loop if output.band else None
+        if loop is not None and loop.gain * row[inputs.index(loop.input)] < 0:
+            found.append(f"the gain of {output.name} by {loop.input} has the wrong sign: it would drive it away")
+    return found
+
+
+def _dead_times(made: Made) -> list[str]:
+    """Return which dead times are not whole ticks; the simulated plant has the nearest that is."""
+    tick_s, lags = made.process.tick_s, made.linear.parameters.get("lags", ())
+    return [
+        f"{lag['output']} after {lag['source']}, {lag['delay_s']:g} s, is simulated as {near:g} s"
+        for lag in lags
+        if abs((near := round(lag["delay_s"] / tick_s) * tick_s) - lag["delay_s"]) > SMALL * tick_s
+    ]
+
+
 def _warnings(made: Made) -> list[str]:
     """Return what a control engineer would want to know, in words."""
     m, process, found = made.model, made.process, list[str]()
@@ -96,6 +120,8 @@ def _warnings(made: Made) -> list[str]:
         found.append("controllability: the inputs do not move the outputs with a band independently within the horizon")
     if made.linear.error > ROUGH:
         found.append(f"kink: derivatives differ by {made.linear.error:.1e} with the step; the model holds for one side")
+    found += [f"loop: {text}" for text in _loops(made, effect)]
+    found += [f"dead time: {text}" for text in _dead_times(made)]
     steady = m.A_tick - np.eye(len(m.A))
     if _rank_deficit(np.vstack([steady, m.C])):
         found.append("observability: the outputs do not show where some state rests")

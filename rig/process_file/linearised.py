@@ -1,5 +1,7 @@
 """The linear model of a process file's plant at its operating point, whichever way the plant is given."""
 
+import warnings
+from collections.abc import Callable
 from math import factorial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -9,13 +11,13 @@ from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
 from plant.own.maker import LINEAR, PYTHON, TRANSFER_FUNCTIONS
-from plant.own.python_class import Equations, load_equations, source_digest
+from plant.own.python_class import Equations, equations_of, evaluated
 from rig.process_file.declaration import LagSection, PlantSection, ProcessFile
 
 Array = NDArray[np.float64]
 
 AT_REST: Final = 1e-8
-"""Largest change of a state in a second, over its size, that still counts as rest."""
+"""Largest change of a state in a sampling period, over its size, that still counts as rest."""
 STEP: Final = 1e-5
 """Of differences, over the size of the variable."""
 PADE_ORDER: Final = 2
@@ -47,20 +49,15 @@ class Linearised(NamedTuple):
     """Of the derivatives: largest difference from those with steps twice as wide, over the largest of each column."""
 
 
-def linearised(file: ProcessFile, folder: Path, to_model: str) -> Linearised:
-    """Return the model of a process.
-
-    Args:
-        file: What the process file says.
-        folder: Where it is.
-        to_model: The way from the model file's folder to that one.
+def linearised(file: ProcessFile, folder: Path) -> Linearised:
+    """Return the model of a process whose file is in a folder.
 
     Raises:
-        UsageError: The plant cannot be read, does not rest, or does not fit the signals.
+        ColdloopError: The plant cannot be read, does not rest, or does not fit the signals: one line.
     """
     plant = file.plant
     if plant.python is not None:
-        found = _from_equations(file, folder, plant.python, to_model)
+        found = _from_equations(file, folder, plant.python)
     elif plant.matrices is not None:
         found = _from_matrices(file, folder / plant.matrices)
     else:
@@ -68,7 +65,7 @@ def linearised(file: ProcessFile, folder: Path, to_model: str) -> Linearised:
     for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
         if not np.isfinite(getattr(found, name)).all():
             raise UsageError(f"plant: {name} of the linear model is not finite; look at the plant's equations there")
-    return found
+    return found if file.load else found._replace(F=np.zeros_like(found.F), G=np.zeros_like(found.G))
 
 
 def _operating(file: ProcessFile) -> tuple[Array, float]:
@@ -85,67 +82,86 @@ def _given_outputs(file: ProcessFile) -> Array:
 # -- a class with equations ------------------------------------------------------------------------------------------
 
 
-def _from_equations(file: ProcessFile, folder: Path, place: str, to_model: str) -> Linearised:
-    source, _, name = place.partition(":")
-    equations = load_equations(folder / source, name)
+def _from_equations(file: ProcessFile, folder: Path, place: str) -> Linearised:
+    source, name = _source(folder, place)
+    equations = equations_of(source, name, place)
     u, w = _operating(file)
-    x = _rest(equations, u, w, place)
-    y = np.asarray(equations.outputs(x, u, w), dtype=np.float64)
-    if y.shape != (len(file.outputs),):
-        raise UsageError(f"{place}: outputs() returns {y.size} numbers, the file declares {len(file.outputs)} outputs")
+    n, m = len(equations.states), len(u)
+    x = _rest(equations, u, w, place, file.tick_s * file.ticks_per_sample)
+    y = evaluated(equations.outputs, x, u, w, size=len(file.outputs), where=place)
 
     def flow(v: Array) -> Array:
-        return np.asarray(equations.derivatives(v[: len(x)], v[len(x) : -1], float(v[-1])), dtype=np.float64)
+        return evaluated(equations.derivatives, v[:n], v[n:-1], float(v[-1]), size=n, where=place)
 
     def read(v: Array) -> Array:
-        return np.asarray(equations.outputs(v[: len(x)], v[len(x) : -1], float(v[-1])), dtype=np.float64)
+        return evaluated(equations.outputs, v[:n], v[n:-1], float(v[-1]), size=len(y), where=place)
 
     at = np.array([*x, *u, w])
-    (J, one), (H, other) = _jacobian(flow, at), _jacobian(read, at)
-    n = len(x)
+    scale = np.array([*_sizes(x, equations), *((one.high - one.low) / 4 for one in file.inputs), _load_size(file)])
+    (J, one), (H, other) = _jacobian(flow, at, scale), _jacobian(read, at, scale)
+    parameters = {"file": place.partition(":")[0], "class": name, "source": source}
     return Linearised(
-        J[:, :n], J[:, n:-1], J[:, -1], H[:, :n], H[:, n:-1], H[:, -1], x, u, w, y, dict(equations.states), PYTHON,
-        {"file": str(Path(to_model) / source), "class": name}, source_digest(folder / source, name), max(one, other),
+        J[:, :n], J[:, n : n + m], J[:, -1], H[:, :n], H[:, n : n + m], H[:, -1], x, u, w, y, dict(equations.states),
+        PYTHON, parameters, "", max(one, other),
     )  # fmt: skip
 
 
-def _rest(equations: Equations, u: Array, w: float, place: str) -> Array:
-    """Return the state that does not move."""
+def _source(folder: Path, place: str) -> tuple[str, str]:
+    """Return the text of the file that `file.py:Class` names, and the class."""
+    file, _, name = place.partition(":")
+    try:
+        return (folder / file).read_text(encoding="utf-8"), name
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{folder / file}: {error}; a plant's file is looked for beside the process file") from None
+
+
+def _sizes(x: Array, equations: Equations) -> Array:
+    """Return how large states are: their values at rest, or at the guess, or 1 where both are 0."""
+    size = np.maximum(np.abs(x), np.abs(np.array(equations.guess, dtype=np.float64)))
+    return np.where(size > 0.0, size, 1.0)
+
+
+def _load_size(file: ProcessFile) -> float:
+    return 0.25 * (file.load.span[1] - file.load.span[0]) if file.load else 1.0
+
+
+def _rest(equations: Equations, u: Array, w: float, place: str, sample_s: float) -> Array:
+    """Return the state that does not move: in a sample by no more than `AT_REST` of its size."""
     from scipy.optimize import root  # noqa: PLC0415
 
     guess = np.array(equations.guess, dtype=np.float64)
-    if guess.shape != (len(equations.states),):
-        raise UsageError(f"{place}: guess has {guess.size} numbers, there are {len(equations.states)} states")
-    try:
-        with np.errstate(all="ignore"):
-            found = root(lambda x: np.asarray(equations.derivatives(x, u, w), dtype=np.float64), guess, tol=1e-12)
-            left = np.asarray(equations.derivatives(found.x, u, w), dtype=np.float64)
-    except Exception as error:
-        raise UsageError(f"{place}: derivatives() fails near guess: {type(error).__name__}: {error}") from error
-    moving = np.abs(left) / np.maximum(1.0, np.abs(found.x))
-    if not np.all(moving <= AT_REST):
-        worst = list(equations.states)[int(np.nanargmax(np.where(np.isfinite(moving), moving, np.inf)))]
+    size = _sizes(guess, equations)
+
+    def motion(scaled: Array) -> Array:
+        slope = evaluated(equations.derivatives, scaled * size, u, w, size=len(size), where=f"{place}, near guess")
+        return sample_s * slope / size
+
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = root(motion, guess / size, tol=1e-12)
+        left = np.abs(motion(found.x)) / np.maximum(1.0, np.abs(found.x))
+    if not np.all(left <= AT_REST):
+        worst = list(equations.states)[int(np.argmax(np.where(np.isfinite(left), left, np.inf)))]
         raise UsageError(
             f"{place}: no state of rest with the inputs at their operating point: {worst} keeps moving; give other "
             "values of at, or a guess nearer to it"
         )
-    return np.array(found.x, dtype=np.float64)
+    return np.array(found.x * size, dtype=np.float64)
 
 
-def _jacobian(function: Any, at: Array) -> tuple[Array, float]:  # noqa: ANN401 a function of arrays
+def _jacobian(function: Callable[[Array], Array], at: Array, scale: Array) -> tuple[Array, float]:
     """Return central differences, shape (k, len(at)), and how far those of twice the step are from them."""
     columns, errors = [], []
-    for i, value in enumerate(at):
-        step = STEP * max(1.0, abs(value))
+    for i, size in enumerate(scale):
         by_step = []
-        for h in (step, 2 * step):
+        for h in (STEP * size, 2 * STEP * size):
             up, down = at.copy(), at.copy()
             up[i] += h
             down[i] -= h
             by_step.append((function(up) - function(down)) / (2 * h))
         fine, coarse = by_step
         columns.append(fine)
-        errors.append(np.abs(fine - coarse).max() / max(np.abs(fine).max(), 1e-12))
+        errors.append(np.abs(fine - coarse).max() / max(np.abs(fine).max(), 1e-300))
     return np.array(columns).T, float(max(errors))
 
 

@@ -1,6 +1,5 @@
 """A process file made into a model file: the linear model, and the process as programs are loaded with it."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from coldloop.errors import UsageError
 from coldloop.process.declaration import NO_LOAD, Band, Input, Load, Loop, Output, Process, State
 from coldloop.process.lti_model import LtiModel, discretise
+from coldloop.registers.optimizer_plc import INPUT_SAMPLES, PREDICTED_SAMPLES
 from rig.plc_sizing.problem_sizes import ProblemSizes, iteration_shares
 from rig.process_file.declaration import OutputSection, ProcessFile, read_process_file
 from rig.process_file.linearised import Linearised, linearised
@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 
 REGISTERS_OF_A_REQUEST: Final = 125
 """What one read of Modbus carries: the latched update, and the rack's measurement, are one."""
+TINY: Final = 1e-12
+TOLD_APART: Final = 1e-6
+"""Least singular value, of columns of size 1, with which constants are told from states."""
 USUAL_WALK: Final = 0.01
 """Process noise of a state over what it moves by when each input makes its largest step, held for the horizon."""
 
@@ -32,16 +35,17 @@ class Made:
     linear: Linearised
 
 
-def made_from(path: Path, out: Path) -> Made:
-    """Return the model of a process file, for a model file at `out`.
+def made_from(path: Path) -> Made:
+    """Return the model of a process file.
 
     Raises:
         ColdloopError: One line that names file, key and remedy.
     """
     file = read_process_file(path)
-    linear = linearised(file, path.parent, os.path.relpath(path.resolve().parent, out.resolve().parent))
+    linear = linearised(file, path.parent)
     process = _process(file, linear)
     _check_room(process)
+    _check_rest(file, linear)
     tick = discretise(linear.A, linear.B, linear.F, file.tick_s)
     names, units = zip(*linear.states.items(), strict=True)
     model = LtiModel(
@@ -76,6 +80,7 @@ def _process(file: ProcessFile, linear: Linearised) -> Process:
         ),
         decision_instants=file.prediction.decision_instants,
         constraint_instants=file.prediction.constraint_instants,
+        constants=_constants(file, linear),
         iterations=iteration_shares(_sizes(file, len(linear.states))),
     )  # fmt: skip
 
@@ -109,9 +114,29 @@ def _states(file: ProcessFile, linear: Linearised) -> tuple[State, ...]:
     )
 
 
+def _constants(file: ProcessFile, linear: Linearised) -> tuple[str, ...]:
+    """Return the outputs whose constant error can be told from states, load and each other, those with bands last.
+
+    Hautus' test at the integrator: (A, F; C, G) and a column of ones for each constant have no direction of zeros
+    (Pannocchia and Rawlings, AIChE J. 49, 2003).
+    """
+    with_load = [linear.F[:, None], linear.G[:, None]] if file.load else [np.zeros((len(linear.A), 0)), linear.D[:, :0]]
+    modes = np.vstack([np.hstack([linear.A, with_load[0]]), np.hstack([linear.C, with_load[1]])])
+    found: list[int] = []
+    for place in sorted(range(len(file.outputs)), key=lambda place: file.outputs[place].band is not None):
+        column = np.eye(len(modes))[:, [len(linear.A) + place]]
+        wider = np.hstack([modes, column])
+        if wider.shape[1] > len(wider):
+            break
+        sizes = np.linalg.svd(wider / np.maximum(np.linalg.norm(wider, axis=0), TINY), compute_uv=False)
+        if sizes[-1] > TOLD_APART:
+            modes, found = wider, [*found, place]
+    return tuple(file.outputs[place].name for place in sorted(found))
+
+
 def _sizes(file: ProcessFile, states: int) -> ProblemSizes:
     bands = sum(output.band is not None for output in file.outputs)
-    constants = len(file.outputs) - 1  # by default all outputs but one have a constant, and the load a mismatch
+    constants = len(file.outputs)  # as many at most have one, and the load a mismatch
     return ProblemSizes(
         len(file.prediction.decision_instants), len(file.inputs), len(file.outputs), bands,
         len(file.prediction.constraint_instants), states + constants,
@@ -119,16 +144,37 @@ def _sizes(file: ProcessFile, states: int) -> ProblemSizes:
 
 
 def _check_room(process: Process) -> None:
-    """Check that what the link carries at once fits into one request.
+    """Check that each record of the link that is read at once fits into one request.
 
     Raises:
-        UsageError: It does not.
+        UsageError: One does not.
     """
-    words = 16 + 2 * (len(process.inputs) + len(process.outputs) + len(process.states))
-    latched = 12 + 2 * (2 * len(process.inputs) + len(process.outputs) + len(process.states))
-    if max(words, latched) > REGISTERS_OF_A_REQUEST:
-        most = (REGISTERS_OF_A_REQUEST - 16) // 2
+    inputs, outputs, states = len(process.inputs), len(process.outputs), len(process.states)
+    bands = len(process.bands)
+    words = {
+        "the latched update": 12 + 2 * (2 * inputs + outputs + states),
+        "the rack's measurement": 18 + 2 * (inputs + outputs + states),
+        "the prediction": 6 + 2 * (len(PREDICTED_SAMPLES) * bands + len(INPUT_SAMPLES) * inputs),
+        "the operating limits": 4 * bands + 6 * inputs,
+        "the model deviation": 2 + 2 * inputs + 4 * outputs,
+    }
+    longest = max(words, key=lambda name: words[name])
+    if words[longest] > REGISTERS_OF_A_REQUEST:
         raise UsageError(
-            f"{len(process.inputs)} inputs, {len(process.outputs)} outputs and {len(process.states)} states are more "
-            f"than one Modbus request carries: outputs, states and twice the inputs are {most} together at most"
+            f"{inputs} inputs, {outputs} outputs ({bands} with a band) and {states} states are too many: {longest} is "
+            f"{words[longest]} registers, and one Modbus request carries {REGISTERS_OF_A_REQUEST}"
         )
+
+
+def _check_rest(file: ProcessFile, linear: Linearised) -> None:
+    """Check that outputs at rest are within the ranges of their sensors.
+
+    Raises:
+        UsageError: One is not.
+    """
+    for one, value in zip(file.outputs, linear.y0, strict=True):
+        if not one.range[0] <= value <= one.range[1]:
+            raise UsageError(
+                f"outputs: {one.name} rests at {value:.5g}, outside the range of its sensor, {one.range[0]:g} to "
+                f"{one.range[1]:g}: every reading would be taken for a failed sensor"
+            )

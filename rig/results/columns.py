@@ -6,6 +6,7 @@ from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import (
     INPUT_NAMES,
     OUTPUT_NAMES,
@@ -14,6 +15,7 @@ from coldloop.process.signals import (
     STATE_UNITS,
     STATION_SIGNAL_NAMES,
     STATION_SIGNAL_UNITS,
+    TICK_UNIT,
 )
 from coldloop.registers.audit import Event
 from coldloop.registers.control_plc import Verdict
@@ -42,7 +44,7 @@ class Column(NamedTuple):
         return pa.field(self.name, self.kind, metadata={"unit": self.unit, "description": self.description})
 
 
-_TICK: Final = Column("tick", pa.int64(), "1", "Tick since the start of the session, of 0.25 s")
+_TICK: Final = Column("tick", pa.int64(), "1", f"Tick since the start of the session, of {TICK_UNIT}")
 _TIME: Final = Column("time_s", pa.float64(), "s", "Plant time since the start of the session")
 _TAU_U: Final = Column("tau_u_s", pa.float64(), "s", "Updating period t_{i+1} - t_i")
 _UPDATE: Final = fields_of(Optimization)
@@ -51,7 +53,7 @@ _EVENT: Final = fields_of(Event)
 MODEL_RANGE_COLUMN: Final = Column("model_range", pa.int32(), "1", fields_of(ModelRangeStatus)["outside"].description)
 
 PHYSICAL_COLUMNS: Final = (
-    Column("load_w", pa.float32(), "W", fields_of(PlantSample)["load"].description),
+    Column("load_w", pa.float32(), PROCESS.load.unit or "1", fields_of(PlantSample)["load"].description),
     *(
         Column(name, pa.float32(), field.unit, f"{field.description}; applied from this tick on")
         for name, field in zip(INPUT_NAMES, inputs_of(tuple(fields_of(Actuators).values())), strict=True)
@@ -128,7 +130,7 @@ EVENTS: Final = (
 )
 
 FILES: Final = {
-    "trace.parquet": ("One row a tick of 0.25 s", TRACE),
+    "trace.parquet": (f"One row a tick of {TICK_UNIT}", TRACE),
     "updates.parquet": ("One row an update whose sequence was played", UPDATES),
     "events.parquet": ("One row an event of the journals: modes, alarms, commands", EVENTS),
 }

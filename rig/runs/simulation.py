@@ -23,6 +23,7 @@ from coldloop.config import Configuration
 from coldloop.errors import UsageError
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICK_S
+from coldloop.process.whole_ticks import whole_ticks
 from coldloop.registers.audit import Event
 from rig.cosim.one_process import OneProcessRig
 from rig.durations import duration
@@ -169,10 +170,13 @@ def _ticks(duration_s: float | str | None) -> int | None:
             return duration(duration_s)
         except ArgumentTypeError as error:
             raise UsageError(f"duration_s: {error}") from None
-    ticks = duration_s / TICK_S
-    if not (ticks > 0 and ticks.is_integer()):
+    try:
+        ticks = whole_ticks(duration_s)
+    except (ValueError, OverflowError):
+        ticks = 0
+    if ticks <= 0:
         raise UsageError(f"duration_s={duration_s}: not a positive multiple of {TICK_S} s")
-    return int(ticks)
+    return ticks
 
 
 def _run(effective: Configuration[Settings], ticks: int | None) -> Simulation:

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, 
 
 from coldloop.process.cold_box import LEVEL_BAND, T5_BAND
 from coldloop.process.loaded import IS_COLD_BOX, PROCESS
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import STRETCH, TICK_S
 from coldloop.registers.safety import AlarmKind, AlarmPriority
 
 PASSING: Final = (AlarmKind.SCAN_OVERRUN, AlarmKind.ACCESS_REFUSED, AlarmKind.SECOND_WRITER)
@@ -51,7 +51,7 @@ DEFAULT_RULES: Final[Mapping[AlarmKind, AlarmRule]] = MappingProxyType({
     AlarmKind.LEVEL_BAND: AlarmRule(HIGH),  # the bath may run dry or flood; on-delay: `band_delay_s`
     AlarmKind.T5_BAND: AlarmRule(HIGH),  # the turbines leave their range; on-delay: `band_delay_s`
     AlarmKind.PLANT_FROZEN: AlarmRule(HIGH),  # measurements are old
-    AlarmKind.CAPACITY: AlarmRule(HIGH, on_delay_s=20.0, off_delay_s=30.0),  # no control holds this load
+    AlarmKind.CAPACITY: AlarmRule(HIGH, 20.0 * STRETCH, 30.0 * STRETCH),  # no control holds this load
     # Control is degraded, or a protection is lost: act within the shift.
     AlarmKind.MODE: AlarmRule(MEDIUM),  # the ladder has left MPC
     AlarmKind.SEQUENCE_EXHAUSTED: AlarmRule(MEDIUM),  # outputs are held, then the classical loops control
@@ -79,7 +79,7 @@ def _known_name(name: str) -> str:
     return name.lower()
 
 
-Delay = Annotated[FiniteFloat, Field(ge=0, le=86_400)]
+Delay = Annotated[FiniteFloat, Field(ge=0, le=345_600 * TICK_S)]
 
 
 class RuleSettings(BaseModel):
@@ -111,7 +111,7 @@ class AlarmSettings(BaseModel):
     """L1, %, of the cold box, as the next."""
     t5_band: tuple[FiniteFloat, FiniteFloat] = T5_BAND
     """T5, K."""
-    band_delay_s: Delay = 5.0
+    band_delay_s: Delay = 5.0 * STRETCH
     """On-delay of the two band alarms: how long an output must be outside, plant time."""
     rules: dict[Annotated[str, AfterValidator(_known_name)], RuleSettings] = {}
     """By name of the alarm, such as `sensor_bad`."""

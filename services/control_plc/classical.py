@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, m
 from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
+from coldloop.process.whole_ticks import whole_ticks
 from coldloop.registers.control_plc import SequenceRow
 
 
@@ -73,8 +74,10 @@ class ClassicalSettings(BaseModel):
 
     @model_validator(mode="after")
     def _whole_ticks(self) -> Self:
-        if self.period_ticks * TICK_S != self.period_s:
-            raise ValueError(f"period_s must be a multiple of the tick, {TICK_S} s")
+        try:
+            whole_ticks(self.period_s)
+        except ValueError:
+            raise ValueError(f"period_s must be a multiple of the tick, {TICK_S} s") from None
         return self
 
 

@@ -14,7 +14,7 @@ from coldloop.errors import ConfigurationError
 from coldloop.process.limits import InputLimits
 from coldloop.process.load_profile import LOAD_SPAN
 from coldloop.process.model_file import ModelHeader
-from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.signals import STRETCH, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
     Acknowledgement,
@@ -47,7 +47,7 @@ SEEN = 0.1
 """Share of its rate by which an input must have moved for the process to show it."""
 HANDSHAKE_TICKS = TICKS_PER_SAMPLE
 """Longest time that the classical loops wait for an announced sequence."""
-HANDSHAKE_PAUSE_S = 30.0
+HANDSHAKE_PAUSE_S = 30.0 * STRETCH
 """After a handshake that came to nothing the classical loops are not held again for so long."""
 SET_BACK_TICKS = TICKS_PER_SAMPLE
 """Time set back by more than this drops all sequences: they were for a time that will come again."""

@@ -46,7 +46,7 @@ from control_plc.settings import SHOWN, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
 
-TICKS_PER_SECOND: Final = round(1 / TICK_S)
+TICKS_PER_SECOND: Final = max(1, round(1 / TICK_S))
 ANSWER_TICKS: Final = 8
 """In real time a later answer is stale: the rack is read again."""
 SHORTEST_PATIENCE_S: Final = 0.1

@@ -11,7 +11,7 @@ from typing import Annotated, Self
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from coldloop.process.loaded import IS_COLD_BOX, PROCESS
-from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, T1, TICK_S
+from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, STRETCH, T1, TICK_S
 from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
@@ -37,17 +37,17 @@ class SensorCheckSettings(BaseModel):
     """K."""
     pressure: Range = (-1.0, 100.0)
     """bar."""
-    frozen_s: Annotated[float, Field(gt=0)] = 20.0
+    frozen_s: Annotated[float, Field(gt=0)] = 20.0 * STRETCH
     """A controlled output that does not change for so long, while others move, is frozen."""
-    resting_s: Annotated[float, Field(gt=0)] = 60.0
+    resting_s: Annotated[float, Field(gt=0)] = 60.0 * STRETCH
     """Another one, that has moved for a minute before, is if it rests for so long and for twice as long as ever before:
     what is constant in a plant with exact sensors is not taken for frozen."""
     may_rest: bool = True
     """While its inputs do not move a plant may stand still bit for bit, as a simulated one with exact sensors does.
     False for sensors that are always noisy: an image unchanged for `frozen_s` is then stale in any case."""
-    bridged_s: Annotated[float, Field(ge=0)] = 10.0
+    bridged_s: Annotated[float, Field(ge=0)] = 10.0 * STRETCH
     """How long the classical loops work with the last good value of a controlled output; then that loop is left."""
-    estimated_s: Annotated[float, Field(ge=0)] = 1800.0
+    estimated_s: Annotated[float, Field(ge=0)] = 1800.0 * STRETCH
     """How long MPC works without one, by its estimate from the others."""
     estimated_most: Annotated[int, Field(ge=0, le=22)] = 5
     """Bad sensors at most for that; with more, MPC is left after `bridged_s`, too."""

@@ -1,5 +1,6 @@
 """Configuration of the control PLC, checked when it is made and immutable after."""
 
+import math
 from enum import StrEnum
 from typing import Annotated, Final
 
@@ -9,7 +10,7 @@ from coldloop.modbus.endpoints import CONTROL_PORT, PLANT_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
 from coldloop.process.limits import InputLimits
 from coldloop.process.model_settings import ModelSettings
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import SAMPLING_PERIOD_S, STRETCH, TICK_S
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
 from coldloop.service.metrics_settings import MetricsSettings
@@ -52,9 +53,11 @@ class LadderSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    hold_s: Annotated[float, Field(ge=0)] = 30.0
+    hold_s: Annotated[float, Field(ge=0)] = 30.0 * STRETCH
     """How long the last value holds before the classical loops take over."""
-    optimizer_timeout_s: Annotated[float, Field(ge=0, le=16_000)] = 15.0
+    optimizer_timeout_s: Annotated[float, Field(ge=0, le=64_000 * TICK_S)] = max(
+        15.0 * max(STRETCH, 1.0), 3 * SAMPLING_PERIOD_S
+    )
     """An optimiser that gives no sign of life for so long is lost; 0 is never. Plant time, longer than any tau_u."""
     optimizer_patience_s: Annotated[float, Field(gt=0)] = 5.0
     """In lock-step plant time waits while the optimiser is waited for: it is lost after so long in real time."""
@@ -67,7 +70,7 @@ class LadderSettings(BaseModel):
     @property
     def optimizer_ticks(self) -> int:
         """The time-out, in ticks."""
-        return round(self.optimizer_timeout_s / TICK_S)
+        return math.ceil(self.optimizer_timeout_s / TICK_S)
 
 
 class ControlSection(BaseModel):

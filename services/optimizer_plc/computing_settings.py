@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validato
 
 from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.per_signal import PositivePerInput
-from coldloop.process.signals import CONTROLLED, INPUT_NAMES, OUTPUT_NAMES
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STRETCH
 
 PENALTY_WEIGHT = 3000.0
 """alpha that all solvers are judged by with the default weights. In a program's settings it follows from `penalties`
@@ -17,12 +17,11 @@ and `design.violation_weight` wherever it is not set."""
 
 SIGNALS: Final = (*OUTPUT_NAMES, *INPUT_NAMES)
 GROUPS: Final = {
-    "outputs": tuple(name for name in OUTPUT_NAMES if not PROCESS.has_load or name != OUTPUT_NAMES[CONTROLLED[0]]),
+    "outputs": PROCESS.constants,
     "inputs": ("CV155", "CV156") if IS_COLD_BOX else INPUT_NAMES,
 }
-"""What `estimator.disturbances` calls all outputs, or inputs, that may have one. With a load the first
-output with a band has none: no sensor tells a constant error of L1 from liquid helium, or of another from the load; nor
-one of the heater from it.
+"""What `estimator.disturbances` calls all outputs, or inputs, that may have one. No sensor tells a
+constant error of L1 from liquid helium, nor one of the heater from the load.
 """
 
 
@@ -128,11 +127,11 @@ class PlausibilitySettings(BaseModel):
     speed_allowance: Annotated[float, Field(ge=0)] = 5.0
     temperature_allowance: Annotated[float, Field(ge=0)] = 0.0
     pressure_allowance: Annotated[float, Field(ge=0)] = 0.01
-    settled_s: Annotated[float, Field(ge=0)] = 60.0
+    settled_s: Annotated[float, Field(ge=0)] = 60.0 * STRETCH
     """A reading is judged when it has been used for so long: until then the filter learns how the plant differs."""
-    agreeing_s: Annotated[float, Field(ge=0)] = 60.0
+    agreeing_s: Annotated[float, Field(ge=0)] = 60.0 * STRETCH
     """A suspect that agrees with the others for so long is taken back."""
-    longest_s: Annotated[float, Field(ge=0)] = 1800.0
+    longest_s: Annotated[float, Field(ge=0)] = 1800.0 * STRETCH
     """It is taken back after so long in any case: what the others say of it is then no better."""
     most: Annotated[int, Field(ge=0, le=len(OUTPUT_NAMES) - 1)] = min(2, len(OUTPUT_NAMES) - 1)
     """Readings that may be suspected at once; when more contradict the prediction it is the plant: the four gauges of

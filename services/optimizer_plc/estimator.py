@@ -24,7 +24,8 @@ from optimizer_plc.qp.prediction import PredictionModel, Transition
 Array = NDArray[np.float64]
 
 
-MINUTE_S: Final = 60.0
+MEMORY_TICKS: Final = 240
+"""A minute of the cold box."""
 ANY_PLAUSIBLE: Final = PlausibilitySettings()
 UNDETECTABLE: Final = 1e-9
 """Relative size of a direction that no measurement sees."""
@@ -75,7 +76,7 @@ class Belief(NamedTuple):
     """State predicted since, shape (n,)."""
     surprise: Array
     """How far each output was from what the prediction and the other outputs say, over the standard deviation that the
-    filter expects: mean square over about `MINUTE_S`, shape (n_y,)."""
+    filter expects: mean square over about `MEMORY_TICKS`, shape (n_y,)."""
     readings: Any
     """Records, shape (n_y,): which of them are believed, and since when."""
 
@@ -161,7 +162,7 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     if not np.isfinite(innovation).all():
         innovation = imputed(innovation, J)
     if b.since <= c.stationary.gains.shape[0]:  # J is for no longer time
-        note_surprise(belief.surprise, innovation, J, real(b.since) * (c.tick_s / real(MINUTE_S)))
+        note_surprise(belief.surprise, innovation, J, real(b.since) * real(1.0 / MEMORY_TICKS))
     correction = np.zeros(belief.x.size + 1, belief.x.dtype)
     add_transposed_product(c.stationary.gains[period], innovation, correction)
     belief.x[:] = belief.predicted + correction[:-1]
@@ -202,7 +203,9 @@ def check_detectability(prediction: PredictionModel) -> None:
     modes = np.vstack([
         np.hstack([step.A - np.eye(n), step.F]), np.hstack([prediction.C, prediction.G])
     ])  # fmt: skip
-    modes /= np.linalg.norm(modes, axis=0)
+    if not PROCESS.has_load:
+        modes = modes[:, :n]
+    modes /= np.maximum(np.linalg.norm(modes, axis=0), UNDETECTABLE)
     _, sizes, directions = np.linalg.svd(modes)
     if sizes[-1] > UNDETECTABLE:
         return

@@ -41,7 +41,7 @@ log = logging.getLogger("coldloop.optimizer_plc")
 
 LOOK_OUT_S: Final = TICK_S / 8
 """Plant time between two looks for a load step in real time: the new computation begins so much later."""
-HEARTBEAT_S: Final = 1.0
+HEARTBEAT_S: Final = 4 * TICK_S
 """Plant time between two heartbeats while an answer is computed."""
 SHORTEST_PAUSE_S: Final = 0.001
 """Real time between two such requests, however high the factor: others want to be served too."""

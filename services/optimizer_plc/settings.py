@@ -10,8 +10,9 @@ from coldloop.modbus.endpoints import CONTROL_PORT, OPTIMIZER_PORT, Endpoint
 from coldloop.modbus.settings import ServerSettings
 from coldloop.process.limits import InputLimits
 from coldloop.process.model_settings import ModelSettings
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import STRETCH, TICK_S
 from coldloop.process.updating_periods import SHORTEST_TICKS
+from coldloop.process.whole_ticks import TOLERANCE, whole_ticks
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.service.metrics_settings import MetricsSettings
@@ -65,6 +66,14 @@ class RuleName(StrEnum):
     CONTRACTION = "contraction"
 
 
+def _is_whole(seconds: float) -> bool:
+    try:
+        whole_ticks(seconds)
+    except ValueError:
+        return False
+    return True
+
+
 class ContractionSettings(BaseModel):
     """Parameters of the contraction rule, chosen on the draws 11 and 12 of the six families of hours."""
 
@@ -73,9 +82,9 @@ class ContractionSettings(BaseModel):
     q_busy: Annotated[int, Field(ge=1)] = 2
     q_quiet: Annotated[int, Field(ge=1)] = 4
     q_step: Annotated[int, Field(ge=1)] = 9
-    rate: Annotated[float, Field(gt=0)] = 0.02
+    rate: Annotated[float, Field(gt=0)] = 0.02 / STRETCH
     """Contraction of the delivered cost, 1/s, at which the period is shortest."""
-    memory: Annotated[float, Field(ge=0, le=1)] = 0.95
+    memory: Annotated[float, Field(ge=0, le=1)] = 0.95 ** (1.0 / STRETCH)
     """Share of a contraction that is still felt a second later."""
     surprise: Annotated[float, Field(gt=1)] = 2.0
     """Cost reached over cost predicted from which on the next solve is a long one."""
@@ -158,7 +167,7 @@ class ProgramSettings(BaseModel):
     @field_validator("updating_period_s")
     @classmethod
     def _whole_ticks(cls, value: float) -> float:
-        if value % TICK_S or 0 < value < SHORTEST_TICKS * TICK_S:
+        if not _is_whole(value) or 0 < value < SHORTEST_TICKS * TICK_S * (1.0 - TOLERANCE):
             shortest = f"{SHORTEST_TICKS * TICK_S:g} s"
             raise ValueError(f"an updating period is a multiple of {TICK_S:g} s from {shortest} on, or 0 for adaptive")
         return value

@@ -1,5 +1,6 @@
 """Configuration of the plant service, checked when it is made and immutable after."""
 
+import math
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Final
@@ -12,7 +13,7 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.model_settings import ModelSettings
 from coldloop.process.per_signal import PerInput
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import STRETCH, TICK_S
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
 from coldloop.service.metrics_settings import MetricsSettings
@@ -109,7 +110,7 @@ class WatchdogSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    timeout_s: Annotated[float, Field(ge=0, le=16_000)] = 10.0
+    timeout_s: Annotated[float, Field(ge=0, le=64_000 * TICK_S)] = 10.0 * max(STRETCH, 1.0)
     """Plant time without new outputs after which it expires; 0 is never. In lock-step plant time then stops."""
     action: SafeAction = SafeAction.HOLD
     safe_state: PerInput = tuple(one.safe for one in PROCESS.inputs)
@@ -127,7 +128,7 @@ class WatchdogSettings(BaseModel):
     @property
     def ticks(self) -> int:
         """The time-out, in ticks."""
-        return round(self.timeout_s / TICK_S)
+        return math.ceil(self.timeout_s / TICK_S)
 
 
 class PlantServer(ServerSettings):

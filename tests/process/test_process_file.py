@@ -52,7 +52,7 @@ def made(folder: Path, text: str = ONE_BY_ONE, plant: str = HEATER) -> Made:
     """Return what is made from a process file and a plant beside it."""
     (folder / "process.toml").write_text(text, encoding="utf-8")
     (folder / "heater.py").write_text(plant, encoding="utf-8")
-    return made_from(folder / "process.toml", folder / "model.json")
+    return made_from(folder / "process.toml")
 
 
 def test_the_cold_box_is_a_process_like_others_and_survives_a_journey_as_data() -> None:
@@ -68,9 +68,9 @@ def test_a_heater_by_hand(tmp_path: Path) -> None:
     assert (model.C @ model.discretised(1e4).B)[0, 0] == pytest.approx(0.5, rel=1e-6)
 
 
-def test_the_quadruple_tank_has_the_time_constants_that_its_author_gives(tmp_path: Path) -> None:
+def test_the_quadruple_tank_has_the_time_constants_that_its_author_gives() -> None:
     """T_i = A_i / a_i sqrt(2 h_i / g): a mode each (Johansson 2000, equation 7)."""
-    model = made_from(EXAMPLES / "quadruple_tank.toml", tmp_path / "model.json").model
+    model = made_from(EXAMPLES / "quadruple_tank.toml").model
     assert model.x0 == pytest.approx([12.26, 12.78, 1.63, 1.41], abs=0.01)
     area, outlet = (28.0, 32.0, 28.0, 32.0), (0.071, 0.057, 0.071, 0.057)
     constants = [A / a * sqrt(2 * h / 981.0) for A, a, h in zip(area, outlet, model.x0, strict=True)]
@@ -138,6 +138,9 @@ BAD_FILES = {
     "instants that fall": (ONE_BY_ONE + "[prediction]\ndecision_instants = [4, 2]\n", "decision_instants"),
     "constraints behind the horizon": (ONE_BY_ONE + "[prediction]\ndecision_instants = [1, 2]\n", "constraint"),
     "a state that is none": (ONE_BY_ONE + '[[states]]\nname = "pressure"\nwalk = 1.0\n', "pressure"),
+    "an output outside its sensor's range": (changed("range = [200.0, 500.0]", "range = [0.0, 10.0]"), "temperature"),
+    "a keyword of Python": (changed('name = "power"', 'name = "in"'), "in"),
+    "a column of the trace": (changed('name = "temperature"', 'name = "tau_u_s"'), "tau_u_s"),
     "a load outside its span": (ONE_BY_ONE + '[load]\nname = "d"\nat = 5.0\nspan = [0.0, 1.0]\n', "d"),
 }  # fmt: skip
 BAD_PLANTS = {
@@ -147,6 +150,10 @@ BAD_PLANTS = {
     "raises": (HEATER.replace("return [(u[0]", "return [(u[7]"), "IndexError"),
     "divides by zero": (HEATER.replace("return [(u[0]", "1 / 0\n        return [(u[0]"), "ZeroDivisionError"),
     "never rests": (HEATER.replace("- 2.0 * (x[0] - 300.0)", "+ 1.0"), "T keeps moving"),
+    "states without units": (HEATER.replace('{"T": "K"}', '["T1"]'), "dict of names and units"),
+    "a state's name with spaces": (HEATER.replace('"T": "K"', '"the T": "K"'), "dict of names and units"),
+    "steps of no time": (HEATER.replace("guess =", "steps_per_tick = 0\n    guess ="), "steps_per_tick"),
+    "outputs that raise": (HEATER.replace("return [x[0]]", "return [x[9]]"), "outputs() fails: IndexError"),
     "too many outputs": (HEATER.replace("return [x[0]]", "return [x[0], x[0]]"), "outputs()"),
     "an output that is no number": (HEATER.replace("return [x[0]]", "return [x[0] * float('nan')]"), "not finite"),
 }
@@ -174,7 +181,7 @@ def test_more_signals_than_a_request_carries_are_refused(tmp_path: Path) -> None
     n = 60
     np.savez(tmp_path / "matrices.npz", A=-np.eye(n), B=np.ones((n, 1)), C=np.eye(1, n))
     text = ONE_BY_ONE.replace('python = "heater.py:Heater"', 'matrices = "matrices.npz"')
-    with pytest.raises(ColdloopError, match="60 states are more than one Modbus request carries"):
+    with pytest.raises(ColdloopError, match="60 states are too many: the rack's measurement is"):
         made(tmp_path, text.replace("noise = 0.1", "noise = 0.1\nat = 325.0"))
 
 
@@ -189,3 +196,35 @@ def test_the_command_prints_it_and_writes_nothing_that_is_half_made(tmp_path: Pa
     assert failed.code != 0
     assert len(failed.complaints) == 1
     assert not (tmp_path / "other.json").exists()
+
+
+def test_an_integrator_and_a_load_leave_out_the_constants_that_nothing_tells_from_them(tmp_path: Path) -> None:
+    """The level of a tank is the integral of what flows in: its gauge's error is no other thing than level."""
+    tank = HEATER.replace("(u[0] - 2.0 * (x[0] - 300.0)) / 100.0", "(u[0] - 50.0) / 100.0")
+    assert made(tmp_path, plant=tank.replace("300.0", "325.0")).process.constants == ()
+    assert made(tmp_path).process.constants == ("temperature",)
+    load = '[load]\nname = "sun"\nat = 0.0\nspan = [-1.0, 1.0]\n'
+    assert made(tmp_path, ONE_BY_ONE + load, HEATER.replace("u[0] -", "u[0] + w -")).process.constants == ()
+    two = made_from(EXAMPLES / "quadruple_tank.toml").process.constants
+    assert len(two) == 1
+
+
+def test_what_the_load_does_is_left_out_of_the_model_where_none_is_declared(tmp_path: Path) -> None:
+    assert not made(tmp_path, plant=HEATER.replace("u[0] -", "u[0] + w -")).model.F.any()
+
+
+def test_a_small_state_rests_and_is_linearised_as_a_large_one(tmp_path: Path) -> None:
+    """In MK: all numbers of the state a million times smaller."""
+    small = HEATER.replace("x[0] - 300.0", "1e6 * x[0] - 300.0").replace("/ 100.0", "/ 100.0e6")
+    small = small.replace("return [x[0]]", "return [1e6 * x[0]]").replace("[300.0]", "[300.0e-6]")
+    model = made(tmp_path, plant=small).model
+    assert model.x0 == pytest.approx([325.0e-6])
+    assert pytest.approx(np.array([[-0.02]]), rel=1e-6) == model.A
+
+
+def test_loops_and_dead_times_are_looked_at(tmp_path: Path) -> None:
+    loop = 'loop = { input = "power", gain = -5.0, integral_time_s = 60.0 }\n'
+    assert "wrong sign" in described(made(tmp_path, ONE_BY_ONE + loop))
+    assert "wrong sign" not in described(made(tmp_path, ONE_BY_ONE + loop.replace("-5.0", "5.0")))
+    column = (EXAMPLES / "wood_berry.toml").read_text(encoding="utf-8").replace("delay_s = 60.0", "delay_s = 61.0")
+    assert "xD after reflux, 61 s, is simulated as 60 s" in described(made(tmp_path, column))

@@ -18,7 +18,7 @@ def test_a_newcomer_gets_what_the_page_shows(processes: Processes, tmp_path: Pat
 
     page = PAGE.read_text(encoding="utf-8")
     assert "process.toml" in coldloop("new", "heater")
-    plant = (tmp_path / "heater" / "plant.py").read_text(encoding="utf-8")
+    plant = (tmp_path / "heater" / "my_plant.py").read_text(encoding="utf-8")
     shown = page.split("```python\n")[1].split("```")[0].splitlines()
     assert [line for line in shown if line] == [line for line in plant.splitlines() if line in shown and line]
     found = coldloop("process", "heater/process.toml").splitlines()
@@ -33,7 +33,7 @@ def test_a_newcomer_gets_what_the_page_shows(processes: Processes, tmp_path: Pat
 
 
 def test_a_folder_that_is_in_use_is_left_alone(processes: Processes, tmp_path: Path) -> None:
-    (tmp_path / "plant.py").write_text("mine", encoding="utf-8")
+    (tmp_path / "my_plant.py").write_text("mine", encoding="utf-8")
     started = processes.coldloop("new", tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     code, _, err = started.ended(PROGRAM_S)
     assert code != 0

@@ -6,7 +6,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-FILES: Final = ("process.toml", "plant.py")
+FILES: Final = ("process.toml", "my_plant.py")
 
 
 def declare(parser: argparse.ArgumentParser) -> None:

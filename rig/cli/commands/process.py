@@ -24,7 +24,7 @@ def execute(options: argparse.Namespace) -> int:
         require_regular_file(out)
         if out.resolve() == options.file.resolve():
             raise UsageError(f"{out}: is the process file; name another one with --out")
-    made = made_from(options.file, out or options.file)
+    made = made_from(options.file)
     sys.stdout.write(described(made))
     if out is not None:
         try:

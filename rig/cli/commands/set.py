@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
 from coldloop.process.signals import TICK_S
+from coldloop.process.whole_ticks import whole_ticks
 from rig.cli.commands.options import (
     add_rig_options,
     add_to_subcommands,
@@ -60,11 +61,11 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def _seconds(text: str) -> float:
     try:
-        ticks = float(text) / TICK_S
-    except ValueError:
-        ticks = -1.0
-    if not (0 <= ticks < LONGEST_TICKS and ticks.is_integer()):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds in multiples of 0.25")
+        ticks = whole_ticks(float(text))
+    except (ValueError, OverflowError):
+        ticks = -1
+    if not 0 <= ticks < LONGEST_TICKS:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds in multiples of {TICK_S:g}")
     return ticks * TICK_S
 
 

@@ -1,7 +1,6 @@
 """Makes the plant of a process other than the cold box, from what its model file says of it."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Final
 
 from coldloop.errors import ModelFileError
@@ -9,7 +8,7 @@ from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import ModelHeader
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from plant.own.linear import LinearPlant
-from plant.own.python_class import PythonPlant, load_equations, source_digest
+from plant.own.python_class import PythonPlant, equations_of
 from plant.own.transfer_functions import TransferFunctionPlant, lags_of
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.rack.rack import MakePlant
@@ -26,23 +25,12 @@ def check_signals(header: ModelHeader) -> None:
     """Check that a model file is of the process that this program is loaded with.
 
     Raises:
-        ModelFileError: It is not, or its plant's source has changed.
+        ModelFileError: It is not.
     """
     if (header.state_names, header.input_names, header.output_names) != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
         raise ModelFileError(
             f"{header.file}: a model of another process than COLDLOOP_PROCESS names; name the same for both"
         )
-    if header.plant != PYTHON:
-        return
-    source, name = _source(header)
-    if not source.is_file() or source_digest(source, name) != header.parameters_digest:
-        raise ModelFileError(
-            f"{header.file}: made from another {source} than is there; make it again, `coldloop process`"
-        )
-
-
-def _source(header: ModelHeader) -> tuple[Path, str]:
-    return header.file.parent / header.plant_parameters["file"], header.plant_parameters["class"]
 
 
 def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlant:
@@ -56,7 +44,8 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlan
         ModelFileError: The plant cannot be made.
     """
     if header.plant == PYTHON:
-        equations = load_equations(*_source(header))
+        parameters = header.plant_parameters
+        equations = equations_of(parameters["source"], parameters["class"], parameters["file"])
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
             return PythonPlant(equations, x0=header.x0, u0=header.u0, load=load, noise=noise_of_seed(seed))

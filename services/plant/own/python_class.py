@@ -1,10 +1,10 @@
-"""A plant that a user has written in Python: a class with its equations, in a file beside the process file."""
+"""A plant that a user has written in Python: a class with its equations. Its source is in the model file."""
 
-import hashlib
-import importlib.util
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, Protocol
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from coldloop.errors import ModelFileError
 from coldloop.process.signals import TICK_S
 from plant.numeric import RealArray
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+
+NAME: Final = r"[A-Za-z][A-Za-z0-9_]{0,31}"
+"""Of a signal or a state."""
 
 
 class Equations(Protocol):
@@ -31,32 +34,52 @@ class Equations(Protocol):
         """Return y."""
 
 
-def load_equations(file: Path, name: str) -> Equations:
-    """Return an instance of the class of a file.
+def equations_of(source: str, name: str, where: str) -> Equations:
+    """Return an instance of a class of a Python source; `where` names it in messages.
 
     Raises:
-        ModelFileError: The file is not there or does not run, or the class lacks something.
+        ModelFileError: The source does not run, or the class lacks something: one line.
     """
-    spec = importlib.util.spec_from_file_location(f"coldloop_plant_{file.stem}", file)
-    if spec is None or spec.loader is None or not file.is_file():
-        raise ModelFileError(f"{file}: no such Python file; it is looked for beside the process file")
-    module = importlib.util.module_from_spec(spec)
+    module = ModuleType(f"coldloop_plant_{name}")
+    sys.modules[module.__name__] = module  # dataclasses look there
     try:
-        spec.loader.exec_module(module)
+        exec(compile(source, where, "exec"), vars(module))  # noqa: S102 it is what the user has written
         made: Any = getattr(module, name)()
+        made.steps_per_tick = int(getattr(made, "steps_per_tick", 1))
+        states, guess = dict(made.states), np.array(made.guess, dtype=np.float64)
     except Exception as error:
-        raise ModelFileError(f"{file}: {name} cannot be made: {type(error).__name__}: {error}") from error
-    for needed in ("states", "guess", "derivatives", "outputs"):
-        if not hasattr(made, needed):
-            raise ModelFileError(f"{file}: {name} has no {needed}; docs/your-plant.md says what it needs")
-    made.steps_per_tick = int(getattr(made, "steps_per_tick", 1))
+        raise ModelFileError(f"{where}: {name} cannot be made: {_said(error)}") from error
+    for needed in ("derivatives", "outputs"):
+        if not callable(getattr(made, needed, None)):
+            raise ModelFileError(f"{where}: {name} has no {needed}(x, u, w); docs/your-plant.md says what it needs")
+    if not isinstance(made.states, Mapping) or not all(re.fullmatch(NAME, str(each)) for each in states):
+        raise ModelFileError(f'{where}: states of {name} are a dict of names and units, such as {{"T": "K"}}')
+    if guess.shape != (len(states),):
+        raise ModelFileError(f"{where}: guess of {name} has {guess.size} numbers, there are {len(states)} states")
+    if made.steps_per_tick < 1:
+        raise ModelFileError(f"{where}: steps_per_tick of {name} is {made.steps_per_tick}; it is 1 or more")
     found: Equations = made
     return found
 
 
-def source_digest(file: Path, name: str) -> str:
-    """Return the SHA-256 of a plant's source, in hexadecimal."""
-    return hashlib.sha256(name.encode() + b"\n" + file.read_bytes()).hexdigest()
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}".replace("\n", " ")
+
+
+def evaluated(function: Callable[..., Any], *at: Any, size: int, where: str) -> RealArray:  # noqa: ANN401
+    """Return what derivatives() or outputs() give at a point, shape (size,).
+
+    Raises:
+        ModelFileError: It fails there, or returns something else: one line.
+    """
+    name = getattr(function, "__name__", "it")
+    try:
+        found = np.asarray(function(*at), dtype=np.float64)
+    except Exception as error:
+        raise ModelFileError(f"{where}: {name}() fails: {_said(error)}") from error
+    if found.shape != (size,):
+        raise ModelFileError(f"{where}: {name}() returns {found.size} numbers, not {size}")
+    return found
 
 
 def runge_kutta(equations: Equations, x: RealArray, u: RealArray, w: float, tick_s: float) -> RealArray:

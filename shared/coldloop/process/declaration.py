@@ -101,7 +101,7 @@ class Load:
     """What descriptions call it."""
 
 
-NO_LOAD: Final = Load(name="none", unit="", span=(0.0, 1.0), walk=1e-6)
+NO_LOAD: Final = Load(name="no load", unit="", span=(0.0, 1.0), walk=1e-6)
 """The load of a process that has none."""
 
 
@@ -124,6 +124,8 @@ class Process:
     load: Load
     decision_instants: tuple[int, ...]
     constraint_instants: tuple[int, ...]
+    constants: tuple[str, ...]
+    """Outputs whose constant error is told from states, load and the other constants: estimated by default."""
     iterations: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     """See `share`; what is not named is 1."""
 

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import struct
 from bisect import bisect_right
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,8 @@ from coldloop.errors import LoadFileError
 from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.signals import LAST_TICK, TICK_S
 
-LOAD_SPAN: Final = PROCESS.load.span
-"""Lowest and highest load."""
+LOAD_SPAN: Final[tuple[float, float]] = struct.unpack("2f", struct.pack("2f", *PROCESS.load.span))
+"""Lowest and highest load, as registers have them."""
 COLUMNS: Final = ("time_s", "load_w")
 
 

@@ -8,6 +8,9 @@ from coldloop.process.loaded import PROCESS
 TICK_S: Final = PROCESS.tick_s
 """Length of a tick, the basic period tau_1 of the paper, in seconds of plant time."""
 
+STRETCH: Final = TICK_S / COLD_BOX.tick_s
+"""How much longer a tick is than the cold box's: as much longer are the defaults of times in the process."""
+
 TICK_UNIT: Final = f"{TICK_S:g} s"
 
 TICKS_PER_SAMPLE: Final = PROCESS.ticks_per_sample

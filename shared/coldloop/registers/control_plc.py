@@ -3,7 +3,6 @@
 from enum import IntEnum
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Self
 
-from coldloop.process.load_profile import LOAD_SPAN
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import (
     INPUT_NAMES,
@@ -189,7 +188,7 @@ class Update(NamedTuple):
     ]
     load: Annotated[
         float,
-        f32(f"{NOUN} {PROCESS.load.name}", unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1]),
+        f32(f"{NOUN} {PROCESS.load.name}", unit=PROCESS.load.unit, low=PROCESS.load.span[0], high=PROCESS.load.span[1]),
     ]
     u_before: Annotated[
         tuple[float, ...],

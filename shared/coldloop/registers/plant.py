@@ -5,7 +5,6 @@ from enum import IntEnum, IntFlag
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Self
 
-from coldloop.process.load_profile import LOAD_SPAN
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import (
     INPUT_NAMES,
@@ -183,7 +182,7 @@ class LoadStep(NamedTuple):
     """One step of the load table, held until the next one."""
 
     tick: Annotated[int, u32("First tick of the step", unit=TICK_UNIT, high=LAST_TICK)]
-    watts: Annotated[float, f32(NOUN, unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])]
+    watts: Annotated[float, f32(NOUN, unit=PROCESS.load.unit, low=PROCESS.load.span[0], high=PROCESS.load.span[1])]
 
 
 class LoadStatus(NamedTuple):
@@ -201,7 +200,9 @@ class LiveLoad(NamedTuple):
     """Changes the heat load of the session under way; what was known of later ticks is dropped."""
 
     tick: Annotated[int, u32("First tick, in the future; 0 is the next tick", unit=TICK_UNIT, high=LAST_TICK)] = 0
-    watts: Annotated[float, f32(NOUN, unit=PROCESS.load.unit, low=LOAD_SPAN[0], high=LOAD_SPAN[1])] = 0.0
+    watts: Annotated[float, f32(NOUN, unit=PROCESS.load.unit, low=PROCESS.load.span[0], high=PROCESS.load.span[1])] = (
+        0.0
+    )
     crc: Annotated[int, u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
 
