@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from coldloop.process.signals import LAST_NUMBER, LAST_TICK
+from coldloop.process.signals import INPUT_NAMES, LAST_NUMBER, LAST_TICK
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Operator, SequenceHeader, SequenceRow
@@ -25,7 +25,7 @@ log = logging.getLogger("coldloop.control_plc")
 
 OWNER: Final = "control_plc/5"
 """Who retained states belong to, and the version of what they hold."""
-ROW: Final = struct.Struct(">3f")
+ROW: Final = struct.Struct(f">{len(INPUT_NAMES)}f")
 OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing")
 """What is retained of a session."""
 
