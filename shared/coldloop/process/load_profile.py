@@ -13,6 +13,9 @@ from coldloop.process.signals import LAST_TICK, TICK_S
 
 LOAD_SPAN: Final = PROCESS.load.span
 """Lowest and highest load."""
+LOAD_UNIT: Final = PROCESS.load.unit
+LOAD_WORD: Final = PROCESS.load.noun.lower() if IS_COLD_BOX else PROCESS.load.name
+"""What operators call the load."""
 COLUMNS: Final = ("time_s", "load_w")
 
 
