@@ -20,6 +20,7 @@ from coldloop.registers.plant import UNUSED
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.service.event_text import alarm_word
 from rig.cli.commands.options import HostPort
+from rig.cli.grafana_board import board
 
 Places = Mapping[str, HostPort]
 """Where each service is."""
@@ -217,4 +218,5 @@ EXPORTS: Final[Mapping[str, Callable[[Sequence[RegisterMap], Places], str]]] = {
     "node-red": as_node_red,
     "fuxa": as_fuxa,
     "ignition": as_ignition,
+    "grafana": lambda _maps, _places: board(),  # of metrics, which have the names of the registers
 }

@@ -92,8 +92,9 @@ def line(status: RigStatus) -> str:
     """Return the state as one line."""
     y = status.process.y
     outputs = "  ".join(f"{OUTPUT_NAMES[i]} {y[i]:6.2f} {OUTPUT_UNITS[i]}" for i in CONTROLLED)
+    load = f"{status.load.watts:6.1f} {LOAD_UNIT}"
     return (
-        f"{status.plant.tick * TICK_S:10.2f} s  {word_of(Mode, status.ladder.mode):9}  {status.load.watts:6.1f} {LOAD_UNIT}  "
+        f"{status.plant.tick * TICK_S:10.2f} s  {word_of(Mode, status.ladder.mode):9}  {load}  "
         f"{outputs}  tau_u {_tau_u(status):>6}  "
         f"{'; '.join(status.alarms) or 'no alarms'}"
     )

@@ -123,7 +123,8 @@ class Reading:
         Raises:
             HTTPBadRequest: They are not numbers, or there is no such signal.
         """
-        names = list(dict.fromkeys(name for name in query.get("names", "").split(",") if name)) or [*BANDED_OUTPUTS, "load"]
+        asked = [name for name in query.get("names", "").split(",") if name]
+        names = list(dict.fromkeys(asked or (*BANDED_OUTPUTS, "load")))
         unknown = [name for name in names if name not in NAMES]
         if unknown:
             raise web.HTTPBadRequest(reason=f"unknown trend {printable(unknown[0])}")

@@ -312,7 +312,8 @@ def _treated(
         row = rows[kinds[0]]
         until = f" until {clock_text(row.shelved_until * TICK_S)}" if row.state == AlarmState.SHELVED else ""
         over = action is AlarmAction.ACKNOWLEDGE and row.state == AlarmState.NORMAL
-        text = f"alarm {alarm_word(kinds[0])}: {'acknowledged, now ' if over else ''}{word(AlarmState(row.state))}{until}"
+        state = word(AlarmState(row.state))
+        text = f"alarm {alarm_word(kinds[0])}: {'acknowledged, now ' if over else ''}{state}{until}"
     elif len(kinds) <= MOST_NAMES:
         states = "; ".join(f"now {word(state)}: {_names(each)}" for state, each in _by_state(rows, done))
         text = f"acknowledged; {states}" if action is AlarmAction.ACKNOWLEDGE else states

@@ -51,8 +51,7 @@ COLD_BOX: Final = Process(
         *(State(name=f"T_nef2_{i}", unit="K") for i in range(1, 7)),
         *(State(name=f"T_nef34_{i}", unit="K") for i in range(1, 13)),
     ),
-    load=Load(name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load",
-              bar=(200.0, 600.0)),  # fmt: skip
+    load=Load(name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load", bar=(200.0, 600.0)),
     decision_instants=(1, 2, 4, 8, 16, 50, 100),
     constraint_instants=(1, 2, 3, 4, 6, 8, 16, 24, 32, 48, 60, 72, 84, 100),
 )

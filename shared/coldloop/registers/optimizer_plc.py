@@ -204,7 +204,10 @@ def outputs_of(prediction: Prediction) -> tuple[tuple[float, ...], ...]:
 class ModelDeviation(NamedTuple):
     """By how much the plant differs from its model, as the filter estimates it; also 0 where nothing is estimated."""
 
-    load: Annotated[float, f32(f"{LOAD_WORD.capitalize()} beyond what is measured or, unmeasured, usual", unit=LOAD_UNIT, finite=False)] = 0.0
+    load: Annotated[
+        float,
+        f32(f"{LOAD_WORD.capitalize()} beyond what is measured or, unmeasured, usual", unit=LOAD_UNIT, finite=False),
+    ] = 0.0
     u: Annotated[
         tuple[float, ...], f32_array("Acts like so much more of the input", INPUT_NAMES, INPUT_UNITS, finite=False)
     ] = (0.0,) * len(INPUT_NAMES)
