@@ -3,7 +3,7 @@
 import math
 from typing import Any, Final
 
-from coldloop.process.declaration import Input, Output, Range
+from coldloop.process.declaration import NO_LOAD, Input, Output, Range
 from coldloop.process.load_profile import LOAD_UNIT, LOAD_WORD
 from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.signals import SAMPLING_PERIOD_S
@@ -17,8 +17,9 @@ READABLE: Final = 1e-3
 
 
 def process_document() -> dict[str, Any]:
-    """Return the process as the page is told: bars of signals with their ends, words and unit of the load."""
-    low, high = PROCESS.load.span
+    """Return the process as the page is told: bars of signals with their ends, words and unit of the load, if any."""
+    span = PROCESS.load.span
+    load = {"word": LOAD_WORD, "unit": LOAD_UNIT, "span": span, "bar": PROCESS.load.bar or span}
     return {
         "name": PROCESS.name,
         "drawn": IS_COLD_BOX,  # there is a drawing of it, which shows the outputs that have no band
@@ -30,7 +31,7 @@ def process_document() -> dict[str, Any]:
         ],
         "controlled": [_output(one) for one in PROCESS.banded],
         "measured": [_output(one) for one in PROCESS.outputs if one.band is None and not IS_COLD_BOX],
-        "load": {"word": LOAD_WORD, "unit": LOAD_UNIT, "span": [low, high], "bar": PROCESS.load.bar or (low, high)},
+        "load": None if PROCESS.load == NO_LOAD else load,
     }  # fmt: skip
 
 

@@ -115,7 +115,7 @@ def test_the_page_has_the_signals_of_the_process_and_nothing_of_a_cold_box(page:
     ends = page.locator("#overview .bar .ends").all_inner_texts()
     # a band of 12 to 12.6 and 1.5 of it on each side; 0 V to 10 V and an eighth of it; what the load may be
     assert [text.split() for text in ends] == [
-        ["11.1", "13.5"], ["11.6", "14"], ["-1.25", "11.3"], ["-1.25", "11.3"], ["-5", "5"]
+        ["11.1", "13.5"], ["11.6", "14"], ["-1.25", "11.3"], ["-1.25", "11.3"], ["-2", "2"]
     ]  # fmt: skip
     for name, level in zip(("h1", "h2"), tank.levels, strict=True):
         assert reading(page, name) == pytest.approx(level, abs=0.02)
@@ -157,15 +157,15 @@ def test_an_operator_drives_a_level_out_of_its_band_and_mpc_brings_it_back(page:
 
 def test_a_load_has_its_own_name_and_unit(page: "Page", tank: Tank) -> None:
     view(page, "commands")
-    page.fill("#load-number", "2.5")
+    page.fill("#load-number", "1.5")
     page.click("#load-set")
     eventually(lambda: page.is_visible("#confirm"), "the page asks to confirm")
-    assert "Change the leak to 2.5 cm3/s from the next tick on" in page.inner_text("#confirm")
-    assert "load 2.5 cm3/s now (was 0 cm3/s)" in confirm(page)
-    assert tank.load == 2.5
-    assert tank.coldloop("set", "load", "0").out == "load 0 cm3/s now (was 2.5 cm3/s)\n"
+    assert "Change the leak to 1.5 cm3/s from the next tick on" in page.inner_text("#confirm")
+    assert "load 1.5 cm3/s now (was 0 cm3/s)" in confirm(page)
+    assert tank.load == 1.5
+    assert tank.coldloop("set", "load", "0").out == "load 0 cm3/s now (was 1.5 cm3/s)\n"
     assert tank.load == 0.0
-    assert "live load: from one tick on, 2.5 cm3/s" in tank.coldloop("events", "--service", "plant").out
+    assert "live load: from one tick on, 1.5 cm3/s" in tank.coldloop("events", "--service", "plant").out
 
 
 def test_a_frozen_level_is_found_among_two_and_crossed_out(page: "Page", tank: Tank) -> None:

@@ -149,20 +149,28 @@ function login() {
   byId("login-user").focus();
 }
 
-export function initCommands(userChanged) {
-  onUser = userChanged;
-  faceplates();
-  for (const one of document.querySelectorAll("[data-command]")) one.addEventListener("click", () => command(JSON.parse(one.dataset.command)));
-  const slider = byId("load-slider"), number = byId("load-number"), { word, unit, span, bar } = state.catalog.process.load;
+function loadPanel() {
+  const { load } = state.catalog.process, slider = byId("load-slider"), number = byId("load-number");
+  byId("load-panel").hidden = !load;
+  if (!load) return;
+  const { word, unit, span, bar } = load;
   byId("load-word").textContent = `${word[0].toUpperCase()}${word.slice(1)}`;
   byId("load-unit").textContent = unit;
   Object.assign(slider, { min: bar[0], max: bar[1], step: (bar[1] - bar[0]) / 400 });
   Object.assign(number, { min: span[0], max: span[1], ariaLabel: `New load in ${unit}` });
   slider.addEventListener("input", () => { number.value = slider.value; });
   number.addEventListener("input", () => { slider.value = number.value; });
-  const followLoad = follow(number, "plant.load status.watts", [slider]), followFactor = follow(byId("factor"), "plant.pace.factor");
+  const followLoad = follow(number, "plant.load status.watts", [slider]);
   byId("load-set").addEventListener("click", () => numberIn(number, (watts) => command({ kind: "load", watts }).then(() => followLoad(watts))));
   byId("load-play").addEventListener("click", playFile);
+}
+
+export function initCommands(userChanged) {
+  onUser = userChanged;
+  faceplates();
+  for (const one of document.querySelectorAll("[data-command]")) one.addEventListener("click", () => command(JSON.parse(one.dataset.command)));
+  loadPanel();
+  const followFactor = follow(byId("factor"), "plant.pace.factor");
   byId("factor-set").addEventListener("click", () => numberIn(byId("factor"), (factor) => command({ kind: "factor", factor }).then(() => followFactor(factor))));
   byId("training").hidden = !state.catalog.training;
   for (const output of state.catalog.outputs) byId("fault-output").append(element("option", { text: output }));

@@ -54,12 +54,13 @@ function bars() {
   byId("measured").after(...measured.map(measuredBar));
   byId("measured").hidden = !measured.length;
   byId("inputs").after(...inputs.map((one) => inputBar(one, one.label)));
-  byId("load").after(loadBar(load));
+  byId("load").hidden = !load;
+  if (load) byId("load").after(loadBar(load));
 }
 
 function overview() {
-  const { unit } = state.catalog.process.load, { decimals } = signal("plant.load status.watts");
-  const loadText = (value, digits = decimals) => `${value.toFixed(Math.max(0, digits))} ${unit}`;
+  const { load } = state.catalog.process, { decimals } = signal("plant.load status.watts");
+  const loadText = (value, digits = decimals) => `${value.toFixed(Math.max(0, digits))} ${load.unit}`;
   const tau = byId("tau-u"), facts = byId("load-facts");
   onChange(({ update, names }) => {
     if (update || names === null) {
@@ -72,11 +73,11 @@ function overview() {
     const note = byId("tau-u-note"), inUse = !state.stale.includes("update");
     note.hidden = inUse;
     if (!inUse) note.textContent = "Of the last update: MPC is not active now.";
-    const rows = [["expected next", state.replay ? "–" : upcoming ? `${loadText(values["plant.load status.next_watts"])} in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
-      ["estimated mismatch", state.update ? loadText(state.update.update.load_mismatch) : "–", "optimizer_plc.", "update"],
-      ["plant against model", state.deviation || "–", "optimizer_plc."]];
+    const ofLoad = () => [["expected next", state.replay ? "–" : upcoming ? `${loadText(values["plant.load status.next_watts"])} in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
+      ["estimated mismatch", state.update ? loadText(state.update.update.load_mismatch) : "–", "optimizer_plc.", "update"]];
+    const rows = [...(load ? ofLoad() : []), ["plant against model", state.deviation || "–", "optimizer_plc."]];
     const shortage = values["control_plc.plan.shortage"];
-    if (shortage) rows.unshift(["load", `${loadText(Math.abs(shortage), decimals - 1)} ${shortage > 0 ? "more than can be held" : "less than is needed"}`, "control_plc.", "update"]);
+    if (load && shortage) rows.unshift(["load", `${loadText(Math.abs(shortage), decimals - 1)} ${shortage > 0 ? "more than can be held" : "less than is needed"}`, "control_plc.", "update"]);
     const text = JSON.stringify(rows);
     if (facts.dataset.text !== text) { facts.dataset.text = text; facts.replaceChildren(...rows.flatMap(([name, value, ...sources]) => [element("dt", { text: name }), element("dd", { class: "value", text: value, "data-sources": sources.join(" ") })])); }
     for (const one of facts.querySelectorAll("dd")) one.classList.toggle("stale", one.dataset.sources.split(" ").some(isStale));

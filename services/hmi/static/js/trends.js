@@ -18,13 +18,15 @@ function inputChart(unit) {
   return { id: names[0], title: titled(names, unit), lines: names.map((name, i) => line(name, COLOURS[i % 3], { stepped: true })), bounds: isShared ? names[0] : null, spread: (bar[1] - bar[0]) / 25, ahead: names, isInputs: true };
 }
 function loadChart() {
-  const { inputs, load } = state.catalog.process, names = inputs.filter((one) => one.unit === load.unit).map((one) => one.name);
-  return { id: "load", title: titled(["load", ...names], load.unit), lines: [line("load", "trend-3", { stepped: true }), ...names.map((name, i) => line(name, COLOURS[i % 2], { stepped: true }))], spread: (load.bar[1] - load.bar[0]) / 20 };
+  const { inputs, load } = state.catalog.process;
+  if (!load) return [];
+  const names = inputs.filter((one) => one.unit === load.unit).map((one) => one.name);
+  return [{ id: "load", title: titled(["load", ...names], load.unit), lines: [line("load", "trend-3", { stepped: true }), ...names.map((name, i) => line(name, COLOURS[i % 2], { stepped: true }))], spread: (load.bar[1] - load.bar[0]) / 20 }];
 }
 function ofProcess() {
   const { controlled, inputs, load } = state.catalog.process;
-  const units = [...new Set(inputs.map((one) => one.unit))].filter((unit) => unit !== load.unit);
-  return [...controlled.map(controlledChart), ...units.map(inputChart), loadChart()];
+  const units = [...new Set(inputs.map((one) => one.unit))].filter((unit) => !load || unit !== load.unit);
+  return [...controlled.map(controlledChart), ...units.map(inputChart), ...loadChart()];
 }
 // Of a whole refrigerator the pressures too, between the inputs and the updating period.
 const PRESSURES = [["P12", "HP bar"], ["P11", "LP bar"]].map(([name, title]) => ({ id: name, title, lines: [{ label: name, stroke: "trend", from: "series" }], station: name, spread: name === "P12" ? 0.4 : 0.04 }));
@@ -145,7 +147,7 @@ export function recolourTrends() { if (charts) { charts.forEach((one) => one.cha
 function stripCharts() {
   const { controlled, load } = state.catalog.process;
   return [...controlled.map((one) => ({ title: `${one.name} ${one.unit} and its band`, lines: [{ label: one.name, stroke: "trend" }], band: one.name, spread: leastSpread(one.bar) })),
-    { ...loadChart(), title: `load ${load.unit}`, lines: [{ label: "load", stroke: "trend", stepped: true }] },
+    ...loadChart().map((one) => ({ ...one, title: `load ${load.unit}`, lines: [{ label: "load", stroke: "trend", stepped: true }] })),
     { title: "τu s", lines: [{ label: "tau_u", stroke: "trend", stepped: true }], spread: 1, updates: true }];
 }
 let strips = null, stripsNow = 0;
