@@ -16,8 +16,11 @@ from typing import Any, Final, NamedTuple
 from coldloop.modbus.requests import MAX_READ_WORDS
 from coldloop.registers.control_plc import Operator
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap, fields_of
+from coldloop.registers.plant import UNUSED
 from coldloop.registers.safety import Alarm, AlarmKind
+from coldloop.service.event_text import alarm_word
 from rig.cli.commands.options import HostPort
+from rig.cli.grafana_board import board
 
 Places = Mapping[str, HostPort]
 """Where each service is."""
@@ -37,11 +40,11 @@ class Tag(NamedTuple):
 def exported(register_map: RegisterMap) -> Iterator[Tag]:
     """Yield the tags of a service, in the order of their addresses."""
     for block in register_map.blocks:
-        if block.writer is not None and block.record is not Operator:
+        if block.record in UNUSED or (block.writer is not None and block.record is not Operator):
             continue
         if block.record is Alarm:
             for kind in AlarmKind:
-                yield from _tags(block, int(kind), f"{block.name}_{kind.name.lower()}")
+                yield from _tags(block, int(kind), f"{block.name}_{alarm_word(kind)}")
         elif block.rows == 1:
             yield from _tags(block, 0, block.name)
 
@@ -215,4 +218,5 @@ EXPORTS: Final[Mapping[str, Callable[[Sequence[RegisterMap], Places], str]]] = {
     "node-red": as_node_red,
     "fuxa": as_fuxa,
     "ignition": as_ignition,
+    "grafana": lambda _maps, _places: board(),  # of metrics, which have the names of the registers
 }

@@ -4,13 +4,14 @@ from typing import Final, NamedTuple
 
 from coldloop.operating.execution import Clients
 from coldloop.operating.rings import last_update
-from coldloop.process.signals import L1, T5, TICK_S
+from coldloop.process.load_profile import LOAD_UNIT
+from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, Process
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import LoadStatus
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
-from coldloop.service.event_text import alarm_cause, word, word_of
+from coldloop.service.event_text import alarm_cause, alarm_word, word_of
 
 QUIET: Final = (AlarmState.NORMAL, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)
 
@@ -54,7 +55,7 @@ async def read_status(clients: Clients) -> RigStatus:
 def _alarm(kind: AlarmKind, row: Alarm) -> str:
     cause = alarm_cause(kind, row.cause)
     state = word_of(AlarmState, row.state)
-    return f"{word(kind)}{f' ({cause})' if cause else ''}, {state}"
+    return f"{alarm_word(kind)}{f' ({cause})' if cause else ''}, {state}"
 
 
 def _pace(status: RigStatus) -> str:
@@ -74,14 +75,13 @@ def page(status: RigStatus) -> str:
     """Return the state as a page."""
     ladder, load, y = status.ladder, status.load, status.process.y
     known = any(y)  # a control PLC that was started again shows nothing before its first scan
-    following = f", {load.next_watts:g} W from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
+    following = f", {load.next_watts:g} {LOAD_UNIT} from {load.next_tick * TICK_S:g} s" if load.upcoming else ""
     rows = [
         ("session", f"{status.plant.session}, {_pace(status)}, {status.plant.tick * TICK_S:.2f} s"),
         ("mode", f"{word_of(Mode, ladder.mode)} ({word_of(Cause, ladder.cause)}) since {ladder.since * TICK_S:g} s"),
         ("operator", word_of(OperatorMode, status.operator.mode)),
-        ("load", f"{load.watts:g} W{following}"),
-        ("L1", f"{y[L1]:.3f} %" if known else "-"),
-        ("T5", f"{y[T5]:.3f} K" if known else "-"),
+        ("load", f"{load.watts:g} {LOAD_UNIT}{following}"),
+        *((OUTPUT_NAMES[i], f"{y[i]:.3f} {OUTPUT_UNITS[i]}" if known else "-") for i in CONTROLLED),
         ("tau_u", _tau_u(status)),
         ("alarms", "; ".join(status.alarms) or "none"),
     ]  # fmt: skip
@@ -91,8 +91,10 @@ def page(status: RigStatus) -> str:
 def line(status: RigStatus) -> str:
     """Return the state as one line."""
     y = status.process.y
+    outputs = "  ".join(f"{OUTPUT_NAMES[i]} {y[i]:6.2f} {OUTPUT_UNITS[i]}" for i in CONTROLLED)
+    load = f"{status.load.watts:6.1f} {LOAD_UNIT}"
     return (
-        f"{status.plant.tick * TICK_S:10.2f} s  {word_of(Mode, status.ladder.mode):9}  {status.load.watts:6.1f} W  "
-        f"L1 {y[L1]:6.2f} %  T5 {y[T5]:6.2f} K  tau_u {_tau_u(status):>6}  "
+        f"{status.plant.tick * TICK_S:10.2f} s  {word_of(Mode, status.ladder.mode):9}  {load}  "
+        f"{outputs}  tau_u {_tau_u(status):>6}  "
         f"{'; '.join(status.alarms) or 'no alarms'}"
     )

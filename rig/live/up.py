@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.process.loaded import FILE as PROCESS_FILE
+from coldloop.process.loaded import PROCESS
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
+from coldloop.registers.plant import PLANT_MAP, Measurement
 from rig.cosim.kept_up import keep_up, say
 from rig.cosim.local_services import KeptService, LocalServices
 from rig.cosim.session_client import SessionClient
@@ -168,7 +171,12 @@ async def _keep_page(page: PageProcess) -> None:
 
 def addresses(settings: Settings, ports: Sequence[int], folder: Path, services: Sequence[str]) -> str:
     """Return where everything is, with a line to paste."""
-    base = "" if tuple(ports) == DEFAULT_PORTS else f" --port-base {ports[0]}"
+    base = "" if PROCESS_FILE is None else f" --process {PROCESS_FILE}"
+    base += "" if tuple(ports) == DEFAULT_PORTS else f" --port-base {ports[0]}"
+    shown = PROCESS.banded[-1]
+    measured = PLANT_MAP.block_of(Measurement).registers()
+    address = next(one.address for one in measured if one.name == f"y.{shown.name}")
+    load = 420 if PROCESS_FILE is None else PROCESS.load.span[1]
     tls = any(getattr(settings, service).server.tls for service in services)
     places = {
         service: f"127.0.0.1:{port}" if service in services else "yours: a client of the control PLC"
@@ -183,11 +191,11 @@ def addresses(settings: Settings, ports: Sequence[int], folder: Path, services: 
         lines += ["Modbus/TCP Security: clients show a certificate; `coldloop certificates` has made some"]
     else:
         lines += [
-            "read T5 (K):",
-            f"  mbpoll -0 -1 -m tcp -p {ports[0]} -t 4:float -B -r 216 -c 1 127.0.0.1",
+            f"read {shown.name} ({shown.unit}):",
+            f"  mbpoll -0 -1 -m tcp -p {ports[0]} -t 4:float -B -r {address} -c 1 127.0.0.1",
         ]
     lines += [
         f"coldloop status{base} --follow    its status",
-        f"coldloop set{base} load 420       and load FILE.csv, mode, setpoint, factor, pause, resume, acknowledge",
+        f"coldloop set{base} load {load:<10g}and load FILE.csv, mode, setpoint, factor, pause, resume, acknowledge",
     ]
     return "\n".join(lines) + "\n"

@@ -6,13 +6,13 @@ from typing import Final
 from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import EventKind
 from coldloop.registers.safety import Alarm, AlarmKind, AlarmState
-from coldloop.service.event_text import alarm_cause, kind_word, word
+from coldloop.service.event_text import alarm_cause, alarm_word, kind_word
 from control_plc.alarm_settings import AlarmSettings
 from control_plc.alarms import TRANSITIONS
 from hmi.process_image import JournalEntry
 
 _KINDS: Final = {kind_word(event): event for events in TRANSITIONS.values() for event in events}
-_ALARMS: Final = {word(kind): kind for kind in AlarmKind}
+_ALARMS: Final = {alarm_word(kind): kind for kind in AlarmKind}
 _CAUSES: Final = {kind: {alarm_cause(kind, cause): cause for cause in range(64)} for kind in AlarmKind}
 
 

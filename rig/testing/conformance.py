@@ -50,7 +50,7 @@ def requirements(method: OutsideMethod, problems: list[QuadraticProblem]) -> lis
         failed[shape] += not (np.shape(first) == kept.shape and np.isfinite(first).all())
         failed[zero] += not np.array_equal(method.solve(problem, kept.copy(), 0)[0], kept)
         failed[same] += not np.array_equal(first, again)
-        intact = all(np.array_equal(part, old) for part, old in zip(problem, before, strict=True))
+        intact = all(np.array_equal(np.asarray(now), old) for now, old in zip(problem, before, strict=True))
         failed[left] += not (intact and np.array_equal(guess, kept))
         failed[count] += not 0 <= done <= LONGEST
     return [Requirement(text, failures) for text, failures in failed.items()]

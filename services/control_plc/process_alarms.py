@@ -59,7 +59,8 @@ class ProcessAlarms:
         report = self._panel.report
         outside = [not low <= y[output] <= high for output, (low, high) in zip(CONTROLLED, self._bands, strict=True)]
         report(AlarmKind.LEVEL_BAND, condition=outside[0])
-        report(AlarmKind.T5_BAND, condition=any(outside[1:]))
+        further = [place for place, is_outside in enumerate(outside[1:]) if is_outside]
+        report(AlarmKind.T5_BAND, condition=bool(further), cause=further[0] if further else 0)
         mode, cause = ladder.mode, ladder.cause
         fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR)
         report(AlarmKind.MODE, condition=fallen, cause=cause)

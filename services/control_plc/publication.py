@@ -10,7 +10,7 @@ from coldloop.registers.common import Identity, ServiceState
 from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, PlantLinkStatus, Process, Status
 from coldloop.registers.safety import AlarmKind, AlarmState
 from coldloop.safety.writer_lease import WriterLease
-from coldloop.service.event_text import log_event
+from coldloop.service.event_text import alarm_word, log_event
 from coldloop.service.journal import JournalPublication
 from coldloop.session.clock import LatenessRecord
 from control_plc.plant_link import PlantLink
@@ -149,7 +149,7 @@ class ControlPublication:
         """Return what telemetry publishes."""
         status, process = self._bank.get(Status), self._bank.get(Process)
         alarms = {
-            kind.name.lower(): AlarmState(alarm.state).name.lower()
+            alarm_word(kind).replace(" ", "_"): AlarmState(alarm.state).name.lower()
             for kind, alarm in zip(AlarmKind, self._program.alarms.rows, strict=True)
             if alarm.state != AlarmState.NORMAL
         }

@@ -17,6 +17,8 @@ from control_plc.numbers import Numbers
 Range = tuple[FiniteFloat, FiniteFloat]
 FIRST_OF_KIND, P1 = (T1, OUTPUT_NAMES.index("P1")) if IS_COLD_BOX else (0, 0)
 """First of the pressures, which are the last outputs; the temperatures are before them. Other outputs have one kind."""
+FEW = int(not IS_COLD_BOX)
+"""1: most of the others are counted without the output itself, which matters where there are few."""
 MOVES = 240
 """Ticks in which an output that is not controlled must have moved before it can be frozen."""
 FIRST_RESTS = [0 if output in CONTROLLED else -MOVES for output in range(len(OUTPUT_NAMES))]
@@ -89,9 +91,9 @@ def count_unchanged(
     longest such times of those that are not controlled, without the times for which they were frozen; below 0: the
     moves that are missing until they count.
     """
-    most = 2 * moved(before, y, 0, len(y)) > len(y)
+    most = 2 * moved(before, y, 0, len(y)) > len(y) - FEW
     temperatures, pressures = moved(before, y, FIRST_OF_KIND, P1), moved(before, y, P1, len(y))
-    most_of_each = (P1 == 0 or 2 * temperatures > P1 - FIRST_OF_KIND) and 2 * pressures > len(y) - P1
+    most_of_each = (P1 == 0 or 2 * temperatures > P1 - FIRST_OF_KIND) and 2 * pressures > len(y) - P1 - FEW
     for output in range(len(y)):
         if y[output] == before[output]:
             unchanged[output] += elapsed * (most if output in CONTROLLED else most_of_each)
@@ -115,6 +117,11 @@ def moved(before: Numbers, y: Numbers, first: int, end: int) -> int:
     for output in range(first, end):
         count += y[output] != before[output]
     return count
+
+
+def have_moved(inputs: Sequence[float], before: Sequence[float], moves: Sequence[float]) -> bool:
+    """Return whether an input has moved so far that something is to be seen of it."""
+    return any(abs(now - then) > move for now, then, move in zip(inputs, before, moves, strict=True))
 
 
 class ImageWatch:
@@ -145,8 +152,7 @@ class ImageWatch:
             return 0
         self._unchanged += elapsed
         if not self._moved:
-            pairs = zip(inputs, self._inputs, self._moves, strict=True)
-            self._moved = any(abs(now - before) > move for now, before, move in pairs)
+            self._moved = have_moved(inputs, self._inputs, self._moves)
         return self._unchanged if self._moved else 0
 
 
@@ -176,6 +182,10 @@ class SensorMonitor:
         self._now = 0
         self.unchanged = [0] * len(initial)
         self.rests = FIRST_RESTS.copy()
+        self._moves = moves
+        self._may_rest = settings.may_rest
+        self._inputs: list[Sequence[float]] = [()] * len(initial)
+        """Inputs when each output moved last."""
         self._image = ImageWatch(moves, may_rest=settings.may_rest)
         self._recovering: dict[int, int] = {}
         """Output, and since which tick its measurements have been good again."""
@@ -197,6 +207,8 @@ class SensorMonitor:
         self._tick = self._now = tick
         history = zip(self.unchanged, self.rests, self.least, strict=True)
         frozen: Collection[int] = [output for output, each in enumerate(history) if is_frozen(*each)]
+        if self._may_rest and not IS_COLD_BOX:
+            frozen = self._not_at_rest(frozen, inputs)
         if self._image.unchanged(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
             frozen = range(len(y))
         if not self.bad and not frozen and are_inside(y, self.low, self.high):
@@ -207,6 +219,13 @@ class SensorMonitor:
             if output not in self.bad:
                 self._good[output] = value
         return tuple(self._good)
+
+    def _not_at_rest(self, unchanged: Collection[int], inputs: Sequence[float]) -> Collection[int]:
+        """Return those of the outputs that should have moved with the inputs: the load alone may not reach each."""
+        for output, count in enumerate(self.unchanged):
+            if not count:
+                self._inputs[output] = inputs
+        return [output for output in unchanged if have_moved(inputs, self._inputs[output], self._moves)]
 
     def set_back(self, tick: int) -> None:
         """Set the time back to `tick`: conditions that hold now begin there."""

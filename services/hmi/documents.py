@@ -23,10 +23,11 @@ from coldloop.registers.optimizer_plc import (
     outputs_of,
 )
 from coldloop.registers.safety import Alarm, AlarmAction, AlarmKind, AlarmPriority, AlarmState
-from coldloop.service.event_text import alarm_cause, word
+from coldloop.service.event_text import alarm_cause, alarm_word, word
 from hmi.compression_station import plant_document
 from hmi.explanation import explain
 from hmi.process_image import JournalEntry, Model
+from hmi.process_view import process_document
 from hmi.sentences import deviation, sentence
 from hmi.signals import signals_of
 from hmi.trends import NAMES, Gap, mode_name, rounded, thin
@@ -91,6 +92,7 @@ def catalog(*, training: bool, replay: bool) -> Document:
             for signal in signals_of(service)
         },
         "trended": list(NAMES),
+        "process": process_document(),
         "inputs": list(INPUT_NAMES),
         "outputs": list(OUTPUT_NAMES),
         "modes": [mode_name(mode) for mode in Mode],
@@ -105,7 +107,7 @@ def alarm_document(kind: AlarmKind, alarm: Alarm) -> Document:
     known = alarm.state in AlarmState.__members__.values()
     return {
         "number": int(kind),
-        "name": word(kind),
+        "name": alarm_word(kind),
         "state": word(AlarmState(alarm.state)) if known else str(alarm.state),
         "active": bool(alarm.active),
         "cause": alarm_cause(kind, alarm.cause) if alarm.times else "",

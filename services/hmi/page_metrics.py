@@ -7,7 +7,7 @@ from prometheus_client.core import Metric
 from coldloop.registers.declaration import fields_of
 from coldloop.registers.maps import MAPS
 from coldloop.registers.optimizer_plc import Optimization
-from coldloop.service.event_text import word
+from coldloop.service.event_text import alarm_word
 from coldloop.service.metrics import block_families, build_family, gauge
 from hmi.process_image import Model
 
@@ -33,7 +33,7 @@ def page_families(model: Model, browsers: int) -> Iterator[Metric]:
 
 
 def _alarms(model: Model) -> Iterator[Metric]:
-    rows = [(word(kind), alarm) for kind, alarm in model.alarm_rows()]
+    rows = [(alarm_word(kind), alarm) for kind, alarm in model.alarm_rows()]
     for name, description, values in (
         ("coldloop_alarm_active", "1 while the condition of an alarm holds", [row.active for _, row in rows]),
         ("coldloop_alarm_state",

@@ -12,7 +12,8 @@ from typing import Final
 
 from aiohttp import BasicAuth, hdrs, web
 
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import INPUT_NAMES, TICK_S
+from coldloop.registers.optimizer_plc import BANDED_OUTPUTS
 from coldloop.service.metrics import exposition
 from coldloop.service.metrics_server import CONTENT_TYPE
 from hmi.broadcast import Broadcast
@@ -31,13 +32,13 @@ from hmi.long_reads import LongReads
 from hmi.page_metrics import page_families
 from hmi.process_image import JournalEntry, Model
 from hmi.settings import HmiSection
-from hmi.trends import NAMES
+from hmi.trends import NAMES, STATION_NAMES
 
 STATIC: Final = Path(__file__).parent / "static"
 POINTS: Final = 800
 MOST_POINTS: Final = 4000
-MOST_NAMES: Final = 16
-"""Signals of one trend."""
+MOST_NAMES: Final = 8 + 1 + len(INPUT_NAMES) + len(BANDED_OUTPUTS) + len(STATION_NAMES)
+"""Signals of one trend: what the page draws without being asked, and eight pens."""
 ROWS_AT_ONCE: Final = 500
 """Rows of a table that are made and sent at a time."""
 WINDOW_S: Final = 300.0
@@ -122,7 +123,8 @@ class Reading:
         Raises:
             HTTPBadRequest: They are not numbers, or there is no such signal.
         """
-        names = list(dict.fromkeys(name for name in query.get("names", "").split(",") if name)) or ["L1", "T5", "load"]
+        asked = [name for name in query.get("names", "").split(",") if name]
+        names = list(dict.fromkeys(asked or (*BANDED_OUTPUTS, "load")))
         unknown = [name for name in names if name not in NAMES]
         if unknown:
             raise web.HTTPBadRequest(reason=f"unknown trend {printable(unknown[0])}")

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ModelDeviation, UpdatingRuleStatus
@@ -13,7 +14,22 @@ AT_REST: Final = 1e-9
 """A Gamma that is smaller is rounding: the cost is at its floor."""
 
 NOTABLE: Final = {"W": 2.0, "%": 0.2, "Hz": 5.0, "K": 0.05, "bar": 0.005}
-"""A plant that differs from its model by less is not worth a word."""
+"""A cold box that differs from its model by less is not worth a word, ..."""
+NOTABLE_SHARE: Final = 0.01
+"""... nor another process by less than this share of the range of an input, ..."""
+NOTABLE_NOISE: Final = 5.0
+"""... or so many times the noise of an output."""
+
+
+def _notable() -> tuple[float, ...]:
+    """Return what is worth a word, by input and output."""
+    if IS_COLD_BOX:
+        return tuple(NOTABLE[unit] for unit in INPUT_UNITS + OUTPUT_UNITS)
+    inputs = (NOTABLE_SHARE * (one.high - one.low) for one in PROCESS.inputs)
+    return *inputs, *(NOTABLE_NOISE * one.noise for one in PROCESS.outputs)
+
+
+NOTABLE_DEVIATIONS: Final = _notable()
 MOST_DEVIATIONS: Final = 4
 SURPRISING: Final = 3.0
 """A reading that is so many times further from its prediction than the filter expects is worth a word."""
@@ -26,14 +42,18 @@ def deviation(found: ModelDeviation, suspects: int = 0) -> str:
     not what the filter takes it for; and those that are not used for that reason (bit i is output i).
     """
     parts = [
-        (value, unit, f"needs {abs(value):.3g} {unit} {'less' if value > 0 else 'more'} of {name}")
+        (value, f"needs {abs(value):.3g} {unit} {'less' if value > 0 else 'more'} of {name}")
         for name, unit, value in zip(INPUT_NAMES, INPUT_UNITS, found.u, strict=True)
     ]
     parts += [
-        (value, unit, f"{name} {value:+.3g} {unit}")
+        (value, f"{name} {value:+.3g} {unit}")
         for name, unit, value in zip(OUTPUT_NAMES, OUTPUT_UNITS, found.y, strict=True)
     ]
-    notable = [(abs(value) / NOTABLE[unit], text) for value, unit, text in parts if abs(value) >= NOTABLE[unit]]
+    notable = [
+        (abs(value) / least, text)
+        for (value, text), least in zip(parts, NOTABLE_DEVIATIONS, strict=True)
+        if abs(value) >= least
+    ]
     texts = [text for _, text in sorted(notable, reverse=True)[:MOST_DEVIATIONS]]
     surprise, name = max(zip(found.surprise, OUTPUT_NAMES, strict=True))
     if surprise >= SURPRISING:

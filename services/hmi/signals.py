@@ -7,9 +7,12 @@ import re
 from functools import cache
 from typing import Any, Final, NamedTuple
 
+from coldloop.process.loaded import IS_COLD_BOX
 from coldloop.registers.declaration import Block, Kind, RegisterMap, fields_of
 from coldloop.registers.maps import MAPS
+from coldloop.registers.plant import UNUSED
 from coldloop.registers.text import from_words
+from hmi.process_view import decimals_by_unit
 
 DECIMALS: Final = {
     "%": 2,
@@ -25,7 +28,7 @@ DECIMALS: Final = {
     "g/s": 2,
     "kg": 2,
     "kW": 1,
-}
+} | ({} if IS_COLD_BOX else decimals_by_unit())
 _WORD: Final = re.compile(r"(\d+) ([^,;:()]+?)(?: \([^)]*\))?(?=[,;:]|$)")
 
 
@@ -52,8 +55,8 @@ def words_in(description: str) -> dict[int, str]:
 
 
 def shown_blocks(register_map: RegisterMap) -> list[Block]:
-    """Return the blocks that the page shows value by value: those with one row."""
-    return [block for block in register_map.blocks if block.rows == 1]
+    """Return the blocks that the page shows value by value: those with one row that mean something."""
+    return [block for block in register_map.blocks if block.rows == 1 and block.record not in UNUSED]
 
 
 def _texts(block: Block) -> set[str]:

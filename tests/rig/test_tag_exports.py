@@ -3,8 +3,10 @@
 import csv
 import io
 import json
+import re
 import struct
 import tomllib
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,13 +14,16 @@ import pytest
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import CONTROL_MAP
+from coldloop.registers.declaration import fields_of as fields_of_record
 from coldloop.registers.maps import MAPS
 from coldloop.registers.plant import PLANT_MAP, Measurement
 from coldloop.registers.safety import AlarmKind
+from coldloop.service.metrics import metric_name
 from rig.cli.tag_exports import exported, runs
 from tests.conftest import Coldloop
 
 T5_ADDRESS = 216
+GRAFANA = Path(__file__).parents[2] / "docs" / "grafana.json"
 
 
 def made(coldloop: Coldloop, kind: str) -> str:
@@ -91,3 +96,20 @@ def test_each_request_reads_neighbours_of_one_block_that_fit(service: str) -> No
 def test_a_new_alarm_is_exported_by_itself() -> None:
     names = {tag.name for tag in exported(CONTROL_MAP)}
     assert {f"alarms_{kind.name.lower()}_state" for kind in AlarmKind} <= names
+
+
+def test_the_dashboard_of_the_docs_is_the_one_that_is_made_and_its_metrics_are_there(coldloop: Coldloop) -> None:
+    text = made(coldloop, "grafana")
+    assert text == GRAFANA.read_text(encoding="utf-8")
+    panels = json.loads(text)["panels"]
+    places = [(panel["gridPos"]["x"], panel["gridPos"]["y"]) for panel in panels]
+    assert len(set(places)) == len(panels)
+    asked = set(re.findall(r"coldloop_(?:control|optimizer)_plc_\w+", text))
+    served = {
+        metric_name(service, block.name, field)
+        for service, register_map in MAPS.items()
+        for block in register_map.blocks
+        for field in fields_of_record(block.record)
+    }
+    assert asked <= served
+    assert len(asked) == 9

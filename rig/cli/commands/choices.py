@@ -13,7 +13,7 @@ LOADS: Final = ("a", "b", "c", "d", "e", "f", "2h", "6h", "8h", "pulses", "quenc
 SERVICES: Final = ("control_plc", "optimizer_plc", "plant")
 WITHOUT: Final = ("optimizer",)
 REGISTER_FORMATS: Final = ("csv", "json", "markdown", "table")
-TAG_FORMATS: Final = ("fuxa", "ignition", "node-red", "telegraf")
+TAG_FORMATS: Final = ("fuxa", "grafana", "ignition", "node-red", "telegraf")
 FIGURE_FORMATS: Final = ("png", "pdf", "svg")
 STUDIES: Final = (
     "cholesky", "unlimited", "limited", "solver-comparison", "trajectories", "updating-period", "plc-2h", "adaptive-2h",

@@ -1,4 +1,4 @@
-"""`coldloop registers`: the register maps, as a table, Markdown, CSV or JSON, or as tags of other programs."""
+"""`coldloop registers`: the register maps, as a table, Markdown, CSV or JSON, or as files of other programs."""
 
 import argparse
 import sys
@@ -10,7 +10,7 @@ from rig.cli.commands.options import HostPort, port_base
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--format", choices=(*REGISTER_FORMATS, *TAG_FORMATS), default="table",
-                        help="fuxa, ignition, node-red and telegraf: files to import into these programs")  # fmt: skip
+                        help="fuxa, grafana, ignition, node-red, telegraf: files for these programs")  # fmt: skip
     parser.add_argument("--service", choices=SERVICES, help="default: all")
     parser.add_argument("--host", default="127.0.0.1", help="where these programs find the rig (default: 127.0.0.1)")
     parser.add_argument("--port-base", type=port_base, metavar="PORT", help="first of three consecutive ports")

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
+from coldloop.process.load_profile import LOAD_UNIT
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import TICK_S
 from coldloop.process.whole_ticks import whole_ticks
 from rig.cli.commands.options import (
@@ -26,22 +28,23 @@ if TYPE_CHECKING:
     from rig.live.operator_request import Work
 
 MODES: Final = ("auto", "classical", "manual")
-INPUTS: Final = {"cv155": "CV155", "ncr22": "NCR22_A", "cv156": "CV156"}
+INPUTS: Final = {one.register: one.name for one in PROCESS.inputs}
+UNIT: Final = {"W": "watts"}.get(LOAD_UNIT, LOAD_UNIT)
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_rig_options(parser)
     what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
-    load = what.add_parser("load", help="watts, or a CSV file time_s,load_w")
-    load.add_argument("new_load", metavar="WATTS|FILE", help="watts, or a CSV file time_s,load_w that begins now")
+    load = what.add_parser("load", help=f"{UNIT}, or a CSV file time_s,load_w")
+    load.add_argument("new_load", metavar="LOAD|FILE", help=f"{UNIT}, or a CSV file time_s,load_w that begins now")
     load.add_argument("--at", type=_seconds, metavar="SECONDS", help="plant time at which it begins (default: now)")
     load.set_defaults(document=_load)
     mode = what.add_parser("mode", help="who drives")
     mode.add_argument("mode", choices=MODES, metavar="auto|classical|manual")
     mode.set_defaults(document=lambda options: {"kind": "mode", "mode": options.mode})
     setpoint = what.add_parser("setpoint", help="an input in manual mode")
-    setpoint.add_argument("input", choices=INPUTS, metavar="cv155|ncr22|cv156")
+    setpoint.add_argument("input", choices=INPUTS, metavar="|".join(INPUTS))
     setpoint.add_argument("value", type=float)
     setpoint.set_defaults(
         document=lambda options: {"kind": "setpoint", "input": INPUTS[options.input], "value": options.value}
@@ -54,7 +57,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     resume = what.add_parser("resume", help="resume plant time")
     resume.set_defaults(document=lambda _: {"kind": "pause", "paused": False})
     acknowledge = what.add_parser("acknowledge", help="an alarm, or all")
-    acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as t5-band (default: all)")
+    acknowledge.add_argument("alarm", nargs="?", metavar="ALARM", help="such as mode (default: all)")
     acknowledge.set_defaults(document=_acknowledgement)
     add_to_subcommands(what)
 
@@ -109,7 +112,7 @@ def _stream(options: argparse.Namespace) -> tuple[tuple[str, ...], "Work"]:
     from coldloop.process.load_profile import read_load_file
 
     if not Path(options.new_load).is_file():
-        raise UsageError(f"load '{options.new_load}': neither watts nor a file")
+        raise UsageError(f"load '{options.new_load}': neither {UNIT} nor a file")
     load = read_load_file(Path(options.new_load))
     return ("plant",), lambda clients: stream_load(clients, load, _tick(options), tell)
 
@@ -135,8 +138,9 @@ def _tick(options: argparse.Namespace) -> int:
 
 def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
     from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
+    from coldloop.service.event_text import alarm_word
 
-    kinds = {kind.name.lower().replace("_", "-"): int(kind) for kind in AlarmKind}
+    kinds = {alarm_word(kind).replace(" ", "-"): int(kind) for kind in AlarmKind}
     if options.alarm is not None and options.alarm not in kinds:
         raise UsageError(f"unknown alarm '{options.alarm}'; choose from {', '.join(kinds)}")
     alarm = ALL_ALARMS if options.alarm is None else kinds[options.alarm]

@@ -26,7 +26,7 @@ def check_peer(raw: bytes, register_map: RegisterMap, order: WordOrder, peer: st
         raise PeerUnreachableError(
             f"{peer} has another register map (version {identity.map_version}, digest {identity.map_digest:08x}, "
             f"not version {register_map.version}, {register_map.digest:08x}): "
-            "check the port, and run the same release on both sides"
+            "check the port, and run the same release, of the same process, on both sides"
         )
 
 

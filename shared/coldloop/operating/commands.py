@@ -1,20 +1,25 @@
 """What operators can ask for: checked here, described in words, and carried out elsewhere."""
 
-from typing import Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
 from coldloop.errors import LoadFileError, UsageError
-from coldloop.process.load_profile import LOAD_SPAN, LoadProfile, load_profile_of
+from coldloop.process.load_profile import LOAD_SPAN, LOAD_UNIT, LOAD_WORD, LoadProfile, load_profile_of
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, LAST_TICK, OUTPUT_NAMES, TICK_S
 from coldloop.registers.plant import SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, AlarmAction, AlarmKind
-from coldloop.service.event_text import word
+from coldloop.service.event_text import alarm_word, word
 
 LONGEST_FILE: Final = 1_000_000
 """Characters of a load file."""
 MOST_STEPS: Final = 4000
 """Steps of a load that are sent at once; the plant keeps 4096."""
+
+if TYPE_CHECKING:
+    InputName = str
+else:
+    InputName = Literal[INPUT_NAMES]
 
 
 def duration_text(seconds: float) -> str:
@@ -56,7 +61,7 @@ class SetSetpoint(_Command):
     """An input in manual mode."""
 
     kind: Literal["setpoint"]
-    input: Literal["CV155", "NCR22_A", "CV156"]
+    input: InputName
     value: float
 
     @property
@@ -66,7 +71,7 @@ class SetSetpoint(_Command):
 
 
 class SetLoad(_Command):
-    """The heat load from a tick on."""
+    """The load from a tick on, in its unit: the heat load of the cold box, W."""
 
     kind: Literal["load"]
     watts: Annotated[float, Field(ge=LOAD_SPAN[0], le=LOAD_SPAN[1])]
@@ -77,7 +82,7 @@ class SetLoad(_Command):
     def text(self) -> str:
         """The command in words."""
         begin = clock_text(self.tick * TICK_S) if self.tick else "the next tick"
-        return f"Change the heat load to {self.watts:g} W from {begin} on"
+        return f"Change the {LOAD_WORD} to {self.watts:g} {LOAD_UNIT} from {begin} on"
 
 
 class PlayLoad(_Command):
@@ -158,7 +163,7 @@ class TreatAlarm(_Command):
     @property
     def text(self) -> str:
         """The command in words."""
-        name = "all alarms" if self.alarm == ALL_ALARMS else f"alarm {word(AlarmKind(self.alarm))}"
+        name = "all alarms" if self.alarm == ALL_ALARMS else f"alarm {alarm_word(self.alarm)}"
         time = f" for {duration_text(self.time_s)}" if self.action == AlarmAction.SHELVE and self.time_s else ""
         return f"{word(AlarmAction(self.action)).capitalize()}: {name}{time}"
 

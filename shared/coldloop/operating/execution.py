@@ -22,7 +22,7 @@ from coldloop.operating.commands import (
     clock_text,
 )
 from coldloop.operating.load_stream import LoadStream
-from coldloop.process.load_profile import LoadProfile
+from coldloop.process.load_profile import LOAD_UNIT, LoadProfile
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
@@ -30,7 +30,7 @@ from coldloop.registers.maps import MAPS
 from coldloop.registers.plant import LiveLoad, LoadStatus, SensorFault, SensorFaultKind
 from coldloop.registers.safety import ALL_ALARMS, Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmState
 from coldloop.registers.seal import sealed
-from coldloop.service.event_text import word
+from coldloop.service.event_text import alarm_word, word
 
 EFFECT_S: Final = 2.0
 """How long the effect of a command is waited for."""
@@ -167,11 +167,11 @@ async def set_load(clients: Clients, command: SetLoad) -> str:
     await client.write(sealed(LiveLoad(command.tick, command.watts)))
     status = await client.read(LoadStatus)
     for _ in range(0 if command.tick else round(EFFECT_S / LOOK_S)):
-        if abs(status.watts - command.watts) <= 1e-3 * max(1.0, command.watts):
+        if math.isclose(status.watts, command.watts, rel_tol=1e-6):
             break
         await asyncio.sleep(LOOK_S)
         status = await client.read(LoadStatus)
-    return f"{_load_text(command, status)} (was {before.watts:g} W)"
+    return f"{_load_text(command, status)} (was {before.watts:g} {LOAD_UNIT})"
 
 
 def _load_text(command: SetLoad, status: LoadStatus) -> str:
@@ -181,13 +181,13 @@ def _load_text(command: SetLoad, status: LoadStatus) -> str:
         LinkError: It knows another one.
     """
     if not status.upcoming:
-        return f"load {status.watts:g} W now"
+        return f"load {status.watts:g} {LOAD_UNIT} now"
     if command.tick and status.last_tick != command.tick:
         raise LinkError(f"the load from {command.tick * TICK_S:g} s on is different: another client has overwritten it")
-    text = f"load {command.watts:g} W from {status.last_tick * TICK_S:g} s on"
+    text = f"load {command.watts:g} {LOAD_UNIT} from {status.last_tick * TICK_S:g} s on"
     if status.next_tick == status.last_tick:
         return text
-    return f"{text}, before it {status.next_watts:g} W from {status.next_tick * TICK_S:g} s on"
+    return f"{text}, before it {status.next_watts:g} {LOAD_UNIT} from {status.next_tick * TICK_S:g} s on"
 
 
 async def play_load(clients: Clients, command: PlayLoad) -> str:
@@ -277,8 +277,8 @@ def _seen(
     Raises:
         UsageError: None is as it was seen.
     """
-    waiting = [kind for kind in kinds if word(kind) in seen or rows[kind].state in WAITING]
-    same = [kind for kind in waiting if seen.get(word(kind)) == rows[kind].times]
+    waiting = [kind for kind in kinds if alarm_word(kind) in seen or rows[kind].state in WAITING]
+    same = [kind for kind in waiting if seen.get(alarm_word(kind)) == rows[kind].times]
     again = [kind for kind in waiting if kind not in same]
     if not waiting:
         raise UsageError("no alarm waits for an acknowledgement any more")
@@ -312,7 +312,8 @@ def _treated(
         row = rows[kinds[0]]
         until = f" until {clock_text(row.shelved_until * TICK_S)}" if row.state == AlarmState.SHELVED else ""
         over = action is AlarmAction.ACKNOWLEDGE and row.state == AlarmState.NORMAL
-        text = f"alarm {word(kinds[0])}: {'acknowledged, now ' if over else ''}{word(AlarmState(row.state))}{until}"
+        state = word(AlarmState(row.state))
+        text = f"alarm {alarm_word(kinds[0])}: {'acknowledged, now ' if over else ''}{state}{until}"
     elif len(kinds) <= MOST_NAMES:
         states = "; ".join(f"now {word(state)}: {_names(each)}" for state, each in _by_state(rows, done))
         text = f"acknowledged; {states}" if action is AlarmAction.ACKNOWLEDGE else states
@@ -333,7 +334,7 @@ def _by_state(rows: Sequence[Alarm], kinds: Sequence[AlarmKind]) -> list[tuple[A
 
 
 def _names(kinds: Sequence[AlarmKind]) -> str:
-    return ", ".join(word(kind) for kind in kinds)
+    return ", ".join(alarm_word(kind) for kind in kinds)
 
 
 async def fault_sensor(clients: Clients, command: FaultSensor) -> str:

@@ -5,7 +5,7 @@ from typing import Final
 
 from coldloop.errors import LinkError, PeerUnreachableError, UsageError
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.load_profile import LoadProfile
+from coldloop.process.load_profile import LOAD_UNIT, LoadProfile
 from coldloop.process.signals import TICK_S
 from coldloop.registers.plant import AHEAD_STEPS, LOAD_ROWS, LoadAhead, LoadStatus, LoadStep
 from coldloop.registers.seal import sealed
@@ -95,7 +95,7 @@ class LoadStream:
             kind = PeerUnreachableError if isinstance(error, PeerUnreachableError) else LinkError
             raise kind(
                 f"{error}; of {self.steps} steps the plant has taken at least the first {self._sent}, and holds "
-                f"{self._watts[self._sent - 1]:g} W from {self._times[self._sent - 1] * TICK_S:g} s on"
+                f"{self._watts[self._sent - 1]:g} {LOAD_UNIT} from {self._times[self._sent - 1] * TICK_S:g} s on"
             ) from None
         self._sent, self._unanswered = self._sent + record.length, 0
         return record.length

@@ -23,13 +23,14 @@ _JT_VALVE, _TURBINE_VALVE = (
 _HEATER: Final = Input(
     name="NCR22_A", unit="W", register="ncr22", description="Actuator part of the bath heater's power",
     span=(0, 1000), low=0.0, high=150.0, rate=10.0, safe=75.0, scale=50.0, weight=4e-4, walk=0.5,
+    bar=(-10.0, 160.0),
 )  # fmt: skip
 
 
 def _output(name: str, unit: str, quantity: str) -> Output:
-    bands = {"L1": LEVEL_BAND, "T5": T5_BAND}
+    bands, bars = {"L1": LEVEL_BAND, "T5": T5_BAND}, {"L1": (56.0, 64.0), "T5": (6.0, 20.0)}
     band = Band(low=bands[name][0], high=bands[name][1], weight=100.0) if name in bands else None
-    return Output(name=name, unit=unit, quantity=quantity, band=band)
+    return Output(name=name, unit=unit, quantity=quantity, band=band, bar=bars.get(name))
 
 
 COLD_BOX: Final = Process(
@@ -50,7 +51,7 @@ COLD_BOX: Final = Process(
         *(State(name=f"T_nef2_{i}", unit="K") for i in range(1, 7)),
         *(State(name=f"T_nef34_{i}", unit="K") for i in range(1, 13)),
     ),
-    load=Load(name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load"),
+    load=Load(name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load", bar=(200.0, 600.0)),
     constants=("V1", *(f"T{i}" for i in range(1, 11)), *(f"P{i}" for i in range(1, 11))),
     decision_instants=(1, 2, 4, 8, 16, 50, 100),
     constraint_instants=(1, 2, 3, 4, 6, 8, 16, 24, 32, 48, 60, 72, 84, 100),

@@ -36,6 +36,8 @@ class Input:
     """In the cost, per square of its deviation from the operating point."""
     walk: float
     """Random walk of its constant error, per square root of a sampling period."""
+    bar: Range | None = None
+    """Ends of its bar on the operator's page; from its bounds where they are not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +78,8 @@ class Output:
     weight: float = 0.0
     """In the cost, per square of its deviation from the operating point."""
     band: Band | None = None
+    bar: Range | None = None
+    """Ends of its bar on the operator's page; from its band, or the range of its sensor, where they are not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,6 +103,8 @@ class Load:
     """Random walk of what of it is not measured, per square root of a sampling period."""
     noun: str = "Load"
     """What descriptions call it."""
+    bar: Range | None = None
+    """Ends of its bar on the operator's page; its span where they are not given."""
 
 
 NO_LOAD: Final = Load(name="no load", unit="", span=(0.0, 1.0), walk=1e-6)

@@ -14,6 +14,9 @@ from coldloop.process.signals import LAST_TICK, TICK_S
 
 LOAD_SPAN: Final[tuple[float, float]] = struct.unpack("2f", struct.pack("2f", *PROCESS.load.span))
 """Lowest and highest load, as registers have them."""
+LOAD_UNIT: Final = PROCESS.load.unit
+LOAD_WORD: Final = PROCESS.load.noun.lower() if IS_COLD_BOX else PROCESS.load.name
+"""What operators call the load."""
 COLUMNS: Final = ("time_s", "load_w")
 
 

@@ -3,6 +3,7 @@
 from enum import IntEnum
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Self
 
+from coldloop.process.load_profile import LOAD_UNIT, LOAD_WORD
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import (
     INPUT_NAMES,
@@ -103,7 +104,7 @@ class Optimization(NamedTuple):
     mismatch: Annotated[float, f32("D^r of Algorithm 1", finite=False)]
     contraction: Annotated[float, f32("K^r of Algorithm 1", finite=False)]
     gamma: Annotated[float, f32("Γ of Algorithm 1, the gradient that decides the next step in q", finite=False)]
-    load_mismatch: Annotated[float, f32("Estimated load mismatch", unit="W", finite=False)]
+    load_mismatch: Annotated[float, f32("Estimated load mismatch", unit=LOAD_UNIT, finite=False)]
 
 
 class UpdatingRuleKind(IntEnum):
@@ -203,7 +204,10 @@ def outputs_of(prediction: Prediction) -> tuple[tuple[float, ...], ...]:
 class ModelDeviation(NamedTuple):
     """By how much the plant differs from its model, as the filter estimates it; also 0 where nothing is estimated."""
 
-    load: Annotated[float, f32("Heat load beyond what is measured or, unmeasured, usual", unit="W", finite=False)] = 0.0
+    load: Annotated[
+        float,
+        f32(f"{LOAD_WORD.capitalize()} beyond what is measured or, unmeasured, usual", unit=LOAD_UNIT, finite=False),
+    ] = 0.0
     u: Annotated[
         tuple[float, ...], f32_array("Acts like so much more of the input", INPUT_NAMES, INPUT_UNITS, finite=False)
     ] = (0.0,) * len(INPUT_NAMES)

@@ -5,7 +5,7 @@ from enum import IntEnum, IntFlag
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Self
 
-from coldloop.process.loaded import PROCESS
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.signals import (
     INPUT_NAMES,
     INPUT_UNITS,
@@ -354,6 +354,9 @@ class Surroundings(NamedTuple):
     ambient: Annotated[float, f32("Temperature of the surroundings", unit="K", low=270, high=320)] = 300.0
 
 
+UNUSED: Final = () if IS_COLD_BOX else (StationStatus, StationSample, Surroundings, ModelRangeStatus)
+"""Records that mean nothing in this process: of a refrigerator and its property tables."""
+
 PLANT_MAP: Final = RegisterMap(
     service="plant",
     version=4,
@@ -368,7 +371,7 @@ PLANT_MAP: Final = RegisterMap(
             Block("lease", 350, LeaseStatus, "Who may write outputs"),
             Block("session", 400, PlantSession, "Start of a simulation session", Role.OPERATOR),
             Block("pace", 410, SessionPace, "Time base of the present session", Role.OPERATOR),
-            Block("load status", 420, LoadStatus, "The heat load and its known steps"),
+            Block("load status", 420, LoadStatus, f"The {NOUN.lower()} and its known steps"),
             Block("live load", 440, LiveLoad, f"{NOUN} from a tick on", Role.OPERATOR, sealed=True),
             Block(
                 "sensor faults",
@@ -378,7 +381,7 @@ PLANT_MAP: Final = RegisterMap(
                 Role.OPERATOR,
                 len(OUTPUT_NAMES),
             ),
-            Block("load ahead", 600, LoadAhead, "Future steps of the heat load", Role.OPERATOR, sealed=True),
+            Block("load ahead", 600, LoadAhead, f"Future steps of the {NOUN.lower()}", Role.OPERATOR, sealed=True),
             Block("station", 700, StationStatus, "Compression station and nitrogen pre-cooler of a whole refrigerator"),
             Block(
                 "surroundings",

@@ -10,6 +10,8 @@ from datetime import UTC, datetime
 from enum import IntEnum
 from typing import Final, NamedTuple
 
+from coldloop.process.load_profile import LOAD_UNIT
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.range_bits import ModelRange
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import Event, EventKind
@@ -39,6 +41,24 @@ def _listed(words: Sequence[str]) -> Words:
 def _members(kind: type[IntEnum]) -> Words:
     words = {member.value: word(member) for member in kind}
     return lambda number: words.get(number, str(number))
+
+
+def _alarm_words() -> dict[int, str]:
+    """Return the words for alarms; those of bands name the outputs, but for the cold box, whose names are old."""
+    words = {kind.value: word(kind) for kind in AlarmKind}
+    if not IS_COLD_BOX:
+        first, *further = (output.name for output in PROCESS.banded)
+        words[AlarmKind.LEVEL_BAND] = f"{first} outside its band"
+        words[AlarmKind.T5_BAND] = f"{' or '.join(further) or 'further output'} outside its band"
+    return words
+
+
+_ALARM_WORDS: Final = _alarm_words()
+
+
+def alarm_word(number: int) -> str:
+    """Return the word for an alarm."""
+    return _ALARM_WORDS.get(number, str(number))
 
 
 def _causes(kind: type[IntEnum]) -> Words:
@@ -74,7 +94,7 @@ class _Wording(NamedTuple):
     """Of the value; None when the kind has none."""
 
 
-_ALARM: Final = _Wording(_members(AlarmKind))
+_ALARM: Final = _Wording(alarm_word)
 _SUPPRESSION: Final = _ALARM._replace(cause=lambda _: "")  # that of an alarm that may never have been raised
 _SHELVING: Final = _SUPPRESSION._replace(unit="s")
 _WORDINGS: Final[Mapping[int, _Wording]] = {
@@ -96,11 +116,11 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
     EventKind.PLANT_LINK: _Wording(_members(PlantLinkState), _causes(LinkCause)),
     EventKind.LEASE: _Wording(_listed(("ended", "granted", "a second writer was refused"))),
     EventKind.SENSOR_FAULT: _Wording(_listed(OUTPUT_NAMES), _members(SensorFaultKind)),
-    EventKind.LOAD: _Wording(_row, unit="W"),
+    EventKind.LOAD: _Wording(_row, unit=LOAD_UNIT),
     EventKind.CERTIFICATE: _Wording(_listed(("", "expires soon", "has expired")), unit="days left"),
     EventKind.LOST: _Wording(unit="events or lines"),
     EventKind.SENSOR: _Wording(_listed(OUTPUT_NAMES), _listed(("good again", "bad", "suspect"))),
-    EventKind.LIVE_LOAD: _Wording(_listed(("from one tick on", "steps ahead")), unit="W"),
+    EventKind.LIVE_LOAD: _Wording(_listed(("from one tick on", "steps ahead")), unit=LOAD_UNIT),
     EventKind.STATION_ALARM: _Wording(
         _listed([str(alarm.name).lower().replace("_", " ") for alarm in StationAlarm]), _listed(("returned", "raised"))
     ),
@@ -111,18 +131,23 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
     ),
     EventKind.PACE: _Wording(_listed(("lock-step", "real time", "paused")), unit="x real time"),
 }
+_FURTHER_BANDS: Final = [output.name for output in PROCESS.banded[1:]]
+_SHORTAGE: Final = (
+    (
+        "",
+        "too much load: reduce it, or the bath will run dry",
+        "too little load: raise it, or the turbine gets too cold and the bath floods",
+    )
+    if IS_COLD_BOX
+    else ("", "too much load: reduce it", "too little load: raise it")
+)
 _ALARM_CAUSES: Final[Mapping[int, Words]] = {
+    AlarmKind.T5_BAND: _listed(_FURTHER_BANDS if len(_FURTHER_BANDS) > 1 else ("",)),
     AlarmKind.STATE_NOT_RETAINED: _listed(("", "the previous one was set aside")),
     AlarmKind.MODE: _causes(Cause),
     AlarmKind.SENSOR_BAD: _listed(OUTPUT_NAMES),
     AlarmKind.SENSOR_SUSPECT: _listed(OUTPUT_NAMES),
-    AlarmKind.CAPACITY: _listed(
-        (
-            "",
-            "too much load: reduce it, or the bath will run dry",
-            "too little load: raise it, or the turbine gets too cold and the bath floods",
-        )
-    ),
+    AlarmKind.CAPACITY: _listed(_SHORTAGE),
     AlarmKind.SEQUENCE_REJECTED: _causes(Verdict),
     AlarmKind.PLANT_LOST: _causes(LinkCause),
     AlarmKind.PLANT_OTHER_MASTER: _causes(LinkCause),
@@ -168,7 +193,7 @@ def describe(event: Event) -> EventText:
     if event.kind == EventKind.SETPOINT and event.subject < len(INPUT_UNITS):
         unit = INPUT_UNITS[event.subject]
     elif event.kind == EventKind.ALARM_RAISED and event.subject == AlarmKind.CAPACITY:
-        unit = "W"
+        unit = LOAD_UNIT
     return EventText(
         kind=kind_word(event.kind),
         subject=wording.subject(event.subject),

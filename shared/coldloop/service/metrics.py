@@ -14,6 +14,7 @@ from prometheus_client.registry import Collector
 from coldloop import __version__
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.declaration import Block, fields_of
+from coldloop.registers.plant import UNUSED
 
 _NOT_IN_NAMES: Final = re.compile(r"[^a-zA-Z0-9_]+")
 
@@ -48,7 +49,7 @@ def bank_families(bank: RegisterBank) -> Iterator[Metric]:
     """Yield all registers of a service that are not rows of a table and that no client writes."""
     yield build_family()
     for block in bank.map.blocks:
-        if block.rows == 1 and block.writer is None:
+        if block.rows == 1 and block.writer is None and block.record not in UNUSED:
             yield from block_families(bank.map.service, block, bank.get(block.record))
 
 

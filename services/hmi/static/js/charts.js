@@ -115,6 +115,9 @@ function short(value) {
   return String(Number(value.toPrecision(6)));
 }
 
+// The least range of a chart of a signal, from the ends of its bar.
+export const leastSpread = ([low, high]) => Math.min(1, (high - low) / 8);
+
 // The range shows the whole band, and is never so narrow that noise looks like movement.
 function spread(low, high, band, least = 0.1) {
   const all = [low, high, ...(band || [])].filter((value) => Number.isFinite(value));

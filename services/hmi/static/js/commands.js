@@ -1,6 +1,6 @@
 // Commands in two steps, preview and confirmation, with their results. Login.
 import { ask, element, isStale, onChange, send, signal, state, timeText } from "./store.js";
-import { bindAll } from "./values.js";
+import { bindAll, inputBar } from "./values.js";
 
 const byId = (id) => document.getElementById(id);
 let onUser = () => {};
@@ -112,14 +112,13 @@ async function playFile() {
 
 function faceplates() {
   const holder = byId("faceplates");
-  const units = { CV155: "%", NCR22_A: "W", CV156: "%" };
-  for (const [input, field] of [["CV155", "cv155"], ["NCR22_A", "ncr22"], ["CV156", "cv156"]]) {
-    const limits = `optimizer_plc.operating limits.input_low.${input} optimizer_plc.operating limits.input_high.${input}`;
-    const value = element("input", { type: "number", step: "any", id: `setpoint-${input}`, "aria-label": `New setpoint of ${input} in ${units[input]}` });
+  for (const one of state.catalog.process.inputs) {
+    const input = one.name;
+    const value = element("input", { type: "number", step: "any", id: `setpoint-${input}`, "aria-label": `New setpoint of ${input} in ${one.unit}` });
     const button = element("button", { type: "button", text: "Write", onclick: () => numberIn(value, (wanted) => command({ kind: "setpoint", input, value: wanted })) });
     const plate = element("div", { class: "faceplate" },
-      element("div", { class: "bar", "data-name": input, "data-signal": `control_plc.process.u.${input}`, "data-bounds": limits, "data-low": input === "NCR22_A" ? -10 : 15, "data-high": input === "NCR22_A" ? 160 : 65 }),
-      element("div", { class: "row" }, element("span", { class: "label", text: "setpoint" }), element("span", { class: "value", "data-signal": `control_plc.operator.${field}` }), element("span", { class: "spacer" }), value, button));
+      inputBar(one, input),
+      element("div", { class: "row" }, element("span", { class: "label", text: "setpoint" }), element("span", { class: "value", "data-signal": `control_plc.operator.${one.register}` }), element("span", { class: "spacer" }), value, button));
     holder.append(plate);
   }
   bindAll(holder);
@@ -150,16 +149,28 @@ function login() {
   byId("login-user").focus();
 }
 
+function loadPanel() {
+  const { load } = state.catalog.process, slider = byId("load-slider"), number = byId("load-number");
+  byId("load-panel").hidden = !load;
+  if (!load) return;
+  const { word, unit, span, bar } = load;
+  byId("load-word").textContent = `${word[0].toUpperCase()}${word.slice(1)}`;
+  byId("load-unit").textContent = unit;
+  Object.assign(slider, { min: bar[0], max: bar[1], step: (bar[1] - bar[0]) / 400 });
+  Object.assign(number, { min: span[0], max: span[1], ariaLabel: `New load in ${unit}` });
+  slider.addEventListener("input", () => { number.value = slider.value; });
+  number.addEventListener("input", () => { slider.value = number.value; });
+  const followLoad = follow(number, "plant.load status.watts", [slider]);
+  byId("load-set").addEventListener("click", () => numberIn(number, (watts) => command({ kind: "load", watts }).then(() => followLoad(watts))));
+  byId("load-play").addEventListener("click", playFile);
+}
+
 export function initCommands(userChanged) {
   onUser = userChanged;
   faceplates();
   for (const one of document.querySelectorAll("[data-command]")) one.addEventListener("click", () => command(JSON.parse(one.dataset.command)));
-  const slider = byId("load-slider"), number = byId("load-number");
-  slider.addEventListener("input", () => { number.value = slider.value; });
-  number.addEventListener("input", () => { slider.value = number.value; });
-  const followLoad = follow(number, "plant.load status.watts", [slider]), followFactor = follow(byId("factor"), "plant.pace.factor");
-  byId("load-set").addEventListener("click", () => numberIn(number, (watts) => command({ kind: "load", watts }).then(() => followLoad(watts))));
-  byId("load-play").addEventListener("click", playFile);
+  loadPanel();
+  const followFactor = follow(byId("factor"), "plant.pace.factor");
   byId("factor-set").addEventListener("click", () => numberIn(byId("factor"), (factor) => command({ kind: "factor", factor }).then(() => followFactor(factor))));
   byId("training").hidden = !state.catalog.training;
   for (const output of state.catalog.outputs) byId("fault-output").append(element("option", { text: output }));

@@ -1,6 +1,6 @@
 // Starts the page: views, theme, links, the state of the stream.
-import { ask, connect, element, indexed, isStale, onChange, pageIsSilent, state, take } from "./store.js";
-import { bindAll } from "./values.js";
+import { ask, connect, element, indexed, isStale, onChange, pageIsSilent, signal, state, take } from "./store.js";
+import { bindAll, controlledBar, inputBar, loadBar, measuredBar } from "./values.js";
 import { hideTrends, initTrends, recolourStrips, recolourTrends, refreshStrips, showTrends } from "./trends.js";
 import { initWhy, pick, recolourWhy, showWhy } from "./why.js";
 import { initAlarms, redrawAlarms } from "./alarms.js";
@@ -48,7 +48,19 @@ function links() {
   });
 }
 
+function bars() {
+  const { controlled, measured, inputs, load } = state.catalog.process;
+  byId("controlled").after(...controlled.map(controlledBar));
+  byId("measured").after(...measured.map(measuredBar));
+  byId("measured").hidden = !measured.length;
+  byId("inputs").after(...inputs.map((one) => inputBar(one, one.label)));
+  byId("load").hidden = !load;
+  if (load) byId("load").after(loadBar(load));
+}
+
 function overview() {
+  const { load } = state.catalog.process, { decimals } = signal("plant.load status.watts");
+  const loadText = (value, digits = decimals) => `${value.toFixed(Math.max(0, digits))} ${load.unit}`;
   const tau = byId("tau-u"), facts = byId("load-facts");
   onChange(({ update, names }) => {
     if (update || names === null) {
@@ -61,11 +73,11 @@ function overview() {
     const note = byId("tau-u-note"), inUse = !state.stale.includes("update");
     note.hidden = inUse;
     if (!inUse) note.textContent = "Of the last update: MPC is not active now.";
-    const rows = [["expected next", state.replay ? "–" : upcoming ? `${values["plant.load status.next_watts"]?.toFixed(1)} W in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
-      ["estimated mismatch", state.update ? `${state.update.update.load_mismatch.toFixed(1)} W` : "–", "optimizer_plc.", "update"],
-      ["plant against model", state.deviation || "–", "optimizer_plc."]];
+    const ofLoad = () => [["expected next", state.replay ? "–" : upcoming ? `${loadText(values["plant.load status.next_watts"])} in ${((values["plant.load status.next_tick"] - state.tick) * state.catalog.tick_s).toFixed(0)} s` : "as now", "plant.", "control_plc.process."],
+      ["estimated mismatch", state.update ? loadText(state.update.update.load_mismatch) : "–", "optimizer_plc.", "update"]];
+    const rows = [...(load ? ofLoad() : []), ["plant against model", state.deviation || "–", "optimizer_plc."]];
     const shortage = values["control_plc.plan.shortage"];
-    if (shortage) rows.unshift(["load", `${Math.abs(shortage).toFixed(0)} W ${shortage > 0 ? "more than can be held" : "less than is needed"}`, "control_plc.", "update"]);
+    if (load && shortage) rows.unshift(["load", `${loadText(Math.abs(shortage), decimals - 1)} ${shortage > 0 ? "more than can be held" : "less than is needed"}`, "control_plc.", "update"]);
     const text = JSON.stringify(rows);
     if (facts.dataset.text !== text) { facts.dataset.text = text; facts.replaceChildren(...rows.flatMap(([name, value, ...sources]) => [element("dt", { text: name }), element("dd", { class: "value", text: value, "data-sources": sources.join(" ") })])); }
     for (const one of facts.querySelectorAll("dd")) one.classList.toggle("stale", one.dataset.sources.split(" ").some(isStale));
@@ -76,9 +88,15 @@ function overview() {
   setInterval(refreshStrips, 1000);
 }
 
-// One drawing for each kind of plant. If another plant is found later, the page reloads.
+// One drawing for each kind of cold box. If another one is found later, the page reloads. Other processes have none.
 const MIMICS = { refrigerator: "static/mimic-refrigerator.svg" };
 async function mimic(kind) {
+  if (!state.catalog.process.drawn) {
+    document.body.dataset.plant = "not-drawn";
+    byId("mimic").remove();
+    byId("strips").setAttribute("aria-label", "Controlled outputs, load and updating period over the last five minutes");
+    return;
+  }
   const text = await (await fetch(MIMICS[kind] || "static/mimic.svg")).text();
   byId("mimic").append(document.importNode(new DOMParser().parseFromString(text, "image/svg+xml").documentElement, true));
   document.body.dataset.plant = kind;
@@ -92,7 +110,7 @@ async function start() {
   await mimic(state.plant.kind);
   theme(localStorage.getItem("theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
   byId("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; localStorage.setItem("theme", next); theme(next); });
-  initDetail(); for (const one of [document.querySelector("header"), byId("overview"), byId("commands")]) bindAll(one);
+  bars(); initDetail(); for (const one of [document.querySelector("header"), byId("overview"), byId("commands")]) bindAll(one);
   links(); overview();
   initTrends((time) => { location.hash = "#why"; pick(`?at=${time}`); });
   initWhy(); initCommands(redrawAlarms); initAlarms(); initReplay();

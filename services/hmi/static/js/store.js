@@ -76,6 +76,12 @@ export function timeText(seconds) {
   return `${sign}${hours}:${pad(minutes)}:${tail}`;
 }
 
+// A length of time such as "15 min", in the largest unit that it is a whole number of.
+export function durationText(seconds) {
+  const [unit, length] = [["h", 3600], ["min", 60], ["s", 1]].find((one) => seconds % one[1] === 0) || ["s", 1];
+  return `${Number((seconds / length).toPrecision(3))} ${unit}`;
+}
+
 export function valueText(name, as) {
   const value = state.values[name], about = signal(name);
   if (value === undefined || value === null) return "–";

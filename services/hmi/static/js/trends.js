@@ -1,35 +1,52 @@
 // Trends: a window of plant time, the horizon ahead, zoom, values at the cursor, export.
-import { ask, element, state, timeText } from "./store.js";
-import { asPicture, legendOf, makeChart } from "./charts.js";
+import { ask, durationText, element, state, timeText } from "./store.js";
+import { asPicture, leastSpread, legendOf, makeChart } from "./charts.js";
 
-const WINDOWS = [[300, "5 min"], [900, "15 min"], [1800, "30 min"], [3600, "1 h"], [7200, "2 h"]];
-const LAYOUT = [
-  { id: "L1", title: "L1 %", lines: [{ label: "L1", stroke: "trend", from: "series" }], band: "L1", spread: 1, tall: true, ahead: ["L1"], ribbon: true },
-  { id: "T5", title: "T5 K", lines: [{ label: "T5", stroke: "trend", from: "series" }], band: "T5", spread: 1, tall: true, ahead: ["T5"] },
-  { id: "valves", title: "(%)", lines: [{ label: "CV155", stroke: "trend", from: "series", stepped: true }, { label: "CV156", stroke: "trend-2", from: "series", stepped: true }], bounds: "CV155", spread: 2, ahead: ["CV155", "CV156"] },
-  { id: "heat", title: "(W)", lines: [{ label: "load", stroke: "trend-3", from: "series", stepped: true }, { label: "NCR22_A", stroke: "trend", from: "series", stepped: true }], spread: 20 },
+const WINDOWS = [60, 180, 360, 720, 1440]; // sampling periods: 5 min to 2 h of the cold box
+const COLOURS = ["trend", "trend-2", "trend-3"];
+const LAST = [
   { id: "tau", title: "τu s, click to see why", lines: [{ label: "tau_u", stroke: "trend", from: "updates", stepped: true }], spread: 1 },
   { id: "cost", title: "(cost)", tall: true, lines: [{ label: "J", name: "J reached", stroke: "trend", from: "updates" }, { label: "J_predicted", name: "J predicted", stroke: "trend-2", from: "updates", dash: [4, 3] }], log: true },
 ];
+const line = (label, stroke, more) => ({ label, stroke, from: "series", ...more });
+const titled = (names, unit) => (names.length > 1 ? `(${unit})` : `${names[0]} ${unit}`);
+const controlledChart = (one, place) => ({ id: one.name, title: `${one.name} ${one.unit}`, lines: [line(one.name, "trend")], band: one.name, spread: leastSpread(one.bar), tall: true, ahead: [one.name], ribbon: place === 0 });
+// Inputs of one unit share a chart, and those in the unit of the load the chart of the load.
+function inputChart(unit) {
+  const group = state.catalog.process.inputs.filter((one) => one.unit === unit), names = group.map((one) => one.name);
+  const { bounds, bar } = group[0], isShared = group.every((one) => String(one.bounds) === String(bounds));
+  return { id: names[0], title: titled(names, unit), lines: names.map((name, i) => line(name, COLOURS[i % 3], { stepped: true })), bounds: isShared ? names[0] : null, spread: (bar[1] - bar[0]) / 25, ahead: names, isInputs: true };
+}
+function loadChart() {
+  const { inputs, load } = state.catalog.process;
+  if (!load) return [];
+  const names = inputs.filter((one) => one.unit === load.unit).map((one) => one.name);
+  return [{ id: "load", title: titled(["load", ...names], load.unit), lines: [line("load", "trend-3", { stepped: true }), ...names.map((name, i) => line(name, COLOURS[i % 2], { stepped: true }))], spread: (load.bar[1] - load.bar[0]) / 20 }];
+}
+function ofProcess() {
+  const { controlled, inputs, load } = state.catalog.process;
+  const units = [...new Set(inputs.map((one) => one.unit))].filter((unit) => !load || unit !== load.unit);
+  return [...controlled.map(controlledChart), ...units.map(inputChart), ...loadChart()];
+}
 // Of a whole refrigerator the pressures too, between the inputs and the updating period.
 const PRESSURES = [["P12", "HP bar"], ["P11", "LP bar"]].map(([name, title]) => ({ id: name, title, lines: [{ label: name, stroke: "trend", from: "series" }], station: name, spread: name === "P12" ? 0.4 : 0.04 }));
 const isRefrigerator = () => state.plant.kind === "refrigerator";
-const drawn = () => (isRefrigerator() ? [...LAYOUT.slice(0, 4), ...PRESSURES, ...LAYOUT.slice(4)] : LAYOUT);
+const drawn = () => [...ofProcess(), ...(isRefrigerator() ? PRESSURES : [])];
 // Further pens: any other signal that trends are kept of, each in a chart of its own.
 const MOST_PENS = 8;
 let pens = [];
-const layout = () => [...drawn().slice(0, -2), ...pens.map((name) => ({ id: `pen-${name}`, title: `${name}${unitOf(name)}`, lines: [{ label: name, stroke: "trend", from: "series", stepped: name === "mode" }], spread: 0.01 })), ...drawn().slice(-2)];
+const layout = () => [...drawn(), ...pens.map((name) => ({ id: `pen-${name}`, title: `${name}${unitOf(name)}`, lines: [{ label: name, stroke: "trend", from: "series", stepped: name === "mode" }], spread: 0.01 })), ...LAST];
 const names = () => layout().flatMap((one) => one.lines).filter((line) => line.from === "series").map((line) => line.label).join(",");
 const unitOf = (name) => { const about = ["process.y.", "process.u.", "process."].map((part) => state.catalog.signals[`control_plc.${part}${name}`]).concat(state.catalog.signals[`plant.station.signals.${name}`]).find(Boolean); return about && about.unit ? ` ${about.unit}` : ""; };
 const stationBand = (name) => { const [low, high] = (state.plant.bands || {})[`plant.station.signals.${name}`] || []; return Number.isFinite(low) && Number.isFinite(high) ? [low, high] : null; };
 const REFRESH_MS = 500;
 
-let seconds = 300, zoom = null, held = false, newest = null, onPick = () => {};
+let seconds = 0, zoom = null, held = false, newest = null, onPick = () => {};
 let charts = null, timer = null;
 
 function range() {
   if (zoom) return zoom;
-  const now = newest ? newest.now_s : 0, ahead = Math.min(500, seconds / 4);
+  const now = newest ? newest.now_s : 0, ahead = Math.min(100 * state.catalog.process.sample_s, seconds / 4);
   return [now - seconds, now + ahead];
 }
 
@@ -56,16 +73,16 @@ function readout(u) {
   const isReplaced = (name) => (newest.substituted[name] || []).some(([from, to]) => from <= time && time < to);
   const parts = Object.entries(newest.series).map(([name, values]) => [`${name}${isReplaced(name) ? " (substituted)" : ""}`, at(newest.time, values)]);
   parts.push(["τu", at(newest.updates.time, newest.updates.tau_u)], ["q", at(newest.updates.time, newest.updates.q)]);
-  target.textContent = `${timeText(Math.round(time * 4) / 4)}  ${parts.filter((one) => one[1] !== null).map(([name, value]) => `${name} ${Number(value.toPrecision(5))}`).join("  ")}`;
+  target.textContent = `${timeText(Math.round(time / state.catalog.tick_s) * state.catalog.tick_s)}  ${parts.filter((one) => one[1] !== null).map(([name, value]) => `${name} ${Number(value.toPrecision(5))}`).join("  ")}`;
 }
 
 function show(one) {
   const source = (line) => (line.from === "updates" ? newest.updates : newest.series)[line.label] || [];
   const times = one.lines[0].from === "updates" ? newest.updates.time : newest.time;
-  const predictions = one.ahead ? newest.predictions.map((each) => ({ time: one.ahead[0].startsWith("CV") ? each.input_time : each.time, curves: one.ahead.map((name) => each[name]) })) : [];
+  const predictions = one.ahead ? newest.predictions.map((each) => ({ time: one.isInputs ? each.input_time : each.time, curves: one.ahead.map((name) => each[name]) })) : [];
   one.show([times, ...one.lines.map(source)], {
     band: one.band ? newest.bands[one.band] : one.station ? stationBand(one.station) : one.bounds ? newest.bounds[one.bounds] : null,
-    bandName: one.band ? "band" : one.station ? "alarm limits" : one.bounds ? "bounds of both" : "",
+    bandName: one.band ? "band" : one.station ? "alarm limits" : one.bounds ? ["bounds", "bounds of both"][one.lines.length - 1] || "bounds of all" : "",
     predictions, planned: newest.planned, gaps: newest.gaps, substituted: newest.substituted, marks: newest.marks, modes: newest.modes, now: newest.now_s, ribbon: one.ribbon,
   });
 }
@@ -88,8 +105,10 @@ async function refresh() {
 export function initTrends(pick) {
   onPick = pick;
   const holder = document.getElementById("windows");
-  for (const [length, label] of WINDOWS) {
-    holder.append(element("button", { type: "button", class: "quiet", text: label, "aria-pressed": String(length === seconds), onclick: (event) => {
+  const lengths = WINDOWS.map((samples) => samples * state.catalog.process.sample_s);
+  [seconds] = lengths;
+  for (const length of lengths) {
+    holder.append(element("button", { type: "button", class: "quiet", text: durationText(length), "aria-pressed": String(length === seconds), onclick: (event) => {
       seconds = length; zoom = null; document.getElementById("unzoom").hidden = true;
       for (const other of holder.children) other.setAttribute("aria-pressed", String(other === event.target));
       refresh();
@@ -125,20 +144,23 @@ export function hideTrends() { clearInterval(timer); timer = null; }
 export function recolourTrends() { if (charts) { charts.forEach((one) => one.chart.destroy()); charts = null; refresh(); } }
 
 // The four small ones under the mimic.
-const STRIPS = [
-  { title: "L1 % and its band", lines: [{ label: "L1", stroke: "trend" }], band: "L1", spread: 1 }, { title: "T5 K and its band", lines: [{ label: "T5", stroke: "trend" }], band: "T5", spread: 1 },
-  { title: "load W", lines: [{ label: "load", stroke: "trend", stepped: true }], spread: 20 }, { title: "τu s", lines: [{ label: "tau_u", stroke: "trend", stepped: true }], spread: 1, updates: true },
-];
+function stripCharts() {
+  const { controlled, load } = state.catalog.process;
+  return [...controlled.map((one) => ({ title: `${one.name} ${one.unit} and its band`, lines: [{ label: one.name, stroke: "trend" }], band: one.name, spread: leastSpread(one.bar) })),
+    ...loadChart().map((one) => ({ ...one, title: `load ${load.unit}`, lines: [{ label: "load", stroke: "trend", stepped: true }] })),
+    { title: "τu s", lines: [{ label: "tau_u", stroke: "trend", stepped: true }], spread: 1, updates: true }];
+}
 let strips = null, stripsNow = 0;
 export async function refreshStrips() {
   if (document.getElementById("overview").hidden) return;
+  const { controlled, sample_s } = state.catalog.process, length = WINDOWS[0] * sample_s;
   let found;
-  try { found = await ask("api/trend?names=L1,T5,load&seconds=300&points=400"); } catch { return; }
+  try { found = await ask(`api/trend?names=${[...controlled.map((one) => one.name), "load"]}&seconds=${length}&points=400`); } catch { return; }
   const holder = document.getElementById("strip-charts");
   stripsNow = found.now_s;
   if (!strips) {
     holder.replaceChildren();
-    strips = STRIPS.map((one) => { const box = element("div", { class: "strip" }); holder.append(box); return { ...one, ...makeChart(box, one.lines, { title: one.title, spread: one.spread, small: true, axis: true, range: () => [stripsNow - 300, stripsNow] }) }; });
+    strips = stripCharts().map((one) => { const box = element("div", { class: "strip" }); holder.append(box); return { ...one, ...makeChart(box, one.lines, { title: one.title, spread: one.spread, small: true, axis: true, range: () => [stripsNow - length, stripsNow] }) }; });
   }
   for (const one of strips) {
     const times = one.updates ? found.updates.time : found.time;

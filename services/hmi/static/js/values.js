@@ -99,6 +99,16 @@ function bindTag(tag) {
   watched.push([tag, name]);
 }
 
+// A bar of a signal of the process, with its band or its bounds: ends that the optimiser keeps it within.
+function bar(name, label, ends, more = {}) {
+  return element("div", { class: "bar", "data-name": label, "data-signal": `control_plc.process.${name}`, "data-low": ends[0], "data-high": ends[1], ...more });
+}
+const within = (kind, name) => ["low", "high"].map((end) => `optimizer_plc.operating limits.${kind}_${end}.${name}`).join(" ");
+export const inputBar = (one, label) => bar(`u.${one.name}`, label, one.bar, { "data-bounds": within("input", one.name) });
+export const controlledBar = (one) => bar(`y.${one.name}`, one.name, one.bar, { "data-band": within("output", one.name) });
+export const measuredBar = (one) => bar(`y.${one.name}`, one.name, one.bar);
+export const loadBar = (one) => bar("load", "load", one.bar);
+
 function bindBar(bar) {
   const name = bar.dataset.signal, width = 100;
   const drawing = shape("svg", { viewBox: `0 0 ${width} 20`, preserveAspectRatio: "none", "aria-hidden": "true" });

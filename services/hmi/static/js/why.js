@@ -1,6 +1,6 @@
 // Explanation of the updating period of one update.
-import { ask, element, indexed, onChange, shape, timeText } from "./store.js";
-import { makeChart } from "./charts.js";
+import { ask, element, indexed, onChange, shape, state, timeText } from "./store.js";
+import { leastSpread, makeChart } from "./charts.js";
 
 let following = true, shown = null, charts = null, window_ = [0, 1], asked = 0;
 const byId = (id) => document.getElementById(id);
@@ -50,12 +50,13 @@ function budget(found) {
 }
 
 async function curves(found) {
-  const from = found.time_s - 30, to = found.time_s + (found.prediction ? 200 : 60);
+  const { controlled, sample_s } = state.catalog.process;
+  const from = found.time_s - 6 * sample_s, to = found.time_s + (found.prediction ? 40 : 12) * sample_s;
   let trend;
-  try { trend = await ask(`api/trend?names=L1,T5&seconds=${to - from}&end=${to}&points=400`); } catch { return; }
+  try { trend = await ask(`api/trend?names=${controlled.map((one) => one.name)}&seconds=${to - from}&end=${to}&points=400`); } catch { return; }
   window_ = [from, to];
   if (!charts) {
-    charts = ["L1", "T5"].map((name) => { const box = element("div", { class: "chart" }); byId("why-charts").append(box); return { name, ...makeChart(box, [{ label: name, stroke: "trend" }], { title: `${name} ${name === "L1" ? "%" : "K"}`, spread: 0.5, axis: true, range: () => window_ }) }; });
+    charts = controlled.map(({ name, unit, bar }) => { const box = element("div", { class: "chart" }); byId("why-charts").append(box); return { name, ...makeChart(box, [{ label: name, stroke: "trend" }], { title: `${name} ${unit}`, spread: leastSpread(bar) / 2, axis: true, range: () => window_ }) }; });
   }
   for (const one of charts) {
     const predictions = found.prediction ? [{ time: found.prediction.time, curves: [found.prediction[one.name]] }] : [];

@@ -1,0 +1,69 @@
+"""What the page shows of the process that it is loaded with: its signals, and from where to where their bars go."""
+
+import math
+from typing import Any, Final
+
+from coldloop.process.declaration import NO_LOAD, Input, Output, Range
+from coldloop.process.load_profile import LOAD_UNIT, LOAD_WORD
+from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.signals import SAMPLING_PERIOD_S
+
+BESIDE_BAND: Final = 1.5
+"""What a bar shows beside a band, on each side, over the width of the band."""
+BESIDE_BOUNDS: Final = 0.125
+"""The same of the bounds of an input."""
+READABLE: Final = 1e-3
+"""Share of a range that is worth a digit."""
+
+
+def process_document() -> dict[str, Any]:
+    """Return the process as the page is told: bars of signals with their ends, words and unit of the load, if any."""
+    span = PROCESS.load.span
+    load = {"word": LOAD_WORD, "unit": LOAD_UNIT, "span": span, "bar": PROCESS.load.bar or span}
+    return {
+        "name": PROCESS.name,
+        "drawn": IS_COLD_BOX,  # there is a drawing of it, which shows the outputs that have no band
+        "sample_s": SAMPLING_PERIOD_S,
+        "inputs": [
+            {"name": one.name, "label": one.name[: len(one.register)], "register": one.register, "unit": one.unit,
+             "bounds": [one.low, one.high], "bar": one.bar or _input_bar(one)}
+            for one in PROCESS.inputs
+        ],
+        "controlled": [_output(one) for one in PROCESS.banded],
+        "measured": [_output(one) for one in PROCESS.outputs if one.band is None and not IS_COLD_BOX],
+        "load": None if PROCESS.load == NO_LOAD else load,
+    }  # fmt: skip
+
+
+def _output(one: Output) -> dict[str, Any]:
+    return {"name": one.name, "unit": one.unit, "bar": one.bar or _output_bar(one)}
+
+
+def _output_bar(one: Output) -> Range:
+    """Return the ends of the bar of an output: about its band within the range of its sensor, or that range."""
+    if one.band is None:
+        return one.range
+    low, high = _widened(one.band.low, one.band.high, BESIDE_BAND)
+    return (low, high) if one.range[0] == one.range[1] else (max(low, one.range[0]), min(high, one.range[1]))
+
+
+def _input_bar(one: Input) -> Range:
+    return _widened(one.low, one.high, BESIDE_BOUNDS)
+
+
+def _widened(low: float, high: float, share: float) -> Range:
+    return low - share * (high - low), high + share * (high - low)
+
+
+def decimals_by_unit() -> dict[str, int]:
+    """Return how many digits after the point values with the units of the process are shown with.
+
+    The last digit is the noise of an output, and a tenth of the largest move of an input in a sampling period.
+    """
+    low, high = PROCESS.load.span
+    steps = [(LOAD_UNIT, READABLE * (high - low)), *((one.unit, one.rate / 10) for one in PROCESS.inputs)]
+    steps += [(one.unit, one.noise) for one in PROCESS.outputs]
+    found: dict[str, int] = {}
+    for unit, step in steps:
+        found[unit] = max(found.get(unit, 0), math.ceil(-math.log10(step)))
+    return found
