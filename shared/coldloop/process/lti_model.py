@@ -23,7 +23,7 @@ from coldloop.process.signals import STATE_NAMES
 
 RealArray: TypeAlias = NDArray[np.float64]
 
-UNNAMED: dict[str, Any] = {"plant": COLD_BOX, "note": "", "plant_parameters": {}}
+UNNAMED: dict[str, Any] = {"plant": COLD_BOX, "note": "", "plant_parameters": {}, "plant_rest": {}}
 """What a model file leaves out."""
 MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
 
@@ -94,6 +94,8 @@ class LtiModel:
     """Where it comes from, if not from the plant's equations."""
     plant_parameters: dict[str, Any] = field(default_factory=dict)
     """The plant's parameters by section, as in a plant file; none are those of the reference plant."""
+    plant_rest: dict[str, Any] = field(default_factory=dict)
+    """Where a refrigerator is at rest, and the gains of its pressure controller; none are those that are shipped."""
 
     def __post_init__(self) -> None:
         n, m, p = len(self.state_names), len(self.input_names), len(self.output_names)
