@@ -37,6 +37,7 @@ COMMANDS: Final = {
     "registers": "the register maps",
     "certificates": "certificates for Modbus/TCP Security on a test site",
     "model": "the prediction model",
+    "exergy": "where a refrigerator loses the exergy that it is given",
     "identify": "by how much the gains of the prediction model should be scaled to predict a recorded run",
     "config": "the effective configuration and where each value comes from",
     "completion": "a script that completes commands and options in a shell",

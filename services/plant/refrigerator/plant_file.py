@@ -203,6 +203,18 @@ def read_plant_file(path: Path, limits: InputLimits, *, whole: bool = False) -> 
     """Return what a plant file says: of a refrigerator if it has one of its sections, or if `whole` is set.
 
     Raises:
+        ConfigurationError: As `read_refrigerator`.
+    """
+    file = read_refrigerator(path, limits)
+    if whole or WARM_SECTIONS & file.model_fields_set:
+        return file
+    return PlantFile.model_validate(file.model_dump(include=set(PlantFile.model_fields)))
+
+
+def read_refrigerator(path: Path, limits: InputLimits) -> RefrigeratorPlantFile:
+    """Return what a plant file says of a refrigerator; what it leaves out is as in the reference plant.
+
+    Raises:
         ConfigurationError: One line: the file cannot be read, a key is unknown or out of range, or the operating point
             is outside the limits of the inputs.
     """
@@ -216,6 +228,4 @@ def read_plant_file(path: Path, limits: InputLimits, *, whole: bool = False) -> 
                 f"{path}: operating_point.{key}: {value:g} is outside the limits of this input, {low:g} to {high:g};"
                 " take a value within, or change limits.low and limits.high"
             )
-    if whole or WARM_SECTIONS & file.model_fields_set:
-        return file
-    return PlantFile.model_validate(file.model_dump(include=set(PlantFile.model_fields)))
+    return file
