@@ -42,11 +42,11 @@ def execute(options: argparse.Namespace) -> int:
 def lines_of(balance: "ExergyBalance") -> list[str]:
     """Return a balance as text; rows are sorted by what is lost."""
     rows = sorted(balance.destroyed.items(), key=lambda row: -row[1])
+    of_all, of_electricity = (100.0 * balance.useful / each for each in (balance.put_in, balance.electricity))
     return [
         f"cold power {balance.cold_power:.1f} W at {balance.T_bath:.3f} K, load and heater",
-        f"specific power {balance.specific_power:.0f} W/W of electricity; Carnot's machine {balance.ideal_power:.1f} W/W",
-        f"of Carnot {100.0 * balance.useful / balance.electricity:.2f} % by the electricity,"
-        f" {100.0 * balance.useful / balance.put_in:.2f} % with the nitrogen's exergy",
+        f"specific power {balance.specific_power:.0f} W/W of electricity; Carnot {balance.ideal_power:.1f} W/W",
+        f"Carnot fraction {of_electricity:.2f} % by the electricity, {of_all:.2f} % with the nitrogen's exergy",
         "",
         f"{'exergy':{NAME_WIDTH}} {'kW':>9} {'%':>8}",
         _row("electricity", balance.electricity, balance.put_in),
@@ -59,4 +59,5 @@ def lines_of(balance: "ExergyBalance") -> list[str]:
 
 
 def _row(name: str, exergy: float, whole: float) -> str:
-    return f"{name:{NAME_WIDTH}} {1e-3 * exergy:9.3f} {100.0 * exergy / whole:8.2f}"
+    kilowatts, share = (round(value, 3) + 0.0 for value in (1e-3 * exergy, 100.0 * exergy / whole))  # no -0.000
+    return f"{name:{NAME_WIDTH}} {kilowatts:9.3f} {share:8.2f}"

@@ -1,6 +1,6 @@
 """The operating point of a refrigerator's plant file, or which of its components is in the way and what would help."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -11,15 +11,19 @@ from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError
 from plant.cold_box.physics import PA_PER_BAR, streams
 from plant.components.screw_compressor import compress
 from plant.helium.properties import Helium
-from plant.refrigerator.equilibrium import AMBIENT, Rest, find_refrigerator_equilibrium
+from plant.numeric import RealArray
+from plant.refrigerator.equilibrium import AMBIENT, Rest, find_refrigerator_equilibrium, first_guess
 from plant.refrigerator.file import RefrigeratorFile
+from plant.refrigerator.linearisation import jacobian
 from plant.refrigerator.model import make_refrigerator_file
-from plant.refrigerator.physics import BOX_STATES, STATE_NAMES
+from plant.refrigerator.physics import BOX_STATES, COMMAND_NAMES, STATE_NAMES, STATE_UNITS
 from plant.refrigerator.plant_file import RefrigeratorPlantFile
 from plant.refrigerator.prediction import prediction_model
 from plant.refrigerator.station_settings import LqWeights
 
 OPEN: Final = 100.0
+WIDER: Final = 100.0
+"""How much wider valves are made to see whether they are in the way."""
 LEAST_BYPASS: Final = 0.5
 """g/s: with less the low pressure cannot be raised."""
 COIL: Final = STATE_NAMES.index("T_nef5")
@@ -50,10 +54,7 @@ def refrigerator_operating_point(file: RefrigeratorPlantFile, helium: Helium, we
         try:
             rest = find_refrigerator_equilibrium(cold, plant, helium, file.station.buffer_bar * PA_PER_BAR)
         except (NoEquilibriumError, np.linalg.LinAlgError):
-            raise NoEquilibriumError(
-                "nef6: finds no rest with the nitrogen bath and the cold box; more nef6.ua_w_per_k or"
-                " nef5.ua_w_per_k would help, or less flow"
-            ) from None
+            raise NoEquilibriumError(_why_restless(cold, file, helium)) from None
         for obstacle in _wrong_rest(rest, file, helium):
             raise NoEquilibriumError(obstacle)
         try:
@@ -105,9 +106,33 @@ def _wrong_flows(cold: Equilibrium, file: RefrigeratorPlantFile, helium: Helium)
         )
 
 
-def _wrong_rest(rest: Rest, file: RefrigeratorPlantFile, helium: Helium) -> Iterator[str]:
-    """Yield what is in the way at the rest that was found."""
-    bypass, _, _, feed = rest.v
+def _why_restless(cold: Equilibrium, file: RefrigeratorPlantFile, helium: Helium) -> str:
+    """Return why no rest was found: a part is too fast, or a valve too small, as with a wider one there is a rest."""
+    plant, P_buffer = file.refrigerator, file.station.buffer_bar * PA_PER_BAR
+    x, n = first_guess(cold, plant, P_buffer), len(STATE_NAMES)
+    v, d = np.zeros(len(COMMAND_NAMES)), np.array([cold.w, AMBIENT, 0.0, 1.0, 1.0, 1.0])
+    for obstacle in _too_fast(jacobian(x, cold.u, v, d, plant, helium)[:n, :n], STATE_NAMES, STATE_UNITS):
+        return obstacle
+    for section, key in (("nef5", "cv167_area_mm2"), ("station", "cv956_area_mm2")):
+        part = getattr(file, section)
+        wide = part.model_copy(update={key: WIDER * getattr(part, key)})
+        wider = file.model_copy(update={section: wide}).refrigerator
+        try:
+            rest = find_refrigerator_equilibrium(cold, wider, helium, P_buffer)
+        except (NoEquilibriumError, np.linalg.LinAlgError):
+            continue
+        for obstacle in _too_narrow(WIDER * rest.v):
+            if obstacle.startswith(section):
+                return obstacle
+    return (
+        "nef6: finds no rest with the nitrogen bath and the cold box; more nef6.ua_w_per_k or nef5.ua_w_per_k would"
+        " help, or less flow"
+    )
+
+
+def _too_narrow(v: RealArray) -> Iterator[str]:
+    """Yield which warm valve would have to open further than it can."""
+    bypass, _, _, feed = v
     if not 0.0 < bypass <= OPEN:
         yield (
             f"station.cv956_area_mm2: the bypass would be {bypass:.0f} % open; more of it, or less displacement of nc1"
@@ -118,6 +143,11 @@ def _wrong_rest(rest: Rest, file: RefrigeratorPlantFile, helium: Helium) -> Iter
             f"nef5.cv167_area_mm2: the nitrogen feed would be {feed:.0f} % open; more of it would help, or more"
             " nef6.ua_w_per_k, which leaves less to cool"
         )
+
+
+def _wrong_rest(rest: Rest, file: RefrigeratorPlantFile, helium: Helium) -> Iterator[str]:
+    """Yield what is in the way at the rest that was found."""
+    yield from _too_narrow(rest.v)
     yield from obstacles(cold_part(rest), cooled_file(file, rest), helium)
 
 
@@ -134,20 +164,31 @@ def cooled_file(file: RefrigeratorPlantFile, rest: Rest) -> RefrigeratorPlantFil
 
 def _wrong_dynamics(model: LtiModel) -> Iterator[str]:
     """Yield that the refrigerator runs away with its pressures controlled, or is too fast for a tick."""
-    rates, vectors = np.linalg.eig(model.A)
-    sizes = np.array([SIZES.get(unit, 1.0) for unit in model.state_units])
-    moves = np.abs(vectors) / sizes[:, np.newaxis]
-    names = [model.state_names[int(k)] for k in np.argmax(moves, axis=0)]
-    rising, falling = int(np.argmax(rates.real)), int(np.argmin(rates.real))
-    if rates[rising].real > GROWTH:
+    rates, parts = _rates(model.A, model.state_names, model.state_units)
+    rising = int(np.argmax(rates))
+    if rates[rising] > GROWTH:
         yield (
-            f"{_part(names[rising])}: runs away from this operating point within {1.0 / rates[rising].real:.0f} s,"
-            " with its pressures controlled; take other operating_point.cv155_pct and cv156_pct"
+            f"{parts[rising]}: runs away from this operating point within {1.0 / rates[rising]:.0f} s, with its"
+            " pressures controlled; take other operating_point.cv155_pct and cv156_pct"
         )
-    if rates[falling].real < -FASTEST:
-        part = _part(names[falling])
+    yield from _too_fast(model.A, model.state_names, model.state_units)
+
+
+def _too_fast(A: RealArray, names: Sequence[str], units: Sequence[str]) -> Iterator[str]:
+    """Yield which part follows faster than steps of a tick can."""
+    rates, parts = _rates(A, names, units)
+    falling = int(np.argmin(rates))
+    if rates[falling] < -FASTEST:
+        part = parts[falling]
         more = MORE.get(part, f"{part}.aluminium_kg")
-        yield f"{part}: follows within {-1.0 / rates[falling].real:.2f} s, too fast for a tick; more {more} would help"
+        yield f"{part}: follows within {-1.0 / rates[falling]:.2g} s, too fast for a tick; more {more} would help"
+
+
+def _rates(A: RealArray, names: Sequence[str], units: Sequence[str]) -> tuple[RealArray, list[str]]:
+    """Return the real parts of the eigenvalues (1/s), and the part that moves most with each."""
+    rates, vectors = np.linalg.eig(A)
+    moves = np.abs(vectors) / np.array([SIZES.get(unit, 1.0) for unit in units])[:, np.newaxis]
+    return rates.real, [_part(names[int(k)]) for k in np.argmax(moves, axis=0)]
 
 
 SIZES: Final = {"Pa": 2e3, "m3": 2e-3, "kg": 0.01, "kg/s": 0.01, "bar": 0.1, "bar s": 1.0}

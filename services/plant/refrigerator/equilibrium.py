@@ -72,7 +72,7 @@ def find_refrigerator_equilibrium(
     Raises:
         NoEquilibriumError: Newton's method does not converge.
     """
-    start = _start(cold, plant, P_buffer)
+    start = first_guess(cold, plant, P_buffer)
     d = np.array([cold.w, AMBIENT, 0.0, 1.0, 1.0, 1.0])
     v = np.array([start[CV956], 0.0, 0.0, start[CV167]])
     x = _relaxed(start, cold.u, v, d, plant, helium)
@@ -107,7 +107,8 @@ def _relaxed(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refr
     return x
 
 
-def _start(cold: Equilibrium, plant: Refrigerator, P_buffer: float) -> RealArray:
+def first_guess(cold: Equilibrium, plant: Refrigerator, P_buffer: float) -> RealArray:
+    """Return the state from which the search sets out."""
     station, precooler = plant.station, plant.precooler
     hot = AMBIENT + station.cooler_approach
     nitrogen = NITROGEN_LEVEL / 100.0 * precooler.nef5.volume * LIQUID_DENSITY

@@ -37,6 +37,8 @@ J_PER_KJ: Final = 1e3
 
 CubicMetres = Annotated[float, within(0.05, 1000)]
 Area = Annotated[float, within(0.05, 100_000)]
+ReliefPressure = Annotated[float, within(1.01, 50)]
+ReliefSpan = Annotated[float, within(0.01, 10)]
 Lag = Annotated[float, within(0.5, 1000)]
 Speed = Annotated[float, within(0.1, 1000)]
 Share = Annotated[float, within(0.05, 1)]
@@ -127,9 +129,9 @@ class StationSection(Section):
 class ReliefSection(Section):
     """A relief valve into the atmosphere."""
 
-    pressure_bar: Annotated[float, within(1.01, 50)]
+    pressure_bar: ReliefPressure
     """At which it begins to open."""
-    span_bar: Annotated[float, within(0.01, 10)]
+    span_bar: ReliefSpan
     """Rise above it at which it is fully open."""
     area_mm2: Area
     """Effective flow area then."""
@@ -142,6 +144,30 @@ class ReliefSection(Section):
         )
 
 
+class HpReliefSection(ReliefSection):
+    """That of the high-pressure line."""
+
+    pressure_bar: ReliefPressure = 18.0
+    span_bar: ReliefSpan = 1.0
+    area_mm2: Area = 120.0
+
+
+class LpReliefSection(ReliefSection):
+    """That of the low-pressure line."""
+
+    pressure_bar: ReliefPressure = 1.5
+    span_bar: ReliefSpan = 0.2
+    area_mm2: Area = 2500.0
+
+
+class BufferReliefSection(ReliefSection):
+    """That of the buffer."""
+
+    pressure_bar: ReliefPressure = 12.0
+    span_bar: ReliefSpan = 1.0
+    area_mm2: Area = 100.0
+
+
 class RefrigeratorParameters(BoxParameters):
     """The parameters of a refrigerator."""
 
@@ -150,9 +176,9 @@ class RefrigeratorParameters(BoxParameters):
     nc1: CompressorSection = CompressorSection()
     nc2: CompressorSection = CompressorSection()
     station: StationSection = StationSection()
-    hp_relief: ReliefSection = ReliefSection(pressure_bar=18.0, span_bar=1.0, area_mm2=120.0)
-    lp_relief: ReliefSection = ReliefSection(pressure_bar=1.5, span_bar=0.2, area_mm2=2500.0)
-    buffer_relief: ReliefSection = ReliefSection(pressure_bar=12.0, span_bar=1.0, area_mm2=100.0)
+    hp_relief: HpReliefSection = HpReliefSection()
+    lp_relief: LpReliefSection = LpReliefSection()
+    buffer_relief: BufferReliefSection = BufferReliefSection()
 
     @property
     def refrigerator(self) -> Refrigerator:
