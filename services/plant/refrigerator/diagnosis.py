@@ -13,7 +13,6 @@ from plant.components.screw_compressor import compress
 from plant.helium.properties import Helium
 from plant.numeric import RealArray
 from plant.refrigerator.equilibrium import AMBIENT, Rest, find_refrigerator_equilibrium, first_guess
-from plant.refrigerator.file import RefrigeratorFile
 from plant.refrigerator.linearisation import jacobian
 from plant.refrigerator.model import make_refrigerator_file
 from plant.refrigerator.physics import BOX_STATES, COMMAND_NAMES, STATE_NAMES, STATE_UNITS
@@ -33,9 +32,8 @@ class Found(NamedTuple):
     """A refrigerator at rest, with what goes with it."""
 
     rest: Rest
-    file: RefrigeratorFile
     model: LtiModel
-    """Of the refrigerator with its pressure loop closed; it carries the plant."""
+    """Of the refrigerator with its pressure loop closed; it carries the plant, its rest and its gains."""
 
 
 def refrigerator_operating_point(file: RefrigeratorPlantFile, helium: Helium, weights: LqWeights) -> Found:
@@ -66,7 +64,7 @@ def refrigerator_operating_point(file: RefrigeratorPlantFile, helium: Helium, we
         model = prediction_model(own, plant, file.parameters, own.document)
         for obstacle in _wrong_dynamics(model):
             raise NoEquilibriumError(obstacle)
-    return Found(rest, own, model)
+    return Found(rest, model)
 
 
 def _wrong_pressures(file: RefrigeratorPlantFile) -> Iterator[str]:
@@ -87,7 +85,7 @@ def _wrong_pressures(file: RefrigeratorPlantFile) -> Iterator[str]:
 
 
 def _wrong_flows(cold: Equilibrium, file: RefrigeratorPlantFile, helium: Helium) -> Iterator[str]:
-    """Yield that the compressors deliver less than the cold box takes, or more than the bypass returns."""
+    """Yield that the compressors deliver less than the cold box takes."""
     plant = file.refrigerator
     box, station = plant.box, plant.station
     s = streams(cold.x, cold.u, box, helium)
