@@ -21,9 +21,9 @@ from plant.helium.properties import load_helium
 from plant.refrigerator.diagnosis import cold_part, cooled_file, refrigerator_operating_point
 from plant.refrigerator.equilibrium import Rest
 from plant.refrigerator.plant_file import RefrigeratorPlantFile
-from plant.refrigerator.station_settings import LqWeights
+from plant.refrigerator.station_settings import StationSettings
 
-DEFAULT_WEIGHTS: Final = LqWeights()
+DEFAULT_CONTROL: Final = StationSettings()
 HORIZON_S = 100.0
 """Time after which the gains are given: the level integrates, so there are no final ones."""
 TWO_SIDED = 1e-3
@@ -42,7 +42,7 @@ class Description(NamedTuple):
 
 
 def describe_model(
-    in_use: Path, plant: PlantFile, design: ControlDesign, weights: LqWeights = DEFAULT_WEIGHTS
+    in_use: Path, plant: PlantFile, design: ControlDesign, control: StationSettings = DEFAULT_CONTROL
 ) -> Description:
     """Solve for the operating point and linearise there; return the model and its description.
 
@@ -50,16 +50,16 @@ def describe_model(
         in_use: Model file that is configured, which is compared by its digest.
         plant: The cold box or the refrigerator, and its operating point.
         design: Whose bands the outputs at rest are compared with.
-        weights: Of the controller of a refrigerator's pressures.
+        control: Of a refrigerator's pressures; its weights decide the gains.
 
     Raises:
         plant.cold_box.equilibrium.NoEquilibriumError: The plant does not come to rest there; one line that says why.
     """
     helium = load_helium()
     if isinstance(plant, RefrigeratorPlantFile):
-        found = refrigerator_operating_point(plant, helium, weights)
+        found = refrigerator_operating_point(plant, helium, control.weights)
         rest, box, model = cold_part(found.rest), cooled_file(plant, found.rest).box, found.model
-        station = _station_lines(found.rest)
+        station = [*_station_lines(found.rest), *_set_point_line(plant, control)]
     else:
         rest, box, station = operating_point(plant, helium), plant.box, []
         model = model_at(rest, box, helium, plant.parameters)
@@ -112,6 +112,15 @@ def _station_lines(rest: Rest) -> list[str]:
         f"           compressors {signals['M_NC']:.1f} g/s, {signals['E_NC']:.1f} kW, {per_watt:.0f} W/W",
         f"           bypass {signals['M_CV956']:.1f} g/s, nitrogen {signals['M_GN2']:.2f} g/s",
     ]
+
+
+def _set_point_line(plant: RefrigeratorPlantFile, control: StationSettings) -> list[str]:
+    """Return what is to be set where the pressures at rest are not the set points."""
+    high, low = plant.boundaries.p_hp_bar, plant.boundaries.p_lp_bar
+    if (high, low) == (control.hp_bar, control.lp_bar):
+        return []
+    settings = f"--set plant.station.hp_bar={high:g} --set plant.station.lp_bar={low:g}"
+    return [f"set points {control.hp_bar:g} and {control.lp_bar:g} bar are not the pressures at rest: {settings}"]
 
 
 def _eigenvalue_lines(model: LtiModel, error: float) -> list[str]:

@@ -70,6 +70,15 @@ def test_gains_are_those_of_the_weights_that_are_configured(coldloop: "Coldloop"
     assert coldloop(*run, "--set", weights, "--out", tmp_path / "b").code == 0
 
 
+def test_pressures_at_rest_that_are_not_the_set_points_are_said(coldloop: "Coldloop", tmp_path: Path) -> None:
+    file = tmp_path / "lower.toml"
+    file.write_text("[boundaries]\np_hp_bar = 15.5\n[station]\nbuffer_bar = 5")
+    outcome = coldloop("model", "--plant", file)
+    assert (outcome.code, outcome.complaints) == (0, [])
+    assert "--set plant.station.hp_bar=15.5 --set plant.station.lp_bar=1.05\n" in outcome.out
+    assert "P9 15.5000 bar" in outcome.out
+
+
 def test_the_exergy_of_the_example_sums_to_what_is_put_in(coldloop: "Coldloop") -> None:
     outcome = coldloop("exergy", "--plant", EXAMPLE)
     assert (outcome.code, outcome.complaints) == (0, [])

@@ -38,9 +38,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.out is not None and options.plant is not None and options.out.resolve() == options.plant.resolve():
         raise UsageError(f"{options.out}: is the plant file; name another one with --out")
     try:
-        model, text, box = describe_model(
-            in_use, plant, settings.optimizer_plc.program.design, settings.plant.station.weights
-        )
+        model, text, box = describe_model(in_use, plant, settings.optimizer_plc.program.design, settings.plant.station)
     except NoEquilibriumError as error:
         raise UsageError(f"{options.plant or 'the reference plant'}: {error}") from None
     sys.stdout.write(text)
