@@ -41,6 +41,7 @@ COMMANDS: Final = {
     "new": "a folder with a process file and a plant to begin with",
     "process": "a process file: checked, linearised, judged, made into a model file",
     "design": "which decision and constraint instants the problem needs, by what each set costs",
+    "exergy": "where a refrigerator loses the exergy that it is given",
     "identify": "by how much the gains of the prediction model should be scaled to predict a recorded run",
     "config": "the effective configuration and where each value comes from",
     "completion": "a script that completes commands and options in a shell",

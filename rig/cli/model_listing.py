@@ -1,22 +1,29 @@
 """The cold box at its operating point, and its linear model as both PLCs run it, as text."""
 
 from pathlib import Path
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from coldloop.errors import ModelFileError, printable
 from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import LtiModel, load
-from coldloop.process.signals import L1, T5
+from coldloop.process.signals import L1, STATION_SIGNAL_NAMES, STATION_VALVE_NAMES, T5
 from optimizer_plc.qp.design import ControlDesign
 from plant.cold_box.capacity import held_loads
 from plant.cold_box.diagnosis import operating_point
 from plant.cold_box.equilibrium import Equilibrium
 from plant.cold_box.linearisation import linearisation_error
 from plant.cold_box.model import model_at
+from plant.cold_box.physics import ColdBox
 from plant.cold_box.plant_file import PlantFile
 from plant.helium.properties import load_helium
+from plant.refrigerator.diagnosis import cold_part, cooled_file, refrigerator_operating_point
+from plant.refrigerator.equilibrium import Rest
+from plant.refrigerator.plant_file import RefrigeratorPlantFile
+from plant.refrigerator.station_settings import StationSettings
 
+DEFAULT_CONTROL: Final = StationSettings()
 HORIZON_S = 100.0
 """Time after which the gains are given: the level integrates, so there are no final ones."""
 TWO_SIDED = 1e-3
@@ -25,23 +32,41 @@ GRID = 21, 3
 """Openings of CV155 and of CV156 at which it is tried which loads the plant holds."""
 
 
-def describe_model(in_use: Path, plant: PlantFile, design: ControlDesign) -> tuple[LtiModel, str]:
+class Description(NamedTuple):
+    """The model of a plant file, and what is said of it."""
+
+    model: LtiModel
+    text: str
+    box: ColdBox
+    """With the temperature after the pre-cooler that it has at rest."""
+
+
+def describe_model(
+    in_use: Path, plant: PlantFile, design: ControlDesign, control: StationSettings = DEFAULT_CONTROL
+) -> Description:
     """Solve for the operating point and linearise there; return the model and its description.
 
     Args:
         in_use: Model file that is configured, which is compared by its digest.
-        plant: The cold box and its operating point.
+        plant: The cold box or the refrigerator, and its operating point.
         design: Whose bands the outputs at rest are compared with.
+        control: Of a refrigerator's pressures; its weights decide the gains.
 
     Raises:
         plant.cold_box.equilibrium.NoEquilibriumError: The plant does not come to rest there; one line that says why.
     """
-    helium, box = load_helium(), plant.box
-    rest = operating_point(plant, helium)
-    model = model_at(rest, box, helium, plant.parameters)
+    helium = load_helium()
+    if isinstance(plant, RefrigeratorPlantFile):
+        found = refrigerator_operating_point(plant, helium, control.weights)
+        rest, box, model = cold_part(found.rest), cooled_file(plant, found.rest).box, found.model
+        station = [*_station_lines(found.rest), *_set_point_line(plant, control)]
+    else:
+        rest, box, station = operating_point(plant, helium), plant.box, []
+        model = model_at(rest, box, helium, plant.parameters)
     error = linearisation_error(rest.x, rest.u, rest.w, box, helium)
     lines = [
         *_equilibrium_lines(model, rest),
+        *station,
         *_eigenvalue_lines(model, error),
         *_gain_lines(model),
         *_kink_line(error),
@@ -49,7 +74,7 @@ def describe_model(in_use: Path, plant: PlantFile, design: ControlDesign) -> tup
         f"model      sha256 {model.digest}",
         *_in_use_line(in_use),
     ]
-    return model, "\n".join(lines) + "\n"
+    return Description(model, "\n".join(lines) + "\n", box)
 
 
 def _in_use_line(file: Path) -> list[str]:
@@ -76,6 +101,26 @@ def _equilibrium_lines(model: LtiModel, rest: Equilibrium) -> list[str]:
         f"residual   {rest.residual:.2e} per second (2 kPa, 1 % of level, 1 K)",
         *(f"outputs    {'  '.join(outputs[i : i + 6])}" for i in range(0, len(outputs), 6)),
     ]
+
+
+def _station_lines(rest: Rest) -> list[str]:
+    signals = dict(zip(STATION_SIGNAL_NAMES, rest.signals.tolist(), strict=True))
+    openings = [f"{name} {value:.2f} %" for name, value in zip(STATION_VALVE_NAMES, rest.v.tolist(), strict=True)]
+    per_watt = 1e3 * signals["E_NC"] / float(rest.d[0] + rest.u[1])
+    return [
+        f"station    {'  '.join(openings)}",
+        f"           compressors {signals['M_NC']:.1f} g/s, {signals['E_NC']:.1f} kW, {per_watt:.0f} W/W",
+        f"           bypass {signals['M_CV956']:.1f} g/s, nitrogen {signals['M_GN2']:.2f} g/s",
+    ]
+
+
+def _set_point_line(plant: RefrigeratorPlantFile, control: StationSettings) -> list[str]:
+    """Return what is to be set where the pressures at rest are not the set points."""
+    high, low = plant.boundaries.p_hp_bar, plant.boundaries.p_lp_bar
+    if (high, low) == (control.hp_bar, control.lp_bar):
+        return []
+    settings = f"--set plant.station.hp_bar={high:g} --set plant.station.lp_bar={low:g}"
+    return [f"set points {control.hp_bar:g} and {control.lp_bar:g} bar are not the pressures at rest: {settings}"]
 
 
 def _eigenvalue_lines(model: LtiModel, error: float) -> list[str]:
@@ -105,14 +150,13 @@ def _kink_line(error: float) -> list[str]:
     return ["kink       derivatives differ on both sides: the second law limits cells of NEF1 or NEF2; less UA there"]
 
 
-def held_line(plant: PlantFile, design: ControlDesign, limits: InputLimits) -> str:
+def held_line(box: ColdBox, level: float, design: ControlDesign, limits: InputLimits) -> str:
     """Return which loads a plant holds with L1 as in its file and T5 within its band: some seconds of computing."""
     openings = [np.linspace(limits.low[k], limits.high[k], count) for k, count in zip((0, 2), GRID, strict=True)]
     heater, warmth = (limits.low[1], limits.high[1]), (design.output_low[1], design.output_high[1])
-    level = plant.operating_point.level_pct
     try:
         with np.errstate(all="ignore"):
-            held = held_loads(plant.box, load_helium(), level, openings[0], heater, openings[1], warmth)
+            held = held_loads(box, load_helium(), level, openings[0], heater, openings[1], warmth)
     except ValueError:
         return "holds      no load with T5 within its band\n"
     loads = f"[{max(held.least.w, 0.0):.0f},{held.largest.w:.0f}]"

@@ -1,6 +1,7 @@
 """Makes the plant that a configuration asks for."""
 
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import ConfigurationError, ModelFileError
@@ -10,7 +11,7 @@ from plant.cold_box.physics import REFERENCE, ColdBox
 from plant.cold_box.program import ColdBoxProgram
 from plant.components.valve import Valve
 from plant.mismatched import MismatchedPlant
-from plant.own_model import box_of
+from plant.own_model import box_of, refrigerator_in
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.rack.rack import MakePlant
 from plant.refrigerator.events import EventSchedule
@@ -19,6 +20,7 @@ from plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSett
 
 if TYPE_CHECKING:
     from plant.refrigerator.file import RefrigeratorFile
+    from plant.refrigerator.physics import Refrigerator
 
 NO_MISMATCH: Final = MismatchSettings()
 
@@ -49,18 +51,27 @@ def plant_maker(header: ModelHeader, section: PlantSection) -> MakePlant:
         return partial(make_program, header, section.sensors, mismatch=section.mismatch)
     if section.mismatch != NO_MISMATCH:
         raise ConfigurationError("plant.mismatch: for a cold box alone; set plant.kind to cold-box, or leave it out")
-    if box_of(header) != REFERENCE:
+    if header.plant == COLD_BOX and box_of(header) != REFERENCE:
         raise ModelFileError("model.file: of another cold box than the refrigerator's; set plant.kind to cold-box")
-    from plant.refrigerator.file import SHIPPED, read_refrigerator_file  # noqa: PLC0415 a cold box starts without it
-
-    path = section.refrigerator.file or SHIPPED
-    file = read_refrigerator_file(path)
+    plant, file = _refrigerator_and_rest(header, section.refrigerator.file)
     if section.station.control is StationControlKind.LQ and section.station.weights != file.weights:
         raise ConfigurationError(
-            f"plant.station.weights: the gains in {path} belong to other weights; make a file with"
-            " `python -m plant.refrigerator.model FILE` and name it in plant.refrigerator.file"
+            "plant.station.weights: the gains of this refrigerator belong to other weights; make a file with"
+            " `python -m plant.refrigerator.model FILE` and name it in plant.refrigerator.file, or, with a plant file,"
+            " its model file with `coldloop model --plant` and these weights"
         )
-    return partial(_make_refrigerator, header, section, file)
+    return partial(_make_refrigerator, header, section, plant, file)
+
+
+def _refrigerator_and_rest(header: ModelHeader, named: Path | None) -> "tuple[Refrigerator, RefrigeratorFile]":
+    """Return the refrigerator that a model file describes, and its rest: of a file that is named, or of its own."""
+    from plant.refrigerator.file import SHIPPED, read_refrigerator_file, rest_in  # noqa: PLC0415 as below
+    from plant.refrigerator.physics import REFERENCE_REFRIGERATOR  # noqa: PLC0415 a cold box starts without it
+
+    plant = REFERENCE_REFRIGERATOR if header.plant == COLD_BOX else refrigerator_in(header)
+    if named is None and header.plant_rest:
+        return plant, rest_in(header.plant_rest, plant, "model.file: plant_rest")
+    return plant, read_refrigerator_file(named or SHIPPED, plant)
 
 
 def make_program(
@@ -94,13 +105,19 @@ def mismatched_box(box: ColdBox, mismatch: MismatchSettings) -> ColdBox:
 
 
 def _make_refrigerator(
-    header: ModelHeader, section: PlantSection, file: "RefrigeratorFile", load: HeatLoad, seed: int
+    header: ModelHeader,
+    section: PlantSection,
+    plant: "Refrigerator",
+    file: "RefrigeratorFile",
+    load: HeatLoad,
+    seed: int,
 ) -> PlantProgram:
     from plant.refrigerator.program import RefrigeratorProgram  # noqa: PLC0415
 
     happening = section.refrigerator
     with kernels_of("the refrigerator", about_s=20):
         return RefrigeratorProgram(
+            plant=plant,
             file=file,
             u0=header.u0,
             load=load,

@@ -2,6 +2,7 @@
 
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 from pydantic import ValidationError
 
@@ -11,9 +12,14 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.model_file import COLD_BOX, ModelHeader, read_header
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from plant.cold_box.model import parameters_digest
-from plant.cold_box.physics import REFERENCE, ColdBox
+from plant.cold_box.physics import ColdBox
 from plant.cold_box.plant_file import LISTING, BoxParameters
 from plant.helium.properties import load_helium
+
+if TYPE_CHECKING:
+    from plant.refrigerator.physics import Refrigerator
+
+P = TypeVar("P", bound=BoxParameters)
 
 
 def own_header(file: Path) -> ModelHeader:
@@ -29,7 +35,10 @@ def own_header(file: Path) -> ModelHeader:
         check_signals(header)
         return header
     names = (header.state_names[: len(STATE_NAMES)], header.input_names, header.output_names)
-    own = _own_parameters_digest(header.plant, box_of(header, str(file)))
+    if header.plant == COLD_BOX:
+        own = _box_digest(box_of(header, str(file)))
+    else:
+        own = _refrigerator_digest(refrigerator_in(header, str(file)))
     if header.parameters_digest != own or names != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
         raise ModelFileError(f"{file}: a model of another plant; make one with `coldloop model --out FILE`")
     return header
@@ -39,24 +48,35 @@ def box_of(model: ModelHeader | LtiModel, where: str = "model.file") -> ColdBox:
     """Return the cold box that a model file describes, the reference plant if it describes none; `where` names it.
 
     Raises:
-        ModelFileError: A parameter is unknown or out of range, or the plant is no cold box alone.
+        ModelFileError: A parameter is unknown or out of range.
     """
-    if not model.plant_parameters:
-        return REFERENCE
-    if model.plant != COLD_BOX:
-        raise ModelFileError(f"{where}: plant_parameters of a {model.plant}; only a cold box alone can have its own")
+    if model.plant == COLD_BOX:
+        return _parameters(model, BoxParameters, where).box
+    return refrigerator_in(model, where).box
+
+
+def refrigerator_in(model: ModelHeader | LtiModel, where: str = "model.file") -> "Refrigerator":
+    """Return the refrigerator that a model file describes, likewise."""
+    from plant.refrigerator.plant_file import RefrigeratorParameters  # noqa: PLC0415 a cold box starts without it
+
+    return _parameters(model, RefrigeratorParameters, where).refrigerator
+
+
+def _parameters(model: ModelHeader | LtiModel, kind: type[P], where: str) -> P:
     try:
-        return BoxParameters.model_validate(model.plant_parameters).box
+        return kind.model_validate(model.plant_parameters)
     except ValidationError as error:
-        wrong = explained(error, {}, BoxParameters, LISTING)
+        wrong = explained(error, {}, kind, LISTING)
         raise ModelFileError(f"{where}: plant_parameters: {wrong}; make it with `coldloop model --plant`") from None
 
 
 @cache
-def _own_parameters_digest(plant: str, box: ColdBox) -> str:
-    if plant == COLD_BOX:
-        return parameters_digest(box, load_helium())
-    from plant.refrigerator.file import refrigerator_digest  # noqa: PLC0415
-    from plant.refrigerator.physics import REFERENCE_REFRIGERATOR  # noqa: PLC0415 a cold box alone starts without it
+def _box_digest(box: ColdBox) -> str:
+    return parameters_digest(box, load_helium())
 
-    return refrigerator_digest(REFERENCE_REFRIGERATOR, load_helium())
+
+@cache
+def _refrigerator_digest(plant: "Refrigerator") -> str:
+    from plant.refrigerator.file import refrigerator_digest  # noqa: PLC0415
+
+    return refrigerator_digest(plant, load_helium())

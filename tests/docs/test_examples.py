@@ -157,7 +157,8 @@ class Reader:
         self._runs = 0
         (folder / "short_plan.toml").write_text(PLAN)
         (folder / "my_plan.toml").write_text(PLAN)
-        (folder / "my_box.toml").write_bytes((ROOT / "examples" / "smaller_turbine.toml").read_bytes())
+        for name, example in (("my_box", "smaller_turbine"), ("efficient_refrigerator", "efficient_refrigerator")):
+            (folder / f"{name}.toml").write_bytes((ROOT / "examples" / f"{example}.toml").read_bytes())
         for name, watts in (("my_hours.csv", 400), ("another.csv", 370)):
             (folder / name).write_text(f"time_s,load_w\n0,384\n5,{watts}\n")
 

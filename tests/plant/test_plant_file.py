@@ -19,11 +19,13 @@ from coldloop.process.signals import T5
 from plant.cold_box.diagnosis import operating_point
 from plant.cold_box.model import build_model, model_at, parameters_digest
 from plant.cold_box.physics import REFERENCE
-from plant.cold_box.plant_file import BoxParameters, PlantFile, read_plant_file
+from plant.cold_box.plant_file import BoxParameters, PlantFile
 from plant.helium.properties import load_helium
 from plant.kinds import plant_maker
 from plant.load import find_load
 from plant.own_model import own_header
+from plant.refrigerator.physics import REFERENCE_REFRIGERATOR
+from plant.refrigerator.plant_file import WARM_SECTIONS, RefrigeratorPlantFile, read_plant_file
 from plant.settings import MismatchSettings, PlantSection
 
 ROOT = Path(__file__).parents[2]
@@ -48,21 +50,38 @@ def test_the_defaults_are_the_reference_plant_to_the_bit(tmp_path: Path) -> None
     plant = read_plant_file(file, InputLimits())
     assert plant == PlantFile()
     assert (plant.box, plant.parameters) == (REFERENCE, {})
+    whole = read_plant_file(file, InputLimits(), whole=True)
+    assert isinstance(whole, RefrigeratorPlantFile)
+    assert (whole.refrigerator, whole.parameters) == (REFERENCE_REFRIGERATOR, {})
 
 
 def test_the_file_on_the_page_has_every_key_with_its_default_and_its_range() -> None:
     page = (ROOT / "docs" / "your-refrigerator.md").read_text(encoding="utf-8")
-    found = re.search(r"```toml\n(.*?)```", page, re.DOTALL)
-    assert found is not None
-    assert flattened(tomllib.loads(found[1])) == flattened(PlantFile().model_dump())
-    told = re.findall(r"^(\w+) = .*# ([\d. ]+?) to ([\d. ]+\d)", found[1], re.MULTILINE)
-    schema = PlantFile.model_json_schema()["$defs"]
+    box, warm = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert flattened(tomllib.loads(box)) == flattened(PlantFile().model_dump())
+    assert flattened(tomllib.loads(box + warm)) == flattened(RefrigeratorPlantFile().model_dump())
+    told = re.findall(r"^(\w+) = .*# ([\d. ]+?) to ([\d. ]+\d)", box + warm, re.MULTILINE)
+    schema = RefrigeratorPlantFile.model_json_schema()["$defs"]
     ranges = {
         (key, each["minimum"], each["maximum"])
         for section in schema.values() for key, each in section["properties"].items()
     }  # fmt: skip
-    assert len(told) > 15
+    assert len(told) > 35
     assert {(key, float(low.replace(" ", "")), float(high.replace(" ", ""))) for key, low, high in told} <= ranges
+
+
+def test_every_parameter_of_a_refrigerator_but_the_numbers_of_cells_has_a_key_and_every_key_a_parameter() -> None:
+    usual, reached = leaves(REFERENCE_REFRIGERATOR), set()
+    defaults = RefrigeratorPlantFile().model_dump()
+    for section, keys in defaults.items():
+        for name in keys if section in WARM_SECTIONS else ():
+            part = {**keys, name: 1.05 * keys[name]}
+            changed = leaves(RefrigeratorPlantFile.model_validate({section: part}).refrigerator)
+            moved = {place for place, pair in enumerate(zip(usual, changed, strict=True)) if len(set(pair)) > 1}
+            assert len(moved) == (0 if name == "buffer_bar" else 1), f"{section}.{name}"
+            reached |= moved
+    box = len(leaves(REFERENCE))
+    assert {usual[place] for place in range(box, len(usual)) if place not in reached} == {8}
 
 
 def test_every_parameter_but_the_numbers_of_cells_has_a_key_and_every_key_a_parameter() -> None:
@@ -118,7 +137,7 @@ TAMPERED: dict[str, tuple[Callable[[], object], str]] = {
     "a number": (lambda: 5, "plant_parameters|TypeError"),
     "a list": (lambda: ["bath"], "model file"),
     "null": (lambda: None, "TypeError"),
-    "nothing": (dict, "no sections of a plant file"),
+    "nothing": (dict, "plant_parameters: no sections"),
 }
 
 
@@ -133,10 +152,10 @@ def test_a_model_file_with_other_parameters_is_refused(name: str, tmp_path: Path
     assert "\n" not in str(refused.value)
 
 
-def test_a_refrigerator_has_no_parameters_in_its_model_file(tmp_path: Path) -> None:
+def test_a_refrigerator_of_other_parameters_than_its_model_is_refused(tmp_path: Path) -> None:
     digest = read_header(SHIPPED_MODELS["refrigerator"]).parameters_digest
     file = write_model(tmp_path / "box.json", example_with(), digest, "refrigerator")
-    with pytest.raises(ModelFileError, match="only a cold box alone"):
+    with pytest.raises(ModelFileError, match="another plant"):
         own_header(file)
 
 

@@ -13,9 +13,10 @@ from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE, ModelSettings
 from coldloop.process.signals import L1, T5
 from optimizer_plc.qp.design import ControlDesign
-from plant.cold_box.plant_file import PlantFile, read_plant_file
+from plant.cold_box.plant_file import PlantFile
 from plant.load import find_load
 from plant.numeric import RealArray
+from plant.refrigerator.plant_file import read_plant_file
 from rig import Simulation
 from rig import simulate as run_in_process
 from rig.cli.model_listing import describe_model
@@ -42,7 +43,7 @@ class Made(NamedTuple):
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     file, settings = tmp_path_factory.mktemp("made") / "my_box.json", Settings()
     plant = read_plant_file(EXAMPLE, settings.limits)
-    model, _ = describe_model(DEFAULT_MODEL_FILE, plant, settings.optimizer_plc.program.design)
+    model, *_ = describe_model(DEFAULT_MODEL_FILE, plant, settings.optimizer_plc.program.design)
     model.save(file)
     return Made(file, model, run_in_process(load="a", duration_s="10min", model={"file": str(file)}))
 
@@ -107,7 +108,7 @@ def test_an_output_that_rests_outside_its_band_and_a_kink_are_said() -> None:
         "nef34": {"ua_w_per_k": 15_000.0},
         "operating_point": {"level_pct": 50.0},
     }
-    _, text = describe_model(DEFAULT_MODEL_FILE, PlantFile.model_validate(changes), ControlDesign())
+    _, text, _ = describe_model(DEFAULT_MODEL_FILE, PlantFile.model_validate(changes), ControlDesign())
     assert "L1 rests at 50.00 %, its band is 59 to 61 %: set optimizer_plc.program.design.output_low" in text
     assert "kink       derivatives differ on both sides" in text
 

@@ -1,4 +1,4 @@
-"""`coldloop model`: the cold box at its operating point, and its linear model as both PLCs run it."""
+"""`coldloop model`: the plant at its operating point, and its linear model as both PLCs run it."""
 
 import argparse
 import sys
@@ -11,7 +11,7 @@ from rig.cli.commands.options import configuration
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument("--plant", type=Path, metavar="FILE", help="plant file (TOML): parameters of another cold box")
+    parser.add_argument("--plant", type=Path, metavar="FILE", help="plant file (TOML): parameters of another plant")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the model file, for model.file")
 
 
@@ -21,23 +21,31 @@ def execute(options: argparse.Namespace) -> int:
     from coldloop.process.lti_model import load
     from coldloop.whole_file import require_regular_file
     from plant.cold_box.equilibrium import NoEquilibriumError
-    from plant.cold_box.plant_file import PlantFile, read_plant_file
+    from plant.cold_box.plant_file import PlantFile
+    from plant.refrigerator.plant_file import RefrigeratorPlantFile, read_plant_file
+    from plant.settings import PlantKind
     from rig.cli.model_listing import describe_model, held_line
 
     if options.out is not None:
         require_regular_file(options.out)
     settings = configuration(options).settings
     in_use = settings.model.file
-    plant = PlantFile() if options.plant is None else read_plant_file(options.plant, settings.limits)
+    whole = settings.plant.kind is PlantKind.REFRIGERATOR
+    if options.plant is not None:
+        plant = read_plant_file(options.plant, settings.limits, whole=whole)
+    else:
+        plant = RefrigeratorPlantFile() if whole else PlantFile()
     if options.out is not None and options.plant is not None and options.out.resolve() == options.plant.resolve():
         raise UsageError(f"{options.out}: is the plant file; name another one with --out")
     try:
-        model, text = describe_model(in_use, plant, settings.optimizer_plc.program.design)
+        model, text, box = describe_model(in_use, plant, settings.optimizer_plc.program.design, settings.plant.station)
     except NoEquilibriumError as error:
         raise UsageError(f"{options.plant or 'the reference plant'}: {error}") from None
     sys.stdout.write(text)
     if options.plant is not None:
-        sys.stdout.write(held_line(plant, settings.optimizer_plc.program.design, settings.limits))
+        sys.stdout.write(
+            held_line(box, plant.operating_point.level_pct, settings.optimizer_plc.program.design, settings.limits)
+        )
     if options.out is not None:
         try:
             model.save(options.out)

@@ -14,7 +14,7 @@ from plant.cold_box.physics import evaluate
 from plant.cold_box.program import ColdBoxProgram
 from plant.helium.properties import load_helium
 from plant.integrator import advance_along
-from plant.refrigerator.physics import BOX_STATES, REFERENCE_REFRIGERATOR, SIGNALS
+from plant.refrigerator.physics import BOX_STATES, SIGNALS
 from plant.refrigerator.program import RefrigeratorProgram
 from plant.refrigerator.tick import ALARMS, MODE, RefrigeratorMemory, advance_tick
 from rig.cosim.compiled.records import (
@@ -77,7 +77,7 @@ def show_station(m: RefrigeratorMemory, station: Array) -> None:
 def constants_of(program: ColdBoxProgram) -> PlantConstants:
     """Return what does not change in a session."""
     if isinstance(program, RefrigeratorProgram):
-        return RefrigeratorConstants(REFERENCE_REFRIGERATOR, load_helium(), program.law)
+        return RefrigeratorConstants(program.plant, load_helium(), program.law)
     return BoxConstants(program.box, load_helium())
 
 

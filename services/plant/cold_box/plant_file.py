@@ -3,15 +3,11 @@
 Every key is optional; the defaults are the reference plant. Numbers of cells are no keys: they name the states.
 """
 
-from pathlib import Path
 from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic.fields import FieldInfo
 
-from coldloop.config import load_configuration
-from coldloop.errors import ConfigurationError
-from coldloop.process.limits import InputLimits
 from coldloop.process.model_range import SATURATION_BAR, SUPPLY_BAR
 from plant.cold_box.physics import CELLS, PA_PER_BAR, REFERENCE, ColdBox
 from plant.components.heat_exchanger import HeatExchanger
@@ -26,17 +22,17 @@ NOZZLE_UNITS: Final = 1e8
 """g sqrt(K)/(s bar) in a kg sqrt(K)/(s Pa)."""
 
 
-def _within(low: float, high: float) -> FieldInfo:
+def within(low: float, high: float) -> FieldInfo:
     """Return the range of a number; texts and truth values are none."""
     info: FieldInfo = Field(strict=True, ge=low, le=high)
     return info
 
 
-HeatTransfer = Annotated[float, _within(10, 200_000)]
-Litres = Annotated[float, _within(0.1, 2000)]
-Mass = Annotated[float, _within(0.1, 20_000)]
-Drop = Annotated[float, _within(0.0001, 1)]
-Flow = Annotated[float, _within(0.1, 5000)]
+HeatTransfer = Annotated[float, within(10, 200_000)]
+Litres = Annotated[float, within(0.1, 2000)]
+Mass = Annotated[float, within(0.1, 20_000)]
+Drop = Annotated[float, within(0.0001, 1)]
+Flow = Annotated[float, within(0.1, 5000)]
 
 OPERATING_INPUTS: Final = (43.0, 75.0, 36.0)  # CV155 %, NCR22_A W, CV156 %; left of the capacity maximum at 50 %
 OPERATING_LEVEL: Final = 60.0  # %
@@ -51,37 +47,37 @@ class Section(BaseModel):
 class BathSection(Section):
     """The phase separator NS1."""
 
-    volume_m3: Annotated[float, _within(0.005, 10)] = 0.2
+    volume_m3: Annotated[float, within(0.005, 10)] = 0.2
     """Of the vessel; 1 % of level is a hundredth of it."""
-    wall_kg: Annotated[float, _within(0.1, 10_000)] = 50.0
+    wall_kg: Annotated[float, within(0.1, 10_000)] = 50.0
     """Aluminium that warms when the vessel is dry."""
-    relief_pressure_bar: Annotated[float, _within(*SATURATION_BAR)] = 1.8
+    relief_pressure_bar: Annotated[float, within(*SATURATION_BAR)] = 1.8
     """At which its relief valve begins to open."""
-    relief_span_bar: Annotated[float, _within(0.01, 2)] = 0.3
+    relief_span_bar: Annotated[float, within(0.01, 2)] = 0.3
     """Rise above it at which that valve is fully open."""
-    relief_area_mm2: Annotated[float, _within(1, 100_000)] = 400.0
+    relief_area_mm2: Annotated[float, within(1, 100_000)] = 400.0
     """Its flow area then."""
 
 
 class JtValveSection(Section):
     """The Joule-Thomson valve CV155."""
 
-    area_mm2: Annotated[float, _within(0.05, 500)] = 3.9
+    area_mm2: Annotated[float, within(0.05, 500)] = 3.9
     """Effective flow area when fully open."""
 
 
 class TurbineSection(Section):
     """The turbine and its inlet valve CV156."""
 
-    cv156_area_mm2: Annotated[float, _within(0.5, 5000)] = 26.0
+    cv156_area_mm2: Annotated[float, within(0.5, 5000)] = 26.0
     """Effective flow area of CV156 when fully open."""
-    nozzle_g_sqrt_k_per_s_bar: Annotated[float, _within(0.5, 5000)] = 22.0
+    nozzle_g_sqrt_k_per_s_bar: Annotated[float, within(0.5, 5000)] = 22.0
     """K of the choked nozzle, m = K P / sqrt(T) with m in g/s, P in bar, T in K."""
-    efficiency: Annotated[float, _within(0.2, 0.95)] = 0.7
+    efficiency: Annotated[float, within(0.2, 0.95)] = 0.7
     """Isentropic."""
-    speed_hz_per_sqrt_j_per_kg: Annotated[float, _within(0.1, 100)] = 10.0
+    speed_hz_per_sqrt_j_per_kg: Annotated[float, within(0.1, 100)] = 10.0
     """Shaft speed over the square root of the isentropic enthalpy drop."""
-    windage_g_per_s: Annotated[float, _within(0.1, 1000)] = 15.0
+    windage_g_per_s: Annotated[float, within(0.1, 1000)] = 15.0
     """Flow below which windage takes work."""
 
 
@@ -140,21 +136,21 @@ class ReturnLineSection(Section):
 class BoundariesSection(Section):
     """What the cold box is given."""
 
-    p_hp_bar: Annotated[float, _within(*SUPPLY_BAR)] = 16.0
+    p_hp_bar: Annotated[float, within(*SUPPLY_BAR)] = 16.0
     """Supply pressure."""
-    p_lp_bar: Annotated[float, _within(SATURATION_BAR[0], 2)] = 1.05
+    p_lp_bar: Annotated[float, within(SATURATION_BAR[0], 2)] = 1.05
     """Suction pressure of the compressor."""
-    t_in_k: Annotated[float, _within(30, 300)] = 80.0
+    t_in_k: Annotated[float, within(30, 300)] = 80.0
     """Temperature after the nitrogen pre-cooler."""
 
 
 class OperatingPointSection(Section):
     """Where the plant is at rest, and its model linear."""
 
-    cv155_pct: Annotated[float, _within(0, 100)] = OPERATING_INPUTS[0]
-    ncr22_a_w: Annotated[float, _within(0, 1000)] = OPERATING_INPUTS[1]
-    cv156_pct: Annotated[float, _within(0, 100)] = OPERATING_INPUTS[2]
-    level_pct: Annotated[float, _within(5, 95)] = OPERATING_LEVEL
+    cv155_pct: Annotated[float, within(0, 100)] = OPERATING_INPUTS[0]
+    ncr22_a_w: Annotated[float, within(0, 1000)] = OPERATING_INPUTS[1]
+    cv156_pct: Annotated[float, within(0, 100)] = OPERATING_INPUTS[2]
+    level_pct: Annotated[float, within(5, 95)] = OPERATING_LEVEL
     """L1; the load is what the box then cools beside its heater."""
 
     @property
@@ -218,21 +214,3 @@ class PlantFile(BoxParameters):
         part = getattr(self, section)
         changed = part.model_copy(update={name: factor * getattr(part, name)})
         return self.model_copy(update={section: changed}).box
-
-
-def read_plant_file(path: Path, limits: InputLimits) -> PlantFile:
-    """Return what a plant file says.
-
-    Raises:
-        ConfigurationError: One line: the file cannot be read, a key is unknown or out of range, or the operating point
-            is outside the limits of the inputs.
-    """
-    file = load_configuration(PlantFile, file=path, environment={}, option="--plant", listing=LISTING).settings
-    inputs = file.operating_point.model_dump(exclude={"level_pct"})
-    for (key, value), low, high in zip(inputs.items(), limits.low, limits.high, strict=True):
-        if not low <= value <= high:
-            raise ConfigurationError(
-                f"{path}: operating_point.{key}: {value:g} is outside the limits of this input, {low:g} to {high:g};"
-                " take a value within, or change limits.low and limits.high"
-            )
-    return file

@@ -5,6 +5,7 @@ levels, the two pressures and the buffer's content are given. The mass of the wh
 equation follows from the others, and the steps of Newton's method are those of least squares.
 """
 
+from math import isfinite
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ from plant.refrigerator.physics import (
     read,
 )
 
-P_HP, P_LP, P_BUFFER = 16e5, 1.05e5, 6e5
+P_BUFFER: Final = 6e5
 AMBIENT: Final = 300.0
 NITROGEN_LEVEL: Final = 60.0
 TOLERANCE: Final = 1e-10
@@ -61,13 +62,17 @@ class Rest(NamedTuple):
     """Largest |dx/dt| in units of `rate_scales`, per second."""
 
 
-def find_refrigerator_equilibrium(cold: Equilibrium, plant: Refrigerator, helium: Helium) -> Rest:
+def find_refrigerator_equilibrium(
+    cold: Equilibrium, plant: Refrigerator, helium: Helium, P_buffer: float = P_BUFFER
+) -> Rest:
     """Return the rest of `plant` at the cold box's inputs and level, near the rest `cold` of the cold box alone.
+
+    Supply and suction pressure are the cold box's boundaries, `P_buffer` (Pa) is that of the buffer.
 
     Raises:
         NoEquilibriumError: Newton's method does not converge.
     """
-    start = _start(cold, plant)
+    start = first_guess(cold, plant, P_buffer)
     d = np.array([cold.w, AMBIENT, 0.0, 1.0, 1.0, 1.0])
     v = np.array([start[CV956], 0.0, 0.0, start[CV167]])
     x = _relaxed(start, cold.u, v, d, plant, helium)
@@ -78,6 +83,8 @@ def find_refrigerator_equilibrium(cold: Equilibrium, plant: Refrigerator, helium
         residual = float(np.max(np.abs(dx)))
         if residual < TOLERANCE:
             return Rest(x, cold.u, v, d, *read(x, cold.u, v, d, plant, helium), residual)
+        if not isfinite(residual):
+            break
         J = jacobian(x, cold.u, v, d, plant, helium)[: len(STATE_NAMES)] / scales[:, np.newaxis]
         load = len(STATE_NAMES) + 3 + len(COMMAND_NAMES) + DISTURBANCE_NAMES.index("NCR22_HL")
         bypass, feed = len(STATE_NAMES) + 3, len(STATE_NAMES) + 6
@@ -100,14 +107,15 @@ def _relaxed(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refr
     return x
 
 
-def _start(cold: Equilibrium, plant: Refrigerator) -> RealArray:
+def first_guess(cold: Equilibrium, plant: Refrigerator, P_buffer: float) -> RealArray:
+    """Return the state from which the search sets out."""
     station, precooler = plant.station, plant.precooler
     hot = AMBIENT + station.cooler_approach
     nitrogen = NITROGEN_LEVEL / 100.0 * precooler.nef5.volume * LIQUID_DENSITY
     masses = [
-        gas_mass(station.hp, P_HP, hot),
-        gas_mass(station.lp, P_LP, AMBIENT),
-        gas_mass(station.buffer, P_BUFFER, AMBIENT),
+        gas_mass(station.hp, plant.box.P_HP, hot),
+        gas_mass(station.lp, plant.box.P_LP, AMBIENT),
+        gas_mass(station.buffer, P_buffer, AMBIENT),
     ]
     exchanger = np.linspace(hot - 25.0, 84.0, precooler.nef6.cells)
     return np.concatenate([cold.x, exchanger, [80.0, nitrogen, 30.0], masses, [0.0, 1.0, 1.0, 25.0, 0.0, 0.0]])

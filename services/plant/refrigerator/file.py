@@ -47,21 +47,21 @@ class RefrigeratorFile:
         bypass, _, _, feed = self.v0
         return StationReference(self.gains, bypass, feed)
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """As plain data: what a model file of the refrigerator carries as its `plant_rest`."""
+        return {
+            "state_names": list(STATE_NAMES), "command_names": list(COMMAND_NAMES),
+            "weights": self.weights.model_dump(), "parameters_digest": self.parameters_digest, "w0": self.w0,
+            "x0": list(self.x0), "u0": list(self.u0), "v0": list(self.v0), "gains": [list(row) for row in self.gains],
+        }  # fmt: skip
+
     def save(self, path: Path) -> None:
         """Write the file (OSError if it cannot be written)."""
-        document: dict[str, Any] = {"format": FORMAT, "plant": KIND, "state_names": list(STATE_NAMES)}
-        document |= {"command_names": list(COMMAND_NAMES), "weights": self.weights.model_dump()}
-        document |= {"parameters_digest": self.parameters_digest, "w0": self.w0}
-        document |= {
-            "x0": list(self.x0),
-            "u0": list(self.u0),
-            "v0": list(self.v0),
-            "gains": [list(row) for row in self.gains],
-        }
-        write_document(path, document)
+        write_document(path, {"format": FORMAT, "plant": KIND, **self.document})
 
 
-def read_refrigerator_file(path: Path) -> RefrigeratorFile:
+def read_refrigerator_file(path: Path, plant: Refrigerator = REFERENCE_REFRIGERATOR) -> RefrigeratorFile:
     """Return what a file holds that was made for this very refrigerator.
 
     Raises:
@@ -70,6 +70,15 @@ def read_refrigerator_file(path: Path) -> RefrigeratorFile:
     document = read_document(path, REMEDY)
     if document.get("plant") != KIND:
         raise ModelFileError(f"{path}: not the file of a refrigerator; {REMEDY}")
+    return rest_in(document, plant, str(path))
+
+
+def rest_in(document: dict[str, Any], plant: Refrigerator, path: str) -> RefrigeratorFile:
+    """Return what `RefrigeratorFile.document` has made of this very refrigerator; `path` is for the message.
+
+    Raises:
+        ModelFileError: It is incomplete, or was made from another plant.
+    """
     try:
         first, second = (tuple(float(gain) for gain in row) for row in document["gains"])
         file = RefrigeratorFile(
@@ -87,7 +96,7 @@ def read_refrigerator_file(path: Path) -> RefrigeratorFile:
     sizes = len(file.x0), len(file.u0), len(file.v0), len(first), len(second)
     if names != (list(STATE_NAMES), list(COMMAND_NAMES)) or sizes != (len(STATE_NAMES), 3, len(COMMAND_NAMES), 6, 6):
         raise ModelFileError(f"{path}: made for a refrigerator with other states; {REMEDY}")
-    if file.parameters_digest != refrigerator_digest(REFERENCE_REFRIGERATOR, load_helium()):
+    if file.parameters_digest != refrigerator_digest(plant, load_helium()):
         raise ModelFileError(f"{path}: made for a refrigerator with other parameters; {REMEDY}")
     return file
 

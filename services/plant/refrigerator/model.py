@@ -37,11 +37,11 @@ def rest_of(plant: Refrigerator = REFERENCE_REFRIGERATOR) -> Rest:
 
 
 def make_refrigerator_file(
-    plant: Refrigerator = REFERENCE_REFRIGERATOR, weights: LqWeights | None = None
+    plant: Refrigerator = REFERENCE_REFRIGERATOR, weights: LqWeights | None = None, rest: Rest | None = None
 ) -> RefrigeratorFile:
-    """Return operating point and gains of a refrigerator; raises as `rest_of`."""
-    weights = weights or LqWeights()
-    helium, rest = load_helium(), rest_of(plant)
+    """Return operating point and gains of a refrigerator at a rest, by default that of `rest_of`, which may raise."""
+    weights, rest = weights or LqWeights(), rest or rest_of(plant)
+    helium = load_helium()
     lines = line_model(jacobian(rest.x, rest.u, rest.v, rest.d, plant, helium))
     first, second = lq_gains(lines, plant.station.actuator.lag, weights).tolist()
     return RefrigeratorFile(

@@ -65,7 +65,7 @@ class Refrigerator(NamedTuple):
     """Components of the refrigerator; the defaults are the reference plant."""
 
     box: ColdBox = REFERENCE
-    """Its boundary conditions P_HP, P_LP, T_in are not read."""
+    """Its boundaries P_HP and P_LP are the pressures at rest; the equations do not read them, nor T_in."""
     precooler: Precooler = Precooler()
     station: CompressionStation = CompressionStation()
 

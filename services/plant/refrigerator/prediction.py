@@ -7,8 +7,9 @@ them: the nitrogen's level while the coil is wet, the buffer while its valves ar
 """
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -35,8 +36,16 @@ LOOP_NAMES: Final = ("bypass", "inventory", "integral_HP", "integral_LP")
 LOOP_UNITS: Final = ("kg/s", "kg/s", "bar s", "bar s")
 
 
-def prediction_model(file: RefrigeratorFile, plant: Refrigerator = REFERENCE_REFRIGERATOR) -> LtiModel:
-    """Return the linear model of a refrigerator with its pressure loop closed by the gains of its file."""
+def prediction_model(
+    file: RefrigeratorFile,
+    plant: Refrigerator = REFERENCE_REFRIGERATOR,
+    parameters: Mapping[str, Any] | None = None,
+    rest: Mapping[str, Any] | None = None,
+) -> LtiModel:
+    """Return the linear model of a refrigerator with its pressure loop closed by the gains of its file.
+
+    `parameters` and `rest` are what the model file is to carry of the plant, beside the linear model.
+    """
     helium = load_helium()
     x0, u0, v0 = np.array(file.x0), np.array(file.u0), np.array(file.v0)
     d0 = np.array([file.w0, 300.0, 0.0, 1.0, 1.0, 1.0])
@@ -60,6 +69,7 @@ def prediction_model(file: RefrigeratorFile, plant: Refrigerator = REFERENCE_REF
         output_names=process.OUTPUT_NAMES, output_units=process.OUTPUT_UNITS,
         load_name=cold_box.LOAD_NAME, load_unit=cold_box.LOAD_UNIT,
         parameters_digest=refrigerator_digest(plant, helium), plant=KIND,
+        plant_parameters=dict(parameters or {}), plant_rest=dict(rest or {}),
     )  # fmt: skip
 
 

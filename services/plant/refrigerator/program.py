@@ -17,6 +17,7 @@ from plant.refrigerator.file import RefrigeratorFile
 from plant.refrigerator.physics import (
     BOX_STATES,
     REFERENCE_REFRIGERATOR,
+    Refrigerator,
     check_refrigerator,
     read,
 )
@@ -33,7 +34,8 @@ class RefrigeratorProgram(ColdBoxProgram):
     rest.
 
     Args:
-        file: Operating point and gains; `x0` of the plant is its.
+        plant: The parameters of the refrigerator.
+        file: Its operating point and gains; `x0` of the plant is its.
         u0: Inputs held until the first `apply`, 3 numbers.
         load: The heat load over time.
         station: Settings of the station's controller.
@@ -47,6 +49,7 @@ class RefrigeratorProgram(ColdBoxProgram):
     def __init__(
         self,
         *,
+        plant: Refrigerator = REFERENCE_REFRIGERATOR,
         file: RefrigeratorFile,
         u0: Sequence[float],
         load: HeatLoad,
@@ -54,17 +57,18 @@ class RefrigeratorProgram(ColdBoxProgram):
         events: EventSchedule,
         noise: MeasurementNoise | None = None,
     ) -> None:
-        check_refrigerator(REFERENCE_REFRIGERATOR)
-        self._plant, self._tables = plain_tuples(REFERENCE_REFRIGERATOR), plain_tuples(load_helium())
-        self.law = station_law(station, file.reference, REFERENCE_REFRIGERATOR.station)
+        check_refrigerator(plant)
+        self.plant = plant
+        self._plant, self._tables = plain_tuples(plant), plain_tuples(load_helium())
+        self.law = station_law(station, file.reference, plant.station)
         """Of the station's controller."""
         self._events = events
         x, v = np.array(file.x0, dtype=np.float64), np.array(file.v0, dtype=np.float64)
         d = self._disturbances(0, load.value(0))
-        y, signals = read(x, np.array(u0, dtype=np.float64), v, d, REFERENCE_REFRIGERATOR, load_helium())
+        y, signals = read(x, np.array(u0, dtype=np.float64), v, d, plant, load_helium())
         self._memory = RefrigeratorMemory(x, y, signals, v, np.zeros(3), np.zeros(2, np.int64))
         control_tick(self._memory, d, self.law)
-        super().__init__(box=REFERENCE_REFRIGERATOR.box, x0=file.x0[:BOX_STATES], u0=u0, load=load, noise=noise)
+        super().__init__(box=plant.box, x0=file.x0[:BOX_STATES], u0=u0, load=load, noise=noise)
 
     def _warm_up(self) -> None:
         d = self._disturbances(0, self.load)

@@ -24,7 +24,9 @@ from coldloop.process.signals import STATE_NAMES
 
 RealArray: TypeAlias = NDArray[np.float64]
 
-UNNAMED: dict[str, Any] = {"plant": COLD_BOX, "note": "", "plant_parameters": {}, "process": {}}
+UNNAMED: dict[str, Any] = {
+    "plant": COLD_BOX, "note": "", "plant_parameters": {}, "plant_rest": {}, "process": {},
+}  # fmt: skip
 """What a model file leaves out."""
 MATRICES = ("A", "B", "F", "C", "D", "G", "A_tick", "B_tick", "F_tick")
 
@@ -97,6 +99,8 @@ class LtiModel:
     """The plant's parameters by section, as in a plant file; none are those of the reference plant."""
     process: dict[str, Any] = field(default_factory=dict)
     """`coldloop.process.declaration.Process` as plain data; none is the cold box."""
+    plant_rest: dict[str, Any] = field(default_factory=dict)
+    """Where a refrigerator is at rest, and the gains of its pressure controller; none are those that are shipped."""
 
     def __post_init__(self) -> None:
         n, m, p = len(self.state_names), len(self.input_names), len(self.output_names)

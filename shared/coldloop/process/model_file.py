@@ -52,6 +52,8 @@ class ModelHeader:
     """The process that the plant is; none is the cold box."""
     file: Path = Path()
     """Where it was read from."""
+    plant_rest: dict[str, Any] = field(default_factory=dict)
+    """Where a refrigerator is at rest, and the gains of its pressure controller; none are those that are shipped."""
 
     @property
     def short_digest(self) -> int:
@@ -75,7 +77,7 @@ def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
         described |= {name: tuple(str(text) for text in document[name]) for name in LISTS_OF_TEXT}
         described |= {name: tuple(float(number) for number in document[name]) for name in VECTORS}
         described |= {"plant": str(document.get("plant", COLD_BOX)), "note": str(document.get("note", ""))}
-        described["plant_parameters"] = _parameters(document)
+        described |= {name: _sections(document, name) for name in ("plant_parameters", "plant_rest")}
         described["process"] = dict(document.get("process", {}))
         header = ModelHeader(w0=float(document["w0"]), file=path, **described)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -87,11 +89,11 @@ def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
     return header
 
 
-def _parameters(document: dict[str, Any]) -> dict[str, Any]:
-    parameters = document.get("plant_parameters", {})
-    if "plant_parameters" in document and not (isinstance(parameters, dict) and parameters):
-        raise TypeError("plant_parameters are no sections of a plant file")
-    return dict(parameters)
+def _sections(document: dict[str, Any], name: str) -> dict[str, Any]:
+    sections = document.get(name, {})
+    if name in document and not (isinstance(sections, dict) and sections):
+        raise TypeError(f"{name}: no sections")
+    return dict(sections)
 
 
 def read_document(path: Path, remedy: str = REMEDY) -> dict[str, Any]:
