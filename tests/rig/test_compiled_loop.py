@@ -61,7 +61,7 @@ COMPILED = {
         f"{PROGRAM}interrupting_load_step_w=10",
         f'{PROGRAM}solver="hybrid"',
     ),
-    "refrigerator": (REFRIGERATOR, TRIP, *NOISE),
+    "refrigerator": (REFRIGERATOR, TRIP, "plant.station.noise_bar=0.005", *NOISE),
     "refrigerator with PI and a model of its own": (
         REFRIGERATOR,
         "plant.station.control=pi",

@@ -20,9 +20,29 @@ from plant.refrigerator.physics import (
     read,
 )
 from plant.refrigerator.station_control import station_law
-from plant.refrigerator.station_law import Commands
+from plant.refrigerator.station_law import MEMORY_SIZE, Commands
 from plant.refrigerator.station_settings import StationSettings
 from plant.refrigerator.tick import ALARMS, HP, LP, MODE, RefrigeratorMemory, advance_program_tick, control_tick
+
+
+class GaugeNoise:
+    """White Gaussian noise on the station's gauges: of each tick by itself, so that nothing of it is retained.
+
+    Args:
+        deviation: Standard deviation, bar; 0 measures exactly.
+        seed: Of the draws, 0 or more.
+    """
+
+    def __init__(self, deviation: float, seed: int) -> None:
+        self._deviation, self._seed = deviation, seed
+
+    def at(self, tick: int) -> tuple[float, float]:
+        """Return by how much the gauges of the high and of the low pressure are off, bar."""
+        if not self._deviation:
+            return 0.0, 0.0
+        generator = np.random.Generator(np.random.Philox(key=self._seed, counter=[0, tick, 0, 0]))
+        hp, lp = self._deviation * generator.standard_normal(2)
+        return float(hp), float(lp)
 
 
 class RefrigeratorProgram(PlantProgram):
@@ -38,6 +58,7 @@ class RefrigeratorProgram(PlantProgram):
         station: Settings of the station's controller.
         events: Disturbances of the refrigerator.
         noise: Noise on the cold box's measurements; None measures exactly.
+        seed: Of the noise on the station's gauges.
 
     Raises:
         ValueError: An argument of wrong length, not finite, or out of range.
@@ -52,16 +73,18 @@ class RefrigeratorProgram(PlantProgram):
         station: StationSettings,
         events: EventSchedule,
         noise: MeasurementNoise | None = None,
+        seed: int = 0,
     ) -> None:
         check_refrigerator(REFERENCE_REFRIGERATOR)
         self._plant, self._tables = plain_tuples(REFERENCE_REFRIGERATOR), plain_tuples(load_helium())
         self.law = station_law(station, file.reference, REFERENCE_REFRIGERATOR.station)
         """Of the station's controller."""
         self._events = events
+        self._gauges = GaugeNoise(station.noise_bar, seed)
         x, v = np.array(file.x0, dtype=np.float64), np.array(file.v0, dtype=np.float64)
         d = self._disturbances(0, load.value(0))
         y, signals = read(x, np.array(u0, dtype=np.float64), v, d, REFERENCE_REFRIGERATOR, load_helium())
-        self._memory = RefrigeratorMemory(x, y, signals, v, np.zeros(3), np.zeros(2, np.int64))
+        self._memory = RefrigeratorMemory(x, y, signals, v, np.zeros(MEMORY_SIZE), np.zeros(2, np.int64))
         control_tick(self._memory, d, self.law)
         super().__init__(box=REFERENCE_REFRIGERATOR.box, x0=file.x0[:BOX_STATES], u0=u0, load=load, noise=noise)
 
@@ -112,10 +135,11 @@ class RefrigeratorProgram(PlantProgram):
 
     def _disturbances(self, tick: int, w: float) -> RealArray:
         given, ambient = self._events.at(tick), self._events.ambient(tick)
-        return np.array([w, ambient, 1e-3 * given.leak, given.nitrogen, given.nc1, given.nc2], dtype=np.float64)
+        physical = (w, ambient, 1e-3 * given.leak, given.nitrogen, given.nc1, given.nc2)
+        return np.array([*physical, *self._gauges.at(tick)], dtype=np.float64)
 
     def ahead(self, ticks: int) -> RealArray:
-        """Return the disturbances, without load, of `ticks` ticks and of the one behind them, shape (ticks + 1, 6)."""
+        """Return the disturbances, without load, of `ticks` ticks and of the one behind them, shape (ticks + 1, 8)."""
         return np.array([self._disturbances(self.tick + later, 0.0) for later in range(ticks + 1)])
 
     @property

@@ -88,6 +88,11 @@ class StationSettings(BaseModel):
     pi_hp: PiTuning = PiTuning(gain=0.024, integral_s=50.0)
     pi_lp: PiTuning = PiTuning(gain=0.2, integral_s=4.0)
     pi_nitrogen: PiTuning = PiTuning(gain=2.0, integral_s=600.0)
+    noise_bar: Annotated[float, Field(ge=0, le=0.1)] = 0.0
+    """Standard deviation of the noise on the station's own gauges of high and low pressure, bar."""
+    dead_band: Annotated[float, Field(ge=0, le=20)] = 1.0
+    """Inventory flow up to which the buffer's valves stay shut, over the standard deviation that the noise gives it:
+    without noise there is no dead band."""
     charge_ends_bar: Annotated[float, Field(gt=0, le=0.5)] = 0.08
     """So far above its set point does the low pressure close the charge valve, whatever the high pressure asks for."""
     alarms: StationAlarmSettings = StationAlarmSettings()

@@ -10,6 +10,7 @@ from coldloop.process.signals import OUTPUT_NAMES, TICK_S
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import RealArray
 from plant.refrigerator.physics import (
+    DISTURBANCE_NAMES,
     SIGNAL_NAMES,
     STATE_NAMES,
     Refrigerator,
@@ -22,8 +23,11 @@ from plant.refrigerator.station_law import StationLaw, StationMeasurement, contr
 HP, LP, BUFFER, NITROGEN, LOST = (SIGNAL_NAMES.index(name) for name in ("P12", "P11", "P13", "L_N2", "lost"))
 CV956, CV952, CV953 = (STATE_NAMES.index(name) for name in ("CV956", "CV952", "CV953"))
 P1: Final = OUTPUT_NAMES.index("P1")
-NC1, NC2 = 4, 5
-"""Columns of the disturbances."""
+NC1, NC2 = (DISTURBANCE_NAMES.index(name) for name in ("NC1", "NC2"))
+HP_NOISE, LP_NOISE = (len(DISTURBANCE_NAMES) + i for i in range(2))
+"""Columns of what is given in a tick: beside the disturbances, by how much the station's gauges are off (bar)."""
+GIVEN: Final = len(DISTURBANCE_NAMES) + 2
+"""Number of these columns."""
 MODE: Final = 0
 ALARMS: Final = 1
 
@@ -40,18 +44,18 @@ class RefrigeratorMemory(NamedTuple):
     commands: RealArray
     """Openings asked of the warm valves, %, shape (4,)."""
     integrals: RealArray
-    """Of the controller, shape (3,): `plant.refrigerator.station_law.control_station`."""
+    """Of the controller, shape (5,): `plant.refrigerator.station_law.control_station`."""
     status: NDArray[np.int64]
     """Its mode and alarms, shape (2,)."""
 
 
 @kernel
 def control_tick(m: RefrigeratorMemory, d: RealArray, law: StationLaw) -> None:
-    """Let the controller answer what its sensors show; `d` (6,) holds from the tick on that begins."""
+    """Let the controller answer what its sensors show; `d` (8,) holds from the tick on that begins."""
     x, signals = m.x, m.signals
     measured = StationMeasurement(
-        signals[HP], signals[LP], signals[BUFFER], x[CV956], x[CV952], x[CV953], signals[NITROGEN], signals[LOST],
-        m.y[P1], d[NC1] != 0.0, d[NC2] != 0.0,
+        signals[HP] + d[HP_NOISE], signals[LP] + d[LP_NOISE], signals[BUFFER], x[CV956], x[CV952], x[CV953],
+        signals[NITROGEN], signals[LOST], m.y[P1], d[NC1] != 0.0, d[NC2] != 0.0,
     )  # fmt: skip
     m.status[ALARMS] = raised_alarms(law.alarms, measured)
     commands, m.status[MODE] = control_station(law, m.integrals, measured)
@@ -75,7 +79,7 @@ def advance_tick(
     Args:
         m: State, overwritten.
         u: Inputs of the cold box, shape (3,).
-        d: Disturbances during the tick, shape (6,): `plant.refrigerator.DISTURBANCE_NAMES`.
+        d: What is given during the tick, shape (8,): `plant.refrigerator.DISTURBANCE_NAMES`, noise of the gauges.
         ahead: Those of the next tick.
         plant: Parameters.
         helium: Tables.
