@@ -24,7 +24,10 @@ from plant.settings import PlantSection
 FILE = read_refrigerator_file(SHIPPED)
 HP, LP, LEVEL, LOST = (STATION_SIGNAL_NAMES.index(name) for name in ("P12", "P11", "L_N2", "lost"))
 BOTH = pytest.mark.parametrize("control", ["lq", "pi"])
-AT_REST = StationMeasurement(16.0, 1.05, 6.0, FILE.v0[0], 0.0, 0.0, 60.0, 0.0, 1.23, nc1=True, nc2=True)
+AT_REST = StationMeasurement(
+    16.0, 1.05, 6.0, FILE.v0[0], 0.0, 0.0, 60.0, 0.0, 1.23, nc1=True, nc2=True,
+    loaded=2, turbine=True, overspeed=False, deviating=False,
+)  # fmt: skip
 
 
 def make(

@@ -11,6 +11,7 @@ import numpy as np
 from coldloop.process.signals import TICK_S
 from coldloop.registers.plant import StationAlarm, StationMode
 from plant.refrigerator.compression_station import CompressionStation
+from plant.refrigerator.equipment import EquipmentLaw
 from plant.refrigerator.station_law import (
     MEMORY_SIZE,
     AlarmLimits,
@@ -77,6 +78,10 @@ def station_law(settings: StationSettings, reference: StationReference, station:
         alarms=AlarmLimits(
             limits.hp_high_bar, limits.hp_low_bar, limits.lp_high_bar, limits.lp_low_bar, limits.nitrogen_low,
             limits.helium_lost_kg, limits.bath_relief_bar,
+        ),
+        equipment=EquipmentLaw(
+            settings.start.idle, settings.start.idle_s, settings.start.load_s, limits.lp_low_bar,
+            settings.turbine.run_up_s, settings.turbine.governed_hz, settings.turbine.overspeed_hz,
         ),
     )  # fmt: skip
 

@@ -16,6 +16,7 @@ from plant.components.gas_valve import CHOKED
 from plant.components.valve import Valve
 from plant.helium.properties import GAS_CONSTANT
 from plant.numeric import RealArray
+from plant.refrigerator.equipment import EquipmentLaw
 
 PA_PER_BAR: Final = 1e5
 DESIGN_TEMPERATURE: Final = 300.0
@@ -36,9 +37,10 @@ HP_INTEGRAL, LP_INTEGRAL, NITROGEN_INTEGRAL, SMOOTHED, DIRECTION = range(5)
 """What the controller remembers: integrals of the errors of HP and LP (bar s) and of the nitrogen's level (% s); with a
 dead band the smoothed inventory flow (kg/s), and 1 while the charge valve may be open, -1 for the discharge valve."""
 MEMORY_SIZE: Final = 5
+COMPRESSORS: Final = 2
 LEAST_PRESSURE: Final = 0.5
 """bar, taken for the valves' flows when a line is emptier."""
-AUTOMATIC, LIMITED, CHARGE_STOPPED, ONE_COMPRESSOR, STOPPED = map(int, StationMode)
+AUTOMATIC, LIMITED, CHARGE_STOPPED, ONE_COMPRESSOR, STOPPED, STARTING = map(int, StationMode)
 
 
 class StationMeasurement(NamedTuple):
@@ -65,6 +67,14 @@ class StationMeasurement(NamedTuple):
     nc1: bool
     """Whether the compressor is switched on."""
     nc2: bool
+    loaded: int
+    """Compressors that are switched on and loaded."""
+    turbine: bool
+    """Whether the turbine may run."""
+    overspeed: bool
+    """Whether its protection has tripped it."""
+    deviating: bool
+    """Whether a valve or the heater of the cold box is not as it is asked."""
 
 
 class Commands(NamedTuple):
@@ -127,6 +137,7 @@ class StationLaw(NamedTuple):
     feed: float
     """Opening of CV167 at the operating point, %."""
     alarms: AlarmLimits
+    equipment: EquipmentLaw
 
 
 class Flows(NamedTuple):
@@ -150,6 +161,8 @@ def control_station(c: StationLaw, integrals: RealArray, m: StationMeasurement) 
         integrals[HP_INTEGRAL] = integrals[LP_INTEGRAL] = integrals[SMOOTHED] = integrals[DIRECTION] = 0.0
         bypass = 100.0 * min(max((min(c.lp + STOPPED_RISE, STOPPED_HIGHEST) - m.lp) / STOPPED_SPAN, 0.0), 1.0)
         return Commands(bypass, 100.0 if m.hp > m.buffer else 0.0, 0.0, feed), STOPPED
+    if m.loaded == 0:
+        return Commands(100.0, 100.0 if m.hp > m.buffer and m.lp > c.lp else 0.0, 0.0, feed), STARTING
     wanted = flows_of_lq(c, integrals, m) if c.is_lq else flows_of_pi(c, integrals, m)
     allowed = outside_dead_band(c, integrals, wanted, m) if c.dead_band > 0.0 else wanted
     given, openings = split(c, allowed, m)
@@ -258,7 +271,7 @@ def nitrogen_feed(c: StationLaw, integrals: RealArray, level: float) -> float:
 @kernel
 def mode_of(c: StationLaw, wanted: Flows, given: Flows, m: StationMeasurement) -> int:
     """Return what the law can do about the pressures, with a compressor running."""
-    if not (m.nc1 and m.nc2):
+    if m.loaded < COMPRESSORS:
         return ONE_COMPRESSOR
     if wanted.inventory > given.inventory and charge_room(c, m.lp) < 1.0:
         return CHARGE_STOPPED
@@ -272,7 +285,7 @@ def raised_alarms(limits: AlarmLimits, m: StationMeasurement) -> int:
     conditions = (
         m.hp > limits.hp_high, m.hp < limits.hp_low, m.lp > limits.lp_high, m.lp < limits.lp_low,
         not m.nc1, not m.nc2, m.nitrogen < limits.nitrogen_low, m.lost > limits.helium_lost,
-        not (m.nc1 or m.nc2), m.bath > limits.bath_relief,
+        not (m.nc1 or m.nc2), m.bath > limits.bath_relief, not m.turbine, m.overspeed, m.deviating,
     )  # fmt: skip
     raised = 0
     for bit in range(len(conditions)):
