@@ -124,6 +124,7 @@ def _make_refrigerator(
             station=section.station,
             events=EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k),
             noise=noise_of(section.sensors, seed),
+            seed=seed,
         )
 
 

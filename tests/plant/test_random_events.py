@@ -1,4 +1,4 @@
-"""Helium and energy over random events: valves stuck anywhere, trips, leaks, lost nitrogen and loads."""
+"""Helium and energy over random events: stuck valves and heaters, trips, leaks, lost nitrogen, blocked exchangers."""
 
 import numba
 import numpy as np
@@ -7,6 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.balance import energy_gained, energy_rates
 from plant.cold_box.physics import REFERENCE, cold_box_of, derivative
 from plant.components.phase_separator import content, start_account
@@ -15,6 +16,7 @@ from plant.integrator import advance, plain_tuples
 from plant.numeric import RealArray
 from plant.own_model import own_header
 from plant.refrigerator.balance import refrigerator_energy_rates
+from plant.refrigerator.equipment import EquipmentLaw, act, resting_equipment
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
 from plant.refrigerator.physics import (
     REFERENCE_REFRIGERATOR,
@@ -25,6 +27,8 @@ from plant.refrigerator.physics import (
     inventory,
     refrigerator_of,
 )
+from plant.refrigerator.station_control import station_law
+from plant.refrigerator.station_settings import StationSettings
 
 HELIUM = load_helium()
 PLANT = REFERENCE_REFRIGERATOR
@@ -32,12 +36,19 @@ BATH = REFERENCE.separator
 HEADER = own_header(DEFAULT_MODEL_FILE)
 FILE = read_refrigerator_file(SHIPPED)
 M_LOST = STATE_NAMES.index("M_lost")
+LAW = station_law(StationSettings(), FILE.reference, PLANT.station).equipment
+LP, V1 = SIGNAL_NAMES.index("P11"), OUTPUT_NAMES.index("V1")
 PLAIN, TABLES = plain_tuples(PLANT), plain_tuples(HELIUM)
 
 percent = st.floats(0.0, 100.0)
 inputs = st.tuples(percent, st.floats(0.0, 150.0), percent)
 switch = st.sampled_from([1.0, 1.0, 0.0])
-happenings = st.tuples(st.floats(0.0, 6000.0), st.floats(275.0, 320.0), st.floats(0.0, 0.01), switch, switch, switch)
+exact, blocking = st.just(0.0), st.sampled_from([0.0, 0.0, -10.0, 3.0, 10.0])
+happenings = st.tuples(
+    st.floats(0.0, 6000.0), st.floats(275.0, 320.0), st.floats(0.0, 0.01), switch, switch, switch, exact, exact,
+    switch, switch, switch, st.sampled_from([1.0, 1.0, 0.0, 2.0]), *[blocking] * 4,
+)  # fmt: skip
+"""In the order of `plant.refrigerator.equipment.GIVEN_NAMES`."""
 pieces = st.tuples(st.integers(40, 1200), inputs, st.tuples(percent, percent, percent, percent), happenings)
 
 
@@ -51,36 +62,46 @@ AHEAD = np.array([0.125, 0.125, 0.25, 0.0])
 
 @numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def held(
-    x: RealArray, u: RealArray, v: RealArray, d: RealArray, ticks: int, plain: object, tables: object
+    x: RealArray,
+    equipment: RealArray,
+    u: RealArray,
+    v: RealArray,
+    d: RealArray,
+    ticks: int,
+    plain: object,
+    tables: object,
+    law: EquipmentLaw,
 ) -> tuple[RealArray, RealArray]:
-    """Return the state after some ticks, and sums over their stages.
+    """Return the state after some ticks, and sums over their stages; `equipment` is overwritten.
 
     What crossed the boundary and its size (J), what the bath's rates brought it (J), and the largest difference between
     what crosses and what is stored (W).
     """
     plant, helium = refrigerator_of(plain), helium_of(tables)
     sums, slope, y, signals = np.zeros(4), np.empty(x.shape[0]), np.empty(22), np.empty(len(SIGNAL_NAMES))
+    evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
     for _ in range(ticks):
+        acting = act(law, equipment, u, d, signals[LP], y[V1], plant)
         stage = x
         for k in range(4):
-            crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
-            stored, inwards = refrigerator_energy_rates(stage, slope, crossing, d[0], plant, helium)
+            crossing = evaluate_refrigerator(stage, acting.u, v, acting.d, acting.plant, helium, slope, y, signals)
+            stored, inwards = refrigerator_energy_rates(stage, slope, crossing, d[0], acting.plant, helium)
             sums[0] += WEIGHTS[k] * inwards
             sums[1] += WEIGHTS[k] * abs(inwards)
             sums[2] += WEIGHTS[k] * start_account(crossing.bath, slope).heat
             sums[3] = max(sums[3], abs(stored - inwards))
             stage = x + AHEAD[k] * slope
-        x = advance_refrigerator(x, u, v, d, 0.25, plant, helium)
+        x = advance_refrigerator(x, acting.u, v, acting.d, 0.25, acting.plant, helium)
     return x, sums
 
 
 def balances_over_random_events(course: Course) -> None:
-    """Valves stuck anywhere, trips, leaks, lost nitrogen and loads: helium and energy add up, stage by stage."""
-    x = np.array(FILE.x0)
+    """Whatever is stuck, trips, leaks, blocks up or is lost: helium and energy add up, stage by stage."""
+    x, equipment = np.array(FILE.x0), resting_equipment(np.array(FILE.u0))
     before = inventory(x, PLANT, HELIUM)
     in_bath = content(BATH, x[0], x[1], HELIUM).energy
     for ticks, u, v, d in course:
-        x, sums = held(x, np.array(u), np.array(v), np.array(d), ticks, PLAIN, TABLES)
+        x, sums = held(x, equipment, np.array(u), np.array(v), np.array(d), ticks, PLAIN, TABLES, LAW)
         assert np.all(np.isfinite(x))
         assert inventory(x, PLANT, HELIUM) + x[M_LOST] == pytest.approx(before, rel=1e-9)
         assert sums[3] < 1e-6 * sums[1] / (0.25 * ticks) + 1e-6

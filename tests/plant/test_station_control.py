@@ -17,14 +17,17 @@ from plant.refrigerator.file import SHIPPED, read_refrigerator_file
 from plant.refrigerator.physics import REFERENCE_REFRIGERATOR
 from plant.refrigerator.program import RefrigeratorProgram
 from plant.refrigerator.station_control import StationControl
-from plant.refrigerator.station_law import StationMeasurement
+from plant.refrigerator.station_law import SHUT, StationMeasurement
 from plant.refrigerator.station_settings import StationSettings
 from plant.settings import PlantSection
 
 FILE = read_refrigerator_file(SHIPPED)
 HP, LP, LEVEL, LOST = (STATION_SIGNAL_NAMES.index(name) for name in ("P12", "P11", "L_N2", "lost"))
 BOTH = pytest.mark.parametrize("control", ["lq", "pi"])
-AT_REST = StationMeasurement(16.0, 1.05, 6.0, FILE.v0[0], 0.0, 0.0, 60.0, 0.0, 1.23, nc1=True, nc2=True)
+AT_REST = StationMeasurement(
+    16.0, 1.05, 6.0, FILE.v0[0], 0.0, 0.0, 60.0, 0.0, 1.23, nc1=True, nc2=True,
+    loaded=2, turbine=True, overspeed=False, deviating=False,
+)  # fmt: skip
 
 
 def make(
@@ -36,6 +39,18 @@ def make(
         load=load or LoadProfile((0,), (FILE.w0,)),
         station=StationSettings.model_validate({"control": control}),
         events=EventSchedule(events, 300.0, 0.0),
+    )
+
+
+def noisy(control: str, **station: float) -> RefrigeratorProgram:
+    """Return one whose gauges scatter by 5 mbar, 60 W more from 5 min on and 60 W less from 10 min on."""
+    return RefrigeratorProgram(
+        file=FILE,
+        u0=FILE.u0,
+        load=LoadProfile((0, 1200, 2400), (FILE.w0, FILE.w0 + 60.0, FILE.w0 - 60.0)),
+        station=StationSettings.model_validate({"control": control, "noise_bar": 0.005, **station}),
+        events=EventSchedule((), 300.0, 0.0),
+        seed=3,
     )
 
 
@@ -66,6 +81,38 @@ def test_pressures_are_held_when_the_load_of_the_bath_changes_by_60_w(control: s
     assert np.max(np.abs(signals[:, HP] - 16.0)) < 0.2
     assert np.max(np.abs(signals[:, LP] - 1.05)) < 0.02
     assert signals[-1, HP] == pytest.approx(16.0, abs=0.01)
+
+
+def opened(program: RefrigeratorProgram, seconds: float) -> np.ndarray:
+    """Return of each tick which of CV952 and CV953 is open, shape (N, 2)."""
+    rows = []
+    for _ in range(round(seconds / 0.25)):
+        program.advance()
+        rows.append(program.memory.x[-2:] > SHUT)
+    return np.array(rows)
+
+
+@BOTH
+def test_noise_on_the_gauges_does_not_work_the_valves_of_the_buffer(control: str) -> None:
+    program = noisy(control)
+    valves = opened(program, 900.0)
+    assert valves.any(axis=0).all(), "both were needed, one after the other"
+    assert not valves.all(axis=1).any()
+    assert np.sum(valves[1:] != valves[:-1]) < 40
+    assert program.station.signals[HP] == pytest.approx(16.0, abs=0.25)
+    assert program.station.signals[LP] == pytest.approx(1.05, abs=0.01)
+
+
+def test_without_a_dead_band_noise_opens_both_valves_of_the_buffer_at_once() -> None:
+    valves = opened(noisy("lq", dead_band=0.0), 300.0)
+    assert valves.all(axis=1).mean() > 0.5
+
+
+def test_the_noise_of_a_tick_does_not_depend_on_where_a_program_was_resumed() -> None:
+    first, second = noisy("lq"), noisy("lq")
+    run(first, 330.0)
+    second.resume(**first.retained())
+    assert np.array_equal(run(first, 60.0), run(second, 60.0))
 
 
 @BOTH

@@ -33,7 +33,9 @@ REFRIGERATOR = "plant.kind=refrigerator"
 SINGLE = f'{PROGRAM}arithmetic="float32"'
 TRIP = (
     'plant.refrigerator.events=[{at_s=90, target="nc1", value=0}, {at_s=120, target="nc1", value=1}, '
-    '{at_s=150.25, target="leak", value=2.0}]'
+    '{at_s=30, target="cv155", value=0}, {at_s=45, target="heater", value=2}, {at_s=60, target="heater", value=1}, '
+    '{at_s=65, target="turbine", value=0}, {at_s=75, target="turbine", value=1}, {at_s=80, target="cv155", value=1}, '
+    '{at_s=85, target="blocked_nef2", value=5.0}, {at_s=150.25, target="leak", value=2.0}]'
 )
 COMPILED = {
     "adaptive": (),
@@ -61,7 +63,7 @@ COMPILED = {
         f"{PROGRAM}interrupting_load_step_w=10",
         f'{PROGRAM}solver="hybrid"',
     ),
-    "refrigerator": (REFRIGERATOR, TRIP, *NOISE),
+    "refrigerator": (REFRIGERATOR, TRIP, "plant.station.noise_bar=0.005", *NOISE),
     "refrigerator with PI and a model of its own": (
         REFRIGERATOR,
         "plant.station.control=pi",

@@ -94,7 +94,7 @@ class RefrigeratorState(NamedTuple):
     """As in `BoxState`."""
     memory: RefrigeratorMemory
     ahead: Array
-    """Disturbances at each tick of the trace and at the one behind it, without load, shape (N + 1, 6)."""
+    """Disturbances at each tick of the trace and at the one behind it, without load, shape (N + 1, 16)."""
 
 
 PlantConstants = BoxConstants | RefrigeratorConstants

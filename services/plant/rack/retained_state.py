@@ -15,7 +15,7 @@ from coldloop.session.time_base import TimeBase
 
 log = logging.getLogger("coldloop.plant")
 
-OWNER = "plant/3"
+OWNER = "plant/4"
 """Who retained states belong to, and the version of what they hold."""
 
 Count = Annotated[int, Field(ge=0, lt=2**32)]

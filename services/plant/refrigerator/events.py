@@ -1,4 +1,4 @@
-"""Events of a refrigerator over time: a compressor trips, nitrogen runs out, helium leaks, the weather changes."""
+"""Events of a refrigerator over time: a compressor trips, nitrogen runs out, helium leaks, a valve is stuck."""
 
 from collections.abc import Sequence
 from enum import StrEnum
@@ -24,17 +24,34 @@ class EventTarget(StrEnum):
     """From the high-pressure line, g/s at 16 bar."""
     AMBIENT = "ambient"
     """Temperature of the surroundings, K."""
+    TURBINE = "turbine"
+    """1: the turbine may run, 0: it is tripped."""
+    CV155 = "cv155"
+    """1: the valve follows what is asked, 0: it is stuck where it is."""
+    CV156 = "cv156"
+    HEATER = "heater"
+    """1: the heater follows what is asked, 0: it is off, 2: fully on."""
+    BLOCKED_NEF1 = "blocked_nef1"
+    """Share of the exchanger that impurities block in an hour; below 0 it is cleaned."""
+    BLOCKED_NEF2 = "blocked_nef2"
+    BLOCKED_NEF34 = "blocked_nef34"
+    BLOCKED_NEF6 = "blocked_nef6"
 
 
+BLOCKING = (EventTarget.BLOCKED_NEF1, EventTarget.BLOCKED_NEF2, EventTarget.BLOCKED_NEF34, EventTarget.BLOCKED_NEF6)
 RANGES = {
     EventTarget.NC1: (0.0, 1.0),
     EventTarget.NC2: (0.0, 1.0),
     EventTarget.NITROGEN: (0.0, 1.0),
     EventTarget.LEAK: (0.0, 50.0),
     EventTarget.AMBIENT: (270.0, 320.0),
-}
-MEASURED = {EventTarget.LEAK, EventTarget.AMBIENT}
-"""What has a value; the others are there or not."""
+    EventTarget.TURBINE: (0.0, 1.0),
+    EventTarget.CV155: (0.0, 1.0),
+    EventTarget.CV156: (0.0, 1.0),
+    EventTarget.HEATER: (0.0, 2.0),
+} | dict.fromkeys(BLOCKING, (-10.0, 10.0))
+MEASURED = {EventTarget.LEAK, EventTarget.AMBIENT, *BLOCKING}
+"""What has a value; the others are in one of a few states, numbered from 0."""
 
 
 class RefrigeratorEvent(BaseModel):
@@ -52,8 +69,9 @@ class RefrigeratorEvent(BaseModel):
         low, high = RANGES[self.target]
         if not low <= self.value <= high:
             raise ValueError(f"{self.target} = {self.value:g} is outside {low:g} to {high:g}")
-        if self.target not in MEASURED and self.value not in {0.0, 1.0}:
-            raise ValueError(f"{self.target} = {self.value:g}: write 0 or 1")
+        if self.target not in MEASURED and not self.value.is_integer():
+            states = "0 or 1" if high == 1.0 else "0, 1 or 2"
+            raise ValueError(f"{self.target} = {self.value:g}: write {states}")
         if self.at_s % TICK_S:
             raise ValueError(f"{self.at_s:g} s is not a multiple of {TICK_S} s")
         return self

@@ -110,7 +110,21 @@ def _measured(x: RealArray, signals: RealArray) -> StationMeasurement:
     hp, lp, buffer, nitrogen = (float(signals[index]) for index in (*PRESSURES, BUFFER, NITROGEN))
     bypass, discharge, charge = (float(x[index]) for index in OPENINGS)
     return StationMeasurement(
-        hp, lp, buffer, bypass, discharge, charge, nitrogen, lost=0.0, bath=1.23, nc1=True, nc2=True
+        hp,
+        lp,
+        buffer,
+        bypass,
+        discharge,
+        charge,
+        nitrogen,
+        lost=0.0,
+        bath=1.23,
+        nc1=True,
+        nc2=True,
+        loaded=2,
+        turbine=True,
+        overspeed=False,
+        deviating=False,
     )
 
 

@@ -1,7 +1,7 @@
 """The whole refrigerator as a program: the plant, its station's controller, and their disturbances."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from plant.helium.properties import load_helium
 from plant.integrator import plain_tuples
 from plant.numeric import RealArray
 from plant.program import HeatLoad, MeasurementNoise
+from plant.refrigerator.equipment import ACTING, DEVIATING, resting_equipment
 from plant.refrigerator.events import EventSchedule
 from plant.refrigerator.file import RefrigeratorFile
 from plant.refrigerator.physics import (
@@ -22,9 +23,32 @@ from plant.refrigerator.physics import (
     read,
 )
 from plant.refrigerator.station_control import station_law
-from plant.refrigerator.station_law import Commands
+from plant.refrigerator.station_law import MEMORY_SIZE, Commands
 from plant.refrigerator.station_settings import StationSettings
 from plant.refrigerator.tick import ALARMS, HP, LP, MODE, RefrigeratorMemory, advance_program_tick, control_tick
+
+RETAINED: Final = ("x", "y", "signals", "commands", "integrals", "equipment")
+"""Of the memory; the rest follows from it."""
+
+
+class GaugeNoise:
+    """White Gaussian noise on the station's gauges: of each tick by itself, so that nothing of it is retained.
+
+    Args:
+        deviation: Standard deviation, bar; 0 measures exactly.
+        seed: Of the draws, 0 or more.
+    """
+
+    def __init__(self, deviation: float, seed: int) -> None:
+        self._deviation, self._seed = deviation, seed
+
+    def at(self, tick: int) -> tuple[float, float]:
+        """Return by how much the gauges of the high and of the low pressure are off, bar."""
+        if not self._deviation:
+            return 0.0, 0.0
+        generator = np.random.Generator(np.random.Philox(key=self._seed, counter=[0, tick, 0, 0]))
+        hp, lp = self._deviation * generator.standard_normal(2)
+        return float(hp), float(lp)
 
 
 class RefrigeratorProgram(ColdBoxProgram):
@@ -41,6 +65,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         station: Settings of the station's controller.
         events: Disturbances of the refrigerator.
         noise: Noise on the cold box's measurements; None measures exactly.
+        seed: Of the noise on the station's gauges.
 
     Raises:
         ValueError: An argument of wrong length, not finite, or out of range.
@@ -56,6 +81,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         station: StationSettings,
         events: EventSchedule,
         noise: MeasurementNoise | None = None,
+        seed: int = 0,
     ) -> None:
         check_refrigerator(plant)
         self.plant = plant
@@ -63,10 +89,13 @@ class RefrigeratorProgram(ColdBoxProgram):
         self.law = station_law(station, file.reference, plant.station)
         """Of the station's controller."""
         self._events = events
+        self._gauges = GaugeNoise(station.noise_bar, seed)
         x, v = np.array(file.x0, dtype=np.float64), np.array(file.v0, dtype=np.float64)
         d = self._disturbances(0, load.value(0))
         y, signals = read(x, np.array(u0, dtype=np.float64), v, d, plant, load_helium())
-        self._memory = RefrigeratorMemory(x, y, signals, v, np.zeros(3), np.zeros(2, np.int64))
+        self._memory = RefrigeratorMemory(
+            x, y, signals, v, np.zeros(MEMORY_SIZE), resting_equipment(np.array(u0)), np.zeros(2, np.int64)
+        )
         control_tick(self._memory, d, self.law)
         super().__init__(box=plant.box, x0=file.x0[:BOX_STATES], u0=u0, load=load, noise=noise)
 
@@ -91,7 +120,7 @@ class RefrigeratorProgram(ColdBoxProgram):
     def station_status(self) -> StationStatus:
         """The same for the registers, with what its controller asks for."""
         sample = self.station
-        return StationStatus(sample.tick, sample.mode, sample.alarms, sample.signals, self.commands)
+        return StationStatus(sample.tick, sample.mode, sample.alarms, sample.signals, self.commands, self.acting)
 
     @property
     def surroundings(self) -> Surroundings:
@@ -107,6 +136,11 @@ class RefrigeratorProgram(ColdBoxProgram):
         """Openings that the station's controller asks for from the current tick on, %."""
         return Commands(*self._memory.commands.tolist())
 
+    @property
+    def acting(self) -> tuple[float, ...]:
+        """The inputs that acted on the cold box up to the current tick: CV155 %, NCR22_A W, CV156 %."""
+        return tuple(self._memory.equipment[ACTING:DEVIATING].tolist())
+
     def advance(self) -> None:
         """Go one tick forward."""
         d, ahead = self._disturbances(self.tick, self.load), self._disturbances(self.tick + 1, 0.0)
@@ -117,10 +151,13 @@ class RefrigeratorProgram(ColdBoxProgram):
 
     def _disturbances(self, tick: int, w: float) -> RealArray:
         given, ambient = self._events.at(tick), self._events.ambient(tick)
-        return np.array([w, ambient, 1e-3 * given.leak, given.nitrogen, given.nc1, given.nc2], dtype=np.float64)
+        physical = (w, ambient, 1e-3 * given.leak, given.nitrogen, given.nc1, given.nc2)
+        equipment = (given.turbine, given.cv155, given.cv156, given.heater)
+        blocking = (given.blocked_nef1, given.blocked_nef2, given.blocked_nef34, given.blocked_nef6)
+        return np.array([*physical, *self._gauges.at(tick), *equipment, *blocking], dtype=np.float64)
 
     def ahead(self, ticks: int) -> RealArray:
-        """Return the disturbances, without load, of `ticks` ticks and of the one behind them, shape (ticks + 1, 6)."""
+        """Return the disturbances, without load, of `ticks` ticks and of the one behind them, shape (ticks + 1, 16)."""
         return np.array([self._disturbances(self.tick + later, 0.0) for later in range(ticks + 1)])
 
     @property
@@ -128,7 +165,13 @@ class RefrigeratorProgram(ColdBoxProgram):
         """A copy of what a tick changes."""
         m = self._memory
         return RefrigeratorMemory(
-            m.x.copy(), m.y.copy(), m.signals.copy(), m.commands.copy(), m.integrals.copy(), m.status.copy()
+            m.x.copy(),
+            m.y.copy(),
+            m.signals.copy(),
+            m.commands.copy(),
+            m.integrals.copy(),
+            m.equipment.copy(),
+            m.status.copy(),
         )
 
     def take_over_whole(self, tick: int, u: RealArray, memory: RefrigeratorMemory, y: RealArray) -> None:
@@ -148,24 +191,18 @@ class RefrigeratorProgram(ColdBoxProgram):
         """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
         if warm is None:
             raise ValueError("the retained state is that of a cold box, not of a refrigerator")
-        names = {"x": "x", "signals": "signals", "commands": "commands", "integrals": "control"}
-        kept = {name: np.array(warm[field], dtype=np.float64) for name, field in names.items()}
+        kept: dict[str, Any] = {name: np.array(warm[name], dtype=np.float64) for name in RETAINED}
         for name, values in kept.items():
             if values.shape != getattr(self._memory, name).shape:
                 raise ValueError(f"{name}: expected {len(getattr(self._memory, name))} numbers")
         super().resume(tick, x, u, y, noise_state)
         for since, put in warm["given"]:
             self._events.put(int(since), Surroundings(*put))
-        self._memory = self._memory._replace(
-            x=kept["x"], signals=kept["signals"], commands=kept["commands"], integrals=kept["integrals"]
-        )
+        self._memory = self._memory._replace(**kept)
 
     def retained(self) -> dict[str, Any]:
         """Return what `resume` needs, as plain data."""
         m = self._memory
-        warm = {
-            "x": m.x.tolist(), "signals": m.signals.tolist(),
-            "control": m.integrals.tolist(), "commands": m.commands.tolist(),
-            "given": [(tick, list(put)) for tick, put in self._events.puts],
-        }  # fmt: skip
+        warm: dict[str, Any] = {name: getattr(m, name).tolist() for name in RETAINED}
+        warm["given"] = [(tick, list(put)) for tick, put in self._events.puts]
         return {**super().retained(), "warm": warm}

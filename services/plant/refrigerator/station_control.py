@@ -3,6 +3,7 @@
 A program like the others: no sockets, no clock. What it computes is `plant.refrigerator.station_law`.
 """
 
+from math import hypot
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,9 @@ import numpy as np
 from coldloop.process.signals import TICK_S
 from coldloop.registers.plant import StationAlarm, StationMode
 from plant.refrigerator.compression_station import CompressionStation
+from plant.refrigerator.equipment import EquipmentLaw
 from plant.refrigerator.station_law import (
+    MEMORY_SIZE,
     AlarmLimits,
     Commands,
     Loop,
@@ -45,8 +48,8 @@ class StationControl:
 
     def __init__(self, settings: StationSettings, reference: StationReference, station: CompressionStation) -> None:
         self.law = station_law(settings, reference, station)
-        self.integrals = np.zeros(3)
-        """Of the errors of HP and LP, bar s, and of the nitrogen's level, % s."""
+        self.integrals = np.zeros(MEMORY_SIZE)
+        """What the law remembers, from `station_law.HP_INTEGRAL` on."""
         self.mode = StationMode.AUTOMATIC
         self.alarms = StationAlarm(0)
 
@@ -60,19 +63,25 @@ class StationControl:
 
 def station_law(settings: StationSettings, reference: StationReference, station: CompressionStation) -> StationLaw:
     """Return the constants of the law for a configuration, an operating point and the sizes of valves."""
-    limits = settings.alarms
+    limits, is_lq = settings.alarms, settings.control is StationControlKind.LQ
+    per_bar = hypot(*reference.gains[1][:2]) if is_lq else settings.pi_hp.gain
     return StationLaw(
-        is_lq=settings.control is StationControlKind.LQ,
+        is_lq=is_lq,
         hp=settings.hp_bar, lp=settings.lp_bar, charge_ends=settings.charge_ends_bar,
         share=min(TICK_S / settings.anti_windup_s, 1.0),
         gains=np.array(reference.gains),
         nominal=reference.bypass * per_percent(station.bypass, settings.hp_bar),
+        dead_band=settings.dead_band * settings.noise_bar * per_bar,
         bypass=station.bypass, discharge=station.discharge, charge=station.charge,
         over_hp=_loop(settings.pi_hp), over_lp=_loop(settings.pi_lp), over_nitrogen=_loop(settings.pi_nitrogen),
         nitrogen=settings.nitrogen_level, feed=reference.feed,
         alarms=AlarmLimits(
             limits.hp_high_bar, limits.hp_low_bar, limits.lp_high_bar, limits.lp_low_bar, limits.nitrogen_low,
             limits.helium_lost_kg, limits.bath_relief_bar,
+        ),
+        equipment=EquipmentLaw(
+            settings.start.idle, settings.start.idle_s, settings.start.load_s, limits.lp_low_bar,
+            settings.turbine.run_up_s, settings.turbine.governed_hz, settings.turbine.overspeed_hz,
         ),
     )  # fmt: skip
 

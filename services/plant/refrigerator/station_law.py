@@ -16,6 +16,7 @@ from plant.components.gas_valve import CHOKED
 from plant.components.valve import Valve
 from plant.helium.properties import GAS_CONSTANT
 from plant.numeric import RealArray
+from plant.refrigerator.equipment import EquipmentLaw
 
 PA_PER_BAR: Final = 1e5
 DESIGN_TEMPERATURE: Final = 300.0
@@ -28,9 +29,18 @@ STOPPED_HIGHEST: Final = 1.3
 """bar, to which that is limited: the relief valve of the low-pressure line opens at 1.5 bar."""
 STOPPED_SPAN: Final = 0.25
 """bar below that, at which the bypass is fully open."""
+DECISION_S: Final = 5.0
+"""s, over which the inventory flow is smoothed that decides which of the buffer's valves may open."""
+SHUT: Final = 0.5
+"""%, to which a valve of the buffer has to shut before the other one opens."""
+HP_INTEGRAL, LP_INTEGRAL, NITROGEN_INTEGRAL, SMOOTHED, DIRECTION = range(5)
+"""What the controller remembers: integrals of the errors of HP and LP (bar s) and of the nitrogen's level (% s); with a
+dead band the smoothed inventory flow (kg/s), and 1 while the charge valve may be open, -1 for the discharge valve."""
+MEMORY_SIZE: Final = 5
+COMPRESSORS: Final = 2
 LEAST_PRESSURE: Final = 0.5
 """bar, taken for the valves' flows when a line is emptier."""
-AUTOMATIC, LIMITED, CHARGE_STOPPED, ONE_COMPRESSOR, STOPPED = map(int, StationMode)
+AUTOMATIC, LIMITED, CHARGE_STOPPED, ONE_COMPRESSOR, STOPPED, STARTING = map(int, StationMode)
 
 
 class StationMeasurement(NamedTuple):
@@ -57,6 +67,14 @@ class StationMeasurement(NamedTuple):
     nc1: bool
     """Whether the compressor is switched on."""
     nc2: bool
+    loaded: int
+    """Compressors that are switched on and loaded."""
+    turbine: bool
+    """Whether the turbine may run."""
+    overspeed: bool
+    """Whether its protection has tripped it."""
+    deviating: bool
+    """Whether a valve or the heater of the cold box is not as it is asked."""
 
 
 class Commands(NamedTuple):
@@ -103,6 +121,8 @@ class StationLaw(NamedTuple):
     """K of the LQ controller, shape (2, 6)."""
     nominal: float
     """Bypass flow at the operating point, kg/s."""
+    dead_band: float
+    """Inventory flow (kg/s) up to which the buffer's valves stay shut; 0: they follow every sign of it."""
     bypass: Valve
     discharge: Valve
     charge: Valve
@@ -117,6 +137,7 @@ class StationLaw(NamedTuple):
     feed: float
     """Opening of CV167 at the operating point, %."""
     alarms: AlarmLimits
+    equipment: EquipmentLaw
 
 
 class Flows(NamedTuple):
@@ -132,18 +153,40 @@ def control_station(c: StationLaw, integrals: RealArray, m: StationMeasurement) 
 
     Args:
         c: Constants.
-        integrals: Of the errors of HP and LP (bar s) and of the nitrogen's level (% s), shape (3,); overwritten.
+        integrals: What it remembers, shape (5,), from `HP_INTEGRAL` on; overwritten.
         m: What is measured.
     """
     feed = nitrogen_feed(c, integrals, m.nitrogen)
     if not (m.nc1 or m.nc2):
-        integrals[:2] = 0.0
+        integrals[HP_INTEGRAL] = integrals[LP_INTEGRAL] = integrals[SMOOTHED] = integrals[DIRECTION] = 0.0
         bypass = 100.0 * min(max((min(c.lp + STOPPED_RISE, STOPPED_HIGHEST) - m.lp) / STOPPED_SPAN, 0.0), 1.0)
         return Commands(bypass, 100.0 if m.hp > m.buffer else 0.0, 0.0, feed), STOPPED
+    if m.loaded == 0:
+        return Commands(100.0, 100.0 if m.hp > m.buffer and m.lp > c.lp else 0.0, 0.0, feed), STARTING
     wanted = flows_of_lq(c, integrals, m) if c.is_lq else flows_of_pi(c, integrals, m)
-    given, openings = split(c, wanted, m)
+    allowed = outside_dead_band(c, integrals, wanted, m) if c.dead_band > 0.0 else wanted
+    given, openings = split(c, allowed, m)
     follow(c, integrals, wanted, given, m)
-    return Commands(openings[0], openings[1], openings[2], feed), mode_of(c, wanted, given, m)
+    return Commands(openings[0], openings[1], openings[2], feed), mode_of(c, allowed, given, m)
+
+
+@kernel
+def outside_dead_band(c: StationLaw, integrals: RealArray, wanted: Flows, m: StationMeasurement) -> Flows:
+    """Return the flows with the inventory flow that a dead band leaves of them.
+
+    A valve of the buffer passes the smoothed flow from when that leaves the band until it is back in half of it, not
+    before the other valve is shut. What is not given leads the integrals, see `follow`.
+    """
+    integrals[SMOOTHED] += TICK_S / DECISION_S * (wanted.inventory - integrals[SMOOTHED])
+    smoothed = integrals[SMOOTHED]
+    if integrals[DIRECTION] * smoothed < 0.5 * c.dead_band:
+        integrals[DIRECTION] = 0.0
+    if abs(smoothed) > c.dead_band:
+        integrals[DIRECTION] = 1.0 if smoothed > 0.0 else -1.0
+    direction = integrals[DIRECTION]
+    other = m.discharge if direction > 0.0 else m.charge
+    inventory = direction * max(direction * smoothed, 0.0) if other <= SHUT else 0.0
+    return Flows(wanted.bypass, inventory)
 
 
 @kernel
@@ -151,7 +194,8 @@ def flows_of_lq(c: StationLaw, integrals: RealArray, m: StationMeasurement) -> F
     """Return the flows that state feedback asks for."""
     opened = flowing(c, m)
     state = (
-        m.hp - c.hp, m.lp - c.lp, opened.bypass - c.nominal, opened.inventory, integrals[0], integrals[1],
+        m.hp - c.hp, m.lp - c.lp, opened.bypass - c.nominal, opened.inventory,
+        integrals[HP_INTEGRAL], integrals[LP_INTEGRAL],
     )  # fmt: skip
     bypass = inventory = 0.0
     for i in range(len(state)):
@@ -164,8 +208,8 @@ def flows_of_lq(c: StationLaw, integrals: RealArray, m: StationMeasurement) -> F
 def flows_of_pi(c: StationLaw, integrals: RealArray, m: StationMeasurement) -> Flows:
     """Return the flows that two single loops ask for."""
     return Flows(
-        c.nominal - c.over_lp.gain * (m.lp - c.lp + integrals[1] / c.over_lp.integral_s),
-        -c.over_hp.gain * (m.hp - c.hp + integrals[0] / c.over_hp.integral_s),
+        c.nominal - c.over_lp.gain * (m.lp - c.lp + integrals[LP_INTEGRAL] / c.over_lp.integral_s),
+        -c.over_hp.gain * (m.hp - c.hp + integrals[HP_INTEGRAL] / c.over_hp.integral_s),
     )
 
 
@@ -209,25 +253,25 @@ def follow(c: StationLaw, integrals: RealArray, wanted: Flows, given: Flows, m: 
     else:
         back_hp = inventory * c.over_hp.integral_s / c.over_hp.gain
         back_lp = bypass * c.over_lp.integral_s / c.over_lp.gain
-    integrals[0] = integrals[0] + TICK_S * (m.hp - c.hp) - c.share * back_hp
-    integrals[1] = integrals[1] + TICK_S * (m.lp - c.lp) - c.share * back_lp
+    integrals[HP_INTEGRAL] = integrals[HP_INTEGRAL] + TICK_S * (m.hp - c.hp) - c.share * back_hp
+    integrals[LP_INTEGRAL] = integrals[LP_INTEGRAL] + TICK_S * (m.lp - c.lp) - c.share * back_lp
 
 
 @kernel
 def nitrogen_feed(c: StationLaw, integrals: RealArray, level: float) -> float:
     """Return the opening of the nitrogen feed (%); its integral stops at the ends of the valve's range."""
     error = c.nitrogen - level
-    wanted = c.feed + c.over_nitrogen.gain * (error + integrals[2] / c.over_nitrogen.integral_s)
+    wanted = c.feed + c.over_nitrogen.gain * (error + integrals[NITROGEN_INTEGRAL] / c.over_nitrogen.integral_s)
     given: float = min(max(wanted, 0.0), 100.0)
     if given == wanted or (wanted > given) != (error > 0.0):
-        integrals[2] += TICK_S * error
+        integrals[NITROGEN_INTEGRAL] += TICK_S * error
     return given
 
 
 @kernel
 def mode_of(c: StationLaw, wanted: Flows, given: Flows, m: StationMeasurement) -> int:
     """Return what the law can do about the pressures, with a compressor running."""
-    if not (m.nc1 and m.nc2):
+    if m.loaded < COMPRESSORS:
         return ONE_COMPRESSOR
     if wanted.inventory > given.inventory and charge_room(c, m.lp) < 1.0:
         return CHARGE_STOPPED
@@ -241,7 +285,7 @@ def raised_alarms(limits: AlarmLimits, m: StationMeasurement) -> int:
     conditions = (
         m.hp > limits.hp_high, m.hp < limits.hp_low, m.lp > limits.lp_high, m.lp < limits.lp_low,
         not m.nc1, not m.nc2, m.nitrogen < limits.nitrogen_low, m.lost > limits.helium_lost,
-        not (m.nc1 or m.nc2), m.bath > limits.bath_relief,
+        not (m.nc1 or m.nc2), m.bath > limits.bath_relief, not m.turbine, m.overspeed, m.deviating,
     )  # fmt: skip
     raised = 0
     for bit in range(len(conditions)):

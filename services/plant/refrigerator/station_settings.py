@@ -69,6 +69,36 @@ class StationAlarmSettings(BaseModel):
         return self
 
 
+class CompressorStart(BaseModel):
+    """How a compressor starts: it idles with the bypass open, then it is loaded in a ramp."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    idle: Annotated[float, Field(gt=0, lt=1)] = 0.25
+    """Share of its flow while it idles."""
+    idle_s: Annotated[float, Field(ge=0, le=600)] = 10.0
+    load_s: Annotated[float, Field(gt=0, le=3600)] = 50.0
+
+
+class TurbineProtection(BaseModel):
+    """How the turbine starts, and how fast it may turn."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    run_up_s: Annotated[float, Field(ge=1, le=3600)] = 60.0
+    """Shortest time in which CV156 opens to what is asked."""
+    governed_hz: Annotated[float, Field(ge=100, le=1e4)] = 3000.0
+    """Speed beyond which the governor closes CV156; 2,350 Hz is that of the operating point."""
+    overspeed_hz: Annotated[float, Field(ge=100, le=1e4)] = 3300.0
+    """Speed at which the turbine is tripped."""
+
+    @model_validator(mode="after")
+    def _governor_comes_first(self) -> "TurbineProtection":
+        if not self.governed_hz < self.overspeed_hz:
+            raise ValueError("the governor is to act before the trip: write governed_hz < overspeed_hz")
+        return self
+
+
 class StationSettings(BaseModel):
     """Section `plant.station`: the controller of the compression station."""
 
@@ -88,6 +118,13 @@ class StationSettings(BaseModel):
     pi_hp: PiTuning = PiTuning(gain=0.024, integral_s=50.0)
     pi_lp: PiTuning = PiTuning(gain=0.2, integral_s=4.0)
     pi_nitrogen: PiTuning = PiTuning(gain=2.0, integral_s=600.0)
+    noise_bar: Annotated[float, Field(ge=0, le=0.1)] = 0.0
+    """Standard deviation of the noise on the station's own gauges of high and low pressure, bar."""
+    dead_band: Annotated[float, Field(ge=0, le=20)] = 1.0
+    """Inventory flow up to which the buffer's valves stay shut, over the standard deviation that the noise gives it:
+    without noise there is no dead band."""
     charge_ends_bar: Annotated[float, Field(gt=0, le=0.5)] = 0.08
     """So far above its set point does the low pressure close the charge valve, whatever the high pressure asks for."""
+    start: CompressorStart = CompressorStart()
+    turbine: TurbineProtection = TurbineProtection()
     alarms: StationAlarmSettings = StationAlarmSettings()

@@ -9,6 +9,18 @@ from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import OUTPUT_NAMES, TICK_S
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import RealArray
+from plant.refrigerator.equipment import (
+    DEVIATING,
+    HP_NOISE,
+    LP_NOISE,
+    NC1,
+    NC2,
+    TRIPPED,
+    TURBINE,
+    Acting,
+    act,
+    loaded_compressors,
+)
 from plant.refrigerator.physics import (
     SIGNAL_NAMES,
     STATE_NAMES,
@@ -21,9 +33,7 @@ from plant.refrigerator.station_law import StationLaw, StationMeasurement, contr
 
 HP, LP, BUFFER, NITROGEN, LOST = (SIGNAL_NAMES.index(name) for name in ("P12", "P11", "P13", "L_N2", "lost"))
 CV956, CV952, CV953 = (STATE_NAMES.index(name) for name in ("CV956", "CV952", "CV953"))
-P1: Final = OUTPUT_NAMES.index("P1")
-NC1, NC2 = 4, 5
-"""Columns of the disturbances."""
+P1, V1 = OUTPUT_NAMES.index("P1"), OUTPUT_NAMES.index("V1")
 MODE: Final = 0
 ALARMS: Final = 1
 
@@ -40,18 +50,22 @@ class RefrigeratorMemory(NamedTuple):
     commands: RealArray
     """Openings asked of the warm valves, %, shape (4,)."""
     integrals: RealArray
-    """Of the controller, shape (3,): `plant.refrigerator.station_law.control_station`."""
+    """Of the controller, shape (5,): `plant.refrigerator.station_law.control_station`."""
+    equipment: RealArray
+    """Memory of the machinery, shape (14,): `plant.refrigerator.equipment`."""
     status: NDArray[np.int64]
     """Its mode and alarms, shape (2,)."""
 
 
 @kernel
 def control_tick(m: RefrigeratorMemory, d: RealArray, law: StationLaw) -> None:
-    """Let the controller answer what its sensors show; `d` (6,) holds from the tick on that begins."""
-    x, signals = m.x, m.signals
+    """Let the controller answer what its sensors show; `d` (16,) holds from the tick on that begins."""
+    x, signals, equipment = m.x, m.signals, m.equipment
     measured = StationMeasurement(
-        signals[HP], signals[LP], signals[BUFFER], x[CV956], x[CV952], x[CV953], signals[NITROGEN], signals[LOST],
-        m.y[P1], d[NC1] != 0.0, d[NC2] != 0.0,
+        signals[HP] + d[HP_NOISE], signals[LP] + d[LP_NOISE], signals[BUFFER], x[CV956], x[CV952], x[CV953],
+        signals[NITROGEN], signals[LOST], m.y[P1], d[NC1] != 0.0, d[NC2] != 0.0,
+        loaded_compressors(equipment, d), d[TURBINE] != 0.0 and equipment[TRIPPED] == 0.0, equipment[TRIPPED] != 0.0,
+        equipment[DEVIATING] != 0.0,
     )  # fmt: skip
     m.status[ALARMS] = raised_alarms(law.alarms, measured)
     commands, m.status[MODE] = control_station(law, m.integrals, measured)
@@ -60,9 +74,10 @@ def control_tick(m: RefrigeratorMemory, d: RealArray, law: StationLaw) -> None:
 
 
 @kernel
-def read_tick(m: RefrigeratorMemory, u: RealArray, d: RealArray, plant: Refrigerator, helium: Helium) -> None:
+def read_tick(m: RefrigeratorMemory, acting: Acting, helium: Helium) -> None:
     """Write what the sensors show at the state."""
-    evaluate_refrigerator(m.x, u, m.commands, d, plant, helium, np.empty_like(m.x), m.y, m.signals)
+    dx = np.empty_like(m.x)
+    evaluate_refrigerator(m.x, acting.u, m.commands, acting.d, acting.plant, helium, dx, m.y, m.signals)
 
 
 @kernel
@@ -75,14 +90,15 @@ def advance_tick(
     Args:
         m: State, overwritten.
         u: Inputs of the cold box, shape (3,).
-        d: Disturbances during the tick, shape (6,): `plant.refrigerator.DISTURBANCE_NAMES`.
+        d: What is given during the tick, shape (16,): `plant.refrigerator.equipment.GIVEN_NAMES`.
         ahead: Those of the next tick.
         plant: Parameters.
         helium: Tables.
         law: Of the station's controller.
     """
-    m.x[:] = advance_refrigerator(m.x, u, m.commands, d, TICK_S, plant, helium)
-    read_tick(m, u, d, plant, helium)
+    acting = act(law.equipment, m.equipment, u, d, m.signals[LP], m.y[V1], plant)
+    m.x[:] = advance_refrigerator(m.x, acting.u, m.commands, acting.d, TICK_S, acting.plant, helium)
+    read_tick(m, acting, helium)
     control_tick(m, ahead, law)
 
 

@@ -24,6 +24,7 @@ from coldloop.registers.common import IDENTITY_BLOCK, STATISTICS_BLOCK, SessionP
 from coldloop.registers.configuration import CONFIGURATION_BLOCK, CONFIGURATION_LINES_BLOCK
 from coldloop.registers.declaration import (
     Block,
+    Field,
     RegisterMap,
     Role,
     f32,
@@ -279,6 +280,8 @@ class StationMode(IntEnum):
     ONE_COMPRESSOR = 3
     STOPPED = 4
     """No compressor runs: total trip. The cold box is isolated, the high-pressure line empties into the buffer."""
+    STARTING = 5
+    """The first compressor idles or is being loaded, with the bypass open; the cold box is isolated until it is."""
 
 
 class StationAlarm(IntFlag):
@@ -296,6 +299,11 @@ class StationAlarm(IntFlag):
     """No compressor runs: CV155, CV156 and the heater are off, whatever the control PLC asks for."""
     BATH_RELIEF = 512
     """The bath's relief valve blows into the recovery line."""
+    TURBINE_TRIPPED = 1024
+    OVERSPEED = 2048
+    """It was the protection that tripped the turbine; held until the turbine is switched off."""
+    ACTUATOR = 4096
+    """CV155, CV156 or the heater is not as the control PLC asks."""
 
 
 class StationSample(NamedTuple):
@@ -306,13 +314,18 @@ class StationSample(NamedTuple):
         tuple[float, ...], f32_array("Warm signal", STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, finite=False)
     ]
     mode: Annotated[
-        int, u16("Pressure control: 0 automatic, 1 a valve at its end, 2 charging stopped, 3 one compressor, 4 stopped")
+        int,
+        u16(
+            "Pressure control: 0 automatic, 1 a valve at its end, 2 charging stopped, 3 one compressor, 4 stopped, "
+            "5 starting"
+        ),
     ] = StationMode.AUTOMATIC
     alarms: Annotated[
         int,
         u16(
             "Bits: 1 HP high, 2 HP low, 4 LP high, 8 LP low, 16 NC1, 32 NC2 tripped, 64 nitrogen low, 128 helium lost, "
-            "256 total trip, 512 relief of the bath"
+            "256 total trip, 512 relief of the bath, 1024 turbine tripped, "
+            "2048 by overspeed, 4096 an actuator not as asked"
         ),
     ] = 0
 
@@ -329,6 +342,9 @@ class StationStatus(NamedTuple):
     commands: Annotated[tuple[float, ...], f32_array("Requested opening of valve", STATION_VALVE_NAMES, ("%",) * 4)] = (
         0.0,
     ) * len(STATION_VALVE_NAMES)
+    acting: Annotated[
+        tuple[float, ...], f32_array("Acting on the cold box, whatever is asked", INPUT_NAMES, INPUT_UNITS)
+    ] = (0.0,) * len(INPUT_NAMES)
 
 
 class ModelRangeStatus(NamedTuple):
@@ -344,6 +360,11 @@ class ModelRangeStatus(NamedTuple):
     since: Annotated[int, u32("Tick at which this last changed")] = 0
 
 
+def _blocking(exchanger: str) -> Field:
+    """Declare how fast an exchanger blocks up."""
+    return f32(f"Share of {exchanger} that blocks up in an hour; below 0 it is cleaned", unit="1/h", low=-10, high=10)
+
+
 class Surroundings(NamedTuple):
     """What a refrigerator is given, from the next tick on; refused by a cold box alone."""
 
@@ -352,6 +373,14 @@ class Surroundings(NamedTuple):
     nitrogen: Annotated[int, u16("1: nitrogen in the tank, 0: none", high=1)] = 1
     leak: Annotated[float, f32("Leak of the high-pressure line, as at 16 bar", unit="g/s", low=0, high=50)] = 0.0
     ambient: Annotated[float, f32("Temperature of the surroundings", unit="K", low=270, high=320)] = 300.0
+    turbine: Annotated[int, u16("1: the turbine may run, 0: it is tripped", high=1)] = 1
+    cv155: Annotated[int, u16("1: CV155 follows what is asked, 0: it is stuck", high=1)] = 1
+    cv156: Annotated[int, u16("1: CV156 follows what is asked, 0: it is stuck", high=1)] = 1
+    heater: Annotated[int, u16("1: the heater follows what is asked, 0: it is off, 2: fully on, 150 W", high=2)] = 1
+    blocked_nef1: Annotated[float, _blocking("NEF1")] = 0.0
+    blocked_nef2: Annotated[float, _blocking("NEF2")] = 0.0
+    blocked_nef34: Annotated[float, _blocking("NEF34")] = 0.0
+    blocked_nef6: Annotated[float, _blocking("NEF6")] = 0.0
 
 
 UNUSED: Final = () if IS_COLD_BOX else (StationStatus, StationSample, Surroundings, ModelRangeStatus)
