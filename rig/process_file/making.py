@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from coldloop.errors import UsageError
 from coldloop.process.declaration import NO_LOAD, Band, Input, Load, Loop, Output, Process, State
 from coldloop.process.lti_model import LtiModel, discretise
-from coldloop.registers.optimizer_plc import INPUT_SAMPLES, PREDICTED_SAMPLES
 from rig.plc_sizing.problem_sizes import ProblemSizes, iteration_shares
 from rig.process_file.declaration import OutputSection, ProcessFile, read_process_file
 from rig.process_file.linearised import Linearised, linearised
@@ -144,25 +143,21 @@ def _sizes(file: ProcessFile, states: int) -> ProblemSizes:
 
 
 def _check_room(process: Process) -> None:
-    """Check that each record of the link that is read at once fits into one request.
+    """Check that what the link exchanges in each scan and update fits into one request.
 
     Raises:
         UsageError: One does not.
     """
     inputs, outputs, states = len(process.inputs), len(process.outputs), len(process.states)
-    bands = len(process.bands)
     words = {
         "the latched update": 12 + 2 * (2 * inputs + outputs + states),
         "the rack's measurement": 18 + 2 * (inputs + outputs + states),
-        "the prediction": 6 + 2 * (len(PREDICTED_SAMPLES) * bands + len(INPUT_SAMPLES) * inputs),
-        "the operating limits": 4 * bands + 6 * inputs,
-        "the model deviation": 2 + 2 * inputs + 4 * outputs,
     }
     longest = max(words, key=lambda name: words[name])
     if words[longest] > REGISTERS_OF_A_REQUEST:
         raise UsageError(
-            f"{inputs} inputs, {outputs} outputs ({bands} with a band) and {states} states are too many: {longest} is "
-            f"{words[longest]} registers, and one Modbus request carries {REGISTERS_OF_A_REQUEST}"
+            f"{inputs} inputs, {outputs} outputs and {states} states are too many: {longest} is {words[longest]} "
+            f"registers, and one Modbus request carries {REGISTERS_OF_A_REQUEST}"
         )
 
 

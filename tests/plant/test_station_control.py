@@ -249,7 +249,7 @@ def test_an_event_that_cannot_be_is_refused(bad: dict[str, object], says: str) -
 
 def test_gains_of_other_weights_are_refused() -> None:
     section = PlantSection.model_validate({"kind": "refrigerator", "station": {"weights": {"lp_bar": 0.02}}})
-    with pytest.raises(ConfigurationError, match="the gains in"):
+    with pytest.raises(ConfigurationError, match="the gains of this refrigerator"):
         plant_maker(read_header(DEFAULT_MODEL_FILE), section)
 
 

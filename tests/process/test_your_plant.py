@@ -37,5 +37,5 @@ def test_a_folder_that_is_in_use_is_left_alone(processes: Processes, tmp_path: P
     started = processes.coldloop("new", tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     code, _, err = started.ended(PROGRAM_S)
     assert code != 0
-    assert err.splitlines() == [f"coldloop: {tmp_path / 'plant.py'}: is there already; name another folder"]
+    assert err.splitlines() == [f"coldloop: {tmp_path / 'my_plant.py'}: is there already; name another folder"]
     assert not (tmp_path / "process.toml").exists()

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coldloop.process.limits import LEVEL_BAND, T5_BAND, InputLimits
+from coldloop.process.cold_box import LEVEL_BAND, T5_BAND
+from coldloop.process.limits import InputLimits
 from optimizer_plc.settings import ProgramSettings
 from plant.cold_box.capacity import held_loads
 from plant.cold_box.physics import REFERENCE, derivative

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ModelFileError
-from coldloop.process.limits import T5_BAND
+from coldloop.process.cold_box import T5_BAND
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE, ModelSettings
 from coldloop.process.signals import L1, T5

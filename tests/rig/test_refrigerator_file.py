@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.limits import T5_BAND
+from coldloop.process.cold_box import T5_BAND
 from coldloop.process.lti_model import load
 from coldloop.process.model_settings import ModelSettings
 from plant.load import find_load

@@ -155,10 +155,13 @@ class RegisterClient:
     async def read_rows(self, record: type[R], start: int, count: int) -> list[R]:
         """Return `count` rows from row `start` on.
 
-        Rows that need several requests are read in several, which are sent together, up to `REQUESTS_AT_ONCE`.
+        Rows that need several requests are read in several, which are sent together, up to `REQUESTS_AT_ONCE`. A row
+        that is longer than a request is read in pieces: the seal of a record tells torn ones.
         """
         block, codec = self._places[record]
         row_words = codec.size // 2
+        if row_words > MAX_READ_WORDS:
+            return [await self._long_row(block, codec, row) for row in range(start, start + count)]
         rows_at_once = MAX_READ_WORDS // row_words
         end = start + count
         parts = [(first, min(rows_at_once, end - first)) for first in range(start, end, rows_at_once)]
@@ -171,6 +174,11 @@ class RegisterClient:
             for raw in await self._read_words(block, words):
                 rows += [self._decoded(block, codec, raw, offset) for offset in range(0, len(raw), codec.size)]
         return rows
+
+    async def _long_row(self, block: Block, codec: RecordCodec, row: int) -> Any:  # noqa: ANN401 a record of the block
+        first, words = block.address + row * codec.size // 2, codec.size // 2
+        pieces = [(first + done, min(MAX_READ_WORDS, words - done)) for done in range(0, words, MAX_READ_WORDS)]
+        return self._decoded(block, codec, b"".join(await self._read_words(block, pieces)), 0)
 
     async def write(self, record: tuple[Any, ...]) -> None:
         """Write the record (its first row)."""
