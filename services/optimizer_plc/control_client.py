@@ -6,6 +6,7 @@ from typing import Final, TypeVar
 from coldloop.errors import BUSY, DamagedAnswerError, LinkError, ModelFileError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.endpoints import Endpoint
+from coldloop.modbus.requests import MAX_READ_WRITE_WORDS
 from coldloop.registers.common import Identity, SessionPace
 from coldloop.registers.control_plc import (
     CONTROL_MAP,
@@ -14,6 +15,8 @@ from coldloop.registers.control_plc import (
     Heartbeat,
     LatchedUpdate,
     Plan,
+    SequenceHeader,
+    SequenceRow,
     Update,
     Verdict,
 )
@@ -29,8 +32,10 @@ ATTEMPTS: Final = 3
 ILLEGAL_VALUE: Final = 3
 DAMAGED_THERE: Final = (Verdict.BAD_CRC, Verdict.WRONG_LENGTH)
 """Verdicts on a sequence that is not as it was sent; its number may not be either."""
-ROWS_WITH_HEADER: Final = 18
-"""Rows that fit into one request with the header that commits them."""
+ROWS_WITH_HEADER: Final = (
+    MAX_READ_WRITE_WORDS - CONTROL_MAP.block_of(SequenceHeader).row_words
+) // CONTROL_MAP.block_of(SequenceRow).row_words
+"""Rows that fit into one request with the header that commits them: 18 of three inputs."""
 LONGEST_WAIT_S: Final = 1.0
 """The control PLC answers a request that waits for an update after this real time at the latest."""
 

@@ -99,6 +99,9 @@ class RefrigeratorProgram(ColdBoxProgram):
         control_tick(self._memory, d, self.law)
         super().__init__(box=plant.box, x0=file.x0[:BOX_STATES], u0=u0, load=load, noise=noise)
 
+    def _read(self, w: float) -> RealArray:  # noqa: ARG002 what was read with the memory
+        return self._memory.y
+
     def _warm_up(self) -> None:
         d = self._disturbances(0, self.load)
         advance_program_tick(self.memory, self._u, d, d, self._plant, self._tables, self.law)
