@@ -65,7 +65,7 @@ def test_gains_are_those_of_the_weights_that_are_configured(coldloop: "Coldloop"
     plant = ("--set", "plant.kind=refrigerator", "--set", f"model.file={other}")
     run = ("run", "--in-process", "--duration", "10s", *plant)
     refused = coldloop(*run, "--out", tmp_path / "a")
-    assert (refused.code, len(refused.complaints)) == (1, 1)
+    assert (refused.code, len(refused.complaints)) == (USAGE, 1)
     assert "plant.station.weights" in refused.complaints[0]
     assert coldloop(*run, "--set", weights, "--out", tmp_path / "b").code == 0
 
