@@ -29,11 +29,12 @@ ROOT: Final = Path(__file__).parents[1]
 
 
 def plant() -> None:
-    """Make each plant, which compiles its kernels."""
+    """Make each plant that is ours, which compiles its kernels."""
     from plant.settings import PlantKind  # noqa: PLC0415 not in every image
 
     for kind in PlantKind:
-        _make_plant(kind)
+        if kind is not PlantKind.OF_PROCESS:
+            _make_plant(kind)
 
 
 def default_plant() -> None:

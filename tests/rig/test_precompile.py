@@ -48,6 +48,14 @@ def test_making_the_programs_compiles_all_that_a_session_of_them_needs(plant: st
     assert recorder.before == compiled_kernels() > 0
 
 
+@pytest.mark.parametrize("service", ["plant", "control_plc", "optimizer_plc", "hmi"])
+def test_each_image_can_compile_its_part(service: str) -> None:
+    done = subprocess.run(
+        [sys.executable, ROOT / "docker" / "precompile.py", service], check=False, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize(("numba", "code"), [("", 0), ("raise ImportError('broken')", 1)])
 def test_the_failure_of_one_part_is_that_of_all(tmp_path: Path, numba: str, code: int) -> None:
     (tmp_path / "plant").mkdir()
