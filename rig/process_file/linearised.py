@@ -2,7 +2,7 @@
 
 from math import factorial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,40 +11,16 @@ from coldloop.errors import UsageError
 from plant.own.maker import LINEAR, PYTHON, TRANSFER_FUNCTIONS
 from plant.own.python_class import Equations, load_equations, source_digest
 from rig.process_file.declaration import LagSection, PlantSection, ProcessFile
+from rig.process_file.fmu_model import from_fmu
+from rig.process_file.linear_model import Linearised, given_outputs, jacobian, operating_point
+from rig.process_file.step_test import from_step_test
 
 Array = NDArray[np.float64]
 
 AT_REST: Final = 1e-8
 """Largest change of a state in a second, over its size, that still counts as rest."""
-STEP: Final = 1e-5
-"""Of differences, over the size of the variable."""
 PADE_ORDER: Final = 2
 """Of the approximation of a dead time in the prediction model; the simulated plant has it exactly."""
-
-
-class Linearised(NamedTuple):
-    """dx/dt = A x + B u + F w, y = C x + D u + G w in deviations from (x0, u0, w0, y0); time in seconds."""
-
-    A: Array
-    B: Array
-    F: Array
-    C: Array
-    D: Array
-    G: Array
-    x0: Array
-    u0: Array
-    w0: float
-    y0: Array
-    states: dict[str, str]
-    """Name and unit of each."""
-    kind: str
-    """Of the plant."""
-    parameters: dict[str, Any]
-    """What the plant is made from, in the model file."""
-    digest: str
-    """Of its source."""
-    error: float
-    """Of the derivatives: largest difference from those with steps twice as wide, over the largest of each column."""
 
 
 def linearised(file: ProcessFile, folder: Path, to_model: str) -> Linearised:
@@ -63,6 +39,10 @@ def linearised(file: ProcessFile, folder: Path, to_model: str) -> Linearised:
         found = _from_equations(file, folder, plant.python, to_model)
     elif plant.matrices is not None:
         found = _from_matrices(file, folder / plant.matrices)
+    elif plant.step_test is not None:
+        found = from_step_test(file, folder / plant.step_test)
+    elif plant.fmu is not None:
+        found = from_fmu(file, folder, plant.fmu, to_model)
     else:
         found = _from_lags(file, plant)
     for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
@@ -71,24 +51,13 @@ def linearised(file: ProcessFile, folder: Path, to_model: str) -> Linearised:
     return found
 
 
-def _operating(file: ProcessFile) -> tuple[Array, float]:
-    return np.array([one.at for one in file.inputs]), file.load.at if file.load else 0.0
-
-
-def _given_outputs(file: ProcessFile) -> Array:
-    missing = next((one.name for one in file.outputs if one.at is None), None)
-    if missing is not None:
-        raise UsageError(f"outputs: {missing} needs at, its value at the operating point: this plant has no equations")
-    return np.array([one.at for one in file.outputs], dtype=np.float64)
-
-
 # -- a class with equations ------------------------------------------------------------------------------------------
 
 
 def _from_equations(file: ProcessFile, folder: Path, place: str, to_model: str) -> Linearised:
     source, _, name = place.partition(":")
     equations = load_equations(folder / source, name)
-    u, w = _operating(file)
+    u, w = operating_point(file)
     x = _rest(equations, u, w, place)
     y = np.asarray(equations.outputs(x, u, w), dtype=np.float64)
     if y.shape != (len(file.outputs),):
@@ -101,7 +70,7 @@ def _from_equations(file: ProcessFile, folder: Path, place: str, to_model: str) 
         return np.asarray(equations.outputs(v[: len(x)], v[len(x) : -1], float(v[-1])), dtype=np.float64)
 
     at = np.array([*x, *u, w])
-    (J, one), (H, other) = _jacobian(flow, at), _jacobian(read, at)
+    (J, one), (H, other) = jacobian(flow, at), jacobian(read, at)
     n = len(x)
     return Linearised(
         J[:, :n], J[:, n:-1], J[:, -1], H[:, :n], H[:, n:-1], H[:, -1], x, u, w, y, dict(equations.states), PYTHON,
@@ -132,23 +101,6 @@ def _rest(equations: Equations, u: Array, w: float, place: str) -> Array:
     return np.array(found.x, dtype=np.float64)
 
 
-def _jacobian(function: Any, at: Array) -> tuple[Array, float]:  # noqa: ANN401 a function of arrays
-    """Return central differences, shape (k, len(at)), and how far those of twice the step are from them."""
-    columns, errors = [], []
-    for i, value in enumerate(at):
-        step = STEP * max(1.0, abs(value))
-        by_step = []
-        for h in (step, 2 * step):
-            up, down = at.copy(), at.copy()
-            up[i] += h
-            down[i] -= h
-            by_step.append((function(up) - function(down)) / (2 * h))
-        fine, coarse = by_step
-        columns.append(fine)
-        errors.append(np.abs(fine - coarse).max() / max(np.abs(fine).max(), 1e-12))
-    return np.array(columns).T, float(max(errors))
-
-
 # -- matrices and transfer functions ---------------------------------------------------------------------------------
 
 
@@ -170,10 +122,10 @@ def _from_matrices(file: ProcessFile, path: Path) -> Linearised:
             raise UsageError(
                 f"{path}: {name} has shape {full[name].shape}, and not {shape} for {n} states, {m} inputs, {p} outputs"
             )
-    u, w = _operating(file)
+    u, w = operating_point(file)
     return Linearised(
-        **full, x0=np.zeros(n), u0=u, w0=w, y0=_given_outputs(file), states={f"x{i}": "" for i in range(1, n + 1)},
-        kind=LINEAR, parameters={}, digest="", error=0.0,
+        full["A"], full["B"], full["F"], full["C"], full["D"], full["G"], np.zeros(n), u, w, given_outputs(file),
+        {f"x{i}": "" for i in range(1, n + 1)}, LINEAR, {}, "", 0.0,
     )  # fmt: skip
 
 
@@ -197,10 +149,10 @@ def _from_lags(file: ProcessFile, plant: PlantSection) -> Linearised:
         unit = file.outputs[outputs[lag.output]].unit
         states |= {f"{lag.output}_{lag.source}_{i}": unit for i in range(1, len(a) + 1)}
         first += len(a)
-    u, w = _operating(file)
+    u, w = operating_point(file)
     return Linearised(
         A, B[:, :m], B[:, m], C, np.zeros((len(outputs), m)), np.zeros(len(outputs)), np.zeros(n), u, w,
-        _given_outputs(file), states, TRANSFER_FUNCTIONS, {"lags": [lag.model_dump() for lag in lags]}, "", 0.0,
+        given_outputs(file), states, TRANSFER_FUNCTIONS, {"lags": [lag.model_dump() for lag in lags]}, "", 0.0,
     )  # fmt: skip
 
 

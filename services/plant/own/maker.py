@@ -1,7 +1,6 @@
 """Makes the plant of a process other than the cold box, from what its model file says of it."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Final
 
 from coldloop.errors import ModelFileError
@@ -20,6 +19,7 @@ PYTHON: Final = "python"
 """Kinds of plants: `ModelHeader.plant`."""
 LINEAR: Final = "linear"
 TRANSFER_FUNCTIONS: Final = "transfer-functions"
+FMU: Final = "fmu"
 
 
 def check_signals(header: ModelHeader) -> None:
@@ -32,17 +32,14 @@ def check_signals(header: ModelHeader) -> None:
         raise ModelFileError(
             f"{header.file}: a model of another process than COLDLOOP_PROCESS names; name the same for both"
         )
-    if header.plant != PYTHON:
+    if header.plant not in (PYTHON, FMU):
         return
-    source, name = _source(header)
+    source = header.file.parent / header.plant_parameters["file"]
+    name = header.plant_parameters.get("class", "")
     if not source.is_file() or source_digest(source, name) != header.parameters_digest:
         raise ModelFileError(
             f"{header.file}: made from another {source} than is there; make it again, `coldloop process`"
         )
-
-
-def _source(header: ModelHeader) -> tuple[Path, str]:
-    return header.file.parent / header.plant_parameters["file"], header.plant_parameters["class"]
 
 
 def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlant:
@@ -55,8 +52,12 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlan
     Raises:
         ModelFileError: The plant cannot be made.
     """
+    if header.plant == FMU:
+        return _fmu_plant_maker(header, noise_of_seed)
     if header.plant == PYTHON:
-        equations = load_equations(*_source(header))
+        equations = load_equations(
+            header.file.parent / header.plant_parameters["file"], header.plant_parameters["class"]
+        )
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
             return PythonPlant(equations, x0=header.x0, u0=header.u0, load=load, noise=noise_of_seed(seed))
@@ -74,5 +75,18 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlan
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
             return LinearPlant(model, load, noise_of_seed(seed))
+
+    return make
+
+
+def _fmu_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlant:
+    from plant.own.fmu import FmuPlant, Wiring, fmu_maker  # noqa: PLC0415 few plants are FMUs
+    from plant.own.fmu_file import Fmu  # noqa: PLC0415
+
+    fmu = Fmu(header.file.parent / header.plant_parameters["file"])
+    at_rest = fmu_maker(fmu, Wiring(**header.plant_parameters["wiring"]), header.u0, header.w0)
+
+    def make(load: HeatLoad, seed: int) -> PlantProgram:
+        return FmuPlant(at_rest(), keeps_state=fmu.keeps_state, u0=header.u0, load=load, noise=noise_of_seed(seed))
 
     return make
