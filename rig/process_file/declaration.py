@@ -52,6 +52,8 @@ class InputSection(_Section):
     """A manipulated input."""
 
     name: Name
+    variable: str | None = None
+    """Its name in an FMU, if it is not `name`."""
     unit: str = ""
     description: str = ""
     at: FiniteFloat
@@ -78,6 +80,8 @@ class OutputSection(_Section):
     """A measured output."""
 
     name: Name
+    variable: str | None = None
+    """Its name in an FMU, if it is not `name`."""
     unit: str = ""
     range: Span
     """Of its sensor: what is outside is no measurement."""
@@ -109,6 +113,8 @@ class LoadSection(_Section):
     """The one disturbance, which is measured; leave it out where there is none."""
 
     name: Name
+    variable: str | None = None
+    """Its name in an FMU, if it is not `name`."""
     unit: str = ""
     at: FiniteFloat
     span: Span
@@ -141,11 +147,24 @@ class PlantSection(_Section):
     matrices: str | None = None
     """NPZ file with A, B, C and, where there are such, D, F, G: dx/dt = A x + B u + F w, in deviations and seconds."""
     transfer_functions: tuple[LagSection, ...] | None = None
+    step_test: str | None = None
+    """CSV file with columns time_s, inputs, load (if it moved), outputs: the plant is the model that is found in it."""
+    fmu: str | None = None
+    """FMU for co-simulation, of FMI 2.0 or 3.0, beside the process file; the keys below are for it."""
+    start: dict[str, float] = {}
+    """Start values of its variables, by name."""
+    steps_per_tick: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    """Steps that it is asked for in a tick; 1, or as many as its fixed step needs, if not given."""
+    rest_s: PositiveFloat | None = None
+    """How long it may take from its start to rest at the operating point, s; 24 horizons if not given."""
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        if sum(each is not None for each in (self.python, self.matrices, self.transfer_functions)) != 1:
-            raise ValueError("plant: give one of python, matrices, transfer_functions")
+        sources = ("python", "matrices", "transfer_functions", "step_test", "fmu")
+        if sum(getattr(self, each) is not None for each in sources) != 1:
+            raise ValueError(f"plant: give one of {', '.join(sources)}")
+        if self.fmu is None and (self.start or self.steps_per_tick or self.rest_s):
+            raise ValueError("plant: start, steps_per_tick and rest_s are for an FMU")
         return self
 
 
@@ -193,9 +212,8 @@ class ProcessFile(_Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        names = [one.name for one in self.inputs] + [one.name for one in self.outputs]
-        if self.load is not None:
-            names.append(self.load.name)
+        signals = (*self.inputs, *self.outputs, *((self.load,) if self.load else ()))
+        names = [each.name for each in signals]
         lower = [name.lower() for name in names]
         twice = next((name for name in names if lower.count(name.lower()) > 1), None)
         if twice is not None:
@@ -205,6 +223,8 @@ class ProcessFile(_Section):
             raise ValueError(f"{min(reserved)}: a register, a column or Python has this name already; choose another")
         if not any(output.band for output in self.outputs):
             raise ValueError("outputs: none has a band; give at least one a band to be kept within")
+        if self.plant.fmu is None and any(one.variable for one in signals):
+            raise ValueError(f"{next(one.name for one in signals if one.variable)}: variable is for an FMU")
         inputs = {one.name for one in self.inputs}
         for output in self.outputs:
             if output.loop is not None and output.loop.input not in inputs:

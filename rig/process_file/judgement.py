@@ -21,7 +21,14 @@ SETTLED: Final = 3.0
 
 def described(made: Made) -> str:
     """Return the description of a process and its linear model."""
-    lines = [*_rest(made), *_modes(made), *_gains(made), *_warnings(made), f"model      sha256 {made.model.digest}"]
+    lines = [
+        *_rest(made),
+        *made.linear.notes,
+        *_modes(made),
+        *_gains(made),
+        *_warnings(made),
+        f"model      sha256 {made.model.digest}",
+    ]
     return "\n".join(lines) + "\n"
 
 

@@ -1,10 +1,9 @@
 """The linear model of a process file's plant at its operating point, whichever way the plant is given."""
 
 import warnings
-from collections.abc import Callable
 from math import factorial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,40 +12,16 @@ from coldloop.errors import UsageError
 from plant.own.maker import LINEAR, PYTHON, TRANSFER_FUNCTIONS
 from plant.own.python_class import Equations, equations_of, evaluated
 from rig.process_file.declaration import LagSection, PlantSection, ProcessFile
+from rig.process_file.fmu_model import from_fmu
+from rig.process_file.linear_model import Linearised, given_outputs, jacobian, operating_point
+from rig.process_file.step_test import from_step_test
 
 Array = NDArray[np.float64]
 
 AT_REST: Final = 1e-8
 """Largest change of a state in a sampling period, over its size, that still counts as rest."""
-STEP: Final = 1e-5
-"""Of differences, over the size of the variable."""
 PADE_ORDER: Final = 2
 """Of the approximation of a dead time in the prediction model; the simulated plant has it exactly."""
-
-
-class Linearised(NamedTuple):
-    """dx/dt = A x + B u + F w, y = C x + D u + G w in deviations from (x0, u0, w0, y0); time in seconds."""
-
-    A: Array
-    B: Array
-    F: Array
-    C: Array
-    D: Array
-    G: Array
-    x0: Array
-    u0: Array
-    w0: float
-    y0: Array
-    states: dict[str, str]
-    """Name and unit of each."""
-    kind: str
-    """Of the plant."""
-    parameters: dict[str, Any]
-    """What the plant is made from, in the model file."""
-    digest: str
-    """Of its source."""
-    error: float
-    """Of the derivatives: largest difference from those with steps twice as wide, over the largest of each column."""
 
 
 def linearised(file: ProcessFile, folder: Path) -> Linearised:
@@ -60,6 +35,10 @@ def linearised(file: ProcessFile, folder: Path) -> Linearised:
         found = _from_equations(file, folder, plant.python)
     elif plant.matrices is not None:
         found = _from_matrices(file, folder / plant.matrices)
+    elif plant.step_test is not None:
+        found = from_step_test(file, folder / plant.step_test)
+    elif plant.fmu is not None:
+        found = from_fmu(file, folder, plant.fmu)
     else:
         found = _from_lags(file, plant)
     for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
@@ -68,24 +47,13 @@ def linearised(file: ProcessFile, folder: Path) -> Linearised:
     return found if file.load else found._replace(F=np.zeros_like(found.F), G=np.zeros_like(found.G))
 
 
-def _operating(file: ProcessFile) -> tuple[Array, float]:
-    return np.array([one.at for one in file.inputs]), file.load.at if file.load else 0.0
-
-
-def _given_outputs(file: ProcessFile) -> Array:
-    missing = next((one.name for one in file.outputs if one.at is None), None)
-    if missing is not None:
-        raise UsageError(f"outputs: {missing} needs at, its value at the operating point: this plant has no equations")
-    return np.array([one.at for one in file.outputs], dtype=np.float64)
-
-
 # -- a class with equations ------------------------------------------------------------------------------------------
 
 
 def _from_equations(file: ProcessFile, folder: Path, place: str) -> Linearised:
     source, name = _source(folder, place)
     equations = equations_of(source, name, place)
-    u, w = _operating(file)
+    u, w = operating_point(file)
     n, m = len(equations.states), len(u)
     x = _rest(equations, u, w, place, file.tick_s * file.ticks_per_sample)
     y = evaluated(equations.outputs, x, u, w, size=len(file.outputs), where=place)
@@ -98,7 +66,7 @@ def _from_equations(file: ProcessFile, folder: Path, place: str) -> Linearised:
 
     at = np.array([*x, *u, w])
     scale = np.array([*_sizes(x, equations), *((one.high - one.low) / 4 for one in file.inputs), _load_size(file)])
-    (J, one), (H, other) = _jacobian(flow, at, scale), _jacobian(read, at, scale)
+    (J, one), (H, other) = jacobian(flow, at, scale), jacobian(read, at, scale)
     parameters = {"file": place.partition(":")[0], "class": name, "source": source}
     return Linearised(
         J[:, :n], J[:, n : n + m], J[:, -1], H[:, :n], H[:, n : n + m], H[:, -1], x, u, w, y, dict(equations.states),
@@ -149,22 +117,6 @@ def _rest(equations: Equations, u: Array, w: float, place: str, sample_s: float)
     return np.array(found.x * size, dtype=np.float64)
 
 
-def _jacobian(function: Callable[[Array], Array], at: Array, scale: Array) -> tuple[Array, float]:
-    """Return central differences, shape (k, len(at)), and how far those of twice the step are from them."""
-    columns, errors = [], []
-    for i, size in enumerate(scale):
-        by_step = []
-        for h in (STEP * size, 2 * STEP * size):
-            up, down = at.copy(), at.copy()
-            up[i] += h
-            down[i] -= h
-            by_step.append((function(up) - function(down)) / (2 * h))
-        fine, coarse = by_step
-        columns.append(fine)
-        errors.append(np.abs(fine - coarse).max() / max(np.abs(fine).max(), 1e-300))
-    return np.array(columns).T, float(max(errors))
-
-
 # -- matrices and transfer functions ---------------------------------------------------------------------------------
 
 
@@ -186,9 +138,9 @@ def _from_matrices(file: ProcessFile, path: Path) -> Linearised:
             raise UsageError(
                 f"{path}: {name} has shape {full[name].shape}, and not {shape} for {n} states, {m} inputs, {p} outputs"
             )
-    u, w = _operating(file)
+    u, w = operating_point(file)
     return Linearised(
-        **full, x0=np.zeros(n), u0=u, w0=w, y0=_given_outputs(file), states={f"x{i}": "" for i in range(1, n + 1)},
+        **full, x0=np.zeros(n), u0=u, w0=w, y0=given_outputs(file), states={f"x{i}": "" for i in range(1, n + 1)},
         kind=LINEAR, parameters={}, digest="", error=0.0,
     )  # fmt: skip
 
@@ -213,10 +165,10 @@ def _from_lags(file: ProcessFile, plant: PlantSection) -> Linearised:
         unit = file.outputs[outputs[lag.output]].unit
         states |= {f"{lag.output}_{lag.source}_{i}": unit for i in range(1, len(a) + 1)}
         first += len(a)
-    u, w = _operating(file)
+    u, w = operating_point(file)
     return Linearised(
         A, B[:, :m], B[:, m], C, np.zeros((len(outputs), m)), np.zeros(len(outputs)), np.zeros(n), u, w,
-        _given_outputs(file), states, TRANSFER_FUNCTIONS, {"lags": [lag.model_dump() for lag in lags]}, "", 0.0,
+        given_outputs(file), states, TRANSFER_FUNCTIONS, {"lags": [lag.model_dump() for lag in lags]}, "", 0.0,
     )  # fmt: skip
 
 

@@ -12,7 +12,9 @@ from coldloop.process.declaration import NO_LOAD, Band, Input, Load, Loop, Outpu
 from coldloop.process.lti_model import LtiModel, discretise
 from rig.plc_sizing.problem_sizes import ProblemSizes, iteration_shares
 from rig.process_file.declaration import OutputSection, ProcessFile, read_process_file
-from rig.process_file.linearised import Linearised, linearised
+from rig.process_file.fmu_model import with_units
+from rig.process_file.linear_model import Linearised
+from rig.process_file.linearised import linearised
 
 Array = NDArray[np.float64]
 
@@ -40,7 +42,7 @@ def made_from(path: Path) -> Made:
     Raises:
         ColdloopError: One line that names file, key and remedy.
     """
-    file = read_process_file(path)
+    file = with_units(read_process_file(path), path.parent)
     linear = linearised(file, path.parent)
     process = _process(file, linear)
     _check_room(process)

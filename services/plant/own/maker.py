@@ -1,6 +1,8 @@
 """Makes the plant of a process other than the cold box, from what its model file says of it."""
 
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 from coldloop.errors import ModelFileError
@@ -19,18 +21,30 @@ PYTHON: Final = "python"
 """Kinds of plants: `ModelHeader.plant`."""
 LINEAR: Final = "linear"
 TRANSFER_FUNCTIONS: Final = "transfer-functions"
+FMU: Final = "fmu"
 
 
 def check_signals(header: ModelHeader) -> None:
     """Check that a model file is of the process that this program is loaded with.
 
     Raises:
-        ModelFileError: It is not.
+        ModelFileError: It is not, or its FMU is another file than it was made from.
     """
     if (header.state_names, header.input_names, header.output_names) != (STATE_NAMES, INPUT_NAMES, OUTPUT_NAMES):
         raise ModelFileError(
             f"{header.file}: a model of another process than COLDLOOP_PROCESS names; name the same for both"
         )
+    if header.plant == FMU:
+        source = Path(header.plant_parameters["file"])
+        if not source.is_file() or file_digest(source) != header.parameters_digest:
+            raise ModelFileError(
+                f"{header.file}: made from another {source} than is there; make it again, `coldloop process`"
+            )
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file that a plant is made from, in hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlant:
@@ -43,6 +57,8 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlan
     Raises:
         ModelFileError: The plant cannot be made.
     """
+    if header.plant == FMU:
+        return _fmu_plant_maker(header, noise_of_seed)
     if header.plant == PYTHON:
         parameters = header.plant_parameters
         equations = equations_of(parameters["source"], parameters["class"], parameters["file"])
@@ -63,5 +79,18 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlan
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
             return LinearPlant(model, load, noise_of_seed(seed))
+
+    return make
+
+
+def _fmu_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlant:
+    from plant.own.fmu import FmuPlant, Wiring, fmu_maker  # noqa: PLC0415 few plants are FMUs
+    from plant.own.fmu_file import Fmu  # noqa: PLC0415
+
+    fmu = Fmu(Path(header.plant_parameters["file"]))
+    at_rest = fmu_maker(fmu, Wiring(**header.plant_parameters["wiring"]), header.u0, header.w0)
+
+    def make(load: HeatLoad, seed: int) -> PlantProgram:
+        return FmuPlant(at_rest(), keeps_state=fmu.keeps_state, u0=header.u0, load=load, noise=noise_of_seed(seed))
 
     return make

@@ -1,0 +1,78 @@
+"""The linear model of a plant at its operating point, before it is a model file, and what all ways to it share."""
+
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.errors import UsageError
+from rig.process_file.declaration import ProcessFile
+
+Array = NDArray[np.float64]
+
+STEP: Final = 1e-5
+"""Of differences, over the size of the variable."""
+
+
+class Linearised(NamedTuple):
+    """dx/dt = A x + B u + F w, y = C x + D u + G w in deviations from (x0, u0, w0, y0); time in seconds."""
+
+    A: Array
+    B: Array
+    F: Array
+    C: Array
+    D: Array
+    G: Array
+    x0: Array
+    u0: Array
+    w0: float
+    y0: Array
+    states: dict[str, str]
+    """Name and unit of each."""
+    kind: str
+    """Of the plant."""
+    parameters: dict[str, Any]
+    """What the plant is made from, in the model file."""
+    digest: str
+    """Of its source."""
+    error: float
+    """Of the derivatives: largest difference from those with steps twice as wide, over the largest of each column."""
+    notes: tuple[str, ...] = ()
+    """What there is to say of how it was found, a line each."""
+
+
+def operating_point(file: ProcessFile) -> tuple[Array, float]:
+    """Return inputs and load at the operating point."""
+    return np.array([one.at for one in file.inputs]), file.load.at if file.load else 0.0
+
+
+def given_outputs(file: ProcessFile) -> Array:
+    """Return the outputs at the operating point, which the file gives.
+
+    Raises:
+        UsageError: It does not.
+    """
+    missing = next((one.name for one in file.outputs if one.at is None), None)
+    if missing is not None:
+        raise UsageError(f"outputs: {missing} needs at, its value at the operating point: this plant has no equations")
+    return np.array([one.at for one in file.outputs], dtype=np.float64)
+
+
+def jacobian(function: Callable[[Array], Array], at: Array, scale: Array) -> tuple[Array, float]:
+    """Return central differences, shape (k, len(at)), and how far those of twice the step are from them.
+
+    Steps are shares of the variables' sizes, `scale` (len(at)).
+    """
+    columns, errors = [], []
+    for i, size in enumerate(scale):
+        by_step = []
+        for h in (STEP * size, 2 * STEP * size):
+            up, down = at.copy(), at.copy()
+            up[i] += h
+            down[i] -= h
+            by_step.append((function(up) - function(down)) / (2 * h))
+        fine, coarse = by_step
+        columns.append(fine)
+        errors.append(np.abs(fine - coarse).max() / max(np.abs(fine).max(), 1e-300))
+    return np.array(columns).T, float(max(errors))

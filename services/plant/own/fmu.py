@@ -1,0 +1,183 @@
+"""A plant that is an FMU: its variables connected to the signals, at rest when a session begins."""
+
+import base64
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from coldloop.process.signals import STATE_NAMES, TICK_S
+from plant.numeric import RealArray
+from plant.own.fmu_file import Fmu
+from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+
+log = logging.getLogger("coldloop.plant")
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """Which variables of an FMU are which signals, and how it is run; what a model file says of it."""
+
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+    load: str | None
+    states: Sequence[str]
+    """Variables that are its states, if it shows them."""
+    start: Mapping[str, float]
+    """Start values of variables."""
+    steps_per_tick: int
+    rest_ticks: int = 0
+    """Ticks from its start until it rests at the operating point."""
+
+
+class FmuSimulation:
+    """An instance with its signals connected.
+
+    Args:
+        fmu: The FMU.
+        wiring: Of its variables.
+        tick_s: Length of a tick.
+    """
+
+    def __init__(self, fmu: Fmu, wiring: Wiring, tick_s: float) -> None:
+        names = [*wiring.inputs, *([wiring.load] if wiring.load else [])]
+        self._inputs = [fmu.reference(name) for name in names]
+        self._outputs = [fmu.reference(name) for name in wiring.outputs]
+        self._states = [fmu.reference(name) for name in wiring.states]
+        self._instance = fmu.instance(wiring.start)
+        self._wiring = wiring
+        self._step_s = tick_s / wiring.steps_per_tick
+        self._steps = 0
+
+    def put(self, u: RealArray, w: float) -> None:
+        """Set inputs and load."""
+        self._instance.put(self._inputs, [*u.tolist(), w][: len(self._inputs)])
+
+    def outputs(self) -> RealArray:
+        """Return the outputs."""
+        return self._instance.read(self._outputs)
+
+    def states(self) -> RealArray:
+        """Return the states that it shows."""
+        return self._instance.read(self._states)
+
+    def read(self, references: Sequence[int]) -> RealArray:
+        """Return other real variables."""
+        return self._instance.read(references)
+
+    def tick(self) -> None:
+        """Go one tick forward.
+
+        Raises:
+            ColdloopError: The FMU does not.
+        """
+        for _ in range(self._wiring.steps_per_tick):
+            self._instance.step(self._steps * self._step_s, self._step_s)
+            self._steps += 1
+
+    def rest(self, u: RealArray, w: float) -> None:
+        """Go to rest with inputs and load, for as many ticks as that was found to take."""
+        self.put(u, w)
+        for _ in range(self._wiring.rest_ticks):
+            self.tick()
+
+    def derivatives(self, of: Sequence[int]) -> RealArray:
+        """Return partial derivatives of variables by states, inputs and load, shape (of, n + m + 1)."""
+        by = [*self._states, *self._inputs]
+        found = self._instance.derivatives(of, by)
+        return found if self._wiring.load else np.column_stack([found, np.zeros(len(of))])
+
+    def saved(self) -> dict[str, Any]:
+        """Return the state as plain data."""
+        return {"steps": self._steps, "state": base64.b64encode(self._instance.state()).decode()}
+
+    def return_to(self, saved: Mapping[str, Any]) -> None:
+        """Return to a state that `saved` returned."""
+        self._instance.return_to(base64.b64decode(saved["state"]))
+        self._steps = int(saved["steps"])
+
+
+class FmuPlant(PlantProgram):
+    """An FMU as the plant, at rest at its operating point at tick 0.
+
+    Args:
+        simulation: The FMU there.
+        keeps_state: Whether it can return to a state.
+        u0: Inputs there, held until the first `apply`.
+        load: The load over time.
+        noise: Noise on the measurements; None measures exactly.
+    """
+
+    def __init__(
+        self,
+        simulation: FmuSimulation,
+        *,
+        keeps_state: bool,
+        u0: Sequence[float],
+        load: HeatLoad,
+        noise: MeasurementNoise | None = None,
+    ) -> None:
+        self._simulation = simulation
+        self._keeps_state = keeps_state
+        super().__init__(x0=self._shown().tolist(), u0=u0, load=load, noise=noise)
+
+    def _shown(self) -> RealArray:
+        """Return the states; zeros where the FMU hides them."""
+        states = self._simulation.states()
+        return states if len(states) else np.zeros(len(STATE_NAMES))
+
+    def _warm_up(self) -> None:
+        """Do nothing: a tick would move it."""
+
+    def _read(self, w: float) -> RealArray:
+        self._simulation.put(self._u, w)
+        return self._simulation.outputs()
+
+    def _step(self, w: float) -> tuple[RealArray, RealArray]:
+        self._simulation.put(self._u, w)
+        self._simulation.tick()
+        return self._shown(), self._simulation.outputs()
+
+    def retained(self) -> dict[str, Any]:
+        """Return what `resume` needs, as plain data."""
+        return {**super().retained(), **({"own": self._simulation.saved()} if self._keeps_state else {})}
+
+    def resume(
+        self,
+        tick: int,
+        x: Sequence[float],
+        u: Sequence[float],
+        y: Sequence[float],
+        noise_state: Mapping[str, Any],
+        own: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
+        if own is None or not self._keeps_state:
+            raise ValueError("the FMU cannot return to a state")
+        super().resume(tick, x, u, y, noise_state)
+        self._simulation.return_to(own)
+
+
+def fmu_maker(fmu: Fmu, wiring: Wiring, u0: Sequence[float], w0: float) -> Callable[[], FmuSimulation]:
+    """Return what makes the FMU at rest at its operating point; the way there is simulated once where it keeps states.
+
+    Raises:
+        ColdloopError: It does not get there.
+    """
+    first = FmuSimulation(fmu, wiring, TICK_S)
+    first.rest(np.array(u0), w0)
+    at_rest = first.saved() if fmu.keeps_state else None
+    if at_rest is None:
+        log.info("the FMU cannot save its state: after a restart of this service no session is resumed")
+
+    def make() -> FmuSimulation:
+        made = FmuSimulation(fmu, wiring, TICK_S)
+        if at_rest is None:
+            made.rest(np.array(u0), w0)
+        else:
+            made.return_to(at_rest)
+        return made
+
+    return make
