@@ -22,7 +22,7 @@ def duration(text: str) -> int:
         raise ArgumentTypeError(f"'{text}' is not positive; write 90s, 15min or 2h")
     if not seconds < LONGEST_TICKS * TICK_S:
         raise ArgumentTypeError(f"'{text}' is longer than a session can be, {LONGEST_TICKS * TICK_S:g} s")
-    try:
-        return whole_ticks(seconds)
-    except ValueError:
-        raise ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s") from None
+    ticks = whole_ticks(seconds)
+    if ticks is None:
+        raise ArgumentTypeError(f"'{text}' is not a multiple of {TICK_S} s")
+    return ticks

@@ -1,5 +1,7 @@
 """The whole configuration: what the three services and the rig read."""
 
+from typing import Self
+
 from pydantic import BaseModel, ConfigDict
 
 from coldloop.process.limits import InputLimits
@@ -27,3 +29,8 @@ class Settings(BaseModel):
     telemetry: TelemetrySettings = TelemetrySettings()
     rig: RigSection = RigSection()
     hmi: HmiSection = HmiSection()
+
+    def with_program(self, **changes: object) -> Self:
+        """Return settings with some of the optimiser's program changed."""
+        program = self.optimizer_plc.program.model_copy(update=changes)
+        return self.model_copy(update={"optimizer_plc": self.optimizer_plc.model_copy(update={"program": program})})

@@ -107,14 +107,12 @@ class ChaosPlan(BaseModel):
     def configured(self, effective: Configuration[Settings]) -> Configuration[Settings]:
         """Return a configuration with the values of the plan, as a manifest records it."""
         settings = self.with_plant(effective.settings)
-        optimizer, session = settings.optimizer_plc, settings.session
-        program = optimizer.program.model_copy(update={"updating_period_s": self.updating_period_s})
+        session = settings.session
         load = self.load if isinstance(self.load, str) else ", ".join(self.load)
-        planned = settings.model_copy(
+        planned = settings.with_program(updating_period_s=self.updating_period_s).model_copy(
             update={
                 "plant": settings.plant.model_copy(update={"load": load, "seed": self.seed}),
                 "session": session.model_copy(update={"mode": self.mode, "factor": self.factor}),
-                "optimizer_plc": optimizer.model_copy(update={"program": program}),
             }
         )
         return Configuration(planned, {**effective.sources, **dict.fromkeys(OF_PLAN, f"plan {self.name}")})

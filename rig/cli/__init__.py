@@ -12,7 +12,8 @@ from typing import Final, NoReturn
 
 from coldloop import __version__
 from coldloop.errors import ColdloopError, UsageError, printable
-from rig.cli.process_option import OPTION, VARIABLE, load_named_process
+from coldloop.process.declaration import VARIABLE
+from rig.cli.process_option import OPTION, load_named_process
 from rig.interruption import INTERRUPTION
 
 COMMANDS: Final = {
@@ -47,7 +48,7 @@ COMMANDS: Final = {
     "completion": "a script that completes commands and options in a shell",
 }
 INTERRUPTED = 130
-OF_THE_COLD_BOX: Final = ("study", "reproduce", "model")
+OF_THE_COLD_BOX: Final = ("study", "reproduce", "model", "exergy")
 """Commands that are about its equations, its loads or the paper's figures."""
 
 

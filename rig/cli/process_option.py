@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import UsageError
+from coldloop.process.declaration import VARIABLE
 from rig.interpreter import PYTHON
 
 OPTION: Final = "--process"
-VARIABLE: Final = "COLDLOOP_PROCESS"
 LOADED: Final = "coldloop.process.loaded"
 """The module that reads it, once."""
 

@@ -103,10 +103,7 @@ def _problem(settings: Settings, prediction: PredictionModel, design: ControlDes
 
 def with_power(settings: Settings, power: float) -> Settings:
     """Return the settings for a PLC of this power."""
-    optimizer = settings.optimizer_plc
-    budget = optimizer.program.budget.model_copy(update={"power": power})
-    program = optimizer.program.model_copy(update={"budget": budget})
-    return settings.model_copy(update={"optimizer_plc": optimizer.model_copy(update={"program": program})})
+    return settings.with_program(budget=settings.optimizer_plc.program.budget.model_copy(update={"power": power}))
 
 
 def counted_sizes(problem: PredictiveProblem) -> CountedSizes:

@@ -3,7 +3,7 @@
 import warnings
 from math import factorial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,7 +131,7 @@ def _from_matrices(file: ProcessFile, path: Path) -> Linearised:
         raise UsageError(f"{path}: no {' and '.join(sorted(missing))}; it needs A, B and C")
     n, m, p = len(np.atleast_2d(M["A"])), len(file.inputs), len(file.outputs)
     shapes = {"A": (n, n), "B": (n, m), "F": (n,), "C": (p, n), "D": (p, m), "G": (p,)}
-    full = {name: M.get(name, np.zeros(shape)) for name, shape in shapes.items()}
+    full: dict[str, Any] = {name: M.get(name, np.zeros(shape)) for name, shape in shapes.items()}
     full |= {name: full[name].ravel() for name in ("F", "G")}
     for name, shape in shapes.items():
         if full[name].shape != shape:

@@ -170,11 +170,8 @@ def _ticks(duration_s: float | str | None) -> int | None:
             return duration(duration_s)
         except ArgumentTypeError as error:
             raise UsageError(f"duration_s: {error}") from None
-    try:
-        ticks = whole_ticks(duration_s)
-    except (ValueError, OverflowError):
-        ticks = 0
-    if ticks <= 0:
+    ticks = whole_ticks(duration_s)
+    if ticks is None or ticks <= 0:
         raise UsageError(f"duration_s={duration_s}: not a positive multiple of {TICK_S} s")
     return ticks
 

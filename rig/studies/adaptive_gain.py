@@ -6,19 +6,14 @@ from typing import Final
 
 import numpy as np
 
-from coldloop.process.lti_model import load
 from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from optimizer_plc.budget import PlcBudget
-from plant.load import find_load
 from rig.cosim.one_process import OneProcessRig
-from rig.cosim.scenario import Scenario, natural_ticks
 from rig.plc_sizing.solver_counts import iteration_s
-from rig.results.indicators import evaluate
-from rig.results.recording import Recorder
 from rig.settings import Settings
 from rig.studies.intervals import Interval, geometric_mean, mean_ratio
+from rig.studies.loop_cost import ADAPTIVE, loop_cost
 
-ADAPTIVE: Final = 0.0
 FIXED_S: Final = tuple(share * SAMPLING_PERIOD_S for share in (0.2, 0.3, 0.4, 0.5, 0.7, 1.0))
 """Updating periods, s, that are compared, unless one is given."""
 
@@ -44,22 +39,13 @@ def adaptive_gain(
     costs = []
     for number, (period, name) in enumerate(runs):
         done(number, len(runs))
-        costs.append(_cost(rig, settings, name, period))
+        costs.append(loop_cost(settings, name, period, rig.run))
     by_period = np.array(costs).reshape(-1, len(names))
     best = min(range(1, len(by_period)), key=lambda which: geometric_mean(by_period[which]))
     ratio = mean_ratio(by_period[0], by_period[best])
     which = f"a fixed {fixed[best - 1]:g} s" + (", the best fixed one" if len(fixed) > 1 else "")
     loads = f"load{'s' if len(names) > 1 else ''} {', '.join(names)}"
     return f"With {loads} an adaptive period costs {ratio.text()} of {which}: {_pays(ratio)}."
-
-
-def _cost(rig: OneProcessRig, settings: Settings, name: str, period_s: float) -> float:
-    model = load(settings.model.file)
-    profile = find_load(name, model.w0)
-    scenario = Scenario(natural_ticks(name, profile), profile, period_s, settings.plant.seed)
-    recorder = Recorder(scenario.ticks)
-    rig.run(scenario, recorder)
-    return evaluate(recorder.recording(), model, settings.optimizer_plc.program.design).J_BF
 
 
 def _pays(ratio: Interval) -> str:

@@ -59,7 +59,4 @@ def same_run(
 
 
 def _digest_without_budget(request: RunRequest) -> str:
-    settings = settings_of(request.assignments)
-    program = settings.optimizer_plc.program.model_copy(update={"budget": BudgetSettings()})
-    section = settings.optimizer_plc.model_copy(update={"program": program})
-    return decisive_digest(request, settings.model_copy(update={"optimizer_plc": section}))
+    return decisive_digest(request, settings_of(request.assignments).with_program(budget=BudgetSettings()))

@@ -5,23 +5,20 @@ not the time that its iterations take. The loss is J_BF over that of the fullest
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICKS_PER_SAMPLE
 from optimizer_plc.qp.design import ControlDesign
-from plant.load import find_load
 from rig.cosim.ideal_loop import run_ideal_loop
-from rig.cosim.scenario import Scenario, natural_ticks
 from rig.plc_sizing.budget_tables import counted_sizes, problem_of
 from rig.plc_sizing.memory import estimator_memory, footprint
 from rig.plc_sizing.solver_counts import SOLVERS
-from rig.results.indicators import evaluate
-from rig.results.recording import Recorder
 from rig.settings import Settings
 from rig.studies.intervals import geometric_mean
+from rig.studies.loop_cost import ADAPTIVE, loop_cost
 from rig.text_tables import aligned
 
 KNOTS: Final = (2, 3, 4, 5, 6, 7, 8, 10, 12)
@@ -83,36 +80,21 @@ def judged(settings: Settings, names: Sequence[str], done: Callable[[int, int], 
     found = []
     for number, (label, design) in enumerate(sets.items()):
         done(number, len(sets))
-        found.append(_judged(with_design(settings, design), label, names))
+        found.append(_judged(settings.with_program(design=design), label, names))
     return found
-
-
-def with_design(settings: Settings, design: ControlDesign) -> Settings:
-    """Return settings with another design."""
-    program = settings.optimizer_plc.program.model_copy(update={"design": design})
-    optimizer = settings.optimizer_plc.model_copy(update={"program": program})
-    return settings.model_copy(update={"optimizer_plc": optimizer})
 
 
 def _judged(settings: Settings, label: str, names: Sequence[str]) -> Judged:
     program = settings.optimizer_plc.program
     problem, prediction = problem_of(settings)
+    run = partial(run_ideal_loop, settings, ticks=TICKS_PER_SAMPLE)
     sizes = counted_sizes(problem).without_zeros
     return Judged(
         label, program.design, problem.size, len(problem.Gamma), float(np.linalg.cond(problem.Phi.astype(float))),
         SOLVERS[program.solver].operations(sizes).flops,
         footprint(problem, estimator_memory(prediction, program.estimator), program.solver).total,
-        tuple(_cost(settings, name) for name in names),
+        tuple(loop_cost(settings, name, ADAPTIVE, run) for name in names),
     )  # fmt: skip
-
-
-def _cost(settings: Settings, name: str) -> float:
-    model = load_model(settings.model.file)
-    profile = find_load(name, model.w0)
-    scenario = Scenario(natural_ticks(name, profile), profile, 0.0, settings.plant.seed)
-    recorder = Recorder(scenario.ticks)
-    run_ideal_loop(settings, scenario, recorder, TICKS_PER_SAMPLE)
-    return evaluate(recorder.recording(), model, settings.optimizer_plc.program.design).J_BF
 
 
 def losses(found: Sequence[Judged]) -> list[float]:

@@ -74,10 +74,8 @@ class ClassicalSettings(BaseModel):
 
     @model_validator(mode="after")
     def _whole_ticks(self) -> Self:
-        try:
-            whole_ticks(self.period_s)
-        except ValueError:
-            raise ValueError(f"period_s must be a multiple of the tick, {TICK_S} s") from None
+        if whole_ticks(self.period_s) is None:
+            raise ValueError(f"period_s must be a multiple of the tick, {TICK_S} s")
         return self
 
 

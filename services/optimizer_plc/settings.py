@@ -66,14 +66,6 @@ class RuleName(StrEnum):
     CONTRACTION = "contraction"
 
 
-def _is_whole(seconds: float) -> bool:
-    try:
-        whole_ticks(seconds)
-    except ValueError:
-        return False
-    return True
-
-
 class ContractionSettings(BaseModel):
     """Parameters of the contraction rule, chosen on the draws 11 and 12 of the six families of hours."""
 
@@ -167,7 +159,7 @@ class ProgramSettings(BaseModel):
     @field_validator("updating_period_s")
     @classmethod
     def _whole_ticks(cls, value: float) -> float:
-        if not _is_whole(value) or 0 < value < SHORTEST_TICKS * TICK_S * (1.0 - TOLERANCE):
+        if whole_ticks(value) is None or 0 < value < SHORTEST_TICKS * TICK_S * (1.0 - TOLERANCE):
             shortest = f"{SHORTEST_TICKS * TICK_S:g} s"
             raise ValueError(f"an updating period is a multiple of {TICK_S:g} s from {shortest} on, or 0 for adaptive")
         return value

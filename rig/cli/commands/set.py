@@ -65,9 +65,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def _seconds(text: str) -> float:
     try:
         ticks = whole_ticks(float(text))
-    except (ValueError, OverflowError):
-        ticks = -1
-    if not 0 <= ticks < LONGEST_TICKS:
+    except ValueError:
+        ticks = None
+    if ticks is None or not 0 <= ticks < LONGEST_TICKS:
         raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds in multiples of {TICK_S:g}")
     return ticks * TICK_S
 

@@ -10,6 +10,9 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from types import MappingProxyType
 from typing import Any, Final, Self, get_args, get_type_hints
 
+VARIABLE: Final = "COLDLOOP_PROCESS"
+"""Of the environment: the model file that a program is loaded with."""
+
 Range = tuple[float, float]
 
 

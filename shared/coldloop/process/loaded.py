@@ -11,10 +11,9 @@ from typing import Final
 
 from coldloop.errors import ModelFileError
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.declaration import Process
+from coldloop.process.declaration import VARIABLE, Process
 from coldloop.process.model_file import read_document
 
-VARIABLE: Final = "COLDLOOP_PROCESS"
 REMEDY: Final = "make one with `coldloop process FILE --out MODEL`, or unset the variable"
 
 

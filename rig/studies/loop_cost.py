@@ -1,0 +1,24 @@
+"""What the closed loop costs under a load: J_BF of a run of its natural length."""
+
+from collections.abc import Callable
+from typing import Final
+
+from coldloop.process.lti_model import load
+from plant.load import find_load
+from rig.cosim.scenario import Scenario, natural_ticks
+from rig.results.indicators import evaluate
+from rig.results.recording import Recorder
+from rig.settings import Settings
+
+ADAPTIVE: Final = 0.0
+"""An updating period, s."""
+
+
+def loop_cost(settings: Settings, name: str, period_s: float, run: Callable[[Scenario, Recorder], None]) -> float:
+    """Return J_BF under a load, a named one or a file, with what runs a scenario."""
+    model = load(settings.model.file)
+    profile = find_load(name, model.w0)
+    scenario = Scenario(natural_ticks(name, profile), profile, period_s, settings.plant.seed)
+    recorder = Recorder(scenario.ticks)
+    run(scenario, recorder)
+    return evaluate(recorder.recording(), model, settings.optimizer_plc.program.design).J_BF
