@@ -91,8 +91,15 @@ class OutputSection(_Section):
     """At the operating point; found from the equations where the plant has them."""
     band: Span | None = None
     """What it is to be kept within."""
+    setpoint: FiniteFloat | None = None
+    """What it is to be kept at, instead of a band."""
+    tolerance: PositiveFloat | None = None
+    """Deviation from the setpoint that is none to indicators, figures and alarms; 1 % of `range` if not given."""
     penalty: PositiveFloat | None = None
-    """rho, per square of what the band is missed by and sample; 1 over the square of a twentieth of it if not given."""
+    """rho, per square of what band or setpoint is missed by and sample; if not given 1 over the square of a twentieth
+    of the band, or of the tolerance."""
+    alarm: Span | None = None
+    """Outside of it the alarm is raised; the band, or the setpoint with its tolerance, if not given."""
     weight: NonNegativeFloat = 0.0
     """In the cost, per square of its deviation from the operating point."""
     loop: LoopSection | None = None
@@ -104,13 +111,33 @@ class OutputSection(_Section):
             raise ValueError(f"{self.name}: at = {self.at:g} is outside its range")
         if self.band is not None:
             _rising(self.band, f"{self.name}: band")
-        if self.band is None and (self.loop is not None or self.penalty is not None):
-            raise ValueError(f"{self.name}: a loop or a penalty needs a band")
+        if self.setpoint is None:
+            if self.tolerance is not None:
+                raise ValueError(f"{self.name}: a tolerance needs a setpoint")
+        elif self.band is not None:
+            raise ValueError(f"{self.name}: give a band or a setpoint")
+        elif not self.range[0] <= self.setpoint <= self.range[1]:
+            raise ValueError(f"{self.name}: setpoint = {self.setpoint:g} is outside its range")
+        edges = self.edges
+        if edges is None and any(each is not None for each in (self.loop, self.penalty, self.alarm)):
+            raise ValueError(f"{self.name}: a loop, a penalty or an alarm needs a band or a setpoint")
+        if edges is not None and self.alarm is not None:
+            _rising(self.alarm, f"{self.name}: alarm")
+            if self.alarm[0] > edges[0] or self.alarm[1] < edges[1]:
+                raise ValueError(f"{self.name}: alarm begins inside {edges[0]:g} to {edges[1]:g}; widen it")
         return self
+
+    @property
+    def edges(self) -> Span | None:
+        """The band, or the setpoint less and plus its tolerance; None where it is only measured."""
+        if self.setpoint is None:
+            return self.band
+        tolerance = self.tolerance or 0.01 * (self.range[1] - self.range[0])
+        return self.setpoint - tolerance, self.setpoint + tolerance
 
 
 class LoadSection(_Section):
-    """The one disturbance, which is measured; leave it out where there is none."""
+    """The load: a disturbance that is measured, and that operators and `--load` set; leave it out if there is none."""
 
     name: Name
     variable: str | None = None
@@ -129,8 +156,32 @@ class LoadSection(_Section):
         return self
 
 
+class DisturbanceSection(_Section):
+    """A disturbance beside the load: a state of the model that wanders, and an output where it is measured."""
+
+    name: Name
+    variable: str | None = None
+    """Its name in an FMU, if it is not `name`."""
+    unit: str = ""
+    at: FiniteFloat
+    span: Span
+    noise: PositiveFloat | None = None
+    """Standard deviation of its sensor; not measured but estimated if not given."""
+    walk: PositiveFloat | None = None
+    """Random walk that the estimator expects, per square root of a sampling period; 1 % of its span if not given."""
+    course: str | None = None
+    """CSV file with the columns time_s and `name`, steps held: what the simulated plant meets; nothing if not given."""
+
+    @model_validator(mode="after")
+    def _inside(self) -> Self:
+        _rising(self.span, f"{self.name}: span")
+        if not self.span[0] <= self.at <= self.span[1]:
+            raise ValueError(f"{self.name}: at = {self.at:g} is outside its span")
+        return self
+
+
 class LagSection(_Section):
-    """gain exp(-delay s) / (time constant s + 1) from an input, or from the load, to an output."""
+    """gain exp(-delay s) / (time constant s + 1) from an input, the load or another disturbance, to an output."""
 
     output: Name
     source: Name
@@ -145,10 +196,13 @@ class PlantSection(_Section):
     python: Annotated[str, Field(pattern=r"^[^:]+\.py:[A-Za-z_]\w*$")] | None = None
     """`file.py:Class`, the file beside the process file."""
     matrices: str | None = None
-    """NPZ file with A, B, C and, where there are such, D, F, G: dx/dt = A x + B u + F w, in deviations and seconds."""
+    """NPZ file with A, B, C and, where there are such, D, F, G: dx/dt = A x + B u + F w, in deviations and seconds.
+
+    F and G have a column for the load and one for each other disturbance."""
     transfer_functions: tuple[LagSection, ...] | None = None
     step_test: str | None = None
-    """CSV file with columns time_s, inputs, load (if it moved), outputs: the plant is the model that is found in it."""
+    """CSV file with columns time_s, inputs, load and other disturbances (those that moved), outputs: the plant is the
+    model that is found in it."""
     fmu: str | None = None
     """FMU for co-simulation, of FMI 2.0 or 3.0, beside the process file; the keys below are for it."""
     start: dict[str, float] = {}
@@ -206,13 +260,19 @@ class ProcessFile(_Section):
     inputs: Annotated[tuple[InputSection, ...], Field(min_length=1, max_length=MOST_SIGNALS)]
     outputs: Annotated[tuple[OutputSection, ...], Field(min_length=1, max_length=MOST_SIGNALS)]
     load: LoadSection | None = None
+    disturbances: Annotated[tuple[DisturbanceSection, ...], Field(max_length=MOST_SIGNALS)] = ()
     states: tuple[StateSection, ...] = ()
     """Process noises of states by name; of others 1 % of what they move by with the inputs, a sample."""
     prediction: PredictionSection = PredictionSection()
 
+    @property
+    def outside(self) -> tuple[LoadSection | DisturbanceSection, ...]:
+        """The load, if there is one, and the other disturbances."""
+        return (*((self.load,) if self.load else ()), *self.disturbances)
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        signals = (*self.inputs, *self.outputs, *((self.load,) if self.load else ()))
+        signals = (*self.inputs, *self.outputs, *self.outside)
         names = [each.name for each in signals]
         lower = [name.lower() for name in names]
         twice = next((name for name in names if lower.count(name.lower()) > 1), None)
@@ -221,8 +281,8 @@ class ProcessFile(_Section):
         reserved = RESERVED.intersection(lower) | {name for name in names if iskeyword(name) or iskeyword(name.lower())}
         if reserved:
             raise ValueError(f"{min(reserved)}: a register, a column or Python has this name already; choose another")
-        if not any(output.band for output in self.outputs):
-            raise ValueError("outputs: none has a band; give at least one a band to be kept within")
+        if not any(output.edges for output in self.outputs):
+            raise ValueError("outputs: none has a band or a setpoint; give one to at least one of them")
         if self.plant.fmu is None and any(one.variable for one in signals):
             raise ValueError(f"{next(one.name for one in signals if one.variable)}: variable is for an FMU")
         inputs = {one.name for one in self.inputs}

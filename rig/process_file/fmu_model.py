@@ -40,15 +40,13 @@ def with_units(file: ProcessFile, folder: Path) -> ProcessFile:
         return file
     fmu = Fmu(folder / file.plant.fmu)
 
-    def unit(section: Any) -> Any:  # noqa: ANN401 of an input, an output or the load
+    def unit(section: Any) -> Any:  # noqa: ANN401 of any signal
         variable = section.variable or section.name
         fmu.reference(variable)
         return section if section.unit else section.model_copy(update={"unit": fmu.variables[variable].unit or ""})
 
-    load = file.load and unit(file.load)
-    return file.model_copy(
-        update={"inputs": tuple(map(unit, file.inputs)), "outputs": tuple(map(unit, file.outputs)), "load": load}
-    )
+    named = {name: tuple(map(unit, getattr(file, name))) for name in ("inputs", "outputs", "disturbances")}
+    return file.model_copy(update={**named, "load": file.load and unit(file.load)})
 
 
 def from_fmu(file: ProcessFile, folder: Path, name: str) -> Linearised:
@@ -65,12 +63,12 @@ def from_fmu(file: ProcessFile, folder: Path, name: str) -> Linearised:
     if found is None:
         tested = identified(_step_tested(file, simulation, str(fmu.path)))
         wiring = replace(wiring, states=())
-        model = model_identified(file, tested, y, has_load=file.load is not None)
+        model = model_identified(file, tested, y, file.outside)
     else:
         u, w = operating_point(file)
-        (J, H, how), n = found, len(x)
+        (J, H, how), n, m = found, len(x), len(x) + len(u)
         model = Linearised(
-            J[:, :n], J[:, n:-1], J[:, -1], H[:, :n], H[:, n:-1], H[:, -1], x, u, w, y, _named(fmu, wiring), FMU, {},
+            J[:, :n], J[:, n:m], J[:, m:], H[:, :n], H[:, n:m], H[:, m:], x, u, w, y, _named(fmu, wiring), FMU, {},
             "", 0.0, (f"model      by {how} of the FMU",),
         )  # fmt: skip
     rest = (
@@ -95,6 +93,7 @@ def _wiring(file: ProcessFile, fmu: Fmu) -> Wiring:
         inputs=[one.variable or one.name for one in file.inputs],
         outputs=[one.variable or one.name for one in file.outputs],
         load=(load.variable or load.name) if load else None,
+        disturbances=[one.variable or one.name for one in file.disturbances],
         states=_shown_states(fmu),
         start=dict(file.plant.start),
         steps_per_tick=_steps_per_tick(file, fmu),
@@ -181,20 +180,21 @@ def _differentiated(
     if any(fmu.variables[name].initial != "exact" for name in wiring.states):
         return None
     u, w = operating_point(file)
-    n, p = len(wiring.states), len(outputs)
-    names = [*wiring.states, *wiring.inputs, *([wiring.load] if wiring.load else [])]
+    p = len(outputs)
+    names = [*wiring.states, *wiring.inputs, wiring.load, *wiring.disturbances]
 
     def evaluated(v: Array) -> Array:
-        start = {**wiring.start, **dict(zip(names, v.tolist(), strict=False))}
+        values = {name: value for name, value in zip(names, v.tolist(), strict=True) if name is not None}
+        start = {**wiring.start, **values}
         begun = FmuSimulation(fmu, replace(wiring, start=start), file.tick_s)
         return np.append(begun.outputs(), begun.read(rates))
 
-    at = np.array([*simulation.states(), *u, w])
+    at = np.array([*simulation.states(), *u, *w])
     spans = np.array([one.range[1] - one.range[0] for one in file.outputs])
     if not (np.abs(evaluated(at)[:p] - simulation.outputs()) <= 1e-3 * spans).all():
         return None  # its start values are not its states
     both, _ = jacobian(evaluated, at, np.maximum(1.0, np.abs(at)))
-    return both[p:, : n + len(u) + 1], both[:p], "differences of start values"
+    return both[p:], both[:p], "differences of start values"
 
 
 def _named(fmu: Fmu, wiring: Wiring) -> dict[str, str]:
@@ -213,8 +213,7 @@ def _step_tested(file: ProcessFile, simulation: FmuSimulation, where: str) -> Re
     horizon = _horizon(file)
     count = max(SAMPLES, 10 * horizon)
     signals = [(one.name, one.at, (one.low, one.high)) for one in file.inputs]
-    if file.load is not None:
-        signals.append((file.load.name, file.load.at, file.load.span))
+    signals += [(one.name, one.at, one.span) for one in file.outside]
     steps = np.empty((count, len(signals)))
     for j, (_, at, (low, high)) in enumerate(signals):
         size = STEP_SIZE * (high - low)
@@ -226,8 +225,8 @@ def _step_tested(file: ProcessFile, simulation: FmuSimulation, where: str) -> Re
     outputs, after = np.empty((count, len(file.outputs))), simulation.outputs()
     for k, row in enumerate(steps):
         outputs[k] = after
-        u, w = (row[:-1], float(row[-1])) if file.load is not None else (row, 0.0)
-        simulation.put(u, w)
+        u, w = row[: len(file.inputs)], row[len(file.inputs) :]
+        simulation.put(u, w if file.load else np.append(0.0, w))
         after = _sample(file, simulation)
     names = tuple(name for name, _, _ in signals)
     operating = np.array([value for _, value, _ in signals])

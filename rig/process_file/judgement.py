@@ -57,7 +57,7 @@ def _rest(made: Made) -> list[str]:
 
 
 def _modes(made: Made) -> list[str]:
-    values = sorted(np.linalg.eigvals(made.model.A), key=lambda value: -value.real)
+    values = sorted(np.linalg.eigvals(made.own_A), key=lambda value: -value.real)
     texts = [f"{v.real:.3g}" if abs(v.imag) < 1e-12 else f"{v.real:.3g}{v.imag:+.3g}i" for v in values]
     lines = [f"modes      {'  '.join(texts[i : i + 8])} /s" for i in range(0, len(texts), 8)]
     if made.linear.error:
@@ -69,8 +69,10 @@ def _gains(made: Made) -> list[str]:
     m = made.model
     horizon_s = made.process.decision_instants[-1] * made.process.tick_s * made.process.ticks_per_sample
     held = m.discretised(horizon_s)
-    effects = np.column_stack([m.C @ held.B + m.D, m.C @ held.F + m.G])
-    names, units = (*m.input_names, m.load_name), (*m.input_units, m.load_unit)
+    n = len(made.own_A)
+    effects = np.column_stack([m.C @ held.B + m.D, m.C @ held.F + m.G, (m.C @ held.A)[:, n:]])
+    names = (*m.input_names, m.load_name, *m.state_names[n:])
+    units = (*m.input_units, m.load_unit, *m.state_units[n:])
     return [
         f"after {horizon_s:g} s of +1 {unit} {name}: ".replace("  ", " ")
         + _values(m.output_names, column, m.output_units)
@@ -108,7 +110,7 @@ def _warnings(made: Made) -> list[str]:
     """Return what a control engineer would want to know, in words."""
     m, process, found = made.model, made.process, list[str]()
     sample_s = process.tick_s * process.ticks_per_sample
-    poles = np.linalg.eigvals(m.A)
+    poles = np.linalg.eigvals(made.own_A)
     fastest, slowest = -poles.real.min(), -poles.real.max()
     if poles.real.max() > 0:
         found.append(f"unstable: a mode grows with {poles.real.max():.3g} /s; nothing may be late for longer")
@@ -118,7 +120,7 @@ def _warnings(made: Made) -> list[str]:
         found.append(f"sampling: the fastest mode, {1 / fastest:.2g} s, is over within a sampling period")
     for band, output in zip(process.bands, process.banded, strict=True):
         value = float(m.y0[m.output_names.index(output.name)])
-        if not band.low <= value <= band.high:
+        if not band.margin and not band.low <= value <= band.high:
             found.append(f"band: {output.name} rests at {value:.5g}, its band is {band.low:g} to {band.high:g}")
     rows = [m.output_names.index(output.name) for output in process.banded]
     reach = m.discretised(process.decision_instants[-1] * sample_s).B * [one.scale for one in process.inputs]

@@ -16,7 +16,10 @@ STEP: Final = 1e-5
 
 
 class Linearised(NamedTuple):
-    """dx/dt = A x + B u + F w, y = C x + D u + G w in deviations from (x0, u0, w0, y0); time in seconds."""
+    """dx/dt = A x + B u + F w, y = C x + D u + G w in deviations from (x0, u0, w0, y0); time in seconds.
+
+    F and G have a column for the load and one for each other disturbance, which `with_disturbances` makes states.
+    """
 
     A: Array
     B: Array
@@ -26,7 +29,7 @@ class Linearised(NamedTuple):
     G: Array
     x0: Array
     u0: Array
-    w0: float
+    w0: Array
     y0: Array
     states: dict[str, str]
     """Name and unit of each."""
@@ -42,9 +45,30 @@ class Linearised(NamedTuple):
     """What there is to say of how it was found, a line each."""
 
 
-def operating_point(file: ProcessFile) -> tuple[Array, float]:
-    """Return inputs and load at the operating point."""
-    return np.array([one.at for one in file.inputs]), file.load.at if file.load else 0.0
+def operating_point(file: ProcessFile) -> tuple[Array, Array]:
+    """Return the inputs at the operating point, and load (0 without) and other disturbances there, shape (1 + k,)."""
+    w = [file.load.at if file.load else 0.0, *(one.at for one in file.disturbances)]
+    return np.array([one.at for one in file.inputs]), np.array(w)
+
+
+def with_disturbances(file: ProcessFile, found: Linearised) -> Linearised:
+    """Return the model with the disturbances other than the load as states, which hold, and outputs if measured."""
+    n, k = len(found.A), len(file.disturbances)
+    F, G = (matrix if file.load else np.hstack([0.0 * matrix[:, :1], matrix[:, 1:]]) for matrix in (found.F, found.G))
+    shown = np.eye(k)[[one.noise is not None for one in file.disturbances]]
+    zeros = np.zeros
+    return found._replace(
+        A=np.block([[found.A, F[:, 1:]], [zeros((k, n + k))]]),
+        B=np.vstack([found.B, zeros((k, found.B.shape[1]))]),
+        F=np.vstack([F[:, :1], zeros((k, 1))]),
+        C=np.block([[found.C, G[:, 1:]], [zeros((len(shown), n)), shown]]),
+        D=np.vstack([found.D, zeros((len(shown), found.D.shape[1]))]),
+        G=np.vstack([G[:, :1], zeros((len(shown), 1))]),
+        x0=np.append(found.x0, found.w0[1:]),
+        w0=found.w0[:1],
+        y0=np.append(found.y0, shown @ found.w0[1:]),
+        states=found.states | {one.name: one.unit for one in file.disturbances},
+    )
 
 
 def given_outputs(file: ProcessFile) -> Array:

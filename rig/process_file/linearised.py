@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
+from plant.own.disturbances import outside
 from plant.own.maker import LINEAR, PYTHON, TRANSFER_FUNCTIONS
 from plant.own.python_class import Equations, equations_of, evaluated
 from rig.process_file.declaration import LagSection, PlantSection, ProcessFile
 from rig.process_file.fmu_model import from_fmu
-from rig.process_file.linear_model import Linearised, given_outputs, jacobian, operating_point
+from rig.process_file.linear_model import Linearised, given_outputs, jacobian, operating_point, with_disturbances
 from rig.process_file.step_test import from_step_test
 
 Array = NDArray[np.float64]
@@ -44,7 +45,7 @@ def linearised(file: ProcessFile, folder: Path) -> Linearised:
     for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
         if not np.isfinite(getattr(found, name)).all():
             raise UsageError(f"plant: {name} of the linear model is not finite; look at the plant's equations there")
-    return found if file.load else found._replace(F=np.zeros_like(found.F), G=np.zeros_like(found.G))
+    return with_disturbances(file, found)
 
 
 # -- a class with equations ------------------------------------------------------------------------------------------
@@ -56,21 +57,22 @@ def _from_equations(file: ProcessFile, folder: Path, place: str) -> Linearised:
     u, w = operating_point(file)
     n, m = len(equations.states), len(u)
     x = _rest(equations, u, w, place, file.tick_s * file.ticks_per_sample)
-    y = evaluated(equations.outputs, x, u, w, size=len(file.outputs), where=place)
+    y = evaluated(equations.outputs, x, u, outside(w), size=len(file.outputs), where=place)
 
     def flow(v: Array) -> Array:
-        return evaluated(equations.derivatives, v[:n], v[n:-1], float(v[-1]), size=n, where=place)
+        return evaluated(equations.derivatives, v[:n], v[n : n + m], outside(v[n + m :]), size=n, where=place)
 
     def read(v: Array) -> Array:
-        return evaluated(equations.outputs, v[:n], v[n:-1], float(v[-1]), size=len(y), where=place)
+        return evaluated(equations.outputs, v[:n], v[n : n + m], outside(v[n + m :]), size=len(y), where=place)
 
-    at = np.array([*x, *u, w])
-    scale = np.array([*_sizes(x, equations), *((one.high - one.low) / 4 for one in file.inputs), _load_size(file)])
+    at = np.array([*x, *u, *w])
+    steps = [(one.high - one.low) / 4 for one in file.inputs]
+    scale = np.array([*_sizes(x, equations), *steps, *_outside_sizes(file)])
     (J, one), (H, other) = jacobian(flow, at, scale), jacobian(read, at, scale)
     parameters = {"file": place.partition(":")[0], "class": name, "source": source}
     return Linearised(
-        J[:, :n], J[:, n : n + m], J[:, -1], H[:, :n], H[:, n : n + m], H[:, -1], x, u, w, y, dict(equations.states),
-        PYTHON, parameters, "", max(one, other),
+        J[:, :n], J[:, n : n + m], J[:, n + m :], H[:, :n], H[:, n : n + m], H[:, n + m :], x, u, w, y,
+        dict(equations.states), PYTHON, parameters, "", max(one, other),
     )  # fmt: skip
 
 
@@ -89,11 +91,12 @@ def _sizes(x: Array, equations: Equations) -> Array:
     return np.where(size > 0.0, size, 1.0)
 
 
-def _load_size(file: ProcessFile) -> float:
-    return 0.25 * (file.load.span[1] - file.load.span[0]) if file.load else 1.0
+def _outside_sizes(file: ProcessFile) -> list[float]:
+    spans = [file.load.span if file.load else (0.0, 4.0), *(one.span for one in file.disturbances)]
+    return [0.25 * (high - low) for low, high in spans]
 
 
-def _rest(equations: Equations, u: Array, w: float, place: str, sample_s: float) -> Array:
+def _rest(equations: Equations, u: Array, w: Array, place: str, sample_s: float) -> Array:
     """Return the state that does not move: in a sample by no more than `AT_REST` of its size."""
     from scipy.optimize import root  # noqa: PLC0415
 
@@ -101,7 +104,9 @@ def _rest(equations: Equations, u: Array, w: float, place: str, sample_s: float)
     size = _sizes(guess, equations)
 
     def motion(scaled: Array) -> Array:
-        slope = evaluated(equations.derivatives, scaled * size, u, w, size=len(size), where=f"{place}, near guess")
+        slope = evaluated(
+            equations.derivatives, scaled * size, u, outside(w), size=len(size), where=f"{place}, near guess"
+        )
         return sample_s * slope / size
 
     with np.errstate(all="ignore"), warnings.catch_warnings():
@@ -130,13 +135,15 @@ def _from_matrices(file: ProcessFile, path: Path) -> Linearised:
     if missing:
         raise UsageError(f"{path}: no {' and '.join(sorted(missing))}; it needs A, B and C")
     n, m, p = len(np.atleast_2d(M["A"])), len(file.inputs), len(file.outputs)
-    shapes = {"A": (n, n), "B": (n, m), "F": (n,), "C": (p, n), "D": (p, m), "G": (p,)}
+    k = 1 + len(file.disturbances)
+    shapes = {"A": (n, n), "B": (n, m), "F": (n, k), "C": (p, n), "D": (p, m), "G": (p, k)}
     full: dict[str, Any] = {name: M.get(name, np.zeros(shape)) for name, shape in shapes.items()}
-    full |= {name: full[name].ravel() for name in ("F", "G")}
+    full |= {name: full[name][:, np.newaxis] for name in ("F", "G") if full[name].ndim == 1}
     for name, shape in shapes.items():
         if full[name].shape != shape:
             raise UsageError(
                 f"{path}: {name} has shape {full[name].shape}, and not {shape} for {n} states, {m} inputs, {p} outputs"
+                + (f", {k} disturbances" if k > 1 else "")
             )
     u, w = operating_point(file)
     return Linearised(
@@ -149,6 +156,7 @@ def _from_lags(file: ProcessFile, plant: PlantSection) -> Linearised:
     """Return the lags side by side: a state each, and before it as many as its dead time is approximated with."""
     lags, m = plant.transfer_functions or (), len(file.inputs)
     sources = {one.name: i for i, one in enumerate(file.inputs)} | ({file.load.name: m} if file.load else {})
+    sources |= {one.name: i for i, one in enumerate(file.disturbances, m + 1)}
     outputs = {one.name: i for i, one in enumerate(file.outputs)}
     for lag in lags:
         if lag.source not in sources or lag.output not in outputs:
@@ -156,7 +164,8 @@ def _from_lags(file: ProcessFile, plant: PlantSection) -> Linearised:
             raise UsageError(f"plant.transfer_functions: {unknown} is no signal of this file")
     parts = [lag_model(lag) for lag in lags]
     n = sum(len(a) for a, _, _ in parts)
-    A, B, C = np.zeros((n, n)), np.zeros((n, m + 1)), np.zeros((len(outputs), n))
+    k = 1 + len(file.disturbances)
+    A, B, C = np.zeros((n, n)), np.zeros((n, m + k)), np.zeros((len(outputs), n))
     states: dict[str, str] = {}
     first = 0
     for lag, (a, b, c) in zip(lags, parts, strict=True):
@@ -167,7 +176,7 @@ def _from_lags(file: ProcessFile, plant: PlantSection) -> Linearised:
         first += len(a)
     u, w = operating_point(file)
     return Linearised(
-        A, B[:, :m], B[:, m], C, np.zeros((len(outputs), m)), np.zeros(len(outputs)), np.zeros(n), u, w,
+        A, B[:, :m], B[:, m:], C, np.zeros((len(outputs), m)), np.zeros((len(outputs), k)), np.zeros(n), u, w,
         given_outputs(file), states, TRANSFER_FUNCTIONS, {"lags": [lag.model_dump() for lag in lags]}, "", 0.0,
     )  # fmt: skip
 

@@ -11,6 +11,7 @@ from coldloop.errors import UsageError
 from coldloop.process.declaration import NO_LOAD, Band, Input, Load, Loop, Output, Process, State
 from coldloop.process.lti_model import LtiModel, discretise
 from rig.plc_sizing.problem_sizes import ProblemSizes, iteration_shares
+from rig.process_file.courses import courses_of
 from rig.process_file.declaration import OutputSection, ProcessFile, read_process_file
 from rig.process_file.fmu_model import with_units
 from rig.process_file.linear_model import Linearised
@@ -34,6 +35,14 @@ class Made:
     model: LtiModel
     process: Process
     linear: Linearised
+    disturbances: int
+    """States at the end that are disturbances."""
+
+    @property
+    def own_A(self) -> Array:
+        """A (n, n) of the plant without disturbances."""
+        n = len(self.linear.A) - self.disturbances
+        return self.linear.A[:n, :n]
 
 
 def made_from(path: Path) -> Made:
@@ -44,21 +53,25 @@ def made_from(path: Path) -> Made:
     """
     file = with_units(read_process_file(path), path.parent)
     linear = linearised(file, path.parent)
+    file = _with_sensors(file)
     process = _process(file, linear)
     _check_room(process)
     _check_rest(file, linear)
-    tick = discretise(linear.A, linear.B, linear.F, file.tick_s)
+    tick = discretise(linear.A, linear.B, linear.F[:, 0], file.tick_s)
+    played = courses_of(file, path.parent)
     names, units = zip(*linear.states.items(), strict=True)
     model = LtiModel(
-        A=linear.A, B=linear.B, F=linear.F, C=linear.C, D=linear.D, G=linear.G, A_tick=tick.A, B_tick=tick.B,
-        F_tick=tick.F, x0=linear.x0, u0=linear.u0, w0=linear.w0, y0=linear.y0, state_names=names, state_units=units,
+        A=linear.A, B=linear.B, F=linear.F[:, 0], C=linear.C, D=linear.D, G=linear.G[:, 0],
+        A_tick=tick.A, B_tick=tick.B, F_tick=tick.F,
+        x0=linear.x0, u0=linear.u0, w0=float(linear.w0[0]), y0=linear.y0,
+        state_names=names, state_units=units,
         input_names=tuple(one.name for one in process.inputs), input_units=tuple(one.unit for one in process.inputs),
         output_names=tuple(one.name for one in process.outputs),
-        output_units=tuple(one.unit for one in process.outputs), load_name=process.load.name,
-        load_unit=process.load.unit, parameters_digest=linear.digest, plant=linear.kind,
-        note=f"made from {path.name}", plant_parameters=linear.parameters, process=process.document(),
+        output_units=tuple(one.unit for one in process.outputs),
+        load_name=process.load.name, load_unit=process.load.unit, parameters_digest=linear.digest, plant=linear.kind,
+        note=f"made from {path.name}", plant_parameters=linear.parameters | played, process=process.document(),
     )  # fmt: skip
-    return Made(model, process, linear)
+    return Made(model, process, linear, len(file.disturbances))
 
 
 def _process(file: ProcessFile, linear: Linearised) -> Process:
@@ -74,7 +87,7 @@ def _process(file: ProcessFile, linear: Linearised) -> Process:
             )
             for one in file.inputs
         ),
-        outputs=tuple(map(_output, file.outputs)),
+        outputs=tuple(map(_output, file.outputs, linear.y0.tolist())),
         states=_states(file, linear),
         load=NO_LOAD if load is None else Load(
             name=load.name, unit=load.unit, span=load.span, walk=load.walk or 0.01 * (load.span[1] - load.span[0])
@@ -86,28 +99,41 @@ def _process(file: ProcessFile, linear: Linearised) -> Process:
     )  # fmt: skip
 
 
-def _output(one: OutputSection) -> Output:
-    if one.band is None:
-        band = None
-    else:
-        loop = one.loop
+def _with_sensors(file: ProcessFile) -> ProcessFile:
+    """Return a file with the disturbances that are measured as its last outputs."""
+    sensors = tuple(
+        OutputSection(name=one.name, unit=one.unit, range=one.span, noise=one.noise, at=one.at)
+        for one in file.disturbances
+        if one.noise is not None
+    )
+    return file.model_copy(update={"outputs": file.outputs + sensors})
+
+
+def _output(one: OutputSection, at_rest: float) -> Output:
+    """Return an output that is so at the operating point."""
+    band, loop = None, one.loop
+    if one.edges is not None:
+        low, high = one.edges
+        margin, close = (0.0, (high - low) / 20) if one.setpoint is None else ((high - low) / 2, (high - low) / 2)
         band = Band(
-            low=one.band[0], high=one.band[1], weight=one.penalty or 1.0 / ((one.band[1] - one.band[0]) / 20) ** 2,
+            low=low, high=high, weight=one.penalty or 1.0 / close**2, margin=margin, alarm=one.alarm,
             loop=None if loop is None else Loop(
-                input=loop.input, gain=loop.gain, integral_time_s=loop.integral_time_s
+                input=loop.input, gain=loop.gain, integral_time_s=loop.integral_time_s,
+                setpoint_offset=0.0 if one.setpoint is None else one.setpoint - at_rest,
             ),
         )  # fmt: skip
     return Output(name=one.name, unit=one.unit, range=one.range, noise=one.noise, weight=one.weight, band=band)
 
 
 def _states(file: ProcessFile, linear: Linearised) -> tuple[State, ...]:
-    given = {state.name: state.walk for state in file.states}
+    given = {one.name: one.walk or 0.01 * (one.span[1] - one.span[0]) for one in file.disturbances}
+    given |= {state.name: state.walk for state in file.states}
     unknown = set(given) - set(linear.states)
     if unknown:
         raise UsageError(f"states: {min(unknown)} is no state of the plant: {', '.join(linear.states)}")
     sample_s = file.tick_s * file.ticks_per_sample
     steps = [(one.high - one.low) / 4 for one in file.inputs]
-    moves = np.abs(discretise(linear.A, linear.B, linear.F, sample_s).B) @ steps
+    moves = np.abs(discretise(linear.A, linear.B, linear.F[:, 0], sample_s).B) @ steps
     usual = USUAL_WALK * np.maximum(moves, 1e-6 * max(moves.max(), 1e-12))
     return tuple(
         State(name=name, unit=unit, walk=given.get(name, float(walk)))
@@ -121,10 +147,12 @@ def _constants(file: ProcessFile, linear: Linearised) -> tuple[str, ...]:
     Hautus' test at the integrator: (A, F; C, G) and a column of ones for each constant have no direction of zeros
     (Pannocchia and Rawlings, AIChE J. 49, 2003).
     """
-    with_load = [linear.F[:, None], linear.G[:, None]] if file.load else [np.zeros((len(linear.A), 0)), linear.D[:, :0]]
+    with_load = (linear.F, linear.G) if file.load else (linear.F[:, :0], linear.G[:, :0])
     modes = np.vstack([np.hstack([linear.A, with_load[0]]), np.hstack([linear.C, with_load[1]])])
     found: list[int] = []
-    for place in sorted(range(len(file.outputs)), key=lambda place: file.outputs[place].band is not None):
+    sensors = {one.name for one in file.disturbances}  # whose errors their effects would be blamed for
+    own = [place for place, one in enumerate(file.outputs) if one.name not in sensors]
+    for place in sorted(own, key=lambda place: file.outputs[place].edges is not None):
         column = np.eye(len(modes))[:, [len(linear.A) + place]]
         wider = np.hstack([modes, column])
         if wider.shape[1] > len(wider):
@@ -136,7 +164,7 @@ def _constants(file: ProcessFile, linear: Linearised) -> tuple[str, ...]:
 
 
 def _sizes(file: ProcessFile, states: int) -> ProblemSizes:
-    bands = sum(output.band is not None for output in file.outputs)
+    bands = sum(output.edges is not None for output in file.outputs)
     constants = len(file.outputs)  # as many at most have one, and the load a mismatch
     return ProblemSizes(
         len(file.prediction.decision_instants), len(file.inputs), len(file.outputs), bands,

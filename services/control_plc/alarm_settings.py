@@ -131,10 +131,10 @@ class AlarmSettings(BaseModel):
 
     @property
     def bands(self) -> tuple[tuple[float, float], ...]:
-        """Band of each output that has one."""
+        """What each output with a band is to be within."""
         if IS_COLD_BOX:
             return self.level_band, self.t5_band
-        return tuple((band.low, band.high) for band in PROCESS.bands)
+        return tuple(band.alarm or (band.low, band.high) for band in PROCESS.bands)
 
     @property
     def band_ticks(self) -> int:

@@ -62,10 +62,15 @@ class ClassicalSettings(BaseModel):
         if IS_COLD_BOX:
             return (("L1", "NCR22_A", self.level), ("T5", "CV156", self.temperature))
         return tuple(
-            (output.name, loop.input, PiSettings(gain=loop.gain, integral_time_s=loop.integral_time_s))
+            (
+                output.name, loop.input,
+                PiSettings(
+                    gain=loop.gain, integral_time_s=loop.integral_time_s, setpoint_offset=loop.setpoint_offset
+                ),
+            )
             for output in PROCESS.banded
             if output.band is not None and (loop := output.band.loop) is not None
-        )
+        )  # fmt: skip
 
     @property
     def period_ticks(self) -> int:

@@ -46,7 +46,7 @@ class ControlDesign(BaseModel):
     output_low: PerBand = tuple(band.low for band in PROCESS.bands)
     """Bands: of the cold box those of L1 (%) and T5 (K)."""
     output_high: PerBand = tuple(band.high for band in PROCESS.bands)
-    band_margin: PerBand = (0.0,) * len(PROCESS.bands)
+    band_margin: PerBand = tuple(band.margin for band in PROCESS.bands)
     """How far inside the bands the rows of the problem are: soft rows let an output rest beyond them."""
     input_scale: PerInput = tuple(one.scale for one in PROCESS.inputs)
     input_weight: PerInput = tuple(one.weight for one in PROCESS.inputs)
@@ -72,8 +72,8 @@ class ControlDesign(BaseModel):
         if any(low >= high for low, high in zip(self.output_low, self.output_high, strict=True)):
             raise ValueError("each output_low must be below its output_high")
         widths = (high - low for low, high in zip(self.output_low, self.output_high, strict=True))
-        if any(not 0.0 <= margin < width / 2.0 for margin, width in zip(self.band_margin, widths, strict=True)):
-            raise ValueError("each band_margin must be at least 0 and less than half of its band")
+        if any(not 0.0 <= margin <= width / 2.0 for margin, width in zip(self.band_margin, widths, strict=True)):
+            raise ValueError("each band_margin must be at least 0 and at most half of its band")
         if min(*self.input_scale, *self.input_weight) <= 0:
             raise ValueError("input_scale and input_weight must be positive")
         return self

@@ -10,8 +10,9 @@ import numpy as np
 
 from coldloop.process.signals import STATE_NAMES, TICK_S
 from plant.numeric import RealArray
+from plant.own.disturbances import NO_DISTURBANCES, Disturbances, DisturbedPlant
 from plant.own.fmu_file import Fmu
-from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+from plant.program import HeatLoad, MeasurementNoise
 
 log = logging.getLogger("coldloop.plant")
 
@@ -23,6 +24,8 @@ class Wiring:
     inputs: Sequence[str]
     outputs: Sequence[str]
     load: str | None
+    disturbances: Sequence[str]
+    """Others than the load."""
     states: Sequence[str]
     """Variables that are its states, if it shows them."""
     start: Mapping[str, float]
@@ -42,7 +45,7 @@ class FmuSimulation:
     """
 
     def __init__(self, fmu: Fmu, wiring: Wiring, tick_s: float) -> None:
-        names = [*wiring.inputs, *([wiring.load] if wiring.load else [])]
+        names = [*wiring.inputs, *([wiring.load] if wiring.load else []), *wiring.disturbances]
         self._inputs = [fmu.reference(name) for name in names]
         self._outputs = [fmu.reference(name) for name in wiring.outputs]
         self._states = [fmu.reference(name) for name in wiring.states]
@@ -51,9 +54,9 @@ class FmuSimulation:
         self._step_s = tick_s / wiring.steps_per_tick
         self._steps = 0
 
-    def put(self, u: RealArray, w: float) -> None:
-        """Set inputs and load."""
-        self._instance.put(self._inputs, [*u.tolist(), w][: len(self._inputs)])
+    def put(self, u: RealArray, w: RealArray) -> None:
+        """Set inputs, load (which may be none) and other disturbances."""
+        self._instance.put(self._inputs, [*u.tolist(), *w[0 if self._wiring.load else 1 :].tolist()])
 
     def outputs(self) -> RealArray:
         """Return the outputs."""
@@ -77,17 +80,18 @@ class FmuSimulation:
             self._instance.step(self._steps * self._step_s, self._step_s)
             self._steps += 1
 
-    def rest(self, u: RealArray, w: float) -> None:
-        """Go to rest with inputs and load, for as many ticks as that was found to take."""
+    def rest(self, u: RealArray, w: RealArray) -> None:
+        """Go to rest with inputs and disturbances, for as many ticks as that was found to take."""
         self.put(u, w)
         for _ in range(self._wiring.rest_ticks):
             self.tick()
 
     def derivatives(self, of: Sequence[int]) -> RealArray:
-        """Return partial derivatives of variables by states, inputs and load, shape (of, n + m + 1)."""
+        """Return partial derivatives by states, inputs, load and k other disturbances, shape (of, n + m + 1 + k)."""
         by = [*self._states, *self._inputs]
         found = self._instance.derivatives(of, by)
-        return found if self._wiring.load else np.column_stack([found, np.zeros(len(of))])
+        no_load = len(self._states) + len(self._wiring.inputs)
+        return found if self._wiring.load else np.insert(found, no_load, 0.0, axis=1)
 
     def saved(self) -> dict[str, Any]:
         """Return the state as plain data."""
@@ -99,7 +103,7 @@ class FmuSimulation:
         self._steps = int(saved["steps"])
 
 
-class FmuPlant(PlantProgram):
+class FmuPlant(DisturbedPlant):
     """An FMU as the plant, at rest at its operating point at tick 0.
 
     Args:
@@ -107,6 +111,7 @@ class FmuPlant(PlantProgram):
         keeps_state: Whether it can return to a state.
         u0: Inputs there, held until the first `apply`.
         load: The load over time.
+        disturbances: Others than the load.
         noise: Noise on the measurements; None measures exactly.
     """
 
@@ -117,25 +122,28 @@ class FmuPlant(PlantProgram):
         keeps_state: bool,
         u0: Sequence[float],
         load: HeatLoad,
+        disturbances: Disturbances = NO_DISTURBANCES,
         noise: MeasurementNoise | None = None,
     ) -> None:
         self._simulation = simulation
         self._keeps_state = keeps_state
-        super().__init__(x0=self._shown().tolist(), u0=u0, load=load, noise=noise)
+        self._hidden = np.zeros(len(STATE_NAMES) - len(disturbances.courses))
+        x0 = np.append(self._shown(), disturbances.at(0))
+        super().__init__(disturbances, x0=x0.tolist(), u0=u0, load=load, noise=noise)
 
     def _shown(self) -> RealArray:
         """Return the states; zeros where the FMU hides them."""
         states = self._simulation.states()
-        return states if len(states) else np.zeros(len(STATE_NAMES))
+        return states if len(states) else self._hidden
 
     def _warm_up(self) -> None:
         """Do nothing: a tick would move it."""
 
-    def _read(self, w: float) -> RealArray:
+    def _own_outputs(self, w: RealArray) -> RealArray:
         self._simulation.put(self._u, w)
         return self._simulation.outputs()
 
-    def _step(self, w: float) -> tuple[RealArray, RealArray]:
+    def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
         self._simulation.put(self._u, w)
         self._simulation.tick()
         return self._shown(), self._simulation.outputs()
@@ -160,14 +168,14 @@ class FmuPlant(PlantProgram):
         self._simulation.return_to(own)
 
 
-def fmu_maker(fmu: Fmu, wiring: Wiring, u0: Sequence[float], w0: float) -> Callable[[], FmuSimulation]:
+def fmu_maker(fmu: Fmu, wiring: Wiring, u0: Sequence[float], w0: Sequence[float]) -> Callable[[], FmuSimulation]:
     """Return what makes the FMU at rest at its operating point; the way there is simulated once where it keeps states.
 
     Raises:
         ColdloopError: It does not get there.
     """
     first = FmuSimulation(fmu, wiring, TICK_S)
-    first.rest(np.array(u0), w0)
+    first.rest(np.array(u0), np.array(w0))
     at_rest = first.saved() if fmu.keeps_state else None
     if at_rest is None:
         log.info("the FMU cannot save its state: after a restart of this service no session is resumed")
@@ -175,7 +183,7 @@ def fmu_maker(fmu: Fmu, wiring: Wiring, u0: Sequence[float], w0: float) -> Calla
     def make() -> FmuSimulation:
         made = FmuSimulation(fmu, wiring, TICK_S)
         if at_rest is None:
-            made.rest(np.array(u0), w0)
+            made.rest(np.array(u0), np.array(w0))
         else:
             made.return_to(at_rest)
         return made

@@ -2,6 +2,7 @@
 
 from coldloop.process.lti_model import LtiModel
 from plant.numeric import RealArray
+from plant.own.disturbances import NO_DISTURBANCES, Disturbances
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 
 
@@ -12,10 +13,18 @@ class LinearPlant(PlantProgram):
         model: The linear model, of as many states as the process declares.
         load: The load over time.
         noise: Noise on the measurements; None measures exactly.
+        disturbances: Others than the load.
     """
 
-    def __init__(self, model: LtiModel, load: HeatLoad, noise: MeasurementNoise | None = None) -> None:
+    def __init__(
+        self,
+        model: LtiModel,
+        load: HeatLoad,
+        noise: MeasurementNoise | None = None,
+        disturbances: Disturbances = NO_DISTURBANCES,
+    ) -> None:
         self._model = model
+        self._disturbances = disturbances
         super().__init__(x0=model.x0.tolist(), u0=model.u0.tolist(), load=load, noise=noise)
 
     def _outputs(self, x: RealArray, w: float) -> RealArray:
@@ -28,4 +37,6 @@ class LinearPlant(PlantProgram):
     def _step(self, w: float) -> tuple[RealArray, RealArray]:
         m = self._model
         x = m.x0 + (m.A_tick @ (self._x - m.x0) + m.B_tick @ (self._u - m.u0) + m.F_tick * (w - m.w0))
+        met = self._disturbances.at(self.tick + 1)
+        x[len(x) - len(met) :] = met
         return x, self._outputs(x, w)

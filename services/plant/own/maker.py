@@ -9,6 +9,7 @@ from coldloop.errors import ModelFileError
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.model_file import ModelHeader
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
+from plant.own.disturbances import Disturbances
 from plant.own.linear import LinearPlant
 from plant.own.python_class import PythonPlant, equations_of
 from plant.own.transfer_functions import TransferFunctionPlant, lags_of
@@ -57,40 +58,50 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlan
     Raises:
         ModelFileError: The plant cannot be made.
     """
+    disturbances = Disturbances.of(header.plant_parameters.get("disturbances", ()))
+    w0 = (header.w0, *header.x0[len(header.x0) - len(disturbances.courses) :])
     if header.plant == FMU:
-        return _fmu_plant_maker(header, noise_of_seed)
+        return _fmu_plant_maker(header, noise_of_seed, disturbances, w0)
     if header.plant == PYTHON:
         parameters = header.plant_parameters
         equations = equations_of(parameters["source"], parameters["class"], parameters["file"])
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
-            return PythonPlant(equations, x0=header.x0, u0=header.u0, load=load, noise=noise_of_seed(seed))
+            return PythonPlant(
+                equations, x0=header.x0, u0=header.u0, load=load, disturbances=disturbances, noise=noise_of_seed(seed)
+            )
 
     elif header.plant == TRANSFER_FUNCTIONS:
         lags = lags_of(header.plant_parameters["lags"])
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
             return TransferFunctionPlant(
-                lags, y0=header.y0, u0=header.u0, w0=header.w0, load=load, noise=noise_of_seed(seed)
-            )
+                lags, y0=header.y0, u0=header.u0, w0=w0, load=load, disturbances=disturbances,
+                noise=noise_of_seed(seed),
+            )  # fmt: skip
 
     else:
         model = load_model(header.file)
 
         def make(load: HeatLoad, seed: int) -> PlantProgram:
-            return LinearPlant(model, load, noise_of_seed(seed))
+            return LinearPlant(model, load, noise_of_seed(seed), disturbances)
 
     return make
 
 
-def _fmu_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlant:
+def _fmu_plant_maker(
+    header: ModelHeader, noise_of_seed: NoiseOfSeed, disturbances: Disturbances, w0: tuple[float, ...]
+) -> MakePlant:
     from plant.own.fmu import FmuPlant, Wiring, fmu_maker  # noqa: PLC0415 few plants are FMUs
     from plant.own.fmu_file import Fmu  # noqa: PLC0415
 
     fmu = Fmu(Path(header.plant_parameters["file"]))
-    at_rest = fmu_maker(fmu, Wiring(**header.plant_parameters["wiring"]), header.u0, header.w0)
+    at_rest = fmu_maker(fmu, Wiring(**header.plant_parameters["wiring"]), header.u0, w0)
 
     def make(load: HeatLoad, seed: int) -> PlantProgram:
-        return FmuPlant(at_rest(), keeps_state=fmu.keeps_state, u0=header.u0, load=load, noise=noise_of_seed(seed))
+        return FmuPlant(
+            at_rest(), keeps_state=fmu.keeps_state, u0=header.u0, load=load, disturbances=disturbances,
+            noise=noise_of_seed(seed),
+        )  # fmt: skip
 
     return make

@@ -11,7 +11,8 @@ import numpy as np
 from coldloop.errors import ModelFileError
 from coldloop.process.signals import TICK_S
 from plant.numeric import RealArray
-from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+from plant.own.disturbances import NO_DISTURBANCES, Disturbances, DisturbedPlant, outside
+from plant.program import HeatLoad, MeasurementNoise
 
 NAME: Final = r"[A-Za-z][A-Za-z0-9_]{0,31}"
 """Of a signal or a state."""
@@ -27,10 +28,10 @@ class Equations(Protocol):
     steps_per_tick: int
     """Steps of the integration in a tick."""
 
-    def derivatives(self, x: RealArray, u: RealArray, w: float) -> RealArray | Sequence[float]:
+    def derivatives(self, x: RealArray, u: RealArray, w: float | RealArray) -> RealArray | Sequence[float]:
         """Return dx/dt."""
 
-    def outputs(self, x: RealArray, u: RealArray, w: float) -> RealArray | Sequence[float]:
+    def outputs(self, x: RealArray, u: RealArray, w: float | RealArray) -> RealArray | Sequence[float]:
         """Return y."""
 
 
@@ -82,7 +83,7 @@ def evaluated(function: Callable[..., Any], *at: Any, size: int, where: str) -> 
     return found
 
 
-def runge_kutta(equations: Equations, x: RealArray, u: RealArray, w: float, tick_s: float) -> RealArray:
+def runge_kutta(equations: Equations, x: RealArray, u: RealArray, w: float | RealArray, tick_s: float) -> RealArray:
     """Return the state a tick ahead by the classical method of fourth order, in equal steps."""
     h = tick_s / equations.steps_per_tick
 
@@ -98,7 +99,7 @@ def runge_kutta(equations: Equations, x: RealArray, u: RealArray, w: float, tick
     return x
 
 
-class PythonPlant(PlantProgram):
+class PythonPlant(DisturbedPlant):
     """A user's plant, integrated tick by tick.
 
     Args:
@@ -106,6 +107,7 @@ class PythonPlant(PlantProgram):
         x0: State at tick 0.
         u0: Inputs held until the first `apply`.
         load: The load over time.
+        disturbances: Others than the load.
         noise: Noise on the measurements; None measures exactly.
     """
 
@@ -116,14 +118,15 @@ class PythonPlant(PlantProgram):
         x0: Sequence[float],
         u0: Sequence[float],
         load: HeatLoad,
+        disturbances: Disturbances = NO_DISTURBANCES,
         noise: MeasurementNoise | None = None,
     ) -> None:
         self._equations = equations
-        super().__init__(x0=x0, u0=u0, load=load, noise=noise)
+        super().__init__(disturbances, x0=x0, u0=u0, load=load, noise=noise)
 
-    def _read(self, w: float) -> RealArray:
-        return np.asarray(self._equations.outputs(self._x, self._u, w), dtype=np.float64)
+    def _own_outputs(self, w: RealArray) -> RealArray:
+        return np.asarray(self._equations.outputs(self._own, self._u, outside(w)), dtype=np.float64)
 
-    def _step(self, w: float) -> tuple[RealArray, RealArray]:
-        x = runge_kutta(self._equations, self._x, self._u, w, TICK_S)
-        return x, np.asarray(self._equations.outputs(x, self._u, w), dtype=np.float64)
+    def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
+        x = runge_kutta(self._equations, self._own, self._u, outside(w), TICK_S)
+        return x, np.asarray(self._equations.outputs(x, self._u, outside(w)), dtype=np.float64)

@@ -10,13 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES, TICK_S
 from plant.numeric import RealArray
-from plant.program import HeatLoad, MeasurementNoise, PlantProgram
+from plant.own.disturbances import NO_DISTURBANCES, Disturbances, DisturbedPlant
+from plant.program import HeatLoad, MeasurementNoise
 
 
 class Lag(NamedTuple):
-    """How an output follows an input, or the load: gain exp(-delay s) / (time constant s + 1)."""
+    """How an output follows an input, the load or another disturbance: gain exp(-delay s) / (time constant s + 1)."""
 
     output: str
     source: str
@@ -30,15 +32,16 @@ def lags_of(documents: Sequence[Mapping[str, Any]]) -> tuple[Lag, ...]:
     return tuple(Lag(**document) for document in documents)
 
 
-class TransferFunctionPlant(PlantProgram):
+class TransferFunctionPlant(DisturbedPlant):
     """The lags, each with its own state and what is on its way to it.
 
     Args:
         lags: How outputs follow inputs and load, by deviations from the operating point.
         y0: Outputs there.
         u0: Inputs there, held until the first `apply`.
-        w0: Load there.
+        w0: Load and disturbances there.
         load: The load over time.
+        disturbances: Others than the load, which are the last states.
         noise: Noise on the measurements; None measures exactly.
     """
 
@@ -48,36 +51,40 @@ class TransferFunctionPlant(PlantProgram):
         *,
         y0: Sequence[float],
         u0: Sequence[float],
-        w0: float,
+        w0: Sequence[float],
         load: HeatLoad,
+        disturbances: Disturbances = NO_DISTURBANCES,
         noise: MeasurementNoise | None = None,
     ) -> None:
-        self._y0, self._u0, self._w0 = np.array(y0), np.array(u0), w0
+        self._y0, self._about = np.array(y0), np.array([*u0, *w0])
         self._places = [OUTPUT_NAMES.index(lag.output) for lag in lags]
-        self._sources = [INPUT_NAMES.index(lag.source) if lag.source in INPUT_NAMES else None for lag in lags]
+        count = len(disturbances.courses)
+        sources = (*INPUT_NAMES, PROCESS.load.name, *STATE_NAMES[len(STATE_NAMES) - count :])
+        self._sources = [sources.index(lag.source) for lag in lags]
         self._decay = np.exp([-TICK_S / lag.time_constant_s for lag in lags])
         self._gain = np.array([lag.gain for lag in lags])
         self._response = np.zeros(len(lags))
         self._under_way = [deque([0.0] * round(lag.delay_s / TICK_S)) for lag in lags]
-        super().__init__(x0=(0.0,) * len(STATE_NAMES), u0=u0, load=load, noise=noise)
+        x0 = [*[0.0] * (len(STATE_NAMES) - count), *w0[1:]]
+        super().__init__(disturbances, x0=x0, u0=u0, load=load, noise=noise)
 
     def _warm_up(self) -> None:
         """Do nothing: a tick would move what is under way."""
 
-    def _read(self, w: float) -> RealArray:  # noqa: ARG002 no load acts at once
-        y = self._y0.copy()
+    def _own_outputs(self, w: RealArray) -> RealArray:  # noqa: ARG002 nothing acts at once
+        y = self._y0[: len(self._y0) - sum(self._disturbances.measured)].copy()
         for place, response in zip(self._places, self._response, strict=True):
             y[place] += response
         return y
 
-    def _step(self, w: float) -> tuple[RealArray, RealArray]:
-        u = self._u - self._u0
+    def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
+        moved = np.append(self._u, w) - self._about
         arriving = np.empty(len(self._response))
         for k, (source, under_way) in enumerate(zip(self._sources, self._under_way, strict=True)):
-            under_way.append(w - self._w0 if source is None else u[source])
+            under_way.append(moved[source])
             arriving[k] = under_way.popleft()
         self._response = self._decay * self._response + (1.0 - self._decay) * self._gain * arriving
-        return self._x, self._read(w)
+        return self._own, self._own_outputs(w)
 
     def retained(self) -> dict[str, Any]:
         """Return what `resume` needs, as plain data."""

@@ -51,6 +51,8 @@ class Loop:
     gain: float
     """In the unit of the input per unit of the output."""
     integral_time_s: float
+    setpoint_offset: float = 0.0
+    """Setpoint less the output at the operating point, in the unit of the output."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +63,10 @@ class Band:
     high: float
     weight: float
     """rho, per square of what the band is missed by and sample."""
+    margin: float = 0.0
+    """How far inside it the rows of the problem are: half of it where there is a setpoint, in its middle."""
+    alarm: Range | None = None
+    """Outside of it the alarm is raised; the band where it is not given."""
     loop: Loop | None = None
 
 

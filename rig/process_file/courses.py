@@ -1,0 +1,38 @@
+"""What the simulated plant meets of disturbances beside the load: courses over time, from CSV files."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coldloop.errors import UsageError
+from rig.process_file.csv_columns import TIME, columns
+from rig.process_file.declaration import DisturbanceSection, ProcessFile
+
+
+def courses_of(file: ProcessFile, folder: Path) -> dict[str, Any]:
+    """Return what a model file says of the disturbances among the plant's parameters; nothing if there are none.
+
+    Raises:
+        UsageError: A course cannot be read, or leaves the span: one line.
+    """
+    if not file.disturbances:
+        return {}
+    return {"disturbances": [_course(one, folder, file.tick_s) for one in file.disturbances]}
+
+
+def _course(one: DisturbanceSection, folder: Path, tick_s: float) -> dict[str, Any]:
+    ticks, values = [0], [one.at]
+    if one.course is not None:
+        path = folder / one.course
+        times, values = (column.tolist() for column in columns(path, [TIME, one.name]).T)
+        ticks = [round(time / tick_s) for time in times]
+        if ticks[0] != 0 or (np.diff(ticks) <= 0).any():
+            raise UsageError(
+                f"{path}: {TIME} begins at 0 and rises by at least a tick, {tick_s:g} s, from line to line"
+            )
+        low, high = one.span
+        wrong = next((value for value in values if not low <= value <= high), None)
+        if wrong is not None:
+            raise UsageError(f"{path}: {one.name} = {wrong:g} is outside its span, {low:g} to {high:g}")
+    return {"ticks": ticks, "values": values, "measured": one.noise is not None}

@@ -1,0 +1,78 @@
+"""Disturbances beside the load: what of them the simulated plant meets, and how its equations are given them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+import numpy as np
+
+from coldloop.process.load_profile import LoadProfile
+from plant.numeric import RealArray
+from plant.program import PlantProgram
+
+
+def outside(w: RealArray) -> float | RealArray:
+    """Return what equations are given as w: the load, or load and other disturbances where there are such."""
+    return w if len(w) > 1 else float(w[0])
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """Their courses over time, steps held; each is a state of the process, and an output where it is measured."""
+
+    courses: tuple[LoadProfile, ...] = ()
+    measured: tuple[bool, ...] = ()
+
+    @classmethod
+    def of(cls, documents: Sequence[Mapping[str, Any]]) -> Self:
+        """Return the disturbances of a model file."""
+        courses = (LoadProfile(tuple(each["ticks"]), tuple(each["values"])) for each in documents)
+        return cls(tuple(courses), tuple(each["measured"] for each in documents))
+
+    def at(self, tick: int) -> RealArray:
+        """Return what they are from `tick` to the next, shape (k,)."""
+        return np.array([course.value(tick) for course in self.courses])
+
+    def shown(self, tick: int) -> RealArray:
+        """Return those that are measured."""
+        return np.array([course.value(tick) for course, seen in zip(self.courses, self.measured, strict=True) if seen])
+
+
+NO_DISTURBANCES: Final = Disturbances()
+
+
+class DisturbedPlant(PlantProgram):
+    """A plant with disturbances as its last states and outputs; the others are its kind's.
+
+    Args:
+        disturbances: The disturbances.
+        arguments: Of `PlantProgram`.
+    """
+
+    def __init__(self, disturbances: Disturbances, **arguments: Any) -> None:  # noqa: ANN401 of the base
+        self._disturbances = disturbances
+        super().__init__(**arguments)
+
+    @property
+    def _own(self) -> RealArray:
+        """States without the disturbances."""
+        return self._x[: len(self._x) - len(self._disturbances.courses)]
+
+    def _own_outputs(self, w: RealArray) -> RealArray:
+        """Return the outputs without the disturbances; `w` is load and disturbances."""
+        raise NotImplementedError
+
+    def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
+        """Return states and outputs one tick ahead, without the disturbances."""
+        raise NotImplementedError
+
+    def _outside(self, w: float) -> RealArray:
+        return np.append(w, self._disturbances.at(self.tick))
+
+    def _read(self, w: float) -> RealArray:
+        return np.append(self._own_outputs(self._outside(w)), self._disturbances.shown(self.tick))
+
+    def _step(self, w: float) -> tuple[RealArray, RealArray]:
+        x, y = self._own_step(self._outside(w))
+        met, next_tick = self._disturbances, self.tick + 1
+        return np.append(x, met.at(next_tick)), np.append(y, met.shown(next_tick))
