@@ -218,15 +218,15 @@ class Lag(Fmi3Slave):
 
 def test_instances_do_not_know_of_one_another_and_return_to_their_states(compiled: Path, tmp_path: Path) -> None:
     fmu = Fmu(tanks(tmp_path, compiled))
-    wiring = Wiring(["u"], ["y"], "w", ["tank.x[1]", "tank.x[2]"], {"tank.x[1]": 2.0}, 1)
+    wiring = Wiring(["u"], ["y"], "w", [], ["tank.x[1]", "tank.x[2]"], {"tank.x[1]": 2.0}, 1)
     one, other = (FmuSimulation(fmu, wiring, 0.25) for _ in range(2))
-    one.put(np.array([1.0]), 0.1)
+    one.put(np.array([1.0]), np.array([0.1]))
     for _ in range(40):
         one.tick()
     assert other.states().tolist() == [2.0, 0.0]
     saved = one.saved()
     other.return_to(saved)
-    other.put(np.array([1.0]), 0.1)
+    other.put(np.array([1.0]), np.array([0.1]))
     for each in (one, other):
         each.tick()
     assert one.states().tolist() == other.states().tolist() != saved
@@ -241,11 +241,12 @@ def test_no_unpacked_folder_is_left_behind(compiled: Path, tmp_path: Path) -> No
     assert not left_behind()
 
 
+@pytest.mark.parametrize("disturbance", ["[load]", "[[disturbances]]"])
 def test_an_fmu_is_driven_through_the_rig_over_the_link_as_in_one_process(
-    compiled: Path, tmp_path: Path, processes: Processes
+    disturbance: str, compiled: Path, tmp_path: Path, processes: Processes
 ) -> None:
     tanks(tmp_path, compiled)
-    file = written(tmp_path, TANKS.replace("[5.0, 8.0]", "[1.5, 2.5]"))
+    file = written(tmp_path, TANKS.replace("[5.0, 8.0]", "[1.5, 2.5]").replace("[load]", disturbance))
     traces = []
     for place in (["--in-process"], []):
         out = tmp_path / f"run{len(traces)}"
