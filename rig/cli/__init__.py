@@ -50,6 +50,8 @@ COMMANDS: Final = {
 INTERRUPTED = 130
 OF_THE_COLD_BOX: Final = ("study", "reproduce", "model", "exergy")
 """Commands that are about its equations, its loads or the paper's figures."""
+OF_ANY_PROCESS: Final = ("periods",)
+"""Studies that are not."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -114,7 +116,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _execute(parser: argparse.ArgumentParser, given: Sequence[str]) -> int:
     options = parser.parse_args(given)
-    if os.environ.get(VARIABLE) and given[:1] and given[0] in OF_THE_COLD_BOX:
+    named = given[1] if len(given) > 1 else None
+    if os.environ.get(VARIABLE) and given and given[0] in OF_THE_COLD_BOX and named not in OF_ANY_PROCESS:
         sys.stderr.write(f"coldloop: {given[0]}: of the cold box alone; leave out {OPTION} and unset {VARIABLE}\n")
         return UsageError.exit_code
     if options.execute is None:

@@ -7,6 +7,7 @@ from rig.studies.beyond.contest import ContestStudy
 from rig.studies.beyond.coupling import CouplingStudy
 from rig.studies.beyond.disturbances import DisturbancesStudy
 from rig.studies.beyond.penalties import PenaltiesStudy
+from rig.studies.beyond.periods import PeriodsStudy
 from rig.studies.beyond.robustness import RobustnessStudy
 from rig.studies.beyond.single_precision import SinglePrecision
 from rig.studies.paper.cholesky import CholeskyStudy
@@ -36,6 +37,6 @@ _ALL: Final[tuple[Study, ...]] = (
 STUDIES: Final = {study.name: study for study in _ALL}
 """Those of the report, in the order of the paper."""
 
-_APART: Final[tuple[Study, ...]] = (RobustnessStudy(), ContestStudy(), PenaltiesStudy())
+_APART: Final[tuple[Study, ...]] = (RobustnessStudy(), ContestStudy(), PenaltiesStudy(), PeriodsStudy())
 APART: Final = {study.name: study for study in _APART}
 """Those that are too long for the report."""

@@ -6,7 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
+from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
+from coldloop.process.updating_periods import SHORTEST_TICKS
 from optimizer_plc.budget import PlcBudget
 from rig.cosim.one_process import OneProcessRig
 from rig.plc_sizing.solver_counts import iteration_s
@@ -14,7 +15,11 @@ from rig.settings import Settings
 from rig.studies.intervals import Interval, geometric_mean, mean_ratio
 from rig.studies.loop_cost import ADAPTIVE, loop_cost
 
-FIXED_S: Final = tuple(share * SAMPLING_PERIOD_S for share in (0.2, 0.3, 0.4, 0.5, 0.7, 1.0))
+FIXED_S: Final = tuple(
+    ticks * TICK_S
+    for ticks in sorted({round(share * TICKS_PER_SAMPLE) for share in (0.2, 0.3, 0.4, 0.5, 0.7, 1.0)})
+    if ticks >= SHORTEST_TICKS
+)
 """Updating periods, s, that are compared, unless one is given."""
 
 
@@ -45,10 +50,11 @@ def adaptive_gain(
     ratio = mean_ratio(by_period[0], by_period[best])
     which = f"a fixed {fixed[best - 1]:g} s" + (", the best fixed one" if len(fixed) > 1 else "")
     loads = f"load{'s' if len(names) > 1 else ''} {', '.join(names)}"
-    return f"With {loads} an adaptive period costs {ratio.text()} of {which}: {_pays(ratio)}."
+    return f"With {loads} an adaptive period costs {ratio.text()} of {which}: {pays(ratio)}."
 
 
-def _pays(ratio: Interval) -> str:
+def pays(ratio: Interval) -> str:
+    """Return whether it does, in words; of costs, those of the adaptive period over others."""
     if np.isnan(ratio.low):
         return "one load has no interval; name several"
     if ratio.high < 1.0:
