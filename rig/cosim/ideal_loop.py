@@ -44,7 +44,7 @@ def run_ideal_loop(
     The inputs go through the control PLC's guard: bounds, rates and the slew limit hold as for everybody.
 
     Args:
-        settings: Of plant, limits, model, estimator and design; solver, budget and rule have no effect.
+        settings: Of plant, limits, model, estimator and design; solver, budget, rule, `outside` have no effect.
         scenario: Its updating period has no effect.
         recorder: Takes the samples; there are no updates.
         ticks: From one instant to the next, 1 to 20.

@@ -1,10 +1,10 @@
-"""What a solver that is installed beside this package keeps, and how good it is.
+"""What a solver, a rule or an estimator that is installed beside this package keeps, and how good it is.
 
-`python -m rig.testing.conformance NAME` prints it.
+`python -m rig.testing.conformance NAME` prints it of a solver, with `rule` or `estimator` behind it of such.
 """
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -12,12 +12,16 @@ import numpy as np
 from coldloop.errors import ColdloopError
 from coldloop.process.lti_model import load
 from optimizer_plc.computing_settings import DaqpSettings, OutsideSettings
+from optimizer_plc.entry_points import Part, made
 from optimizer_plc.qp.costs import augmented_cost
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from optimizer_plc.solvers.daqp import DaqpSolver
-from optimizer_plc.solvers.outside import OutsideMethod, OutsideSolver, find_method
+from optimizer_plc.solvers.outside import OutsideMethod, OutsideSolver
 from rig.settings import Settings
+from rig.testing.estimator_conformance import estimator_requirements
+from rig.testing.requirement import Requirement
+from rig.testing.rule_conformance import rule_requirements
 from rig.text_tables import aligned
 
 PROBLEMS: Final = 20
@@ -25,13 +29,6 @@ COUNTS: Final = (0, 1, 2, 5, 20, 100)
 LONGEST: Final = COUNTS[-1]
 NOISE: Final = 1e-9
 """Rise of a cost, relative, that is rounding."""
-
-
-class Requirement(NamedTuple):
-    """Something that a solver has to keep, and in how many problems it did not."""
-
-    text: str
-    failures: int
 
 
 def requirements(method: OutsideMethod, problems: list[QuadraticProblem]) -> list[Requirement]:
@@ -53,7 +50,7 @@ def requirements(method: OutsideMethod, problems: list[QuadraticProblem]) -> lis
         intact = all(np.array_equal(np.asarray(now), old) for now, old in zip(problem, before, strict=True))
         failed[left] += not (intact and np.array_equal(guess, kept))
         failed[count] += not 0 <= done <= LONGEST
-    return [Requirement(text, failures) for text, failures in failed.items()]
+    return [Requirement(text, failures, len(problems)) for text, failures in failed.items()]
 
 
 def quality(solver: OutsideSolver, problems: list[QuadraticProblem]) -> tuple[list[float], float]:
@@ -86,35 +83,63 @@ def problems_of(settings: Settings, count: int = PROBLEMS) -> Iterator[Quadratic
         yield problem.at(QpParameters(random.normal(size=len(moves)) * moves, float(random.normal()), u))
 
 
-def report(name: str) -> tuple[str, bool]:
-    """Return what there is to say of a solver, as text, and whether it keeps what it has to.
+class Report(NamedTuple):
+    """What there is to say of a part."""
 
-    Raises:
-        ConfigurationError: There is none of this name, or it raises.
-    """
+    kept: list[Requirement]
+    more: str = ""
+
+    @property
+    def passes(self) -> bool:
+        """Whether it keeps what it has to."""
+        return not any(one.failures for one in self.kept)
+
+    @property
+    def text(self) -> str:
+        """All of it, in lines."""
+        return f"{aligned([(one.text, one.outcome) for one in self.kept])}\n{self.more}"
+
+
+def of_solver(name: str) -> Report:
+    """Return what there is to say of a solver."""
     problems = list(problems_of(Settings()))
-    kept = requirements(find_method(name), problems)
     gaps, rises = quality(OutsideSolver(OutsideSettings(solver=name)), problems)
-    rows = [(one.text, "yes" if not one.failures else f"NO, in {one.failures} of {len(problems)}") for one in kept]
-    text = aligned(rows) + "\n" + aligned([
+    table = aligned([
         ("iterations", *map(str, COUNTS)), ("above the optimum, of what the guess is", *(f"{gap:.3g}" for gap in gaps)),
     ])  # fmt: skip
     monotone = "never" if not rises else f"in {100 * rises:.0f} % of the steps"
-    return f"{text}\nthe cost rises {monotone} between these counts\n", not any(one.failures for one in kept)
+    more = f"{table}\nthe cost rises {monotone} between these counts\n"
+    return Report(requirements(made(Part.SOLVER, name), problems), more)
+
+
+def of_rule(name: str) -> Report:
+    """Return what there is to say of a rule of the updating period."""
+    return Report(rule_requirements(lambda periods: made(Part.RULE, name, periods)))
+
+
+def of_estimator(name: str) -> Report:
+    """Return what there is to say of a state estimator."""
+    return Report(estimator_requirements(lambda model: made(Part.ESTIMATOR, name, model), Settings()))
+
+
+REPORTS: Final[Mapping[Part, Callable[[str], Report]]] = {
+    Part.SOLVER: of_solver, Part.RULE: of_rule, Part.ESTIMATOR: of_estimator,
+}  # fmt: skip
 
 
 def main() -> int:
-    """Print the report of the solver that is named; return 0 if it keeps everything."""
-    if len(sys.argv) != 2:
-        sys.stderr.write("usage: python -m rig.testing.conformance NAME\n")
+    """Print the report of the part that is named; return 0 if it keeps everything."""
+    name, part = [*sys.argv[1:], Part.SOLVER][:2] if len(sys.argv) > 1 else ("", "")
+    if len(sys.argv) not in (2, 3) or part not in list(Part):
+        sys.stderr.write(f"usage: python -m rig.testing.conformance NAME [{'|'.join(Part)}]\n")
         return 2
     try:
-        text, passes = report(sys.argv[1])
+        report = REPORTS[Part(part)](name)
     except ColdloopError as error:
         sys.stderr.write(f"{error}\n")
         return 1
-    sys.stdout.write(text)
-    return 0 if passes else 1
+    sys.stdout.write(report.text)
+    return 0 if report.passes else 1
 
 
 if __name__ == "__main__":

@@ -43,6 +43,8 @@ class Branch(StrEnum):
     """Gamma = 0: as before."""
     CONTRACTION = "contraction"
     """The contraction rule."""
+    OUTSIDE = "outside"
+    """Somebody else's rule."""
 
 
 DECIDED: Final = frozenset({Branch.DOWN, Branch.UP, Branch.LEVEL})
@@ -188,6 +190,8 @@ def _branch(update: Optimization, before: Optimization | None, rule: UpdatingRul
         return _by_sign(update.gamma)
     if rule.rule == UpdatingRuleKind.CONTRACTION:
         return Branch.CONTRACTION
+    if rule.rule == UpdatingRuleKind.OUTSIDE:
+        return Branch.OUTSIDE
     raise NotImplementedError(f"no words for the rule {rule.rule} of the updating period: add a branch")
 
 

@@ -162,6 +162,10 @@ def _contraction(found: Explanation, rule: UpdatingRuleStatus) -> str:
     )
 
 
+def _outside(found: Explanation, rule: UpdatingRuleStatus) -> str:  # noqa: ARG001 it says nothing of itself
+    return f"{_change(found)} because the rule that is installed beside Coldloop decided so: q = {found.q}."
+
+
 _WORDS: Final[Mapping[Branch, Callable[[Explanation, UpdatingRuleStatus], str]]] = {
     Branch.FIXED: _fixed,
     Branch.FIRST: _first,
@@ -170,5 +174,6 @@ _WORDS: Final[Mapping[Branch, Callable[[Explanation, UpdatingRuleStatus], str]]]
     Branch.INTERRUPTED: _interrupted,
     Branch.LATE: _late,
     Branch.CONTRACTION: _contraction,
+    Branch.OUTSIDE: _outside,
     **dict.fromkeys((Branch.DOWN, Branch.UP, Branch.LEVEL), _algorithm_1),
 }

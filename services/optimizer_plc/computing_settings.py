@@ -235,16 +235,25 @@ class DaqpSettings(BaseModel):
 
 
 class OutsideSettings(BaseModel):
-    """Settings of a solver that is installed beside this package."""
+    """What is installed beside this package, by the names of entry points: `coldloop.solvers` and so on."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     solver: str = ""
-    """Name of its entry point in the group `coldloop.solvers`."""
+    """Used instead of `optimizer_plc.program.solver`."""
+    rule: str = ""
+    """Decides adaptive periods instead of `adaptive.rule`."""
+    estimator: str = ""
+    """Used instead of `estimator.kind`; `estimator.disturbances` says which constants there are to estimate."""
     alpha: PositiveFloat = PENALTY_WEIGHT
-    """Weight that its answers are judged with."""
+    """Weight that answers of the solver are judged with."""
     tau_1_s: PositiveFloat = 0.25
-    """Time of an iteration at P = 1: measured or counted by its author."""
+    """Time of an iteration of the solver at P = 1: measured or counted by its author."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Those that are used."""
+        return tuple(filter(None, (self.solver, self.rule, self.estimator)))
 
 
 class InteriorPointSettings(BaseModel):

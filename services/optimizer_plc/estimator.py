@@ -228,17 +228,18 @@ def state_walks(prediction: PredictionModel, settings: EstimatorSettings) -> lis
     return [by_unit[unit] for unit in prediction.model.state_units]
 
 
+def walks_of(prediction: PredictionModel, settings: EstimatorSettings) -> Array:
+    """Return the process noise of the states, the constants among them, and of the load mismatch, shape (n + 1,)."""
+    constants = np.array([settings.disturbance_walk * one for one in settings.sensors] + [*settings.input_walk])
+    chosen = constants[list(prediction.disturbances)]
+    return np.array([*state_walks(prediction, settings), *chosen, settings.load_walk_w])
+
+
 def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> StationaryGains:
     """Return what the Kalman filter corrects with after every updating period."""
     nx = prediction.n_states
     C = np.ascontiguousarray(np.hstack([prediction.C, prediction.G]))
-    sensors = np.array(settings.sensors)
-    walks = np.concatenate([settings.disturbance_walk * sensors, settings.input_walk])
-    drift = np.array([
-        *state_walks(prediction, settings),
-        *walks[list(prediction.disturbances)],
-        settings.load_walk_w,
-    ])  # fmt: skip
+    sensors, drift = np.array(settings.sensors), walks_of(prediction, settings)
 
     def computed() -> Array:
         P = np.diag(100.0 * drift**2)

@@ -29,13 +29,15 @@ from coldloop.safety.sequence import InputSequence, with_checksum
 from optimizer_plc import scheme
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
-from optimizer_plc.estimator import estimator_of
+from optimizer_plc.estimator import correct, estimator_of
+from optimizer_plc.outside_estimator import OutsideEstimator
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from optimizer_plc.qp.rest import rest_map
 from optimizer_plc.qp.target import target_search
-from optimizer_plc.rules import UpdatingRule, make_rule
+from optimizer_plc.rules import OutsideRule, UpdatingRule, make_rule
+from optimizer_plc.rules.interface import decide_by
 from optimizer_plc.session_state import empty_state
 from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import KernelSolver, make_solver
@@ -62,7 +64,7 @@ class OptimizerProgram:
             self.model_digest = model.short_digest
             self._real = real_of(settings.arithmetic)
             self.disturbances = settings.estimator.disturbed
-            prediction = PredictionModel(model).with_disturbances(self.disturbances)
+            self._prediction = prediction = PredictionModel(model).with_disturbances(self.disturbances)
             self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
             self.solver = make_solver(settings)
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
@@ -98,6 +100,8 @@ class OptimizerProgram:
         fixed_ticks = round(updating_period_s / TICK_S)
         self.constants = self.constants._replace(fixed_ticks=fixed_ticks)
         self.rule = rule or make_rule(self.settings, self.budget, fixed_ticks, self._real)
+        outside = self.settings.outside.estimator
+        self._estimator = OutsideEstimator(outside, self._prediction, self.settings.estimator) if outside else None
         self.solver.reset()
         for part in (self.state.numbers, self.state.playing.numbers, self.state.sent.numbers):
             part[:] = np.zeros(1, part.dtype)
@@ -141,17 +145,34 @@ class OptimizerProgram:
         in_time = self._follow(update, u)
         now["sequences"] = max(int(now["sequences"]), update.playing)
         state.u[:] = u
-        scheme.plan(
-            self.constants, self.rule, state, self._wanted(interrupted=interrupted, in_time=in_time),
-            update.update, update.tick,
-            np.array(update.u_before, self._real), self._real(update.load), np.array(update.y, self._real),
-            np.array(update.x, self._real),
-        )  # fmt: skip
+        self._take(self._wanted(interrupted=interrupted, in_time=in_time), update)
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
         return Plan(
             update.update, update.tick + int(now["ticks"]), load_step, float(now["shortage"]), int(now["suspects"])
         )
+
+    @property
+    def plans_by_steps(self) -> bool:
+        """Whether estimator or rule are not ours, and called between the kernels that `scheme.plan` calls."""
+        return self._estimator is not None or isinstance(self.rule, OutsideRule)
+
+    def _take(self, wanted: int, update: Update) -> None:
+        """Take a measurement and decide the period, by `scheme.plan` or step by step."""
+        c, m, load = self.constants, self.state, self._real(update.load)
+        u_before, y, x = (np.array(values, self._real) for values in (update.u_before, update.y, update.x))
+        if not self.plans_by_steps:
+            scheme.plan(c, self.rule, m, wanted, update.update, update.tick, u_before, load, y, x)
+            return
+        scheme.end_period(m)
+        if self._estimator is None:
+            correct(c.estimator, m.belief, u_before, load, y, x)
+        else:
+            self._estimator.correct(c.estimator, m.belief, u_before, load, y)
+        effective = scheme.judge_played(c, m, load, y)
+        if wanted == scheme.BY_THE_RULE:
+            wanted = decide_by(self.rule, m.rule, *scheme.assess_period(c, m, effective))
+        scheme.begin_period(c, m, wanted, update.update, update.tick, load, effective)
 
     def _knows_what_is_played(self, update: Update) -> bool:
         """Return whether the control PLC plays something of ours, or has not begun to."""

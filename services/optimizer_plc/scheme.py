@@ -20,7 +20,7 @@ from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.qp.profile import inputs_of, shifted
 from optimizer_plc.qp.target import CV155, TargetSearch, bounds_at, find_target, least_warm_load, loads_held
-from optimizer_plc.rules.assessment import Observation, assessed
+from optimizer_plc.rules.assessment import Assessment, Observation, assessed
 from optimizer_plc.rules.interface import UpdatingRule, decide_by
 from optimizer_plc.session_state import Delivery, OptimizerState
 from optimizer_plc.settings import ProgramSettings
@@ -286,32 +286,63 @@ def plan(
 ) -> None:
     """Take the update latched at `tick`, in physical units and the on-line type; decide the updating period.
 
-    `wanted` is its q, or BY_THE_RULE where what is played is the answer to the update before, in time.
+    `wanted` is its q, or BY_THE_RULE where what is played is the answer to the update before, in time. The program does
+    the same step by step where estimator or rule are not ours.
     """
-    now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
+    end_period(m)
+    correct(c.estimator, m.belief, u_before, load, y, x)
+    effective = judge_played(c, m, load, y)
+    if wanted == BY_THE_RULE:
+        o, a = assess_period(c, m, effective)
+        wanted = decide_by(rule, m.rule, o, a)
+    begin_period(c, m, wanted, update, tick, load, effective)
+
+
+@kernel
+def end_period(m: OptimizerState) -> None:
+    """Note the answer of the period that ends; nothing is known of how it went."""
+    now, real = m.numbers[0], m.belief.x.dtype.type
     if now.solved:
         now.sequences = max(now.sequences, m.sent.numbers[0].number)
         now.guessed_before, now.delivered_before = m.sent.numbers[0].hot_start, m.sent.numbers[0].delivered
         now.solved = False
-    correct(c.estimator, m.belief, u_before, load, y, x)
+    now.efficiency = now.mismatch = now.contraction = real(1.0)
+    now.gamma = real(0.0)
+
+
+@kernel
+def judge_played(c: Constants, m: OptimizerState, load: float, y: Array) -> float:
+    """Return J of what is played at the state that is estimated now, and find limits and target there."""
+    now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
     w = m.belief.numbers[0].w
     now.suspects = suspects_of(m.belief.readings)
     now.most_open = most_open(c, m.u, y)
     now.shortage = shortage(c, m.belief.x, w, load, now.most_open, real(0.0))
     find_target(c.target, m.belief.x, w, m.belief.numbers[0].mismatch, now.most_open, m.target)
     qp = problem_at(c, m.belief.x, w, m.playing.u_before, played.share, m.target, now.most_open)
-    effective = with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
-    now.efficiency = now.mismatch = now.contraction = real(1.0)
-    now.gamma = real(0.0)
-    if wanted == BY_THE_RULE:  # step (4): q(t_{k+1}) from the costs
-        o = Observation(
-            now.q, now.iterations, real(now.ticks) * c.estimator.tick_s, now.effective, played.hot_start,
-            played.last_but_one, played.delivered, effective,
-        )  # fmt: skip
-        a = assessed(o)
-        wanted = decide_by(rule, m.rule, o, a)
-        now.efficiency, now.mismatch, now.contraction, now.gamma = a.efficiency, a.mismatch, a.contraction, a.gamma
-    now.q = min(wanted, c.most)  # step (5): its period, and what fits; then step (2), what was sent is played
+    return with_floor(augmented_cost(qp, m.playing.z, c.alpha), qp.constant, c.floor)
+
+
+@kernel
+def assess_period(c: Constants, m: OptimizerState, effective: float) -> tuple[Observation, Assessment]:
+    """Return what a rule decides by, step (4): the costs of the period that ends, and what they say of it."""
+    now, played, real = m.numbers[0], m.playing.numbers[0], m.belief.x.dtype.type
+    o = Observation(
+        now.q, now.iterations, real(now.ticks) * c.estimator.tick_s, now.effective, played.hot_start,
+        played.last_but_one, played.delivered, effective,
+    )  # fmt: skip
+    a = assessed(o)
+    now.efficiency, now.mismatch, now.contraction, now.gamma = a.efficiency, a.mismatch, a.contraction, a.gamma
+    return o, a
+
+
+@kernel
+def begin_period(
+    c: Constants, m: OptimizerState, wanted: int, update: int, tick: int, load: float, effective: float
+) -> None:  # fmt: skip
+    """Begin the period of a q, step (5): its length, and what fits; then step (2), what was sent is played."""
+    now = m.numbers[0]
+    now.q = min(wanted, c.most)
     now.ticks = c.fixed_ticks or min(c.periods[now.q] + now.allowance, c.fitting.shape[0] - 1)
     now.iterations = c.fitting[max(now.ticks - now.allowance, 0)]  # where a period cannot grow, they are fewer
     now.update, now.tick, now.load, now.effective, now.planned = update, tick, load, effective, True

@@ -151,7 +151,7 @@ class ProgramSettings(BaseModel):
     hybrid: HybridSettings = HybridSettings()
     daqp: DaqpSettings = DaqpSettings()
     outside: OutsideSettings = OutsideSettings()
-    """Where it names a solver, that is used instead of `solver`."""
+    """Solver, rule and estimator of somebody else's, used instead of ours."""
 
     decides: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """What follows from other settings, for `coldloop.config`; filled in below, from the fields."""
@@ -204,10 +204,11 @@ class ProgramSettings(BaseModel):
 
     @model_validator(mode="after")
     def _own_arithmetic(self) -> Self:
-        double_only = self.outside.solver or self.solver not in SINGLE_PRECISION_SOLVERS
-        if self.arithmetic is Arithmetic.FLOAT32 and double_only:
+        if self.arithmetic is Arithmetic.FLOAT32 and self.outside.names:
+            raise ValueError(f"{', '.join(self.outside.names)}: what is not ours computes in double precision")
+        if self.arithmetic is Arithmetic.FLOAT32 and self.solver not in SINGLE_PRECISION_SOLVERS:
             raise ValueError(
-                f"{self.solver_name} computes in double precision; choose one of {', '.join(SINGLE_PRECISION_SOLVERS)}"
+                f"{self.solver} computes in double precision; choose one of {', '.join(SINGLE_PRECISION_SOLVERS)}"
             )
         return self
 

@@ -255,7 +255,7 @@ def test_compiled_and_plain_a_rule_is_assessed_the_same(rule: Algorithm1, observ
     assert rule.q_min <= decide_by(rule, np.zeros(MEMORY, np.float32), single, rough) <= rule.q_max
 
 
-@pytest.mark.parametrize("kind", UpdatingRuleKind)
+@pytest.mark.parametrize("kind", [kind for kind in UpdatingRuleKind if kind != UpdatingRuleKind.OUTSIDE])
 @given(observation=observations)
 def test_each_kind_is_decided_by_its_rule(kind: UpdatingRuleKind, observation: Observation) -> None:
     rule = make_rule(ProgramSettings(), PlcBudget(BudgetSettings(), 0.25), 7)._replace(kind=int(kind))

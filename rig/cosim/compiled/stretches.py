@@ -116,10 +116,10 @@ class CompiledStretches:
 
 
 def _is_compiled(program: OptimizerProgram) -> bool:
-    """Tell whether the program's updates have a compiled form: those of a solver of our own."""
+    """Tell whether the program's updates have a compiled form: those of a solver, rule and estimator of our own."""
     if type(program) is not OptimizerProgram:  # who has made another kind of it wants to be asked
         return False
-    return isinstance(program.solver, KernelSolver)
+    return isinstance(program.solver, KernelSolver) and not program.plans_by_steps
 
 
 def _is_ordinary(program: OptimizerProgram) -> bool:

@@ -15,11 +15,12 @@ from optimizer_plc.rules.assessment import Assessment, Observation, assess
 from optimizer_plc.rules.contraction import ContractionRule
 from optimizer_plc.rules.fixed_period import FixedPeriod
 from optimizer_plc.rules.interface import UpdatingRule, decides_by
+from optimizer_plc.rules.outside import OutsideRule
 from optimizer_plc.settings import ProgramSettings
 
 __all__ = [
-    "Algorithm1", "Assessment", "ContractionRule", "FixedPeriod", "Observation", "Rule", "UpdatingRule", "assess",
-    "make_rule",
+    "Algorithm1", "Assessment", "ContractionRule", "FixedPeriod", "Observation", "OutsideRule", "Rule", "UpdatingRule",
+    "assess", "make_rule",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -69,7 +70,7 @@ def decide(rule: Rule, memory: Array, o: Observation, a: Assessment) -> int:
     return contraction.decide(rule.contraction, memory, o, a)
 
 
-def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, real: Real = DOUBLE) -> Rule:
+def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, real: Real = DOUBLE) -> UpdatingRule:
     """Return the rule that the settings name.
 
     Args:
@@ -77,7 +78,12 @@ def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, re
         budget: Knows the q of a fixed period.
         fixed_ticks: Fixed updating period; 0 is adaptive.
         real: Floating-point type of the costs.
+
+    Raises:
+        ConfigurationError: There is no such rule, or it cannot be made.
     """
+    if settings.outside.rule and not fixed_ticks:
+        return OutsideRule(settings.outside.rule, budget)
     adaptive, own = settings.adaptive, settings.adaptive.contraction
     return Rule(
         FIXED_PERIOD if fixed_ticks else int(UpdatingRuleKind[adaptive.rule.name]),  # one type, compiled once

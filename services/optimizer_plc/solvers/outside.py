@@ -4,20 +4,17 @@ The entry point is a class without arguments that follows `OutsideMethod`; `docs
 """
 
 from collections.abc import Sequence
-from importlib.metadata import entry_points
-from typing import Final, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.errors import ConfigurationError
 from optimizer_plc.computing_settings import OutsideSettings
+from optimizer_plc.entry_points import Part, in_its_name, made
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Answer, collected
 
 Array = NDArray[np.float64]
-
-GROUP: Final = "coldloop.solvers"
 
 
 class OutsideMethod(Protocol):
@@ -37,7 +34,7 @@ class OutsideSolver:
         self.alpha = settings.alpha
         self.tau_1_s = settings.tau_1_s
         self.name = settings.solver
-        self._method = find_method(settings.solver)
+        self._method: OutsideMethod = made(Part.SOLVER, settings.solver)
 
     def reset(self) -> None:
         """Forget earlier problems, where the method has something to forget."""
@@ -59,31 +56,10 @@ class OutsideSolver:
     def _point(self, problem: QuadraticProblem, guess: Array, count: int) -> tuple[Array, int]:
         if not count:
             return guess, 0
-        try:
+        with in_its_name(Part.SOLVER, self.name):
             point, done = self._method.solve(problem, guess.copy(), count)
             found = np.asarray(point, dtype=np.float64)
             done = min(int(done), count)
-        except Exception as error:
-            raise ConfigurationError(f"solver {self.name}: {type(error).__name__}: {error}") from error
         if found.shape != guess.shape or not np.isfinite(found).all():
             return guess, done
         return np.clip(found, problem.low, problem.high), done
-
-
-def find_method(name: str) -> OutsideMethod:
-    """Return what the entry point of this name makes.
-
-    Raises:
-        ConfigurationError: There is none, or it cannot be made.
-    """
-    there = entry_points(group=GROUP)
-    known = ", ".join(sorted(there.names)) or "none is installed"
-    if name not in there.names:
-        raise ConfigurationError(
-            f"optimizer_plc.program.outside.solver: no solver '{name}' among the entry points {GROUP}: {known}"
-        )
-    try:
-        made: OutsideMethod = there[name].load()()
-    except Exception as error:
-        raise ConfigurationError(f"solver {name}: cannot be made: {type(error).__name__}: {error}") from error
-    return made

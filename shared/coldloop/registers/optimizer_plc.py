@@ -116,12 +116,14 @@ class UpdatingRuleKind(IntEnum):
     """The rule of the paper."""
     CONTRACTION = 2
     """The rule of this project."""
+    OUTSIDE = 3
+    """Somebody else's."""
 
 
 class UpdatingRuleStatus(NamedTuple):
     """The rule that decides the updating period in this session, and the time that the computation takes."""
 
-    rule: Annotated[int, u16("0 fixed period, 1 Algorithm 1, 2 contraction rule", values=UpdatingRuleKind)] = (
+    rule: Annotated[int, u16("0 fixed period, 1 Algorithm 1, 2 contraction rule, 3 other", values=UpdatingRuleKind)] = (
         UpdatingRuleKind.FIXED
     )
     q_first: Annotated[int, u16("q of the first period, and of one that follows an interruption")] = 0

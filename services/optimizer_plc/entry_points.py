@@ -1,0 +1,44 @@
+"""Somebody else's solver, rule or estimator, by an entry point: nothing is edited here to use it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from importlib.metadata import entry_points
+from typing import Any
+
+from coldloop.errors import ConfigurationError
+
+
+class Part(StrEnum):
+    """What may be somebody else's: a key of `optimizer_plc.program.outside`, and the group `coldloop.<part>s`."""
+
+    SOLVER = "solver"
+    RULE = "rule"
+    ESTIMATOR = "estimator"
+
+
+def made(part: Part, name: str, *given: object) -> Any:  # noqa: ANN401 the caller knows its protocol
+    """Return what the entry point of this name makes of what it is given.
+
+    Raises:
+        ConfigurationError: There is none, or it cannot be made.
+    """
+    group = f"coldloop.{part}s"
+    there = entry_points(group=group)
+    if name not in there.names:
+        known = ", ".join(sorted(there.names)) or "none is installed"
+        raise ConfigurationError(
+            f"optimizer_plc.program.outside.{part}: no {part} '{name}' among the entry points {group}: {known}"
+        )
+    with in_its_name(part, name, "cannot be made: "):
+        return there[name].load()(*given)
+
+
+@contextmanager
+def in_its_name(part: Part, name: str, what: str = "") -> Iterator[None]:
+    """Call what is not ours: whatever it raises is a `ConfigurationError` of one line, with its name."""
+    try:
+        yield
+    except Exception as error:
+        said = " ".join(str(error).split())
+        raise ConfigurationError(f"{part} {name}: {what}{type(error).__name__}: {said}") from error

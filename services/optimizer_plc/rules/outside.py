@@ -1,0 +1,68 @@
+"""Somebody else's rule of the updating period, by an entry point of the group `coldloop.rules`."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
+from optimizer_plc.budget import PlcBudget
+from optimizer_plc.entry_points import Part, in_its_name, made
+from optimizer_plc.rules.assessment import Assessment, Observation
+from optimizer_plc.rules.interface import decides_by
+
+Array = NDArray[np.float64]
+
+
+class OutsideDecision(Protocol):
+    """What an entry point makes for each session; the same observations give the same numbers.
+
+    It may have `after_interruption()`, too: the q of a period that begins with a load step, which else is the first.
+    """
+
+    def __init__(self, periods: Sequence[int]) -> None:
+        """Begin with the ladder: updating periods in ticks, rising. Their numbers q count from 1."""
+
+    def first(self) -> int:
+        """Return q(t_0)."""
+
+    def decide(self, observation: Observation, assessment: Assessment) -> int:
+        """Return q(t_{k+1})."""
+
+
+class OutsideRule:
+    """One of these as a rule: what is no number of a period leaves q as it is, at a beginning at the longest."""
+
+    def __init__(self, name: str, budget: PlcBudget) -> None:
+        self.name, self._most = name, len(budget.ladder)
+        self._rule: OutsideDecision = made(Part.RULE, name, budget.ladder)
+        self.first = self._asked(self._rule.first, otherwise=self._most)
+
+    @property
+    def status(self) -> UpdatingRuleStatus:
+        """The ladder that it may use."""
+        return UpdatingRuleStatus(UpdatingRuleKind.OUTSIDE, self.first, 1, self._most)
+
+    def after_interruption(self, memory: Array) -> int:  # noqa: ARG002 it has its own
+        """Return the q of the period that begins with a load step."""
+        return self._asked(getattr(self._rule, "after_interruption", self._rule.first), otherwise=self._most)
+
+    def decide(self, o: Observation, a: Assessment) -> int:
+        """Return q(t_{k+1}).
+
+        Raises:
+            ConfigurationError: The rule raises, or returns no number.
+        """
+        return self._asked(self._rule.decide, o, a, otherwise=o.q)
+
+    def _asked(self, function: Callable[..., float], *given: object, otherwise: int) -> int:
+        with in_its_name(Part.RULE, self.name):
+            q = float(function(*given))
+        return int(q) if q.is_integer() and 1 <= q <= self._most else otherwise
+
+
+@decides_by(OutsideRule)
+def decide(rule: OutsideRule, memory: Array, o: Observation, a: Assessment) -> int:  # noqa: ARG001 it has its own
+    """Return q(t_{k+1})."""
+    return rule.decide(o, a)
