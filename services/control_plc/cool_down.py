@@ -9,19 +9,17 @@ Pure: measured outputs in, wanted inputs out. How far the turbine may open is it
 """
 
 from collections.abc import Collection, Sequence
-from typing import Annotated, Final
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import IS_COLD_BOX
-from coldloop.process.signals import CONTROLLED, L1, T1, T5, TICK_S
+from coldloop.process.signals import CONTROLLED, L1, OUTPUT_NAMES, T1, T5, TICK_S
 from coldloop.registers.control_plc import CoolDownStep, SequenceRow
 
 CV155, HEATER, CV156 = range(3)
 """Inputs of the cold box."""
-DRY_K: Final = 5.0
-"""T1 above which the bath is dry, and its level stands at 0."""
 
 
 class CoolDownSettings(BaseModel):
@@ -29,7 +27,7 @@ class CoolDownSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    warm_k: Annotated[float, Field(ge=DRY_K, le=300)] = 20.0
+    warm_k: Annotated[float, Field(ge=5, le=300)] = 20.0
     """T1 at the beginning of a session, or after a restart, above which the plant is cooled down."""
     liquid_pct: Annotated[float, Field(gt=0, lt=50)] = 1.0
     """L1 at which the bath begins to be filled."""
@@ -78,9 +76,13 @@ class CoolDown:
             case _:
                 return ()
 
-    def standing(self, y: Sequence[float]) -> Collection[int]:
-        """Return the outputs that are constant without being frozen: the level of a bath that is dry."""
-        return (L1,) if self.is_active and y[T1] > DRY_K else ()
+    @property
+    def standing(self) -> Collection[int]:
+        """Outputs that may be constant for long without being frozen: all but L1 and T5 once the bath is being filled."""
+        if not self.is_active:
+            return ()
+        filling = self.step in (CoolDownStep.FILLING, CoolDownStep.SETTLING)
+        return [output for output in range(len(OUTPUT_NAMES)) if not (filling and output in CONTROLLED)]
 
     def observe(self, tick: int, y: Sequence[float]) -> bool:
         """Take the outputs measured at `tick`; return whether the step has changed."""

@@ -317,8 +317,7 @@ class ControlProgram:
         """Take the measurement of this tick; return the update if it was latched here."""
         applied = tuple(self.guard.applied)
         others = measurement.x, (measurement.load,)
-        standing = self.cool_down.standing(measurement.y)
-        y = tuple(self.sensors.check(self.tick, measurement.y, applied, *others, standing=standing))
+        y = tuple(self.sensors.check(self.tick, measurement.y, applied, *others, standing=self.cool_down.standing))
         if self.cool_down.observe(self.tick, y):
             self.journal.note(self.tick, EventKind.COOL_DOWN, self.cool_down.step)
         self.process = Process(self.tick, measurement.load, applied, y)
