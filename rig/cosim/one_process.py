@@ -51,6 +51,8 @@ class Programs(NamedTuple):
         """Do one tick."""
         if self.control.awaiting_sequence:
             self._deliver(listener)
+        if not self.control.player.invited:
+            self.control.optimizer_seen()  # an optimiser that idles goes on to send heartbeats
         update = self._scan(listener)
         if update is not None:
             self.control.accept_plan(as_transmitted(self.optimizer.plan(as_transmitted(update))))

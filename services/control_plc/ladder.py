@@ -5,7 +5,8 @@
     HOLD       the sequence is exhausted: its last value, for a set time
     CLASSICAL  the PI loops, until a sequence is accepted again
 
-An operator may take the ladder away (CLASSICAL, MANUAL). A bad sensor that MPC needs leads to CLASSICAL at once.
+An operator may take the ladder away (CLASSICAL, MANUAL). A bad sensor that MPC needs, and a plant that begins warm
+(`cool_down.py`), lead to CLASSICAL at once.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ class LadderInputs:
     """Inputs of the choice of mode."""
 
     operator: OperatorMode
+    cooling: bool
+    """The plant is being cooled down from a warm start."""
     sensors_unusable: bool
     row: bool
     """A sequence has a row for this tick."""
@@ -49,6 +52,8 @@ class Ladder:
             return Mode.MANUAL, Cause.OPERATOR
         if inputs.operator is OperatorMode.CLASSICAL:
             return Mode.CLASSICAL, Cause.OPERATOR
+        if inputs.cooling:
+            return Mode.CLASSICAL, Cause.COOL_DOWN
         if inputs.sensors_unusable:
             return Mode.CLASSICAL, Cause.SENSOR_BAD
         if inputs.row:

@@ -38,6 +38,7 @@ class ProcessAlarms:
         y: Sequence[float],
         ladder: Ladder,
         *,
+        cooling: bool,
         late: bool,
         optimizer: bool,
         shortage: float,
@@ -50,6 +51,7 @@ class ProcessAlarms:
             tick: Of the scan.
             y: Outputs, bad ones substituted.
             ladder: Mode and its cause.
+            cooling: The plant is being cooled down: it is not to be in its bands yet.
             late: The rest of a sequence is being played.
             optimizer: Its heartbeat is present.
             shortage: What the load is above what can be held, in W; negative: below what is needed.
@@ -57,12 +59,13 @@ class ProcessAlarms:
             suspects: Outputs that the optimiser does without: bit i is output i.
         """
         report = self._panel.report
-        outside = [not low <= y[output] <= high for output, (low, high) in zip(CONTROLLED, self._bands, strict=True)]
+        bands = zip(CONTROLLED, self._bands, strict=True)
+        outside = [not (cooling or low <= y[output] <= high) for output, (low, high) in bands]
         report(AlarmKind.LEVEL_BAND, condition=outside[0])
         further = [place for place, is_outside in enumerate(outside[1:]) if is_outside]
         report(AlarmKind.T5_BAND, condition=bool(further), cause=further[0] if further else 0)
         mode, cause = ladder.mode, ladder.cause
-        fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR)
+        fallen = mode is not Mode.MPC and cause not in (Cause.SESSION_STARTED, Cause.OPERATOR, Cause.COOL_DOWN)
         report(AlarmKind.MODE, condition=fallen, cause=cause)
         exhausted = mode is not Mode.MPC and cause in (Cause.SEQUENCE_EXHAUSTED, Cause.HOLD_EXPIRED)
         report(AlarmKind.SEQUENCE_EXHAUSTED, condition=exhausted)

@@ -36,6 +36,7 @@ from coldloop.safety.watchdog import Watchdog
 from coldloop.service.journal import Journal
 from control_plc.alarms import AlarmPanel
 from control_plc.classical import ClassicalLoops
+from control_plc.cool_down import CoolDown
 from control_plc.guard import OutputGuard
 from control_plc.ladder import Ladder, LadderInputs
 from control_plc.player import SequencePlayer
@@ -159,6 +160,9 @@ class ControlProgram:
         self.sensors = SensorMonitor(
             self._section.sensors, self._point.outputs, [SEEN * rate for rate in self._limits.rate]
         )
+        self.cool_down = CoolDown(
+            self._section.cool_down, self._limits, self._point.inputs, self._point.outputs, self.alarm_settings.bands
+        )
         self._unknown = False
         """The load or the state that was measured last makes no sense."""
         self._failed_handshake = -math.inf
@@ -213,9 +217,12 @@ class ControlProgram:
 
     @property
     def _usable(self) -> bool:
-        """MPC can work with what is measured: it continues without L1 or T5, and does not begin without them."""
-        drives = self.ladder.mode in OPTIMIZER_DRIVES
-        return not (self._unknown or (self.sensors.unestimated if drives else self.sensors.unusable))
+        """MPC can work with what is measured: it continues without L1 or T5, and does not begin without them.
+
+        Nor does it begin before the plant is cold.
+        """
+        missing = self.sensors.unestimated if self.ladder.mode in OPTIMIZER_DRIVES else self.sensors.unusable
+        return not (self.cool_down.is_active or self._unknown or missing)
 
     @property
     def _earliest(self) -> int:
@@ -245,6 +252,7 @@ class ControlProgram:
             tick,
             LadderInputs(
                 operator=OperatorMode(self.operator.mode),
+                cooling=self.cool_down.is_active,
                 sensors_unusable=not self._usable,
                 row=row is not None,
                 late=self.player.late or not self.optimizer_present,
@@ -270,8 +278,13 @@ class ControlProgram:
         if mode is Mode.MANUAL:
             return SequenceRow(*self.operator[1:])
         if mode is Mode.CLASSICAL and self.process is not None and not self._handing_over(tick):
-            return self._loops.wanted(tick, self.process.y, self.guard.applied, without=self.sensors.unusable)
+            return self._of_the_loops(tick, self.process.y)
         return self.guard.applied if row is None else row
+
+    def _of_the_loops(self, tick: int, y: Sequence[float]) -> SequenceRow:
+        without = {*self.sensors.unusable, *self.cool_down.open_loops}
+        wanted = self._loops.wanted(tick, y, self.guard.applied, without=without)
+        return self.cool_down.wanted(wanted) if self.cool_down.is_active else wanted
 
     def _handing_over(self, tick: int) -> bool:
         """Return whether the loops are at rest, so that the first sequence begins at inputs the optimiser knows.
@@ -303,7 +316,10 @@ class ControlProgram:
     def end_scan(self, measurement: Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
         applied = tuple(self.guard.applied)
-        y = tuple(self.sensors.check(self.tick, measurement.y, applied, measurement.x, (measurement.load,)))
+        others = measurement.x, (measurement.load,)
+        y = tuple(self.sensors.check(self.tick, measurement.y, applied, *others, standing=self.cool_down.standing))
+        if self.cool_down.observe(self.tick, y):
+            self.journal.note(self.tick, EventKind.COOL_DOWN, self.cool_down.step)
         self.process = Process(self.tick, measurement.load, applied, y)
         self._unknown = not (LOAD_SPAN[0] <= measurement.load <= LOAD_SPAN[1] and _are_states(measurement.x))
         self._let_play(usable=self._usable)
@@ -317,8 +333,8 @@ class ControlProgram:
                 )
             )  # fmt: skip
         self._process_alarms.watch(
-            self.tick, y, self.ladder, late=self.player.late, optimizer=self.optimizer_present,
-            shortage=self.shortage, bad=self.sensors.bad, suspects=self.suspects,
+            self.tick, y, self.ladder, cooling=self.cool_down.is_active, late=self.player.late,
+            optimizer=self.optimizer_present, shortage=self.shortage, bad=self.sensors.bad, suspects=self.suspects,
         )  # fmt: skip
         self.tick += 1
         self._in_scan = False

@@ -192,7 +192,12 @@ class SensorMonitor:
         self.bad: dict[int, int] = {}
 
     def check(
-        self, tick: int, y: Sequence[float], inputs: Sequence[float] = (), *others: Sequence[float]
+        self,
+        tick: int,
+        y: Sequence[float],
+        inputs: Sequence[float] = (),
+        *others: Sequence[float],
+        standing: Collection[int] = (),
     ) -> Sequence[float]:
         """Return the outputs measured at `tick`, with bad ones replaced by their last good value.
 
@@ -201,12 +206,15 @@ class SensorMonitor:
             y: As they were measured.
             inputs: Being applied.
             others: What else was measured.
+            standing: Outputs that may be constant while others move.
         """
         elapsed = 1 if self._tick is None else max(0, tick - self._tick)
         count_unchanged(self.unchanged, self.rests, self.before, y, elapsed, self.least)
         self._tick = self._now = tick
         history = zip(self.unchanged, self.rests, self.least, strict=True)
         frozen: Collection[int] = [output for output, each in enumerate(history) if is_frozen(*each)]
+        if standing:
+            frozen = [output for output in frozen if output not in standing]
         if self._may_rest and not IS_COLD_BOX:
             frozen = self._not_at_rest(frozen, inputs)
         if self._image.unchanged(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:

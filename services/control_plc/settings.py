@@ -18,11 +18,13 @@ from coldloop.service.telemetry_settings import TelemetrySettings
 from coldloop.session.settings import SessionSettings
 from control_plc.alarm_settings import AlarmSettings
 from control_plc.classical import ClassicalSettings
+from control_plc.cool_down import CoolDownSettings
 from control_plc.sensors import SensorCheckSettings
 
 SHOWN: Final = (
     "limits", "control_plc.scan_tolerance_ms", "control_plc.skew_alarm_ppm", "control_plc.driver",
-    "control_plc.classical", "control_plc.ladder", "control_plc.sensors", "control_plc.alarms",
+    "control_plc.classical", "control_plc.cool_down", "control_plc.ladder", "control_plc.sensors",
+    "control_plc.alarms",
 )  # fmt: skip
 """What of the configuration decides results: shown in the registers."""
 
@@ -90,6 +92,8 @@ class ControlSection(BaseModel):
     """How much the rack's clock and ours may differ in real time before the alarm is raised."""
     driver: ControlStrategy = ControlStrategy.MPC
     classical: ClassicalSettings = ClassicalSettings()
+    cool_down: CoolDownSettings = CoolDownSettings()
+    """Of a cold box that is warm at the beginning."""
     ladder: LadderSettings = LadderSettings()
     sensors: SensorCheckSettings = SensorCheckSettings()
     alarms: AlarmSettings = AlarmSettings()

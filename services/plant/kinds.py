@@ -16,7 +16,7 @@ from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.rack.rack import MakePlant
 from plant.refrigerator.events import EventSchedule
 from plant.refrigerator.station_settings import StationControlKind
-from plant.settings import MismatchSettings, PlantKind, PlantSection, SensorSettings
+from plant.settings import MismatchSettings, PlantKind, PlantSection, RefrigeratorStart, SensorSettings
 
 if TYPE_CHECKING:
     from plant.refrigerator.file import RefrigeratorFile
@@ -125,6 +125,7 @@ def _make_refrigerator(
             events=EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k),
             noise=noise_of(section.sensors, seed),
             seed=seed,
+            warm=happening.start is RefrigeratorStart.WARM,
         )
 
 

@@ -148,13 +148,23 @@ class PlantKind(StrEnum):
     """That of the process which programs are loaded with."""
 
 
+class RefrigeratorStart(StrEnum):
+    """How a refrigerator is at the beginning of a session."""
+
+    OPERATING_POINT = "operating-point"
+    """At rest, with the bath filled."""
+    WARM = "warm"
+    """At ambient temperature, its helium in the buffer, its compressors about to start."""
+
+
 class RefrigeratorSettings(BaseModel):
-    """Disturbances of a refrigerator."""
+    """Start and disturbances of a refrigerator."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     file: Path | None = None
     """Its operating point and the gains of its pressure controller; by default those of the reference plant."""
+    start: RefrigeratorStart = RefrigeratorStart.OPERATING_POINT
     ambient_k: Annotated[float, Field(ge=RANGES[EventTarget.AMBIENT][0], le=RANGES[EventTarget.AMBIENT][1])] = 300.0
     """Temperature of the surroundings."""
     daily_swing_k: Annotated[float, Field(ge=0, le=20)] = 0.0

@@ -58,7 +58,7 @@ def given(**changed: float) -> np.ndarray:
 def test_with_all_in_order_what_is_asked_acts_to_the_bit() -> None:
     memory, u, d = resting_equipment(np.array(FILE.u0)), np.array([41.3, 77.7, 35.1]), given(T_ambient=300.0)
     law = station_law(StationSettings(), FILE.reference, REFERENCE_REFRIGERATOR.station).equipment
-    acting = act(law, memory, u, d, 1.05, 2400.0, REFERENCE_REFRIGERATOR)
+    acting = act(law, memory, u, d, 1.05, 0.9, 2400.0, REFERENCE_REFRIGERATOR)
     assert acting.u.tolist() == u.tolist()
     assert acting.d.tolist() == d.tolist()
     assert acting.plant == REFERENCE_REFRIGERATOR

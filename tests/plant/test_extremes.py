@@ -284,7 +284,8 @@ def test_one_step_a_tick_is_stable_with_a_margin_and_exact_within_a_percent_of_e
         memory, brought = plant.memory, plant.ahead(0)[0]
         brought[0] = plant.load
         law, lp, speed = plant.law.equipment, signal(plant, "P11"), output(plant, "V1")
-        acting = act(law, memory.equipment, np.array(FILE.u0), brought, lp, speed, PLANT)
+        taken = signal(plant, "M12") / max(signal(plant, "M_NC"), 0.1)
+        acting = act(law, memory.equipment, np.array(FILE.u0), brought, lp, taken, speed, PLANT)
         u, v, d = acting.u, memory.commands, acting.d[: len(DISTURBANCE_NAMES)]
         if tick % 8 == 0:
             A = jacobian(memory.x, u, v, d, PLANT, HELIUM)[: len(STATE_NAMES), : len(STATE_NAMES)]

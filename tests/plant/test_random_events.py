@@ -37,7 +37,8 @@ HEADER = own_header(DEFAULT_MODEL_FILE)
 FILE = read_refrigerator_file(SHIPPED)
 M_LOST = STATE_NAMES.index("M_lost")
 LAW = station_law(StationSettings(), FILE.reference, PLANT.station).equipment
-LP, V1 = SIGNAL_NAMES.index("P11"), OUTPUT_NAMES.index("V1")
+LP, TO_BOX, COMPRESSED = (SIGNAL_NAMES.index(name) for name in ("P11", "M12", "M_NC"))
+V1 = OUTPUT_NAMES.index("V1")
 PLAIN, TABLES = plain_tuples(PLANT), plain_tuples(HELIUM)
 
 percent = st.floats(0.0, 100.0)
@@ -81,7 +82,8 @@ def held(
     sums, slope, y, signals = np.zeros(4), np.empty(x.shape[0]), np.empty(22), np.empty(len(SIGNAL_NAMES))
     evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
     for _ in range(ticks):
-        acting = act(law, equipment, u, d, signals[LP], y[V1], plant)
+        taken = signals[TO_BOX] / max(signals[COMPRESSED], 0.1)
+        acting = act(law, equipment, u, d, signals[LP], taken, y[V1], plant)
         stage = x
         for k in range(4):
             crossing = evaluate_refrigerator(stage, acting.u, v, acting.d, acting.plant, helium, slope, y, signals)

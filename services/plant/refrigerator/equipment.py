@@ -59,6 +59,8 @@ class EquipmentLaw(NamedTuple):
     """s, for which it idles."""
     load_s: float
     """s, in which it is loaded after that."""
+    second: float
+    """Share of what the first one gives that the cold box takes when the second one is started."""
     least_lp: float
     """Low pressure (bar) below which none is started."""
     run_up_s: float
@@ -89,6 +91,14 @@ def resting_equipment(u: RealArray) -> RealArray:
     return memory
 
 
+def standing_equipment(u: RealArray) -> RealArray:
+    """Return the equipment's memory of a refrigerator that stands: compressors and turbine have not started."""
+    memory = resting_equipment(u)
+    memory[:ADMISSION] = memory[ADMISSION] = 0.0
+    memory[ACTING:DEVIATING] = 0.0
+    return memory
+
+
 @kernel
 def loaded_compressors(memory: RealArray, d: RealArray) -> int:
     """Return how many compressors are switched on and loaded."""
@@ -97,7 +107,14 @@ def loaded_compressors(memory: RealArray, d: RealArray) -> int:
 
 @kernel
 def act(
-    law: EquipmentLaw, memory: RealArray, u: RealArray, d: RealArray, lp: float, speed: float, plant: Refrigerator
+    law: EquipmentLaw,
+    memory: RealArray,
+    u: RealArray,
+    d: RealArray,
+    lp: float,
+    taken: float,
+    speed: float,
+    plant: Refrigerator,
 ) -> Acting:
     """Return what acts in the tick that begins.
 
@@ -107,11 +124,12 @@ def act(
         u: Inputs that are asked of the cold box, shape (3,).
         d: What is given, `GIVEN_NAMES`.
         lp: Low pressure, bar.
+        taken: Share of what the compressors give that the cold box takes.
         speed: Of the turbine, Hz.
         plant: Parameters.
     """
     given = d.copy()
-    start_compressors(law, memory, given, lp)
+    start_compressors(law, memory, given, lp, taken)
     isolated = loaded_compressors(memory, d) == 0
     runs = govern_turbine(law, memory, d, speed, isolated)
     if d[CV155_MOVES] != 0.0:
@@ -135,16 +153,17 @@ def act(
 
 
 @kernel
-def start_compressors(law: EquipmentLaw, memory: RealArray, d: RealArray, lp: float) -> None:
+def start_compressors(law: EquipmentLaw, memory: RealArray, d: RealArray, lp: float, taken: float) -> None:
     """Bring starts forward, and write into `d` the shares that both compressors are to run at.
 
-    One starts at a time, NC1 first. It idles, and is loaded in a ramp; one that is switched off stops at once.
+    One starts at a time, NC1 first, and the other when the cold box takes enough for two: the bypass of a warm one
+    could not pass the rest. It idles, and is loaded in a ramp; one that is switched off stops at once.
     """
     for i in range(2):
         other = memory[START + 1 - i]
         if d[NC1 + i] == 0.0:
             memory[START + i] = 0.0
-        elif memory[START + i] > 0.0 or (lp > law.least_lp and not 0.0 < other < 1.0):
+        elif memory[START + i] > 0.0 or (lp > law.least_lp and (other == 0.0 or (other == 1.0 and taken > law.second))):
             memory[START + i] = min(memory[START + i] + TICK_S / (law.idle_s + law.load_s), 1.0)
         come = memory[START + i]
         if come < 1.0:

@@ -12,7 +12,7 @@ from plant.helium.properties import load_helium
 from plant.integrator import plain_tuples
 from plant.numeric import RealArray
 from plant.program import HeatLoad, MeasurementNoise
-from plant.refrigerator.equipment import ACTING, DEVIATING, resting_equipment
+from plant.refrigerator.equipment import ACTING, DEVIATING, GIVEN_NAMES, resting_equipment, standing_equipment
 from plant.refrigerator.events import EventSchedule
 from plant.refrigerator.file import RefrigeratorFile
 from plant.refrigerator.physics import (
@@ -26,7 +26,9 @@ from plant.refrigerator.station_control import station_law
 from plant.refrigerator.station_law import MEMORY_SIZE, Commands
 from plant.refrigerator.station_settings import StationSettings
 from plant.refrigerator.tick import ALARMS, HP, LP, MODE, RefrigeratorMemory, advance_program_tick, control_tick
+from plant.refrigerator.warm_start import warm_state
 
+AMBIENT: Final = GIVEN_NAMES.index("T_ambient")
 RETAINED: Final = ("x", "y", "signals", "commands", "integrals", "equipment")
 """Of the memory; the rest follows from it."""
 
@@ -66,6 +68,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         events: Disturbances of the refrigerator.
         noise: Noise on the cold box's measurements; None measures exactly.
         seed: Of the noise on the station's gauges.
+        warm: Begin with a warm refrigerator that stands, in the place of the operating point.
 
     Raises:
         ValueError: An argument of wrong length, not finite, or out of range.
@@ -82,6 +85,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         events: EventSchedule,
         noise: MeasurementNoise | None = None,
         seed: int = 0,
+        warm: bool = False,
     ) -> None:
         check_refrigerator(plant)
         self.plant = plant
@@ -92,12 +96,13 @@ class RefrigeratorProgram(ColdBoxProgram):
         self._gauges = GaugeNoise(station.noise_bar, seed)
         x, v = np.array(file.x0, dtype=np.float64), np.array(file.v0, dtype=np.float64)
         d = self._disturbances(0, load.value(0))
-        y, signals = read(x, np.array(u0, dtype=np.float64), v, d, plant, load_helium())
-        self._memory = RefrigeratorMemory(
-            x, y, signals, v, np.zeros(MEMORY_SIZE), resting_equipment(np.array(u0)), np.zeros(2, np.int64)
-        )
+        equipment = standing_equipment(np.array(u0)) if warm else resting_equipment(np.array(u0))
+        if warm:
+            x = warm_state(file.x0, plant, load_helium(), ambient=d[AMBIENT], low_pressure=1e5 * station.lp_bar)
+        y, signals = read(x, equipment[ACTING:DEVIATING], v, d, plant, load_helium())
+        self._memory = RefrigeratorMemory(x, y, signals, v, np.zeros(MEMORY_SIZE), equipment, np.zeros(2, np.int64))
         control_tick(self._memory, d, self.law)
-        super().__init__(box=plant.box, x0=file.x0[:BOX_STATES], u0=u0, load=load, noise=noise)
+        super().__init__(box=plant.box, x0=x[:BOX_STATES].tolist(), u0=u0, load=load, noise=noise)
 
     def _read(self, w: float) -> RealArray:  # noqa: ARG002 what was read with the memory
         return self._memory.y

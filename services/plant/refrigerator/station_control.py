@@ -80,7 +80,7 @@ def station_law(settings: StationSettings, reference: StationReference, station:
             limits.helium_lost_kg, limits.bath_relief_bar,
         ),
         equipment=EquipmentLaw(
-            settings.start.idle, settings.start.idle_s, settings.start.load_s, limits.lp_low_bar,
+            settings.start.idle, settings.start.idle_s, settings.start.load_s, settings.start.second, limits.lp_low_bar,
             settings.turbine.run_up_s, settings.turbine.governed_hz, settings.turbine.overspeed_hz,
         ),
     )  # fmt: skip

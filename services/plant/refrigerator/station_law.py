@@ -24,11 +24,13 @@ DESIGN_TEMPERATURE: Final = 300.0
 ROUNDING: Final = 1e-9
 """kg/s, by which flows that are the same may differ."""
 STOPPED_RISE: Final = 0.25
-"""bar above its set point, at which the low pressure shuts the bypass when no compressor runs."""
+"""bar above its set point, at which the low pressure shuts the bypass when no compressor is loaded."""
 STOPPED_HIGHEST: Final = 1.3
 """bar, to which that is limited: the relief valve of the low-pressure line opens at 1.5 bar."""
 STOPPED_SPAN: Final = 0.25
 """bar below that, at which the bypass is fully open."""
+STARTING_SPAN: Final = 0.1
+"""bar below its set point, at which the low pressure has the charge valve open while the first compressor starts."""
 DECISION_S: Final = 5.0
 """s, over which the inventory flow is smoothed that decides which of the buffer's valves may open."""
 SHUT: Final = 0.5
@@ -159,15 +161,23 @@ def control_station(c: StationLaw, integrals: RealArray, m: StationMeasurement) 
     feed = nitrogen_feed(c, integrals, m.nitrogen)
     if not (m.nc1 or m.nc2):
         integrals[HP_INTEGRAL] = integrals[LP_INTEGRAL] = integrals[SMOOTHED] = integrals[DIRECTION] = 0.0
-        bypass = 100.0 * min(max((min(c.lp + STOPPED_RISE, STOPPED_HIGHEST) - m.lp) / STOPPED_SPAN, 0.0), 1.0)
-        return Commands(bypass, 100.0 if m.hp > m.buffer else 0.0, 0.0, feed), STOPPED
+        return Commands(bypass_at_rest(c, m.lp), 100.0 if m.hp > m.buffer else 0.0, 0.0, feed), STOPPED
     if m.loaded == 0:
-        return Commands(100.0, 100.0 if m.hp > m.buffer and m.lp > c.lp else 0.0, 0.0, feed), STARTING
+        discharge = 100.0 if m.hp > m.buffer and m.lp > c.lp else 0.0
+        charge = 100.0 * min(max((c.lp - m.lp) / STARTING_SPAN, 0.0), 1.0)
+        return Commands(bypass_at_rest(c, m.lp), discharge, charge, feed), STARTING
     wanted = flows_of_lq(c, integrals, m) if c.is_lq else flows_of_pi(c, integrals, m)
     allowed = outside_dead_band(c, integrals, wanted, m) if c.dead_band > 0.0 else wanted
     given, openings = split(c, allowed, m)
     follow(c, integrals, wanted, given, m)
     return Commands(openings[0], openings[1], openings[2], feed), mode_of(c, allowed, given, m)
+
+
+@kernel
+def bypass_at_rest(c: StationLaw, lp: float) -> float:
+    """Return the opening of the bypass (%) while no compressor is loaded: so far as the low-pressure line has room."""
+    room = (min(c.lp + STOPPED_RISE, STOPPED_HIGHEST) - lp) / STOPPED_SPAN
+    return 100.0 * min(max(room, 0.0), 1.0)
 
 
 @kernel

@@ -78,6 +78,8 @@ class CompressorStart(BaseModel):
     """Share of its flow while it idles."""
     idle_s: Annotated[float, Field(ge=0, le=600)] = 10.0
     load_s: Annotated[float, Field(gt=0, le=3600)] = 50.0
+    second: Annotated[float, Field(ge=0, le=1)] = 0.7
+    """Share of what the first one gives that the cold box takes when the second one is started."""
 
 
 class TurbineProtection(BaseModel):

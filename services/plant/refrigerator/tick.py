@@ -32,10 +32,13 @@ from plant.refrigerator.physics import (
 from plant.refrigerator.station_law import StationLaw, StationMeasurement, control_station, raised_alarms
 
 HP, LP, BUFFER, NITROGEN, LOST = (SIGNAL_NAMES.index(name) for name in ("P12", "P11", "P13", "L_N2", "lost"))
+TO_BOX, COMPRESSED = SIGNAL_NAMES.index("M12"), SIGNAL_NAMES.index("M_NC")
 CV956, CV952, CV953 = (STATE_NAMES.index(name) for name in ("CV956", "CV952", "CV953"))
 P1, V1 = OUTPUT_NAMES.index("P1"), OUTPUT_NAMES.index("V1")
 MODE: Final = 0
 ALARMS: Final = 1
+LEAST_FLOW: Final = 0.1
+"""g/s through the compressors, below which none of it counts as taken by the cold box."""
 
 
 class RefrigeratorMemory(NamedTuple):
@@ -96,7 +99,8 @@ def advance_tick(
         helium: Tables.
         law: Of the station's controller.
     """
-    acting = act(law.equipment, m.equipment, u, d, m.signals[LP], m.y[V1], plant)
+    taken = m.signals[TO_BOX] / max(m.signals[COMPRESSED], LEAST_FLOW)
+    acting = act(law.equipment, m.equipment, u, d, m.signals[LP], taken, m.y[V1], plant)
     m.x[:] = advance_refrigerator(m.x, acting.u, m.commands, acting.d, TICK_S, acting.plant, helium)
     read_tick(m, acting, helium)
     control_tick(m, ahead, law)

@@ -66,6 +66,8 @@ class EventKind(IntEnum):
     """Something was changed that a refrigerator is given: subject what, value its new value."""
     MODEL_RANGE = 28
     """The simulation left its property tables: subject what, its number from 0, cause 1 left, 0 returned."""
+    COOL_DOWN = 29
+    """The cool-down has come further: subject its step."""
 
 
 class Event(NamedTuple):

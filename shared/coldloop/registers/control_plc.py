@@ -52,6 +52,23 @@ class Cause(IntEnum):
     OPERATOR = 6
     SENSOR_BAD = 7
     RESTARTED = 8
+    COOL_DOWN = 9
+    """The plant began warm, and the optimiser's model does not hold."""
+
+
+class CoolDownStep(IntEnum):
+    """How far the cool-down of a cold box has come."""
+
+    FINISHED = 0
+    """Or it has not begun warm: the optimiser is invited."""
+    TURBINE = 1
+    """The turbine cools, as far as its governor allows; CV155 is open as far as it may be."""
+    BATH = 2
+    """CV156 holds T5; the flow through CV155 cools the bath."""
+    FILLING = 3
+    """There is liquid; CV155 is as at the operating point."""
+    SETTLING = 4
+    """The bath is filled; both loops are closed until L1 and T5 have stayed in their bands."""
 
 
 class OperatorMode(IntEnum):

@@ -15,7 +15,15 @@ from coldloop.process.loaded import IS_COLD_BOX, PROCESS
 from coldloop.process.range_bits import ModelRange
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import Event, EventKind
-from coldloop.registers.control_plc import Cause, LinkCause, Mode, OperatorMode, PlantLinkState, Verdict
+from coldloop.registers.control_plc import (
+    Cause,
+    CoolDownStep,
+    LinkCause,
+    Mode,
+    OperatorMode,
+    PlantLinkState,
+    Verdict,
+)
 from coldloop.registers.plant import SensorFaultKind, StationAlarm, StationMode, Surroundings
 from coldloop.registers.safety import AlarmKind
 from coldloop.registers.text import from_words
@@ -129,6 +137,7 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
     EventKind.MODEL_RANGE: _Wording(
         _listed([str(part.name).lower().replace("_", " ") for part in ModelRange]), _listed(("returned", "left"))
     ),
+    EventKind.COOL_DOWN: _Wording(_members(CoolDownStep)),
     EventKind.PACE: _Wording(_listed(("lock-step", "real time", "paused")), unit="x real time"),
 }
 _FURTHER_BANDS: Final = [output.name for output in PROCESS.banded[1:]]

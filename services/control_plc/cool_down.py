@@ -1,0 +1,125 @@
+"""The cool-down of a cold box: a sequence of steps from a warm plant to a filled bath.
+
+    TURBINE   until T5 is at its set point
+    BATH      until there is liquid
+    FILLING   until L1 is in its band
+    SETTLING  until L1 and T5 have stayed in their bands for a while
+
+Pure: measured outputs in, wanted inputs out. How far the turbine may open is its governor's decision.
+"""
+
+from collections.abc import Collection, Sequence
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from coldloop.process.limits import InputLimits
+from coldloop.process.loaded import IS_COLD_BOX
+from coldloop.process.signals import CONTROLLED, L1, OUTPUT_NAMES, T1, T5, TICK_S
+from coldloop.registers.control_plc import CoolDownStep, SequenceRow
+
+CV155, HEATER, CV156 = range(3)
+"""Inputs of the cold box."""
+
+
+class CoolDownSettings(BaseModel):
+    """When the cool-down begins, and when its steps end."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    warm_k: Annotated[float, Field(ge=5, le=300)] = 20.0
+    """T1 at the beginning of a session, or after a restart, above which the plant is cooled down."""
+    liquid_pct: Annotated[float, Field(gt=0, lt=50)] = 1.0
+    """L1 at which the bath begins to be filled."""
+    settled_s: Annotated[float, Field(ge=0, le=36_000)] = 600.0
+    """How long L1 and T5 have to stay in their bands until the optimiser is invited, plant time."""
+
+
+class CoolDown:
+    """The sequence of a session; it begins with the first measurement of a warm cold box, or never.
+
+    Args:
+        settings: Its limits.
+        limits: Bounds of the inputs.
+        inputs: At the operating point.
+        outputs: At the operating point.
+        bands: Of L1 and T5.
+    """
+
+    def __init__(
+        self,
+        settings: CoolDownSettings,
+        limits: InputLimits,
+        inputs: Sequence[float],
+        outputs: Sequence[float],
+        bands: Sequence[tuple[float, float]],
+    ) -> None:
+        self._settings, self._limits = settings, limits
+        self._inputs, self._outputs, self._bands = inputs, outputs, bands
+        self._has_begun = False
+        self._settled_since: int | None = None
+        self.step = CoolDownStep.FINISHED
+
+    @property
+    def is_active(self) -> bool:
+        """Whether the plant is being cooled down."""
+        return self.step is not CoolDownStep.FINISHED
+
+    @property
+    def open_loops(self) -> Collection[int]:
+        """Outputs whose loops are open."""
+        match self.step:
+            case CoolDownStep.TURBINE:
+                return L1, T5
+            case CoolDownStep.BATH | CoolDownStep.FILLING:
+                return (L1,)
+            case _:
+                return ()
+
+    @property
+    def standing(self) -> Collection[int]:
+        """Outputs that may be constant for long without being frozen: all but L1 and T5 once the bath is being filled."""
+        if not self.is_active:
+            return ()
+        filling = self.step in (CoolDownStep.FILLING, CoolDownStep.SETTLING)
+        return [output for output in range(len(OUTPUT_NAMES)) if not (filling and output in CONTROLLED)]
+
+    def observe(self, tick: int, y: Sequence[float]) -> bool:
+        """Take the outputs measured at `tick`; return whether the step has changed."""
+        before, self.step = self.step, self._next(tick, y)
+        self._has_begun = True
+        return self.step is not before
+
+    def _next(self, tick: int, y: Sequence[float]) -> CoolDownStep:
+        if not self._has_begun:
+            warm = IS_COLD_BOX and y[T1] > self._settings.warm_k
+            return CoolDownStep.TURBINE if warm else CoolDownStep.FINISHED
+        match self.step:
+            case CoolDownStep.TURBINE if y[T5] <= self._outputs[T5]:
+                return CoolDownStep.BATH
+            case CoolDownStep.BATH if y[L1] >= self._settings.liquid_pct:
+                return CoolDownStep.FILLING
+            case CoolDownStep.FILLING if y[L1] >= self._bands[0][0]:
+                return CoolDownStep.SETTLING
+            case CoolDownStep.SETTLING if self._has_settled(tick, y):
+                return CoolDownStep.FINISHED
+        return self.step
+
+    def _has_settled(self, tick: int, y: Sequence[float]) -> bool:
+        inside = all(low <= y[output] <= high for output, (low, high) in zip(CONTROLLED, self._bands, strict=True))
+        if not inside or self._settled_since is None or tick < self._settled_since:
+            self._settled_since = tick if inside else None
+        return inside and (tick - (self._settled_since or 0)) * TICK_S >= self._settings.settled_s
+
+    def wanted(self, by_loops: SequenceRow) -> SequenceRow:
+        """Return the wanted inputs, where the closed loops want `by_loops`; the output guard moves towards them."""
+        row = list(by_loops)
+        if self.step in (CoolDownStep.TURBINE, CoolDownStep.BATH):
+            row[CV155] = self._limits.high[CV155]
+        else:
+            row[CV155] = self._inputs[CV155]
+        if L1 in self.open_loops:
+            row[HEATER] = self._limits.low[HEATER]
+        if T5 in self.open_loops:
+            row[CV156] = self._inputs[CV156]
+        return SequenceRow(*row)
