@@ -28,9 +28,9 @@ class CoolDownSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     warm_k: Annotated[float, Field(ge=5, le=300)] = 20.0
-    """T1 at the beginning of a session, or after a restart, above which the plant is cooled down."""
+    """T1 at the beginning of a session, or after a restart, above which a bath without liquid is cooled down."""
     liquid_pct: Annotated[float, Field(gt=0, lt=50)] = 1.0
-    """L1 at which the bath begins to be filled."""
+    """L1 from which on there is liquid, and the bath is filled."""
     settled_s: Annotated[float, Field(ge=0, le=36_000)] = 600.0
     """How long L1 and T5 have to stay in their bands until the optimiser is invited, plant time."""
 
@@ -92,7 +92,7 @@ class CoolDown:
 
     def _next(self, tick: int, y: Sequence[float]) -> CoolDownStep:
         if not self._has_begun:
-            warm = IS_COLD_BOX and y[T1] > self._settings.warm_k
+            warm = IS_COLD_BOX and y[T1] > self._settings.warm_k and y[L1] < self._settings.liquid_pct
             return CoolDownStep.TURBINE if warm else CoolDownStep.FINISHED
         match self.step:
             case CoolDownStep.TURBINE if y[T5] <= self._outputs[T5]:

@@ -31,6 +31,13 @@ def test_a_cold_plant_is_not_cooled_down_even_if_its_bath_runs_dry_later() -> No
     assert not sequence.standing
 
 
+@pytest.mark.parametrize("lying", [outputs(60.0, 290.0, 10.4), outputs(0.0, 4.44, 10.4)], ids=["T1", "L1"])
+def test_one_sensor_that_lies_does_not_have_a_cold_plant_cooled_down(lying: list[float]) -> None:
+    sequence = make()
+    assert not sequence.observe(0, lying)
+    assert not sequence.is_active
+
+
 def test_a_warm_plant_goes_through_the_steps_in_their_order_and_each_has_its_inputs() -> None:
     sequence = make()
     courses = (

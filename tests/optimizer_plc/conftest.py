@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import NamedTuple
 
-import daqp
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -30,13 +29,12 @@ from optimizer_plc.solvers import Answer, Solver, make_solver
 from plant.cold_box.physics import REFERENCE
 from plant.cold_box.program import ColdBoxProgram
 from plant.load import find_load
+from tests.harness.reference_qp import solved_by_daqp
 
 Array = NDArray[np.float64]
 Situations = Callable[[np.random.Generator], QpParameters]
 Optimum = Callable[[QuadraticProblem], Array]
 PenalisedOptimum = Callable[[QuadraticProblem, float], Array]
-
-UNBOUNDED = 1e30
 
 
 class Jump(NamedTuple):
@@ -72,16 +70,6 @@ def situations(model: LtiModel) -> Situations:
         return QpParameters(x, float(rng.uniform(-150, 200)), rng.uniform([-8, -60, -8], [8, 60, 8]))
 
     return draw
-
-
-def solved_by_daqp(H: Array, f: Array, A: Array, low: Array, high: Array) -> Array:
-    """Minimise z' H z / 2 + f' z; the bounds of the first variables, then of the rows of A."""
-    low, high = np.maximum(low, -UNBOUNDED), np.minimum(high, UNBOUNDED)
-    sense = np.zeros(len(high), dtype=np.int32)
-    H, A = np.ascontiguousarray(H), np.ascontiguousarray(A)
-    z, _, flag, _ = daqp.solve(H, f.copy(), A, high, low, sense, primal_tol=1e-9)
-    assert flag == 1
-    return np.array(z)
 
 
 @pytest.fixture(scope="session")

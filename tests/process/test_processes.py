@@ -4,7 +4,9 @@ An interpreter is loaded with one process, so each of these runs is a process of
 """
 
 import json
+import os
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,7 +15,8 @@ import pytest
 
 from tests.harness.processes import PROGRAM_S, Ended, Processes
 
-EXAMPLES: Final = Path(__file__).parents[2] / "examples" / "processes"
+ROOT: Final = Path(__file__).parents[2]
+EXAMPLES: Final = ROOT / "examples" / "processes"
 TANK, COLUMN = EXAMPLES / "quadruple_tank.toml", EXAMPLES / "wood_berry.toml"
 
 
@@ -87,6 +90,22 @@ def test_any_number_of_signals_and_any_tick(
     assert here["trace_sha256"] == there["trace_sha256"]
     assert here["ticks"] == 1000
     assert all(here[f"y{i}_outside_band_pct"] <= 5.0 for i in range(0, outputs, 2))
+
+
+@pytest.mark.parametrize("file", [TANK, COLUMN], ids=["tank", "column"])
+def test_the_condensed_problem_is_the_one_that_is_written_down(
+    file: Path, processes: Processes, tmp_path: Path
+) -> None:
+    """That of the cold box, whose states weigh, too: tests/optimizer_plc/test_problem.py."""
+    model = tmp_path / "model.json"
+    assert started(processes, "process", file, "--out", model).code == 0
+    environment = {**os.environ, "COLDLOOP_PROCESS": str(model)}
+    command = [sys.executable, "-m", "tests.process.direct_problem"]
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    cost_error, violation = map(float, done.stdout.split())
+    assert cost_error <= 1e-9
+    assert violation <= 1e-6
 
 
 def test_a_model_of_another_process_is_refused_in_one_line(processes: Processes, tmp_path: Path) -> None:
