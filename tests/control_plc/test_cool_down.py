@@ -1,0 +1,72 @@
+"""The cool-down of a cold box: which step follows which, what each asks for, and that the optimiser stays out."""
+
+import pytest
+
+from coldloop.process.limits import InputLimits
+from coldloop.process.signals import L1, OUTPUT_NAMES, T1, T5
+from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, OperatorMode, SequenceRow
+from control_plc.cool_down import CoolDown, CoolDownSettings
+from control_plc.ladder import Ladder, LadderInputs
+
+INPUTS = (43.0, 75.0, 36.0)
+BY_LOOPS = SequenceRow(50.0, 20.0, 30.0)
+
+
+def outputs(level: float, bath: float, exhaust: float) -> list[float]:
+    y = [0.0] * len(OUTPUT_NAMES)
+    y[L1], y[T1], y[T5] = level, bath, exhaust
+    return y
+
+
+def make() -> CoolDown:
+    rest = outputs(60.0, 4.44, 10.4)
+    return CoolDown(CoolDownSettings(settled_s=10.0), InputLimits(), INPUTS, rest, ((59.0, 61.0), (9.0, 16.0)))
+
+
+def test_a_cold_plant_is_not_cooled_down_even_if_its_bath_runs_dry_later() -> None:
+    sequence = make()
+    assert not sequence.observe(0, outputs(60.0, 4.44, 10.4))
+    assert not sequence.observe(1, outputs(0.0, 250.0, 200.0))
+    assert not sequence.is_active
+    assert not sequence.standing
+
+
+def test_a_warm_plant_goes_through_the_steps_in_their_order_and_each_has_its_inputs() -> None:
+    sequence = make()
+    courses = (
+        (0, outputs(0.0, 300.0, 300.0), CoolDownStep.TURBINE, (60.0, 0.0, 36.0)),
+        (1, outputs(0.0, 250.0, 10.3), CoolDownStep.BATH, (60.0, 0.0, 30.0)),
+        (2, outputs(1.1, 4.4, 12.0), CoolDownStep.FILLING, (43.0, 0.0, 30.0)),
+        (3, outputs(59.1, 4.4, 12.0), CoolDownStep.SETTLING, (43.0, 20.0, 30.0)),
+    )
+    for tick, y, step, wanted in courses:
+        assert sequence.observe(tick, y)
+        assert sequence.step is step
+        assert tuple(sequence.wanted(BY_LOOPS)) == wanted
+    assert L1 not in sequence.standing
+
+
+def test_it_ends_when_both_outputs_have_stayed_in_their_bands() -> None:
+    sequence, inside = make(), outputs(60.0, 4.44, 10.4)
+    for tick, y in enumerate((outputs(0.0, 300.0, 300.0), outputs(0.0, 250.0, 10.0), outputs(2.0, 4.4, 10.0), inside)):
+        sequence.observe(tick, y)
+    for tick in range(4, 30):
+        sequence.observe(tick, inside)
+    sequence.observe(30, outputs(61.2, 4.44, 10.4))
+    for tick in range(31, 71):
+        sequence.observe(tick, inside)
+        assert sequence.is_active
+    assert sequence.observe(71, inside)
+    assert not sequence.is_active
+
+
+@pytest.mark.parametrize("operator", OperatorMode)
+def test_while_it_lasts_the_ladder_is_classical_unless_an_operator_drives(operator: OperatorMode) -> None:
+    ladder = Ladder(120, Mode.HOLD, Cause.SESSION_STARTED)
+    ladder.step(1, LadderInputs(operator, cooling=True, sensors_unusable=True, row=True, late=False))
+    chosen = {
+        OperatorMode.AUTO: (Mode.CLASSICAL, Cause.COOL_DOWN),
+        OperatorMode.CLASSICAL: (Mode.CLASSICAL, Cause.OPERATOR),
+        OperatorMode.MANUAL: (Mode.MANUAL, Cause.OPERATOR),
+    }
+    assert (ladder.mode, ladder.cause) == chosen[operator]
