@@ -78,7 +78,7 @@ class CoolDown:
 
     @property
     def standing(self) -> Collection[int]:
-        """Outputs that may stand for long without being frozen: all but L1 and T5 once the bath is being filled."""
+        """Outputs that may be constant for long without being frozen: all but L1 and T5 once the bath fills."""
         if not self.is_active:
             return ()
         filling = self.step in (CoolDownStep.FILLING, CoolDownStep.SETTLING)

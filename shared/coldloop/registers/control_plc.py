@@ -184,7 +184,7 @@ class LadderStatus(NamedTuple):
         int,
         u16(
             "0 none, 1 session started, 2 sequence began, 3 sequence late, 4 sequence exhausted, 5 hold expired, "
-            "6 operator, 7 sensor bad, 8 restarted, 9 cool-down",
+            "6 operator, 7 sensor bad, 8 restarted, 9 cool down",
             values=Cause,
         ),
     ]
