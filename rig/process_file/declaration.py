@@ -136,48 +136,43 @@ class OutputSection(_Section):
         return self.setpoint - tolerance, self.setpoint + tolerance
 
 
-class LoadSection(_Section):
+class _OutsideSection(_Section):
+    """What acts on the plant and is no input."""
+
+    name: Name
+    variable: str | None = None
+    """Its name in an FMU, if it is not `name`."""
+    unit: str = ""
+    at: FiniteFloat
+    span: Span
+    walk: PositiveFloat | None = None
+    """Random walk that the estimator expects, of the load of what is not measured of it, per square root of a sampling
+    period; 1 % of the span if not given."""
+
+    @model_validator(mode="after")
+    def _inside(self) -> Self:
+        _rising(self.span, f"{self.name}: span")
+        if not self.span[0] <= self.at <= self.span[1]:
+            raise ValueError(f"{self.name}: at = {self.at:g} is outside its span")
+        return self
+
+    @property
+    def usual_walk(self) -> float:
+        """The walk, given or not."""
+        return self.walk or 0.01 * (self.span[1] - self.span[0])
+
+
+class LoadSection(_OutsideSection):
     """The load: a disturbance that is measured, and that operators and `--load` set; leave it out if there is none."""
 
-    name: Name
-    variable: str | None = None
-    """Its name in an FMU, if it is not `name`."""
-    unit: str = ""
-    at: FiniteFloat
-    span: Span
-    walk: PositiveFloat | None = None
-    """Random walk of what of it is not measured, per square root of a sampling period; 1 % of its span if not given."""
 
-    @model_validator(mode="after")
-    def _inside(self) -> Self:
-        _rising(self.span, f"{self.name}: span")
-        if not self.span[0] <= self.at <= self.span[1]:
-            raise ValueError(f"{self.name}: at = {self.at:g} is outside its span")
-        return self
-
-
-class DisturbanceSection(_Section):
+class DisturbanceSection(_OutsideSection):
     """A disturbance beside the load: a state of the model that wanders, and an output where it is measured."""
 
-    name: Name
-    variable: str | None = None
-    """Its name in an FMU, if it is not `name`."""
-    unit: str = ""
-    at: FiniteFloat
-    span: Span
     noise: PositiveFloat | None = None
     """Standard deviation of its sensor; not measured but estimated if not given."""
-    walk: PositiveFloat | None = None
-    """Random walk that the estimator expects, per square root of a sampling period; 1 % of its span if not given."""
     course: str | None = None
     """CSV file with the columns time_s and `name`, steps held: what the simulated plant meets; nothing if not given."""
-
-    @model_validator(mode="after")
-    def _inside(self) -> Self:
-        _rising(self.span, f"{self.name}: span")
-        if not self.span[0] <= self.at <= self.span[1]:
-            raise ValueError(f"{self.name}: at = {self.at:g} is outside its span")
-        return self
 
 
 class LagSection(_Section):

@@ -90,7 +90,7 @@ def _process(file: ProcessFile, linear: Linearised) -> Process:
         outputs=tuple(map(_output, file.outputs, linear.y0.tolist())),
         states=_states(file, linear),
         load=NO_LOAD if load is None else Load(
-            name=load.name, unit=load.unit, span=load.span, walk=load.walk or 0.01 * (load.span[1] - load.span[0])
+            name=load.name, unit=load.unit, span=load.span, walk=load.usual_walk
         ),
         decision_instants=file.prediction.decision_instants,
         constraint_instants=file.prediction.constraint_instants,
@@ -126,7 +126,7 @@ def _output(one: OutputSection, at_rest: float) -> Output:
 
 
 def _states(file: ProcessFile, linear: Linearised) -> tuple[State, ...]:
-    given = {one.name: one.walk or 0.01 * (one.span[1] - one.span[0]) for one in file.disturbances}
+    given = {one.name: one.usual_walk for one in file.disturbances}
     given |= {state.name: state.walk for state in file.states}
     unknown = set(given) - set(linear.states)
     if unknown:

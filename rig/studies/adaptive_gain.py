@@ -5,6 +5,7 @@ from itertools import product
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coldloop.process.signals import TICK_S, TICKS_PER_SAMPLE
 from coldloop.process.updating_periods import SHORTEST_TICKS
@@ -45,12 +46,20 @@ def adaptive_gain(
     for number, (period, name) in enumerate(runs):
         done(number, len(runs))
         costs.append(loop_cost(settings, name, period, rig.run))
-    by_period = np.array(costs).reshape(-1, len(names))
-    best = min(range(1, len(by_period)), key=lambda which: geometric_mean(by_period[which]))
-    ratio = mean_ratio(by_period[0], by_period[best])
+    best, ratio = over_best_fixed(np.array(costs).reshape(-1, len(names)))
     which = f"a fixed {fixed[best - 1]:g} s" + (", the best fixed one" if len(fixed) > 1 else "")
     loads = f"load{'s' if len(names) > 1 else ''} {', '.join(names)}"
     return f"With {loads} an adaptive period costs {ratio.text()} of {which}: {pays(ratio)}."
+
+
+def over_best_fixed(costs: NDArray[np.float64]) -> tuple[int, Interval]:
+    """Return which row is the best fixed period, and the cost of the first row, the adaptive one, over its.
+
+    Args:
+        costs: A row for each period, a column for each load.
+    """
+    best = min(range(1, len(costs)), key=lambda which: geometric_mean(costs[which]))
+    return best, mean_ratio(costs[0], costs[best])
 
 
 def pays(ratio: Interval) -> str:

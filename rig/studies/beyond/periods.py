@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 
 from coldloop.process.loaded import PROCESS
 from rig.figures.plot import COLOURS
-from rig.studies.adaptive_gain import FIXED_S, pays
+from rig.studies.adaptive_gain import FIXED_S, over_best_fixed, pays
 from rig.studies.drawing import legend_outside, panels
-from rig.studies.intervals import geometric_mean, mean_ratio
 from rig.studies.loop_cost import ADAPTIVE
 from rig.studies.request import Outcome, RunRequest
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
@@ -42,8 +41,7 @@ class PeriodsStudy:
             result.rows += [_row(load.name, *one) for one in zip(PERIODS_S, found, strict=True)]
             costs.append([one.indicators.J_BF for one in found])
         by_period = np.array(costs).T
-        best = min(range(1, len(PERIODS_S)), key=lambda which: geometric_mean(by_period[which]))
-        ratio = mean_ratio(by_period[0], by_period[best])
+        best, ratio = over_best_fixed(by_period)
         result.note(f"J_BF of the adaptive period over fixed {PERIODS_S[best]:g} s", ratio.value)
         title = (
             f"J_BF of the adaptive period over that of {PERIODS_S[best]:g} s, the best fixed one: {ratio.text()}, "
