@@ -23,10 +23,10 @@ from rig.studies.study import StudyResult
 def panels(
     rows: int, columns: int, size: tuple[float, float], *, sharex: bool = False
 ) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Give a figure with its panels, row by row."""
+    """Give a figure with its panels, row by row; those of a column share their x where asked to."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(rows, columns, squeeze=False, sharex=sharex)
+        axes = figure.subplots(rows, columns, squeeze=False, sharex="col" if sharex else False)
         yield figure, list(np.ravel(axes))
 
 

@@ -98,3 +98,13 @@ def test_the_problem_for_peers_costs_less_where_every_sample_is_free(printed_by:
     assert 0 < free < seven < 2 * free
     assert is_time(fast)
     assert is_time(slow)
+
+
+def test_a_refrigerator_far_from_rest_is_written_and_drawn(printed_by: Benchmark, tmp_path: Path) -> None:
+    case = "5,385 W for 30 s"
+    text = printed_by("far_from_rest.py", "write", str(tmp_path / "now"), "--cases", case)
+    (made, lost) = numbers(r"(-?[0-9.e+-]+) kg of helium made", text) + numbers(r"([0-9.]+) kg lost", text)
+    assert abs(made) < 1e-9, text
+    assert 3.0 < lost < 6.0, text
+    printed_by("far_from_rest.py", "draw", str(tmp_path / "figure.png"), str(tmp_path / "now"))
+    assert (tmp_path / "figure.png").stat().st_size > 1000

@@ -16,13 +16,16 @@ from rig.studies.drawing import over_time
 from rig.studies.request import Happening, Outcome, RunRequest
 from rig.studies.study import Load, Outcomes, StudyOptions, StudyResult, loads
 
-EVENTS: Final = "plant.refrigerator.events="
+
+def _events(*events: tuple[int, str, float]) -> tuple[str, ...]:
+    """Return the setting of a refrigerator's events, each with its second, target and value."""
+    listed = ",".join(f"{{at_s={at},target='{target}',value={value}}}" for at, target, value in events)
+    return (f"plant.refrigerator.events=[{listed}]",)
 
 
-def _both_off_until(s: int) -> str:
+def _both_off_until(s: int) -> tuple[str, ...]:
     """Return the events of a total trip at ten minutes, after which the compressors start one after the other."""
-    off = "{at_s=600,target='nc1',value=0},{at_s=600,target='nc2',value=0}"
-    return f"{EVENTS}[{off},{{at_s={s},target='nc1',value=1}},{{at_s={s + 30},target='nc2',value=1}}]"
+    return _events((600, "nc1", 0), (600, "nc2", 0), (s, "nc1", 1), (s + 30, "nc2", 1))
 
 
 class DisturbanceCase(NamedTuple):
@@ -34,20 +37,19 @@ class DisturbanceCase(NamedTuple):
 
 CASES: Final = {
     "nothing": DisturbanceCase("a", ()),
-    "a compressor trips for 2 min": DisturbanceCase(
-        "a", (f"{EVENTS}[{{at_s=600,target='nc1',value=0}},{{at_s=720,target='nc1',value=1}}]",)
-    ),
-    "no nitrogen for 45 min": DisturbanceCase(
-        "a", (f"{EVENTS}[{{at_s=300,target='nitrogen',value=0}},{{at_s=3000,target='nitrogen',value=1}}]",)
-    ),
-    "a leak for 20 min": DisturbanceCase(
-        "a", (f"{EVENTS}[{{at_s=600,target='leak',value=1}},{{at_s=1800,target='leak',value=0}}]",)
-    ),
-    "10 K warmer outside": DisturbanceCase("a", (f"{EVENTS}[{{at_s=600,target='ambient',value=310}}]",)),
+    "a compressor trips for 2 min": DisturbanceCase("a", _events((600, "nc1", 0), (720, "nc1", 1))),
+    "no nitrogen for 45 min": DisturbanceCase("a", _events((300, "nitrogen", 0), (3000, "nitrogen", 1))),
+    "a leak for 20 min": DisturbanceCase("a", _events((600, "leak", 1), (1800, "leak", 0))),
+    "10 K warmer outside": DisturbanceCase("a", _events((600, "ambient", 310))),
     "a train of pulses": DisturbanceCase("pulses", ()),
     "magnets quench, 5 kW for 30 s": DisturbanceCase("quench", ()),
-    "both compressors trip for 2 min": DisturbanceCase("a", (_both_off_until(720),)),
-    "both compressors trip for 10 min": DisturbanceCase("a", (_both_off_until(1200),)),
+    "both compressors trip for 2 min": DisturbanceCase("a", _both_off_until(720)),
+    "both compressors trip for 10 min": DisturbanceCase("a", _both_off_until(1200)),
+    "the turbine trips for 2 min": DisturbanceCase("a", _events((600, "turbine", 0), (720, "turbine", 1))),
+    "CV155 stuck for 20 min": DisturbanceCase("c", _events((600, "cv155", 0), (1800, "cv155", 1))),
+    "CV156 stuck for 20 min": DisturbanceCase("c", _events((600, "cv156", 0), (1800, "cv156", 1))),
+    "the heater fully on for 10 min": DisturbanceCase("a", _events((600, "heater", 2), (1200, "heater", 1))),
+    "NEF34 blocks up, 20 % in an hour": DisturbanceCase("a", _events((600, "blocked_nef34", 0.2))),
 }
 DRIVERS: Final = {"MPC": (TUNED,), "classical loops": ("control_plc.driver=classical",)}
 STATION: Final = {"LQ": (), "PI": ("plant.station.control=pi",)}
