@@ -14,7 +14,7 @@ from rig.cosim.one_process import OneProcessRig
 from rig.plc_sizing.solver_counts import iteration_s
 from rig.settings import Settings
 from rig.studies.intervals import Interval, geometric_mean, mean_ratio
-from rig.studies.loop_cost import ADAPTIVE, loop_cost
+from rig.studies.loop_cost import ADAPTIVE, loop_cost, require_costs
 
 FIXED_S: Final = tuple(
     ticks * TICK_S
@@ -57,7 +57,11 @@ def over_best_fixed(costs: NDArray[np.float64]) -> tuple[int, Interval]:
 
     Args:
         costs: A row for each period, a column for each load.
+
+    Raises:
+        StudyError: A loop costs nothing.
     """
+    require_costs(costs)
     best = min(range(1, len(costs)), key=lambda which: geometric_mean(costs[which]))
     return best, mean_ratio(costs[0], costs[best])
 

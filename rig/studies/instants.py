@@ -18,7 +18,7 @@ from rig.plc_sizing.memory import estimator_memory, footprint
 from rig.plc_sizing.solver_counts import SOLVERS
 from rig.settings import Settings
 from rig.studies.intervals import geometric_mean
-from rig.studies.loop_cost import ADAPTIVE, loop_cost
+from rig.studies.loop_cost import ADAPTIVE, loop_cost, require_costs
 from rig.text_tables import aligned
 
 KNOTS: Final = (2, 3, 4, 5, 6, 7, 8, 10, 12)
@@ -75,6 +75,9 @@ def judged(settings: Settings, names: Sequence[str], done: Callable[[int, int], 
         settings: With the design whose horizon and instants others are compared with.
         names: Loads, named ones or files.
         done: Is called with the number of sets done and that of all.
+
+    Raises:
+        StudyError: The loop costs nothing.
     """
     sets = candidates(settings.optimizer_plc.program.design)
     found = []
@@ -89,11 +92,12 @@ def _judged(settings: Settings, label: str, names: Sequence[str]) -> Judged:
     problem, prediction = problem_of(settings)
     run = partial(run_ideal_loop, settings, ticks=TICKS_PER_SAMPLE)
     sizes = counted_sizes(problem).without_zeros
+    costs = tuple(loop_cost(settings, name, ADAPTIVE, run) for name in names)
+    require_costs(costs)
     return Judged(
         label, program.design, problem.size, len(problem.Gamma), float(np.linalg.cond(problem.Phi.astype(float))),
         SOLVERS[program.solver].operations(sizes).flops,
-        footprint(problem, estimator_memory(prediction, program.estimator), program.solver).total,
-        tuple(loop_cost(settings, name, ADAPTIVE, run) for name in names),
+        footprint(problem, estimator_memory(prediction, program.estimator), program.solver).total, costs,
     )  # fmt: skip
 
 

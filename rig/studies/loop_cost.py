@@ -3,6 +3,10 @@
 from collections.abc import Callable
 from typing import Final
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coldloop.errors import StudyError
 from coldloop.process.lti_model import load
 from plant.load import find_load
 from rig.cosim.scenario import Scenario, natural_ticks
@@ -22,3 +26,12 @@ def loop_cost(settings: Settings, name: str, period_s: float, run: Callable[[Sce
     recorder = Recorder(scenario.ticks)
     run(scenario, recorder)
     return evaluate(recorder.recording(), model, settings.optimizer_plc.program.design).J_BF
+
+
+def require_costs(costs: ArrayLike) -> None:
+    """Refuse costs of which a ratio would say nothing, those of loops in which nothing happens (`StudyError`)."""
+    if not np.all(np.asarray(costs) > 0.0):
+        raise StudyError(
+            "under some load the loop costs nothing (J_BF is 0): with the inputs at rest all outputs stay in their "
+            "bands. Give the process a load or disturbances that drive them out, or a setpoint where it does not rest"
+        )

@@ -1,10 +1,13 @@
 """Sets of decision and constraint instants: how they are spread, and which is proposed, by hand."""
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coldloop.errors import StudyError
 from optimizer_plc.qp.design import ControlDesign
+from rig.studies.adaptive_gain import over_best_fixed
 from rig.studies.instants import Judged, candidates, losses, proposed, spread
 
 
@@ -38,3 +41,8 @@ def test_the_smallest_set_that_loses_little_is_proposed() -> None:
     assert losses(sets) == pytest.approx([1.0, 1.02, 1.005, 1.0])
     assert proposed(sets).label == "middle"
     assert proposed([sets[1], sets[3]]).label == "fullest"
+
+
+def test_loops_that_cost_nothing_are_not_compared() -> None:
+    with pytest.raises(StudyError, match="costs nothing"):
+        over_best_fixed(np.array([[0.0, 3.0], [0.0, 2.0]]))
