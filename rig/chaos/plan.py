@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from coldloop.config import Configuration, parsed_toml
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.process.load_profile import LoadProfile
+from coldloop.process.loaded import IS_COLD_BOX
 from coldloop.process.signals import TICK_S
 from coldloop.session.settings import TimeMode
 from plant.load import concatenated, find_load, named_families, telegraph
@@ -152,9 +153,18 @@ def _load(load: str | tuple[str, ...], mean_w: float) -> LoadProfile:
 
 
 def shipped_plans() -> list[ChaosPlan]:
-    """Return the plans that come with Coldloop, by name."""
-    entries = [entry for entry in SHIPPED.iterdir() if entry.name.endswith(".toml")]
-    plans = [parse_plan(entry.read_text(encoding="utf-8"), entry.name, {}) for entry in entries]
+    """Return the plans that come with Coldloop, by name: for another process those that suit it."""
+    plans = []
+    for entry in SHIPPED.iterdir():
+        if entry.name.endswith(".toml"):
+            try:
+                plan = parse_plan(entry.read_text(encoding="utf-8"), entry.name, {})
+            except UsageError:
+                if IS_COLD_BOX:
+                    raise
+                continue
+            if IS_COLD_BOX or plan.plant is None:
+                plans.append(plan)
     return sorted(plans, key=lambda plan: plan.name)
 
 

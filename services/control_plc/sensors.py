@@ -231,7 +231,7 @@ class SensorMonitor:
     def _not_at_rest(self, unchanged: Collection[int], inputs: Sequence[float]) -> Collection[int]:
         """Return those of the outputs that should have moved with the inputs: the load alone may not reach each."""
         for output, count in enumerate(self.unchanged):
-            if not count:
+            if not count or not self._inputs[output]:  # of one that has not moved yet, those at first
                 self._inputs[output] = inputs
         return [output for output in unchanged if have_moved(inputs, self._inputs[output], self._moves)]
 

@@ -1,0 +1,35 @@
+"""What the sensors' checks make of a plant that stands still, as a simulated one with exact sensors does."""
+
+import pytest
+
+from control_plc import sensors
+from control_plc.sensors import SensorCheckSettings, SensorMonitor
+
+REST = tuple(10.0 + place for place in range(22))
+INPUTS = (43.0, 75.0, 36.0)
+
+
+def others_moved(tick: int) -> tuple[float, ...]:
+    """Return measurements of which only the first is as it was at the beginning."""
+    return (REST[0], *(value + 1e-3 * tick for value in REST[1:]))
+
+
+@pytest.fixture
+def monitor(monkeypatch: pytest.MonkeyPatch) -> SensorMonitor:
+    """The checks of another process than the cold box."""
+    monkeypatch.setattr(sensors, "IS_COLD_BOX", False)
+    return SensorMonitor(SensorCheckSettings(), REST, moves=(0.1, 0.1, 0.1))
+
+
+def test_an_output_that_never_moved_is_not_frozen_while_the_inputs_rest(monitor: SensorMonitor) -> None:
+    """Once, the first scans after a long silence ended the service: nothing was known of the inputs before."""
+    assert monitor.check(1, others_moved(1), INPUTS) == others_moved(1)
+    assert monitor.check(1000, others_moved(1000), INPUTS) == others_moved(1000)
+    assert not monitor.bad
+
+
+def test_an_output_that_never_moved_is_frozen_once_the_inputs_have_moved(monitor: SensorMonitor) -> None:
+    monitor.check(1, others_moved(1), INPUTS)
+    monitor.check(2, others_moved(2), INPUTS)
+    monitor.check(1000, others_moved(1000), (43.0, 75.0, 36.2))
+    assert list(monitor.bad) == [0]
