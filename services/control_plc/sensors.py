@@ -185,7 +185,9 @@ class SensorMonitor:
         self._moves = moves
         self._may_rest = settings.may_rest
         self._inputs: list[Sequence[float]] = [()] * len(initial)
-        """Inputs when each output moved last."""
+        """Inputs when each output moved last, ..."""
+        self._inputs_moved: list[int | None] = [None] * len(initial)
+        """... and since which tick they have been others."""
         self._image = ImageWatch(moves, may_rest=settings.may_rest)
         self._recovering: dict[int, int] = {}
         """Output, and since which tick its measurements have been good again."""
@@ -229,17 +231,21 @@ class SensorMonitor:
         return tuple(self._good)
 
     def _not_at_rest(self, unchanged: Collection[int], inputs: Sequence[float]) -> Collection[int]:
-        """Return those of the outputs that should have moved with the inputs: the load alone may not reach each."""
+        """Return those that should have moved since the inputs did: the load alone may not reach each output."""
         for output, count in enumerate(self.unchanged):
             if not count or not self._inputs[output]:  # of one that has not moved yet, those at first
-                self._inputs[output] = inputs
-        return [output for output in unchanged if have_moved(inputs, self._inputs[output], self._moves)]
+                self._inputs[output], self._inputs_moved[output] = inputs, None
+            elif self._inputs_moved[output] is None and have_moved(inputs, self._inputs[output], self._moves):
+                self._inputs_moved[output] = self._now
+        since = self._inputs_moved
+        return [one for one in unchanged if (at := since[one]) is not None and self._now - at >= self.least[one]]
 
     def set_back(self, tick: int) -> None:
         """Set the time back to `tick`: conditions that hold now begin there."""
         self._tick = None
         self.bad = {output: min(since, tick) for output, since in self.bad.items()}
         self._recovering = {output: min(since, tick) for output, since in self._recovering.items()}
+        self._inputs_moved = [at if at is None else min(at, tick) for at in self._inputs_moved]
 
     def _judge(self, output: int, *, ok: bool) -> None:
         if not ok:

@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
+from coldloop.registers.control_plc import Mode
 from tests.harness.processes import PROGRAM_S, Ended, Processes
 
 ROOT: Final = Path(__file__).parents[2]
@@ -115,3 +116,30 @@ def test_a_model_of_another_process_is_refused_in_one_line(processes: Processes,
     assert code != 0
     assert "a model of another" in complaints
     assert len(complaints.splitlines()) == 1
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("plan", ["kill", "drop"])
+@pytest.mark.parametrize(("file", "duration"), [(TANK, "30min"), (COLUMN, "2h")], ids=["tank", "column"])
+def test_a_process_survives_chaos_as_the_cold_box_does(
+    file: Path, duration: str, plan: str, processes: Processes, tmp_path: Path
+) -> None:
+    options = ("chaos", plan, "--duration", duration, "--out", tmp_path / "out")
+    code, _, complaints = started(processes, "--process", file, *options)
+    assert code == 0, complaints
+    judged = json.loads((tmp_path / "out" / "chaos.json").read_text(encoding="utf-8"))
+    assert judged["failure"] is None
+    assert judged["ladder"]["mode"] == Mode.MPC
+    assert all(step <= 1.0 for step in judged["largest_steps"].values())
+    assert judged["outside_s"] == judged["undisturbed_outside_s"]
+    raised = {alarm["name"] for fault in judged["faults"] for alarm in fault["alarms"]}
+    assert {"OPTIMIZER_LOST", "PLANT_LOST"} & raised
+    assert "SENSOR_BAD" not in raised
+
+
+def test_the_list_of_plans_has_those_that_suit_the_process(processes: Processes) -> None:
+    code, listed, complaints = started(processes, "--process", TANK, "chaos", "--list")
+    assert code == 0, complaints
+    names = {line.split()[0] for line in listed.splitlines()}
+    assert {"kill", "drop", "lossy"} <= names
+    assert not {"sensor", "mixed", "day", "refrigerator"} & names
