@@ -202,7 +202,7 @@ def test_what_happens_to_a_refrigerator_is_told_by_its_ranges_modes_and_alarms(
     run = replace(run, events=[Happening(*event) for event in happened])
     asked = STUDIES["disturbances"].requests(under)
     result = STUDIES["disturbances"].evaluate(under, dict.fromkeys(asked, run))
-    assert len(result.rows) == len(asked) == 36
+    assert len(result.rows) == len(asked) == 56
     assert {row[3] for row in result.rows} == {7.0}
     assert {row[10] for row in result.rows} == {0.125}
     assert len({row[11] for row in result.rows}) == 1
