@@ -226,8 +226,10 @@ class StateSection(_Section):
 
 
 class PredictionSection(_Section):
-    """Decision and constraint instants, in sampling periods."""
+    """Decision and constraint instants, in sampling periods, and where the model is from, if not from the plant."""
 
+    step_test: str | None = None
+    """CSV file with columns as `PlantSection.step_test`: the model is found in it, and the plant hides its states."""
     decision_instants: tuple[Annotated[int, Field(ge=1, le=400)], ...] = (1, 2, 4, 8, 16, 30, 60)
     constraint_instants: tuple[Annotated[int, Field(ge=1, le=400)], ...] = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 44, 60)
 
@@ -278,6 +280,8 @@ class ProcessFile(_Section):
             raise ValueError(f"{min(reserved)}: a register, a column or Python has this name already; choose another")
         if not any(output.edges for output in self.outputs):
             raise ValueError("outputs: none has a band or a setpoint; give one to at least one of them")
+        if self.prediction.step_test and (self.plant.matrices or self.plant.step_test):
+            raise ValueError("prediction.step_test: plant.matrices and plant.step_test are a model already; keep one")
         if self.plant.fmu is None and any(one.variable for one in signals):
             raise ValueError(f"{next(one.name for one in signals if one.variable)}: variable is for an FMU")
         inputs = {one.name for one in self.inputs}

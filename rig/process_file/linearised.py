@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
 from plant.own.disturbances import outside
-from plant.own.maker import LINEAR, PYTHON, TRANSFER_FUNCTIONS
+from plant.own.maker import FMU, LINEAR, PYTHON, TRANSFER_FUNCTIONS
 from plant.own.python_class import Equations, equations_of, evaluated
 from rig.process_file.declaration import LagSection, PlantSection, ProcessFile
 from rig.process_file.fmu_model import from_fmu
@@ -42,10 +42,23 @@ def linearised(file: ProcessFile, folder: Path) -> Linearised:
         found = from_fmu(file, folder, plant.fmu)
     else:
         found = _from_lags(file, plant)
+    if file.prediction.step_test is not None:
+        found = _by_record(found, from_step_test(file, folder / file.prediction.step_test))
     for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
         if not np.isfinite(getattr(found, name)).all():
             raise UsageError(f"plant: {name} of the linear model is not finite; look at the plant's equations there")
     return with_disturbances(file, found)
+
+
+def _by_record(plant: Linearised, model: Linearised) -> Linearised:
+    """Return the model of a record, for a plant that hides its states."""
+    hidden = dict(plant.parameters)
+    if plant.kind == PYTHON:
+        hidden["rest"] = plant.x0.tolist()
+    elif plant.kind == FMU:
+        hidden["wiring"] = {**hidden["wiring"], "states": ()}
+    notes = (*plant.notes, *model.notes)
+    return model._replace(kind=plant.kind, parameters=hidden, digest=plant.digest, notes=notes)
 
 
 # -- a class with equations ------------------------------------------------------------------------------------------

@@ -142,25 +142,35 @@ def _states(file: ProcessFile, linear: Linearised) -> tuple[State, ...]:
 
 
 def _constants(file: ProcessFile, linear: Linearised) -> tuple[str, ...]:
-    """Return the outputs whose constant error can be told from states, load and each other, those with bands last.
+    """Return the outputs whose constant error can be told from states, load and each other.
 
     Hautus' test at the integrator: (A, F; C, G) and a column of ones for each constant have no direction of zeros
-    (Pannocchia and Rawlings, AIChE J. 49, 2003).
+    (Pannocchia and Rawlings, AIChE J. 49, 2003). Those with bands come last; of equals first the one that is told apart
+    best, as a load that moves one output by much and another by next to nothing hardly differs from an error of the
+    first.
     """
     with_load = (linear.F, linear.G) if file.load else (linear.F[:, :0], linear.G[:, :0])
     modes = np.vstack([np.hstack([linear.A, with_load[0]]), np.hstack([linear.C, with_load[1]])])
     found: list[int] = []
     sensors = {one.name for one in file.disturbances}  # whose errors their effects would be blamed for
     own = [place for place, one in enumerate(file.outputs) if one.name not in sensors]
-    for place in sorted(own, key=lambda place: file.outputs[place].edges is not None):
-        column = np.eye(len(modes))[:, [len(linear.A) + place]]
-        wider = np.hstack([modes, column])
-        if wider.shape[1] > len(wider):
-            break
-        sizes = np.linalg.svd(wider / np.maximum(np.linalg.norm(wider, axis=0), TINY), compute_uv=False)
-        if sizes[-1] > TOLD_APART:
-            modes, found = wider, [*found, place]
+    for is_banded in (False, True):
+        left = [place for place in own if (file.outputs[place].edges is not None) == is_banded]
+        while left and modes.shape[1] < len(modes):
+            wider = [np.hstack([modes, np.eye(len(modes))[:, [len(linear.A) + place]]]) for place in left]
+            apart = [_told_apart(each) for each in wider]
+            best = int(np.argmax(apart))
+            if apart[best] <= TOLD_APART:
+                break
+            modes = wider[best]
+            found.append(left.pop(best))
     return tuple(file.outputs[place].name for place in sorted(found))
+
+
+def _told_apart(columns: Array) -> float:
+    """Return the least singular value of columns scaled to size 1."""
+    scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), TINY)
+    return float(np.linalg.svd(scaled, compute_uv=False)[-1])
 
 
 def _sizes(file: ProcessFile, states: int) -> ProblemSizes:

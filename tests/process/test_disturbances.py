@@ -12,7 +12,7 @@ from plant.own.disturbances import Disturbances
 from rig.process_file.judgement import described
 from rig.process_file.making import Made, made_from
 from tests.harness.processes import Processes
-from tests.process.test_processes import run
+from tests.process.runs import run
 
 POND: Final = '''
 class Pond:

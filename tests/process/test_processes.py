@@ -8,30 +8,18 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pytest
 
 from coldloop.registers.control_plc import Mode
-from tests.harness.processes import PROGRAM_S, Ended, Processes
+from tests.harness.processes import Processes
+from tests.process.runs import run, started
 
 ROOT: Final = Path(__file__).parents[2]
 EXAMPLES: Final = ROOT / "examples" / "processes"
 TANK, COLUMN = EXAMPLES / "quadruple_tank.toml", EXAMPLES / "wood_berry.toml"
-
-
-def started(processes: Processes, *arguments: object) -> Ended:
-    """Run `coldloop` to its end."""
-    return processes.coldloop(*arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE).ended(PROGRAM_S)
-
-
-def run(processes: Processes, file: Path, out: Path, *options: str) -> dict[str, Any]:
-    """Return the summary of a run of a process file."""
-    code, _, complaints = started(processes, "--process", file, "run", "--out", out, *options)
-    assert code == 0, complaints
-    summary: dict[str, Any] = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-    return summary
 
 
 def made(folder: Path, *, inputs: int, outputs: int, tick_s: float, load: bool, states: int = 6) -> Path:

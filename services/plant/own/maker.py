@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -11,7 +12,7 @@ from coldloop.process.model_file import ModelHeader
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from plant.own.disturbances import Disturbances
 from plant.own.linear import LinearPlant
-from plant.own.python_class import PythonPlant, equations_of
+from plant.own.python_class import HiddenPythonPlant, PythonPlant, equations_of
 from plant.own.transfer_functions import TransferFunctionPlant, lags_of
 from plant.program import HeatLoad, MeasurementNoise, PlantProgram
 from plant.rack.rack import MakePlant
@@ -66,8 +67,10 @@ def own_plant_maker(header: ModelHeader, noise_of_seed: NoiseOfSeed) -> MakePlan
         parameters = header.plant_parameters
         equations = equations_of(parameters["source"], parameters["class"], parameters["file"])
 
+        kind = partial(HiddenPythonPlant, rest=parameters["rest"]) if "rest" in parameters else PythonPlant
+
         def make(load: HeatLoad, seed: int) -> PlantProgram:
-            return PythonPlant(
+            return kind(
                 equations, x0=header.x0, u0=header.u0, load=load, disturbances=disturbances, noise=noise_of_seed(seed)
             )
 

@@ -124,9 +124,55 @@ class PythonPlant(DisturbedPlant):
         self._equations = equations
         super().__init__(disturbances, x0=x0, u0=u0, load=load, noise=noise)
 
+    def _seen(self, x: RealArray, w: RealArray) -> RealArray:
+        return np.asarray(self._equations.outputs(x, self._u, outside(w)), dtype=np.float64)
+
     def _own_outputs(self, w: RealArray) -> RealArray:
-        return np.asarray(self._equations.outputs(self._own, self._u, outside(w)), dtype=np.float64)
+        return self._seen(self._own, w)
 
     def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
         x = runge_kutta(self._equations, self._own, self._u, outside(w), TICK_S)
-        return x, np.asarray(self._equations.outputs(x, self._u, outside(w)), dtype=np.float64)
+        return x, self._seen(x, w)
+
+
+class HiddenPythonPlant(PythonPlant):
+    """The same, where the model has other states: those of the equations are not shown, the model's are zeros.
+
+    Args:
+        rest: States of the equations at tick 0.
+        equations: The user's.
+        arguments: Of `PythonPlant`; `x0` is what is shown.
+    """
+
+    def __init__(self, equations: Equations, *, rest: Sequence[float], **arguments: Any) -> None:  # noqa: ANN401
+        self._hidden = np.array(rest, dtype=np.float64)
+        super().__init__(equations, **arguments)
+
+    def _warm_up(self) -> None:
+        """Do nothing: a tick would move what is hidden."""
+
+    def _own_outputs(self, w: RealArray) -> RealArray:
+        return self._seen(self._hidden, w)
+
+    def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
+        self._hidden = runge_kutta(self._equations, self._hidden, self._u, outside(w), TICK_S)
+        return self._own, self._seen(self._hidden, w)
+
+    def retained(self) -> dict[str, Any]:
+        """Return what `resume` needs, as plain data."""
+        return {**super().retained(), "own": {"hidden": self._hidden.tolist()}}
+
+    def resume(
+        self,
+        tick: int,
+        x: Sequence[float],
+        u: Sequence[float],
+        y: Sequence[float],
+        noise_state: Mapping[str, Any],
+        own: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Resume from what `retained` returned (ValueError or KeyError if it is not of this plant)."""
+        if own is None or len(own["hidden"]) != len(self._hidden):
+            raise ValueError("the retained state is that of another plant")
+        super().resume(tick, x, u, y, noise_state)
+        self._hidden = np.array(own["hidden"], dtype=np.float64)
