@@ -10,6 +10,7 @@ from coldloop.errors import ColdloopError
 from rig.process_file.mimic import drawing_of
 
 SIGNALS: Final = ("h1", "v1", "load")
+TEXTS: Final = ("text", "tspan")
 HEAD: Final = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10"'
 
 
@@ -23,8 +24,9 @@ def drawn(folder: Path, inside: str, head: str = HEAD) -> str:
 def test_a_text_with_the_name_of_a_signal_shows_it(tmp_path: Path) -> None:
     """As any editor writes it; also in a part of a text."""
     found = ET.fromstring(drawn(tmp_path, "<text> {h1} </text><text>inflow <tspan>{v1}</tspan></text>"))  # noqa: S314
-    assert [(one.get("data-signal"), one.text) for one in found.findall(".//{*}text")] == [("h1", None), (None, "inflow ")]
-    assert [(one.get("data-signal"), one.text) for one in found.findall(".//{*}tspan")] == [("v1", None)]
+    texts, parts = ([(one.get("data-signal"), one.text) for one in found.findall(f".//{{*}}{tag}")] for tag in TEXTS)
+    assert texts == [("h1", None), (None, "inflow ")]
+    assert parts == [("v1", None)]
 
 
 def test_what_an_editor_adds_is_left_out_and_style_becomes_attributes(tmp_path: Path) -> None:
