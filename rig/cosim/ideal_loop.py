@@ -17,7 +17,7 @@ from coldloop.registers.plant import PlantSample
 from control_plc.guard import OutputGuard
 from optimizer_plc.computing_settings import EstimatorKind
 from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
-from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.prediction import prediction_of
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters, QuadraticProblem
 from optimizer_plc.solvers.daqp import DaqpSolver
 from plant.kinds import plant_maker
@@ -52,7 +52,7 @@ def run_ideal_loop(
     """
     header, model = own_header(settings.model.file), load(settings.model.file)
     program = settings.optimizer_plc.program
-    prediction = PredictionModel(model).with_disturbances(program.estimator.disturbed)
+    prediction = prediction_of(model, program.estimator.disturbed, program.design)
     problem = PredictiveProblem(prediction, program.design, settings.limits)
     kalman = program.estimator.model_copy(update={"kind": EstimatorKind.KALMAN})
     estimator, belief = estimator_of(prediction, kalman), no_belief(prediction.n_states)

@@ -12,7 +12,7 @@ from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import check_detectability
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.qp.design import ControlDesign, Target, trivial_design
-from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.prediction import PredictionModel, prediction_of
 from optimizer_plc.qp.problem import PredictiveProblem
 from optimizer_plc.settings import ProgramSettings, SolverName
 from rig.plc_sizing import operations
@@ -91,7 +91,7 @@ def plc_tables(
 def problem_of(settings: Settings) -> tuple[PredictiveProblem, PredictionModel]:
     """Return the configured problem in single precision, and the model it is made from."""
     program = settings.optimizer_plc.program
-    prediction = PredictionModel(load(settings.model.file)).with_disturbances(program.estimator.disturbed)
+    prediction = prediction_of(load(settings.model.file), program.estimator.disturbed, program.design)
     check_detectability(prediction)
     return _problem(settings, prediction, program.design), prediction
 

@@ -1,4 +1,4 @@
-"""What the simulated plant meets of disturbances beside the load: courses over time, from CSV files."""
+"""What load and other disturbances are over time, for the simulated plant and as the optimiser expects: CSV files."""
 
 from pathlib import Path
 from typing import Any
@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from coldloop.errors import UsageError
+from coldloop.process.declaration import Forecast
 from rig.process_file.csv_columns import TIME, columns
-from rig.process_file.declaration import DisturbanceSection, ProcessFile
+from rig.process_file.declaration import DisturbanceSection, LoadSection, ProcessFile
 
 
 def courses_of(file: ProcessFile, folder: Path) -> dict[str, Any]:
@@ -21,18 +22,33 @@ def courses_of(file: ProcessFile, folder: Path) -> dict[str, Any]:
     return {"disturbances": [_course(one, folder, file.tick_s) for one in file.disturbances]}
 
 
+def forecasts_of(file: ProcessFile, folder: Path) -> tuple[Forecast, ...]:
+    """Return what the optimiser expects.
+
+    Raises:
+        UsageError: A forecast cannot be read, or leaves the span: one line.
+    """
+    return tuple(
+        Forecast(name=one.name, ticks=tuple(ticks), values=tuple(values))
+        for one in file.outside
+        if one.forecast is not None
+        for ticks, values in [_steps(one, folder / one.forecast, file.tick_s)]
+    )
+
+
 def _course(one: DisturbanceSection, folder: Path, tick_s: float) -> dict[str, Any]:
-    ticks, values = [0], [one.at]
-    if one.course is not None:
-        path = folder / one.course
-        times, values = (column.tolist() for column in columns(path, [TIME, one.name]).T)
-        ticks = [round(time / tick_s) for time in times]
-        if ticks[0] != 0 or (np.diff(ticks) <= 0).any():
-            raise UsageError(
-                f"{path}: {TIME} begins at 0 and rises by at least a tick, {tick_s:g} s, from line to line"
-            )
-        low, high = one.span
-        wrong = next((value for value in values if not low <= value <= high), None)
-        if wrong is not None:
-            raise UsageError(f"{path}: {one.name} = {wrong:g} is outside its span, {low:g} to {high:g}")
+    ticks, values = ([0], [one.at]) if one.course is None else _steps(one, folder / one.course, tick_s)
     return {"ticks": ticks, "values": values, "measured": one.noise is not None}
+
+
+def _steps(one: LoadSection | DisturbanceSection, path: Path, tick_s: float) -> tuple[list[int], list[float]]:
+    """Return ticks and values of a CSV file with time_s and the name of a signal."""
+    times, values = (column.tolist() for column in columns(path, [TIME, one.name]).T)
+    ticks = [round(time / tick_s) for time in times]
+    if ticks[0] != 0 or (np.diff(ticks) <= 0).any():
+        raise UsageError(f"{path}: {TIME} begins at 0 and rises by at least a tick, {tick_s:g} s, from line to line")
+    low, high = one.span
+    wrong = next((value for value in values if not low <= value <= high), None)
+    if wrong is not None:
+        raise UsageError(f"{path}: {one.name} = {wrong:g} is outside its span, {low:g} to {high:g}")
+    return ticks, values

@@ -148,6 +148,8 @@ class _OutsideSection(_Section):
     walk: PositiveFloat | None = None
     """Random walk that the estimator expects, of the load of what is not measured of it, per square root of a sampling
     period; 1 % of the span if not given."""
+    forecast: str | None = None
+    """CSV file with the columns time_s and `name`, steps held: what the optimiser expects; it holds if not given."""
 
     @model_validator(mode="after")
     def _inside(self) -> Self:

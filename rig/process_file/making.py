@@ -1,6 +1,6 @@
 """A process file made into a model file: the linear model, and the process as programs are loaded with it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -11,7 +11,7 @@ from coldloop.errors import UsageError
 from coldloop.process.declaration import NO_LOAD, Band, Input, Load, Loop, Output, Process, State
 from coldloop.process.lti_model import LtiModel, discretise
 from rig.plc_sizing.problem_sizes import ProblemSizes, iteration_shares
-from rig.process_file.courses import courses_of
+from rig.process_file.courses import courses_of, forecasts_of
 from rig.process_file.declaration import OutputSection, ProcessFile, read_process_file
 from rig.process_file.fmu_model import with_units
 from rig.process_file.linear_model import Linearised
@@ -55,7 +55,9 @@ def made_from(path: Path) -> Made:
     file = with_units(read_process_file(path), path.parent)
     linear = linearised(file, path.parent)
     file = _with_sensors(file)
-    process = _process(file, linear, _drawing(file, path.parent))
+    process = replace(
+        _process(file, linear), forecasts=forecasts_of(file, path.parent), mimic=_drawing(file, path.parent)
+    )
     _check_room(process)
     _check_rest(file, linear)
     tick = discretise(linear.A, linear.B, linear.F[:, 0], file.tick_s)
@@ -82,7 +84,7 @@ def _drawing(file: ProcessFile, folder: Path) -> str:
     return drawing_of(folder / file.mimic, [*names, "load"] if file.load else names)
 
 
-def _process(file: ProcessFile, linear: Linearised, mimic: str) -> Process:
+def _process(file: ProcessFile, linear: Linearised) -> Process:
     load = file.load
     return Process(
         name=file.name, tick_s=file.tick_s, ticks_per_sample=file.ticks_per_sample,
@@ -104,7 +106,6 @@ def _process(file: ProcessFile, linear: Linearised, mimic: str) -> Process:
         constraint_instants=file.prediction.constraint_instants,
         constants=_constants(file, linear),
         iterations=iteration_shares(_sizes(file, len(linear.states))),
-        mimic=mimic,
     )  # fmt: skip
 
 
@@ -185,9 +186,10 @@ def _told_apart(columns: Array) -> float:
 def _sizes(file: ProcessFile, states: int) -> ProblemSizes:
     bands = sum(output.edges is not None for output in file.outputs)
     constants = len(file.outputs)  # as many at most have one, and the load a mismatch
+    ahead = len(file.prediction.decision_instants) * sum(one.forecast is not None for one in file.outside)
     return ProblemSizes(
         len(file.prediction.decision_instants), len(file.inputs), len(file.outputs), bands,
-        len(file.prediction.constraint_instants), states + constants,
+        len(file.prediction.constraint_instants), states + constants + ahead,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from coldloop.process.limits import InputLimits
 from coldloop.process.lti_model import load as load_model
 from coldloop.safety.sequence import InputSequence
 from optimizer_plc.program import OptimizerProgram
-from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.prediction import PredictionModel, prediction_of
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from optimizer_plc.rules import UpdatingRule
 from optimizer_plc.settings import ProgramSettings, SolverName
@@ -88,7 +88,7 @@ def _recorded(scenario: Scenario, assignments: tuple[str, ...]) -> ProblemSequen
     rig = OneProcessRig(settings, compiled=False)
     listening = rig.optimizer = _ListeningOptimizer(model, program, settings.limits)
     rig.run(scenario, Recorder(scenario.ticks, []))
-    prediction = PredictionModel(model).with_disturbances(program.estimator.disturbed)
+    prediction = prediction_of(model, program.estimator.disturbed, program.design)
     problem = PredictiveProblem(prediction, program.design, settings.limits)
     profiles = PlayedProfiles(problem)
     return ProblemSequence(prediction, settings.limits, problem, profiles, listening.heard, np.array([

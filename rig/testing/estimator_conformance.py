@@ -11,7 +11,7 @@ from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import load
 from coldloop.process.signals import TICKS_PER_SAMPLE
 from optimizer_plc.outside_estimator import Measured, OutsideCorrection, PlantModel, plant_model
-from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.prediction import prediction_of
 from rig.settings import Settings
 from rig.testing.requirement import Requirement
 
@@ -34,7 +34,7 @@ LOST: Final = range(20, 40)
 def estimator_requirements(make: Made, settings: Settings) -> list[Requirement]:
     """Return what the estimators that are made keep, in a session each of several plants of the loaded process."""
     program = settings.optimizer_plc.program
-    prediction = PredictionModel(load(settings.model.file)).with_disturbances(program.estimator.disturbed)
+    prediction = prediction_of(load(settings.model.file), program.estimator.disturbed, program.design)
 
     def model() -> PlantModel:
         return plant_model(prediction, program.estimator)

@@ -199,9 +199,9 @@ def check_detectability(prediction: PredictionModel) -> None:
     """
     if not prediction.disturbances:
         return
-    n, step = prediction.n_states, prediction.sample
+    n, step = prediction.n_estimated, prediction.sample
     modes = np.vstack([
-        np.hstack([step.A - np.eye(n), step.F]), np.hstack([prediction.C, prediction.G])
+        np.hstack([step.A[:n, :n] - np.eye(n), step.F[:n]]), np.hstack([prediction.C[:, :n], prediction.G])
     ])  # fmt: skip
     if not PROCESS.has_load:
         modes = modes[:, :n]
@@ -236,9 +236,9 @@ def walks_of(prediction: PredictionModel, settings: EstimatorSettings) -> Array:
 
 
 def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -> StationaryGains:
-    """Return what the Kalman filter corrects with after every updating period."""
-    nx = prediction.n_states
-    C = np.ascontiguousarray(np.hstack([prediction.C, prediction.G]))
+    """Return what the Kalman filter corrects with after every updating period; what is forecast it leaves alone."""
+    nx = prediction.n_estimated
+    C = np.ascontiguousarray(np.hstack([prediction.C[:, :nx], prediction.G]))
     sensors, drift = np.array(settings.sensors), walks_of(prediction, settings)
 
     def computed() -> Array:
@@ -246,7 +246,7 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
         found = []
         for ticks, step in prediction.transitions.items():
             A = np.eye(nx + 1)
-            A[:nx, :nx], A[:nx, nx] = step.A, step.F[:, 0]
+            A[:nx, :nx], A[:nx, nx] = step.A[:nx, :nx], step.F[:nx, 0]
             process = drift**2 * (ticks * TICK_S / SAMPLING_PERIOD_S)
             measured = sensors**2 * (SAMPLING_PERIOD_S / (ticks * TICK_S) if of_time else 1.0)
             gain = stationary_gain(A, C, process, measured, P, settings.longest_riccati)
@@ -255,9 +255,19 @@ def stationary_gains(prediction: PredictionModel, settings: EstimatorSettings) -
 
     tick = prediction.transitions[1]
     of_time = settings.noise_reference is NoiseReference.TIME
-    decided_by = (tick.A, tick.F, C, drift, sensors, np.array(settings.longest_riccati), np.ones(int(of_time)))
+    decided_by = (
+        tick.A[:nx, :nx],
+        tick.F[:nx],
+        C,
+        drift,
+        sensors,
+        np.array(settings.longest_riccati),
+        np.ones(int(of_time)),
+    )
     found = kept("kalman", b"".join(part.tobytes() for part in decided_by), computed)
-    return StationaryGains(*(np.ascontiguousarray(part) for part in np.split(found, [nx + 1], axis=2)))
+    gains, inverses = np.split(found, [nx + 1], axis=2)
+    gains = np.insert(gains, [nx] * len(prediction.ahead), 0.0, axis=2)
+    return StationaryGains(np.ascontiguousarray(gains), np.ascontiguousarray(inverses))
 
 
 def inverse_covariance(A: Array, C: Array, process: Array, sensors: Array, P: Array) -> Array:

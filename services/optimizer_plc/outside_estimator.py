@@ -72,6 +72,7 @@ class OutsideEstimator:
 
     def __init__(self, name: str, prediction: PredictionModel, settings: EstimatorSettings) -> None:
         self.name = name
+        self._n_states = prediction.n_estimated
         self._estimator: OutsideCorrection = made(Part.ESTIMATOR, name, plant_model(prediction, settings))
 
     def correct(self, c: Estimator, belief: Belief, u_before: Array, load: float, y: Array) -> None:
@@ -80,7 +81,7 @@ class OutsideEstimator:
         Raises:
             ConfigurationError: The estimator raises, or returns something else than a state and a number.
         """
-        b, predicted = belief.numbers[0], belief.predicted
+        b, predicted = belief.numbers[0], belief.predicted[: self._n_states]
         known = load - c.w0 if c.load_known else 0.0
         measured = Measured(int(b["since"]), u_before - c.u0, known, y - c.y0)
         with in_its_name(Part.ESTIMATOR, self.name):
@@ -88,13 +89,14 @@ class OutsideEstimator:
             x, mismatch = np.asarray(x, np.float64), float(mismatch)
         if x.shape == predicted.shape and np.isfinite(x).all() and math.isfinite(mismatch):
             predicted[:], b["mismatch"] = x, mismatch
-        belief.x[:] = predicted
+        belief.x[:] = belief.predicted
         b["w"] = known + b["mismatch"]
 
 
 def plant_model(prediction: PredictionModel, settings: EstimatorSettings) -> PlantModel:
     """Return what an outside estimator is given of the model: copies, which it may change."""
-    A, B, F = (M.copy() for M in prediction.transitions[1])
-    C, D, G = (M.copy() for M in prediction.outputs)
+    n, step = prediction.n_estimated, prediction.transitions[1]
+    A, B, F = step.A[:n, :n].copy(), step.B[:n].copy(), step.F[:n].copy()
+    C, D, G = prediction.C[:, :n].copy(), prediction.D.copy(), prediction.G.copy()
     walks = walks_of(prediction, settings) * math.sqrt(TICK_S / SAMPLING_PERIOD_S)
     return PlantModel(A, B, F, C, D, G, TICK_S, len(prediction.disturbances), np.array(settings.sensors), walks)

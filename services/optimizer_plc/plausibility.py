@@ -60,7 +60,7 @@ def plausibility_of(
     n_y = len(OUTPUT_NAMES)
     constants = np.full(n_y, -1)
     disturbances = prediction.disturbances
-    for place, signal in enumerate(disturbances, prediction.n_states - len(disturbances)):
+    for place, signal in enumerate(disturbances, prediction.n_estimated - len(disturbances)):
         if signal < n_y:
             constants[signal] = place
     spread = 2.0 / (9.0 * n_y)  # Wilson and Hilferty: the quantile of chi-square at so many sigmas

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.first_use import kernels_of
 from coldloop.process.limits import InputLimits
+from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import CONTROLLED, INPUT_NAMES, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
@@ -30,9 +31,10 @@ from optimizer_plc import scheme
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.estimator import correct, estimator_of
+from optimizer_plc.forecasts import Forecasts
 from optimizer_plc.outside_estimator import OutsideEstimator
 from optimizer_plc.qp.arithmetic import real_of
-from optimizer_plc.qp.prediction import PredictionModel
+from optimizer_plc.qp.prediction import prediction_of
 from optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from optimizer_plc.qp.rest import rest_map
 from optimizer_plc.qp.target import target_search
@@ -64,7 +66,8 @@ class OptimizerProgram:
             self.model_digest = model.short_digest
             self._real = real_of(settings.arithmetic)
             self.disturbances = settings.estimator.disturbed
-            self._prediction = prediction = PredictionModel(model).with_disturbances(self.disturbances)
+            self._prediction = prediction = prediction_of(model, self.disturbances, settings.design)
+            self._forecasts = Forecasts(PROCESS.forecasts, settings.design.decision_instants)
             self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
             self.solver = make_solver(settings)
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
@@ -145,12 +148,18 @@ class OptimizerProgram:
         in_time = self._follow(update, u)
         now["sequences"] = max(int(now["sequences"]), update.playing)
         state.u[:] = u
+        self._look_ahead(state.belief.predicted, update.tick)
         self._take(self._wanted(interrupted=interrupted, in_time=in_time), update)
         # a load that keeps moving must not keep the control PLC waiting for ever
         load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
         return Plan(
             update.update, update.tick + int(now["ticks"]), load_step, float(now["shortage"]), int(now["suspects"])
         )
+
+    def _look_ahead(self, x: Array, tick: int) -> None:
+        """Write into a state (n,) what is forecast from `tick` on."""
+        if ahead := len(self._forecasts):
+            x[-ahead:] = self._forecasts.changes(tick)
 
     @property
     def plans_by_steps(self) -> bool:
@@ -242,6 +251,7 @@ class OptimizerProgram:
     def solve(self) -> InputSequence:
         """Predict the state at t_{i+1}, shift the profile, iterate; return the sequence to play from there."""
         n = self._iterations
+        self._look_ahead(self.state.belief.x, int(self._now["tick"]) + int(self._now["ticks"]))
         if isinstance(self.solver, KernelSolver):
             scheme.solve(self.constants, self.method, self.state)
         else:

@@ -162,6 +162,40 @@ def test_the_setpoint_is_kept_over_the_link_as_in_one_process(plant: str, proces
         assert before.rain.to_numpy() == pytest.approx(rain, abs=1e-6)
 
 
+@pytest.mark.parametrize("known", ["rain", "draw", "leak"])
+def test_a_step_that_is_forecast_costs_less_than_one_that_is_not(
+    known: str, processes: Processes, tmp_path: Path
+) -> None:
+    """Of a disturbance that is measured, of one that is estimated, of the load; the pump is slow, 0.1 l/s in 5 s."""
+    header, load = "time_s,rain,draw,leak", known == "leak"
+    weather = f"{header}\n0,0,0,0\n240,{1.5 * (known == 'rain')},{1.0 * (known == 'draw')},{5.0 * load}\n"
+    (tmp_path / "leak.csv").write_text(f"time_s,load_w\n0,0\n240,{5.0 * load}\n", encoding="utf-8")
+    text = FILE.replace("setpoint = 10.5", "setpoint = 10.0").replace("rate = 1.0", "rate = 0.1")
+    options = ("--in-process", "--load", str(tmp_path / "leak.csv"), "--duration", "8min", *ELAPSED)
+    unknown = run(processes, pond(tmp_path, text, weather), tmp_path / "unknown", *options)
+    text = text.replace(f'name = "{known}"', f'name = "{known}"\nforecast = "weather.csv"')
+    expected = run(processes, pond(tmp_path, text, weather), tmp_path / "expected", *options)
+    assert expected["J_BF"] < 0.5 * unknown["J_BF"]
+    assert expected["lower_outside_band_pct"] < unknown["lower_outside_band_pct"]
+
+
+def test_a_forecast_that_never_comes_leaves_no_offset(processes: Processes, tmp_path: Path) -> None:
+    (tmp_path / "promised.csv").write_text("time_s,rain\n0,0\n200,3\n400,0\n", encoding="utf-8")
+    text = FILE.replace('name = "rain"', 'name = "rain"\nforecast = "promised.csv"').replace(
+        'noise = 0.01\ncourse = "weather.csv"', "noise = 0.01"
+    )
+    weather = "time_s,rain,draw\n0,0,0\n"
+    file, options = pond(tmp_path, text, weather), ("--load", "a", "--duration", "10min")
+    here = run(processes, file, tmp_path / "here", "--in-process", *options)
+    there = run(processes, file, tmp_path / "there", *options)
+    assert here["trace_sha256"] == there["trace_sha256"]
+    trace = pd.read_parquet(tmp_path / "here" / "trace.parquet")
+    assert trace[trace.time_s > 570].lower.to_numpy() == pytest.approx(10.5, abs=0.05)
+
+
+ELAPSED: Final = ("--set", "limits.rate_reference=elapsed")
+"""Else short periods allow more than the prediction counts with."""
+
 BAD: Final = {
     "a setpoint and a band": (FILE.replace("tolerance = 0.1", "band = [10.0, 11.0]"), "give a band or a setpoint"),
     "a setpoint outside": (FILE.replace("setpoint = 10.5", "setpoint = 31.0"), "outside its range"),
@@ -172,6 +206,7 @@ BAD: Final = {
     "a name twice": (FILE.replace('"rain"', '"draw"'), "two signals have this name"),
     "outside its span": (FILE.replace("span = [0.0, 3.0]", "span = [1.0, 3.0]"), "rain: at = 0"),
     "no such column": (FILE.replace('"ambient"\n', '"ambient"\ncourse = "weather.csv"\n'), "no column ambient"),
+    "no such forecast": (FILE.replace('"draw"\n', '"draw"\nforecast = "hopes.csv"\n'), "hopes.csv"),
     "no such file": (FILE.replace("weather.csv", "whether.csv"), "whether.csv"),
 }
 

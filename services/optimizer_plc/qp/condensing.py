@@ -48,11 +48,14 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
     C, D, G = (matrix[list(prediction.constrained)] for matrix in (prediction.C, prediction.D, prediction.G))
     Phi, cross, constant = np.zeros((n, n)), np.zeros((nx + 1, n)), np.zeros((nx + 1, nx + 1))
     outputs_z, outputs_s = [], []
-    for of_knots in weights:
+    for sample, of_knots in enumerate(weights, 1):
         u_of_z = input_map(of_knots, design)
+        ahead = [one for one in prediction.ahead if one.first <= sample <= one.last]
         to_z = multiply(A, to_z) + multiply(B, u_of_z)
         to_s = multiply(A, to_s)
         to_s[:, -1] += F[:, 0]
+        for one in ahead:
+            to_s[:, one.place] += one.states
         weighted_z, weighted_s = multiply(Q, to_z), multiply(Q, to_s)
         Phi += multiply(transposed(to_z), weighted_z) + multiply(transposed(u_of_z), R[:, None] * u_of_z)
         cross += 2.0 * (multiply(transposed(to_s), weighted_z) - multiply(weighted_resting, u_of_z))
@@ -60,6 +63,8 @@ def condense(prediction: PredictionModel, design: ControlDesign, weights: Array)
         outputs_z.append(multiply(C, to_z) + multiply(D, u_of_z))
         through_w = multiply(C, to_s)
         through_w[:, -1] += G[:, 0]
+        for one in ahead:
+            through_w[:, one.place] += one.outputs[list(prediction.constrained)]
         outputs_s.append(through_w)
     Phi = np.ascontiguousarray(Phi + _slack_weights(weights, design))
     return Condensed(Phi, cross, constant, np.array(outputs_z), np.array(outputs_s))

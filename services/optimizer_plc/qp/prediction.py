@@ -37,6 +37,20 @@ class Transition(NamedTuple):
         )
 
 
+class Ahead(NamedTuple):
+    """A state that stands for how much a disturbance will differ, in some samples of the horizon, from what it is."""
+
+    place: int
+    """Among the states."""
+    first: int
+    """Sample, counted from 1."""
+    last: int
+    states: Array
+    """What 1 of it adds to the states in a sample, shape (n,)."""
+    outputs: Array
+    """The same of the outputs, shape (n_y,)."""
+
+
 class PredictionModel:
     """LTI model of the plant around its operating point.
 
@@ -55,6 +69,8 @@ class PredictionModel:
         self.real = DOUBLE
         self.disturbances: tuple[int, ...] = ()
         """Signals whose constants are states."""
+        self.ahead: tuple[Ahead, ...] = ()
+        """States at the end that are what is forecast; no transition reads them, as they act later."""
         self.resting_inputs = np.zeros((self.D.shape[1], len(self.x0)))
         """Inputs at which the plant rests at the operating point, by the states, shape (3, n)."""
         self.transitions = {1: tick}
@@ -103,10 +119,44 @@ class PredictionModel:
             twin.transitions[ticks] = Transition(A, B, F)
         return twin
 
+    def with_forecasts(self, sources: Sequence[int], ends: Sequence[int]) -> "PredictionModel":
+        """Return this model with the changes that are forecast of disturbances as further states.
+
+        Args:
+            sources: States that are disturbances; -1 is the load.
+            ends: Last samples of the parts of the horizon that each has a state for, rising.
+        """
+        if not sources:
+            return self
+        n, extra = self.n_states, len(sources) * len(ends)
+        A, _, F = self.sample
+        twin, starts, found = copy(self), (1, *(end + 1 for end in ends[:-1])), list[Ahead]()
+        for source in sources:
+            column, seen = np.zeros(n + extra), self.G[:, 0] if source < 0 else self.C[:, source]
+            column[:n] = F[:, 0] if source < 0 else A[:, source] - np.eye(n)[source]
+            found += [Ahead(n + len(found) + k, starts[k], end, column, seen) for k, end in enumerate(ends)]
+        twin.ahead = tuple(found)
+        twin.x0 = np.concatenate([self.x0, np.zeros(extra)])
+        twin.C = np.hstack([self.C, np.zeros((len(self.C), extra))])
+        twin.resting_inputs = np.hstack([self.resting_inputs, np.zeros((len(self.resting_inputs), extra))])
+        twin.transitions = {
+            ticks: Transition(
+                np.block([[step.A, np.zeros((n, extra))], [np.zeros((extra, n)), np.eye(extra)]]),
+                *(np.vstack([M, np.zeros((extra, M.shape[1]))]) for M in (step.B, step.F)),
+            )
+            for ticks, step in self.transitions.items()
+        }
+        return twin
+
     @property
     def n_states(self) -> int:
         """Number of states."""
         return len(self.x0)
+
+    @property
+    def n_estimated(self) -> int:
+        """Number of those that are estimated: all but what is forecast."""
+        return len(self.x0) - len(self.ahead)
 
     @property
     def sample(self) -> Transition:
@@ -117,6 +167,16 @@ class PredictionModel:
     def outputs(self) -> Transition:
         """C, D and G, which give outputs as a transition gives states."""
         return Transition(self.C, self.D, self.G)
+
+
+def prediction_of(model: LtiModel, disturbed: Sequence[int], design: ControlDesign) -> PredictionModel:
+    """Return the model that an optimiser predicts by: with constants of the signals `disturbed`, and what is forecast.
+
+    Changes are forecast as means over the time from one decision instant to the next.
+    """
+    load, forecasts = PROCESS.load.name, PROCESS.forecasts
+    sources = [-1 if one.name == load else STATE_NAMES.index(one.name) for one in forecasts]
+    return PredictionModel(model).with_disturbances(disturbed).with_forecasts(sources, design.decision_instants)
 
 
 def state_cost(model: LtiModel, design: ControlDesign) -> Array:

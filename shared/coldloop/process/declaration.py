@@ -116,6 +116,17 @@ class Load:
     """Ends of its bar on the operator's page; its span where they are not given."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Forecast:
+    """What the optimiser expects of the load or of another disturbance, steps held."""
+
+    name: str
+    """Of the load, or of a state that is a disturbance."""
+    ticks: tuple[int, ...]
+    """From 0, rising."""
+    values: tuple[float, ...]
+
+
 NO_LOAD: Final = Load(name="no load", unit="", span=(0.0, 1.0), walk=1e-6)
 """The load of a process that has none."""
 
@@ -143,6 +154,7 @@ class Process:
     """Outputs whose constant error is told from states, load and the other constants: estimated by default."""
     iterations: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     """See `share`; what is not named is 1."""
+    forecasts: tuple[Forecast, ...] = ()
     mimic: str = ""
     """Drawing for the operator's page, an SVG text; empty where there is none."""
 
