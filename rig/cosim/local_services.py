@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO, Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
-from coldloop.errors import LinkError
+from coldloop.errors import LinkError, PeerUnreachableError
 from rig.cosim.compiling_services import show_compiling
 from rig.cosim.kept_up import end_of
 from rig.cosim.ports import ReservedPorts
@@ -133,6 +133,8 @@ class LocalServices:
         death = asyncio.ensure_future(self._ended.get())
         try:
             await asyncio.wait({task, death}, return_when=asyncio.FIRST_COMPLETED)
+            if _is_unreachable(task):  # a service that ends closes its connections before
+                await asyncio.wait({death}, timeout=STOP_GRACE_S)
             if death.done():  # first: work that needs the service may fail in the same turn
                 dead = death.result()
                 raise LinkError(f"the {dead} service {self.end_of(dead)}")
@@ -174,6 +176,11 @@ class KeptService:
     async def restart(self) -> None:
         """Start it where it was before."""
         await self._services.start(self._service, may_end=True)
+
+
+def _is_unreachable(work: asyncio.Future[T]) -> bool:
+    """Return whether work has ended because a peer does not answer."""
+    return work.done() and not work.cancelled() and isinstance(work.exception(), PeerUnreachableError)
 
 
 def last_line(log: Path) -> str:
