@@ -1,15 +1,13 @@
-"""An optimiser that is not ours drives another process by its register map; one that breaks off does no harm."""
+"""A rig of another process that is up, seen through the registers that are listed for it."""
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
-import pytest
-
 from coldloop.registers.control_plc import Mode
-from tests.harness.processes import Processes
+from tests.harness.processes import Process, Processes
 from tests.process.outside_client import ACCEPTED, BEGIN_AGAIN, Blocks, Loop, Optimiser, Plant, Service, blocks_of
 from tests.process.runs import started
 
@@ -47,7 +45,7 @@ COLUMN: Final = Case(
 
 
 class Site(NamedTuple):
-    """A rig of a process that is up without an optimiser, and clients of it that know its listed registers alone."""
+    """A rig of a process that is up, and clients of it that know its listed registers alone."""
 
     case: Case
     control_blocks: Blocks
@@ -55,6 +53,7 @@ class Site(NamedTuple):
     """Of the control PLC."""
     plant: Plant
     control: Service
+    rig: Process
 
     def optimiser(self) -> Optimiser:
         return Optimiser(self.control_blocks, self.port, self.case.loops, self.case.tick_s, PERIOD)
@@ -95,69 +94,27 @@ class Site(NamedTuple):
 
 
 @contextmanager
-def up(case: Case, processes: Processes, folder: Path) -> Iterator[Site]:
+def up(
+    case: Case, processes: Processes, folder: Path, *options: object, more: Mapping[str, str] | None = None
+) -> Iterator[Site]:
     """Keep a rig up whose rack limits nothing, so that it shows what the control PLC does."""
-    base, files = processes.three_ports(), {"XDG_RUNTIME_DIR": str(folder)}
-    process = ("--process", case.file)
+    base, process = processes.three_ports(), ("--process", case.file)
     code, listing, complaints = started(processes, *process, "registers", "--format", "json")
     assert code == 0, complaints
     shortened = ("--set", "plant.rate_limited=false", "--set", f"control_plc.ladder.hold_s={2 * PERIOD * case.tick_s}")
-    words = ("--without", "optimizer", "--load", "a", "--factor", case.tick_s / TICK_S, *shortened, "--detach")
-    rig = processes.coldloop(*process, "up", "--port-base", base, *words, more=files)
-    assert rig.popen.wait(PATIENCE_S) == 0, rig.said
+    words = ("up", "--port-base", base, "--load", "a", "--factor", case.tick_s / TICK_S, *shortened, *options)
+    rig = processes.coldloop(*process, *words, more={"XDG_RUNTIME_DIR": str(folder), **(more or {})})
+    wait_until(lambda: "the rig is up" in rig.said or not rig.alive)
+    assert rig.alive, rig.said
     plant, control = Plant(blocks_of(listing, "plant"), base), Service(blocks_of(listing, "control_plc"), base + 1)
-    try:
-        with plant, control:
-            yield Site(case, control.blocks, base + 1, plant, control)
-    finally:
-        assert processes.coldloop("down", "--port-base", base, more=files).popen.wait(PATIENCE_S) == 0
+    with plant, control:
+        yield Site(case, control.blocks, base + 1, plant, control, rig)
+    assert rig.interrupt() in {0, 130}
 
 
-@pytest.mark.usefixtures("realtime")
-@pytest.mark.parametrize("case", [TANK, COLUMN], ids=["tank", "column"])
-def test_pi_controllers_by_registers_drive_a_process(case: Case, processes: Processes, tmp_path: Path) -> None:
-    with up(case, processes, tmp_path) as site, site.optimiser() as optimiser:
-        optimiser.introduce()
-        site.drives(optimiser, 4)
-        site.assert_no_step()
-        measured = site.control.read("process")
-    assert [measured[f"y.{loop.output}"] for loop in case.loops] == pytest.approx(
-        [loop.setpoint for loop in case.loops], abs=0.3
-    )
-
-
-def closes(optimiser: Optimiser, rows: bytes) -> None:  # noqa: ARG001 it does not come to the header
-    """Lose the connection when all rows have been written."""
-    optimiser.client.close()  # type: ignore[no-untyped-call]
-
-
-def closes_in_a_request(optimiser: Optimiser, rows: bytes) -> None:
-    """Lose the connection within the request that would commit them."""
-    optimiser.send_half_a_request(optimiser.next_update(), rows)
-    optimiser.client.close()  # type: ignore[no-untyped-call]
-
-
-def falls_silent(optimiser: Optimiser, rows: bytes) -> None:
-    """Keep the connection, and say no more within that request."""
-    optimiser.send_half_a_request(optimiser.next_update(), rows)
-
-
-@pytest.mark.usefixtures("realtime")
-@pytest.mark.parametrize("breaks_off", [closes, closes_in_a_request, falls_silent])
-def test_one_that_breaks_off_in_a_sequence_leaves_the_ladder_to_act_without_a_step(
-    breaks_off: Callable[[Optimiser, bytes], None], processes: Processes, tmp_path: Path
-) -> None:
-    with up(TANK, processes, tmp_path) as site, ExitStack() as first:
-        optimiser = first.enter_context(site.optimiser())
-        optimiser.introduce()
-        site.drives(optimiser, 3)
-        accepted = site.control.read("status")["accepted"]
-        optimiser.plan(optimiser.next_update())
-        breaks_off(optimiser, optimiser.send_rows([loop.high for loop in TANK.loops]))
-        modes = site.modes_until(Mode.CLASSICAL)
-        assert modes == [Mode.MPC, Mode.REST, Mode.HOLD, Mode.CLASSICAL]
-        assert site.control.read("status")["accepted"] == accepted
-        with site.optimiser() as second:
-            second.introduce()
-            site.drives(second, 2)
-        site.assert_no_step()
+def wait_until(condition: Callable[[], bool]) -> None:
+    """Wait until a condition holds."""
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(TICK_S)
