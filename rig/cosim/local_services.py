@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO, Self, TypeVar
 
 from coldloop.config import PREFIX, to_environment
-from coldloop.errors import LinkError, PeerUnreachableError
+from coldloop.errors import LinkError
 from rig.cosim.compiling_services import show_compiling
 from rig.cosim.kept_up import end_of
 from rig.cosim.ports import ReservedPorts
@@ -23,6 +23,8 @@ from rig.settings import Settings
 T = TypeVar("T")
 
 STOP_GRACE_S = 5.0
+EXIT_S = 2.0
+"""How long a process may take to end after it has closed its connections."""
 
 
 class LocalServices:
@@ -133,8 +135,8 @@ class LocalServices:
         death = asyncio.ensure_future(self._ended.get())
         try:
             await asyncio.wait({task, death}, return_when=asyncio.FIRST_COMPLETED)
-            if _is_unreachable(task):  # a service that ends closes its connections before
-                await asyncio.wait({death}, timeout=STOP_GRACE_S)
+            if _is_link_error(task):  # a service that ends closes its connections before its process has ended
+                await asyncio.wait({death}, timeout=EXIT_S)
             if death.done():  # first: work that needs the service may fail in the same turn
                 dead = death.result()
                 raise LinkError(f"the {dead} service {self.end_of(dead)}")
@@ -178,9 +180,8 @@ class KeptService:
         await self._services.start(self._service, may_end=True)
 
 
-def _is_unreachable(work: asyncio.Future[T]) -> bool:
-    """Return whether work has ended because a peer does not answer."""
-    return work.done() and not work.cancelled() and isinstance(work.exception(), PeerUnreachableError)
+def _is_link_error(task: "asyncio.Future[T]") -> bool:
+    return task.done() and not task.cancelled() and isinstance(task.exception(), LinkError)
 
 
 def last_line(log: Path) -> str:
