@@ -261,6 +261,8 @@ class ProcessFile(_Section):
     states: tuple[StateSection, ...] = ()
     """Process noises of states by name; of others 1 % of what they move by with the inputs, a sample."""
     prediction: PredictionSection = PredictionSection()
+    mimic: str | None = None
+    """SVG file with a drawing for the operator's page, beside the process file."""
 
     @property
     def outside(self) -> tuple[LoadSection | DisturbanceSection, ...]:

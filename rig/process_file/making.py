@@ -16,6 +16,7 @@ from rig.process_file.declaration import OutputSection, ProcessFile, read_proces
 from rig.process_file.fmu_model import with_units
 from rig.process_file.linear_model import Linearised
 from rig.process_file.linearised import linearised
+from rig.process_file.mimic import drawing_of
 
 Array = NDArray[np.float64]
 
@@ -54,7 +55,7 @@ def made_from(path: Path) -> Made:
     file = with_units(read_process_file(path), path.parent)
     linear = linearised(file, path.parent)
     file = _with_sensors(file)
-    process = _process(file, linear)
+    process = _process(file, linear, _drawing(file, path.parent))
     _check_room(process)
     _check_rest(file, linear)
     tick = discretise(linear.A, linear.B, linear.F[:, 0], file.tick_s)
@@ -74,7 +75,14 @@ def made_from(path: Path) -> Made:
     return Made(model, process, linear, len(file.disturbances))
 
 
-def _process(file: ProcessFile, linear: Linearised) -> Process:
+def _drawing(file: ProcessFile, folder: Path) -> str:
+    if file.mimic is None:
+        return ""
+    names = [*(one.name for one in file.inputs), *(one.name for one in file.outputs)]
+    return drawing_of(folder / file.mimic, [*names, "load"] if file.load else names)
+
+
+def _process(file: ProcessFile, linear: Linearised, mimic: str) -> Process:
     load = file.load
     return Process(
         name=file.name, tick_s=file.tick_s, ticks_per_sample=file.ticks_per_sample,
@@ -96,6 +104,7 @@ def _process(file: ProcessFile, linear: Linearised) -> Process:
         constraint_instants=file.prediction.constraint_instants,
         constants=_constants(file, linear),
         iterations=iteration_shares(_sizes(file, len(linear.states))),
+        mimic=mimic,
     )  # fmt: skip
 
 

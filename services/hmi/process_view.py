@@ -22,7 +22,7 @@ def process_document() -> dict[str, Any]:
     load = {"word": LOAD_WORD, "unit": LOAD_UNIT, "span": span, "bar": PROCESS.load.bar or span}
     return {
         "name": PROCESS.name,
-        "drawn": IS_COLD_BOX,  # there is a drawing of it, which shows the outputs that have no band
+        "mimic": "static/mimic.svg" if IS_COLD_BOX else "mimic.svg" if PROCESS.mimic else None,
         "sample_s": SAMPLING_PERIOD_S,
         "inputs": [
             {"name": one.name, "label": one.name[: len(one.register)], "register": one.register, "unit": one.unit,

@@ -12,6 +12,7 @@ from typing import Final
 
 from aiohttp import BasicAuth, hdrs, web
 
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, TICK_S
 from coldloop.registers.optimizer_plc import BANDED_OUTPUTS
 from coldloop.service.metrics import exposition
@@ -74,6 +75,7 @@ class Reading:
         return [
             web.get("/", self.page),
             *static_files(),
+            web.get("/mimic.svg", self.mimic),
             web.get("/api/catalog", self.catalog),
             web.get("/api/state", self.state),
             web.get("/api/stream", self.stream, allow_head=False),
@@ -90,6 +92,12 @@ class Reading:
     async def page(self, _request: web.Request) -> web.StreamResponse:
         """Answer with the page."""
         return web.FileResponse(STATIC / "index.html")
+
+    async def mimic(self, _request: web.Request) -> web.Response:
+        """Answer with the drawing that the process brings; those of the cold box are static files."""
+        answer = web.Response(text=PROCESS.mimic, content_type="image/svg+xml")
+        add_headers(answer)
+        return answer
 
     async def catalog(self, _request: web.Request) -> web.Response:
         """Answer with what the page is made from."""

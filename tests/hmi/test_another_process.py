@@ -26,6 +26,8 @@ TANK: Final = Path(__file__).parents[2] / "examples" / "processes" / "quadruple_
 FACTOR: Final = 4
 LADDER, PROCESS, LOAD_STATUS = 50, 100, 420
 VIEWS: Final = ("overview", "trends", "why", "alarms", "commands", "detail")
+FILLED: Final = ("rect[data-fill]", ".vessel-wall[width='140']")
+"""What is filled in a lower tank, and the tank."""
 OF_THE_COLD_BOX: Final = re.compile(r"CV15[56]|NCR22|\b[TP]\d\b|\bL1\b|\b[Ww]atts|\d W\b|bath|nitrogen|turbine|heat")
 
 
@@ -111,7 +113,6 @@ def alarm(page: "Page", name: str, *words: str) -> Callable[[], bool]:
 def test_the_page_has_the_signals_of_the_process_and_nothing_of_a_cold_box(page: "Page", tank: Tank) -> None:
     bars = page.locator("#overview .bar")
     assert [bars.nth(i).get_attribute("data-name") for i in range(bars.count())] == ["h1", "h2", "v1", "v2", "load"]
-    assert page.locator("#overview .mimic").count() == 0
     ends = page.locator("#overview .bar .ends").all_inner_texts()
     # a band of 12 to 12.6 and 1.5 of it on each side; 0 V to 10 V and an eighth of it; what the load may be
     assert [text.split() for text in ends] == [
@@ -127,6 +128,18 @@ def test_the_page_has_the_signals_of_the_process_and_nothing_of_a_cold_box(page:
         view(page, each)
         found = OF_THE_COLD_BOX.search(page.inner_text(f"#{each}"))
         assert found is None, f"{each}: {found}"
+
+
+def test_the_drawing_of_the_process_file_shows_its_signals(page: "Page", tank: Tank) -> None:
+    view(page, "overview")
+    drawing = page.locator("#mimic svg")
+    assert drawing.locator(".tag").count() == 4
+    assert drawing.locator(".tag .name").all_text_contents() == ["h1", "h2", "v1", "v2"]
+    shown = float((drawing.locator(".tag .reading").first.text_content() or "").split()[0])
+    assert shown == pytest.approx(tank.levels[0], abs=0.02)
+    assert drawing.locator("text[data-signal='control_plc.process.load']").text_content() == "0.000 cm3/s"
+    filled, whole = (float(drawing.locator(one).first.get_attribute("height") or 0.0) for one in FILLED)
+    assert filled / whole == pytest.approx(tank.levels[0] / 20.0, abs=0.01), "the rectangle is full at 20 cm"
 
 
 def test_an_operator_drives_a_level_out_of_its_band_and_mpc_brings_it_back(page: "Page", tank: Tank) -> None:

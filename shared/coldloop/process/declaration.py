@@ -143,6 +143,8 @@ class Process:
     """Outputs whose constant error is told from states, load and the other constants: estimated by default."""
     iterations: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     """See `share`; what is not named is 1."""
+    mimic: str = ""
+    """Drawing for the operator's page, an SVG text; empty where there is none."""
 
     def __post_init__(self) -> None:
         for what in (self.inputs, self.outputs, self.states):

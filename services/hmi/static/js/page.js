@@ -1,6 +1,6 @@
 // Starts the page: views, theme, links, the state of the stream.
 import { ask, connect, element, indexed, isStale, onChange, pageIsSilent, signal, state, take } from "./store.js";
-import { bindAll, controlledBar, inputBar, loadBar, measuredBar } from "./values.js";
+import { bindAll, bindNames, controlledBar, inputBar, loadBar, measuredBar } from "./values.js";
 import { hideTrends, initTrends, recolourStrips, recolourTrends, refreshStrips, showTrends } from "./trends.js";
 import { initWhy, pick, recolourWhy, showWhy } from "./why.js";
 import { initAlarms, redrawAlarms } from "./alarms.js";
@@ -88,17 +88,19 @@ function overview() {
   setInterval(refreshStrips, 1000);
 }
 
-// One drawing for each kind of cold box. If another one is found later, the page reloads. Other processes have none.
+// One drawing for each kind of cold box. If another one is found later, the page reloads. Other processes may bring one.
 const MIMICS = { refrigerator: "static/mimic-refrigerator.svg" };
 async function mimic(kind) {
-  if (!state.catalog.process.drawn) {
+  const own = state.catalog.process.mimic;
+  if (!own) {
     document.body.dataset.plant = "not-drawn";
     byId("mimic").remove();
     byId("strips").setAttribute("aria-label", "Controlled outputs, load and updating period over the last five minutes");
     return;
   }
-  const text = await (await fetch(MIMICS[kind] || "static/mimic.svg")).text();
+  const text = await (await fetch(MIMICS[kind] || own)).text();
   byId("mimic").append(document.importNode(new DOMParser().parseFromString(text, "image/svg+xml").documentElement, true));
+  if (own === "mimic.svg") bindNames(byId("mimic"));
   document.body.dataset.plant = kind;
   onChange(() => { if ((MIMICS[state.plant.kind] || "") !== (MIMICS[kind] || "")) location.reload(); });
 }

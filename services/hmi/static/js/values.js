@@ -17,6 +17,7 @@ export function bindAll(root) {
   for (const one of root.querySelectorAll(".tag[data-signal]")) bindTag(one);
   for (const one of root.querySelectorAll(".bar[data-signal]")) bindBar(one);
   for (const one of root.querySelectorAll("[data-signal]:not(.tag):not(.bar)")) bindText(one);
+  for (const one of root.querySelectorAll("[data-fill]")) bindFill(one);
   for (const one of root.querySelectorAll("[data-source]")) watched.push([one, ...one.dataset.source.split(" ")]);
 }
 
@@ -88,15 +89,37 @@ function bindTag(tag) {
   tag.append(ground, frame, label, letter, text, parts.track, parts.band, parts.pointer, cross(width, 30));
   const draw = () => {
     text.textContent = valueText(name);
-    const { value } = place(tag, parts, width);
-    if (tag.dataset.level && Number.isFinite(value)) {
-      const bath = document.getElementById(tag.dataset.level), height = Number(bath.dataset.full) * Math.min(1, Math.max(0, value / 100));
-      bath.setAttribute("y", Number(bath.dataset.bottom) - height);
-      bath.setAttribute("height", height);
-    }
+    place(tag, parts, width);
   };
   for (const one of [name, ...(pair(tag.dataset.band) || []), ...(pair(tag.dataset.bounds) || [])]) bind(one, draw);
   watched.push([tag, name]);
+}
+
+// A rectangle that is full where its signal is at data-high, and empty at data-low.
+function bindFill(one) {
+  const name = one.dataset.fill, low = Number(one.dataset.low), high = Number(one.dataset.high);
+  const full = Number(one.getAttribute("height")), bottom = Number(one.getAttribute("y")) + full;
+  bind(name, () => {
+    const height = full * Math.min(1, Math.max(0, (number(name) - low) / (high - low) || 0));
+    one.setAttribute("y", bottom - height);
+    one.setAttribute("height", height);
+  });
+  watched.push([one, name]);
+}
+
+// A drawing that a process brings names its signals as the process does; tags and levels have the ends of their bars.
+export function bindNames(root) {
+  const { inputs, controlled, measured, load } = state.catalog.process, known = new Map();
+  const add = (name, signal, one, more) => known.set(name, { name, signal: `control_plc.process.${signal}`, low: one.bar[0], high: one.bar[1], ...more });
+  for (const one of inputs) add(one.name, `u.${one.name}`, one, { bounds: within("input", one.name) });
+  for (const one of controlled) add(one.name, `y.${one.name}`, one, { band: within("output", one.name) });
+  for (const one of measured) add(one.name, `y.${one.name}`, one);
+  if (load) add("load", "load", load);
+  for (const one of root.querySelectorAll("[data-signal], [data-fill]")) {
+    const { signal, ...more } = known.get(one.dataset.signal || one.dataset.fill);
+    if (one.dataset.fill) one.dataset.fill = signal; else one.dataset.signal = signal;
+    if (one.matches(".tag, [data-fill]")) for (const [key, value] of Object.entries(more)) if (!(key in one.dataset)) one.dataset[key] = value;
+  }
 }
 
 // A bar of a signal of the process, with its band or its bounds: ends that the optimiser keeps it within.
