@@ -15,7 +15,7 @@ import struct
 import sys
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Any, NamedTuple, Self
 
@@ -69,6 +69,8 @@ class Update(NamedTuple):
     """Inputs applied from this tick on."""
     y: tuple[float, ...]
     """Measured outputs; not a number where a measurement is bad."""
+    x: tuple[float, ...]
+    """States at this tick; simulated, so a real plant would not show them."""
 
 
 class ControlPlc:
@@ -76,13 +78,19 @@ class ControlPlc:
 
     A block is described by one letter per value as in `struct`: H is a uint16 (one register), I a uint32 and f a
     float32 (two registers).
+
+    Args:
+        host: Its address.
+        port: Its port.
+        model: First 32 bits of the digest of the model file that is predicted by; without, what the control PLC has.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, model: int | None = None) -> None:
         # a request that waits for an update is answered within 1 s; nothing is sent twice without our knowledge
         self._client = ModbusTcpClient(host, port=port, timeout=5.0, retries=0)
         self._low_first = False
         self.holder = 1 + secrets.randbelow(0xFFFFFFFF)
+        self._own_model = model
         self.model = 0
 
     def __enter__(self) -> Self:
@@ -92,9 +100,10 @@ class ControlPlc:
         words = self._ask(self._client.read_holding_registers(IDENTITY, count=8))
         self._low_first = False
         self._low_first = round(self._values("f", words[:2])[0], 3) != MAGIC
-        magic, _, _, _, self.model = self._values("fIHHI", words)
+        magic, _, _, _, model = self._values("fIHHI", words)
         if round(magic, 3) != MAGIC:
             raise FailedError(f"the first value is {magic}, not {MAGIC}: not a control PLC, or another address base")
+        self.model = model if self._own_model is None else self._own_model
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -164,7 +173,7 @@ class ControlPlc:
         words = self._exchange(AWAIT_UPDATE, asked, UPDATE, UPDATE_WORDS)
         session, number, tick, playing, load, *rest = self._opened("IIII" + "f" * 57, words)
         # the rest: inputs until this tick, inputs from it on, the 22 outputs, the simulated states
-        return Update(session, number, tick, playing, load, tuple(rest[3:6]), tuple(rest[6:28]))
+        return Update(session, number, tick, playing, load, tuple(rest[3:6]), tuple(rest[6:28]), tuple(rest[28:]))
 
     def plan(self, update: Update) -> None:
         """Say when the next updating instant is; no load step cuts it short, no shortage, no reading is suspect."""
@@ -193,6 +202,14 @@ class ControlPlc:
 def crc_of(raw: bytes) -> int:
     """Return the CRC of a block, from its values with the high word first; 0 would be none, so it is 1 then."""
     return zlib.crc32(raw) or 1
+
+
+def allowed(before: tuple[float, ...], wanted: Iterable[float]) -> tuple[float, ...]:
+    """Return the inputs that are closest to the wanted ones, within bounds and by no more than a rate from `before`."""
+    nearest = []
+    for u, target, low, high, rate in zip(before, wanted, LOW, HIGH, RATE, strict=True):
+        nearest.append(min(max(u + min(max(target - u, -rate), rate), low), high))
+    return tuple(nearest)
 
 
 class PiLaw:
@@ -225,10 +242,8 @@ class PiLaws:
         Until then the sequence being played goes on, which is constant. So they count from the inputs applied now.
         """
         changes = (0.0, self._level.change(update.y[L1]), self._temperature.change(update.y[T5]))
-        row = []
-        for u, change, low, high, rate in zip(update.u, changes, LOW, HIGH, RATE, strict=True):
-            row.append(min(max(u + min(max(change, -rate), rate), low), high))
-        return [tuple(row)] * ROWS
+        wanted = (u + change for u, change in zip(update.u, changes, strict=True))
+        return [allowed(update.u, wanted)] * ROWS
 
 
 def answered(plc: ControlPlc, law: Callable[[Update], Rows]) -> Iterator[tuple[Update, int]]:
@@ -271,12 +286,17 @@ def optimise(plc: ControlPlc, law: Callable[[Update], Rows], where: str) -> None
             time.sleep(1.0)
 
 
-def main() -> None:
-    """Optimise until Ctrl-C."""
-    parser = argparse.ArgumentParser(description="An optimiser for Coldloop's control PLC, by registers alone.")
+def option_parser(description: str) -> argparse.ArgumentParser:
+    """Return the options of an optimiser: where the control PLC is."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=5021, help="of the control PLC (default: 5021)")
-    options = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Optimise until Ctrl-C."""
+    options = option_parser("An optimiser for Coldloop's control PLC, by registers alone.").parse_args()
     with suppress(KeyboardInterrupt):
         optimise(ControlPlc(options.host, options.port), PiLaws(), f"{options.host}:{options.port}")
 

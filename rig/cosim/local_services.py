@@ -23,6 +23,8 @@ from rig.settings import Settings
 T = TypeVar("T")
 
 STOP_GRACE_S = 5.0
+EXIT_S = 2.0
+"""How long a process may take to end after it has closed its connections."""
 
 
 class LocalServices:
@@ -133,6 +135,8 @@ class LocalServices:
         death = asyncio.ensure_future(self._ended.get())
         try:
             await asyncio.wait({task, death}, return_when=asyncio.FIRST_COMPLETED)
+            if _is_link_error(task):  # a service that ends closes its connections before its process has ended
+                await asyncio.wait({death}, timeout=EXIT_S)
             if death.done():  # first: work that needs the service may fail in the same turn
                 dead = death.result()
                 raise LinkError(f"the {dead} service {self.end_of(dead)}")
@@ -174,6 +178,10 @@ class KeptService:
     async def restart(self) -> None:
         """Start it where it was before."""
         await self._services.start(self._service, may_end=True)
+
+
+def _is_link_error(task: "asyncio.Future[T]") -> bool:
+    return task.done() and not task.cancelled() and isinstance(task.exception(), LinkError)
 
 
 def last_line(log: Path) -> str:

@@ -287,3 +287,44 @@ def test_the_example_is_installed_and_runs_with_no_edit_here(processes: Processe
         conformance = ("-m", "rig.testing.conformance", *words)
         report = processes.python(*conformance, more=beside, **pipes).ended(PROGRAM_S)
         assert report.code == 0, report.out + report.err
+
+
+RAISING = """
+class Raising:
+    solved = 0
+
+    def solve(self, problem, guess, iterations):
+        Raising.solved += 1
+        if Raising.solved > 5:
+            raise ZeroDivisionError("no\\npivot")
+        return guess, iterations
+"""
+
+
+@pytest.fixture
+def raising(tmp_path: Path) -> dict[str, str]:
+    """The environment with a package installed whose solver `raising` raises at its sixth problem."""
+    site = tmp_path / "site"
+    metadata = site / "raising-1.dist-info"
+    metadata.mkdir(parents=True)
+    (site / "raising.py").write_text(RAISING, encoding="utf-8")
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: raising\nVersion: 1\n", encoding="utf-8")
+    (metadata / "entry_points.txt").write_text("[coldloop.solvers]\nraising = raising:Raising\n", encoding="utf-8")
+    return {"PYTHONPATH": str(site)}
+
+
+def test_a_solver_that_raises_on_the_bus_ends_the_run_with_one_line(
+    raising: dict[str, str], processes: Processes, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    run = ("run", "--load", "a", "--duration", "2min", "--outside-solver", "raising", "--out", out)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    code, _, complaints = processes.coldloop(*run, more=raising, **pipes).ended(PROGRAM_S)
+    words = "optimizer_plc: solver raising: ZeroDivisionError: no pivot"
+    assert code != 0
+    said = f"coldloop: the optimizer_plc service has ended with exit code 2: {words} (log: "
+    assert complaints.splitlines()[-1].startswith(said), complaints
+    assert "Traceback" not in complaints
+    log = (out / "logs" / "optimizer_plc.log").read_text(encoding="utf-8")
+    assert log.splitlines()[-1] == words
+    assert "Traceback" not in log

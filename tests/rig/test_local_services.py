@@ -26,3 +26,20 @@ def test_a_service_that_ended_is_named_even_when_the_work_fails_with_it(tmp_path
                 await services.during(unreachable())
 
     asyncio.run(check())
+
+
+@pytest.mark.usefixtures("processes")
+def test_the_end_of_a_service_is_the_reason_also_when_it_is_known_after_its_connections_have_closed(
+    tmp_path: Path,
+) -> None:
+    async def check() -> None:
+        async with LocalServices(Settings(), tmp_path) as services:
+
+            async def unreachable_before_its_end() -> None:
+                asyncio.get_running_loop().call_later(0.2, services.processes["plant"].kill)
+                await unreachable()
+
+            with pytest.raises(LinkError, match=r"the plant service was ended by SIGKILL"):
+                await services.during(unreachable_before_its_end())
+
+    asyncio.run(check())

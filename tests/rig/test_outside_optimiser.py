@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.modbus.client import RegisterClient
+from coldloop.process.cold_box import LEVEL_BAND, T5_BAND
 from coldloop.process.limits import InputLimits
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.signals import OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
 from coldloop.registers.codec import WordOrder
-from coldloop.registers.common import MAGIC
+from coldloop.registers.common import MAGIC, Identity
 from coldloop.registers.control_plc import CONTROL_MAP, LadderStatus, Mode, Status, Verdict
 from coldloop.registers.safety import LeaseState, LeaseStatus
 from rig import cli
@@ -33,16 +34,21 @@ if TYPE_CHECKING:
     from tests.rig.conftest import OnTheBus
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "optimiser_by_registers.py"
+WITH_DO_MPC = EXAMPLE.with_name("optimiser_with_do_mpc.py")
 FACTOR = 5.0
 PATIENCE_S = 120.0
 
 
-def start(processes: Processes, port: int) -> Process:
-    return processes.python(str(EXAMPLE), "--port", str(port), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+def start(processes: Processes, port: int, example: Path = EXAMPLE, *words: str) -> Process:
+    command = (str(example), "--port", str(port), *words)
+    return processes.python(*command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
-def end(optimiser: Process) -> list[str]:
-    """End it; return the verdicts that it got. On a busy machine sequences may be late; anything else is an error."""
+def end(optimiser: Process) -> tuple[str, list[str]]:
+    """End it; return what it has said, and the verdicts in it.
+
+    On a busy machine sequences may be late; any other verdict is an error.
+    """
     assert optimiser.alive, optimiser.ended().err
     optimiser.popen.send_signal(2)
     ended = optimiser.ended()
@@ -50,7 +56,7 @@ def end(optimiser: Process) -> list[str]:
     verdicts = re.findall(r"(accepted|verdict \d+)$", ended.out, re.MULTILINE)
     late = {f"verdict {verdict:d}" for verdict in (Verdict.LATE, Verdict.WRONG_UPDATE, Verdict.PLANT_LOST)}
     assert set(verdicts) <= {"accepted"} | late, ended.out
-    return verdicts
+    return ended.out, verdicts
 
 
 async def until_accepted(control: RegisterClient, more: int) -> None:
@@ -88,7 +94,7 @@ async def test_its_sequences_are_accepted_in_either_word_order(
         optimiser = start(processes, port)
         await until_accepted(control, 4)  # one more: it counts before the example has told it
         lease = await control.read(LeaseStatus)
-        verdicts = await asyncio.to_thread(end, optimiser)
+        _, verdicts = await asyncio.to_thread(end, optimiser)
     assert lease.state == LeaseState.HELD
     assert lease.holder != 0
     assert verdicts.count("accepted") >= 3
@@ -107,7 +113,8 @@ async def test_one_that_was_restarted_drives_again(
                 await asyncio.sleep(0.05)
         second = start(processes, port)
         await until_accepted(control, 3)
-        assert (await asyncio.to_thread(end, second)).count("accepted") >= 2
+        _, verdicts = await asyncio.to_thread(end, second)
+        assert verdicts.count("accepted") >= 2
 
 
 @pytest.fixture
@@ -145,6 +152,62 @@ def test_a_rig_is_kept_up_and_operated_without_our_optimiser(up: int, coldloop: 
     end(optimiser)
 
 
+# -- with do-mpc -------------------------------------------------------------------------------------------------------
+
+PERIODS = 40
+LOAD_STEP = LoadProfile((0, 15 * TICKS_PER_SAMPLE), (385.0, 445.0))
+"""As large as the steps of load a."""
+
+
+async def until_it_has_the_lease(rig: SessionClient) -> int:
+    """Let a session in lock-step go slowly until an optimiser is there, as it would not wait; return the tick."""
+    tick = 0
+    async with asyncio.timeout(PATIENCE_S):
+        while (await rig.control.read(LeaseStatus)).state != LeaseState.HELD:
+            tick += 1
+            await rig.advance(0, tick)
+            await asyncio.sleep(TICK_S)
+    return tick
+
+
+async def driven_until(rig: SessionClient, tick: int) -> list[Status]:
+    """Let a session in lock-step go until that tick; return what was seen from the first sequence on."""
+    seen: list[Status] = []
+    await rig.advance(0, tick)
+    async with asyncio.timeout(PATIENCE_S):
+        while (await rig.plant.read(Identity)).tick < tick:
+            status = await rig.control.read(Status)
+            if seen or status.mode == Mode.MPC:
+                seen.append(status)
+            await asyncio.sleep(0.05)
+    return seen
+
+
+async def test_do_mpc_holds_the_bands_after_a_load_step_and_no_sequence_is_rejected(
+    on_the_bus: "OnTheBus", processes: Processes
+) -> None:
+    async with on_the_bus(services=REQUIRED) as bus:
+        rig = SessionClient(bus.endpoints, bus.settings, services=REQUIRED)
+        try:
+            await rig.connect(PATIENCE_S)
+            await rig.start(Scenario(14400, LOAD_STEP, 0.0, 1))
+            port, model = bus.endpoints.control_plc.port, bus.settings.model.file
+            optimiser = start(processes, port, WITH_DO_MPC, str(model))
+            began = await until_it_has_the_lease(rig)
+            seen = await driven_until(rig, began + PERIODS * TICKS_PER_SAMPLE)
+        finally:
+            rig.close()
+        said, verdicts = await asyncio.to_thread(end, optimiser)
+    assert {status.mode for status in seen} == {Mode.MPC}
+    assert seen[-1].rejected == 0
+    assert seen[-1].deadline_misses == seen[0].deadline_misses
+    assert set(verdicts) == {"accepted"}
+    assert len(verdicts) >= PERIODS - 2
+    outputs = [(float(level), float(t5)) for level, t5 in re.findall(r"L1 +([\d.]+) %  T5 +([\d.]+) K", said)]
+    for values, (low, high) in zip(zip(*outputs, strict=True), (LEVEL_BAND, T5_BAND), strict=True):
+        assert low <= min(values) <= max(values) <= high
+
+
 # -- what it knows -----------------------------------------------------------------------------------------------------
 
 
@@ -158,13 +221,15 @@ def example() -> ModuleType:
     return module
 
 
-def test_it_uses_pymodbus_and_nothing_of_ours() -> None:
-    tree = ast.walk(ast.parse(EXAMPLE.read_text(encoding="utf-8")))
-    names = {node.module or "" for node in tree if isinstance(node, ast.ImportFrom)}
-    tree = ast.walk(ast.parse(EXAMPLE.read_text(encoding="utf-8")))
-    names |= {alias.name for node in tree if isinstance(node, ast.Import) for alias in node.names}
-    foreign = {name.partition(".")[0] for name in names} - set(sys.stdlib_module_names)
-    assert foreign == {"pymodbus"}
+@pytest.mark.parametrize(
+    ("program", "known"),
+    [(EXAMPLE, {"pymodbus"}), (WITH_DO_MPC, {"casadi", "do_mpc", "numpy", "optimiser_by_registers"})],
+)
+def test_it_uses_nothing_of_ours(program: Path, known: set[str]) -> None:
+    nodes = list(ast.walk(ast.parse(program.read_text(encoding="utf-8"))))
+    names = {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
+    names |= {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    assert {name.partition(".")[0] for name in names} - set(sys.stdlib_module_names) == known
 
 
 def test_what_it_has_written_down_is_what_the_rig_has(example: ModuleType) -> None:
