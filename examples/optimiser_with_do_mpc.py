@@ -203,7 +203,7 @@ class DoMpc:
         self._controller.reset_history()  # nobody reads it
         self.solved_s.append(time.perf_counter() - start)
         if not self._controller.solver_stats["success"]:
-            self._controller.set_initial_guess()  # the next one does not begin where this one was left
+            self._controller.opt_x_num = self._controller.opt_x(0.0)  # where the next one begins
             return [before, before]
         return [self._controller.opt_x_num["_u", period, 0].full()[:, 0] for period in range(2)]
 
