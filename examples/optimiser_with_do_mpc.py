@@ -153,7 +153,7 @@ def interrupted_afterwards() -> Iterator[None]:
 
 
 class DoMpc:
-    """A controller: do-mpc, about the state at the next updating instant."""
+    """A controller: do-mpc, from the state at the next updating instant on."""
 
     def __init__(self, model: Model) -> None:
         self._model = model
@@ -203,6 +203,7 @@ class DoMpc:
         self._controller.reset_history()  # nobody reads it
         self.solved_s.append(time.perf_counter() - start)
         if not self._controller.solver_stats["success"]:
+            self._controller.opt_x_num = self._controller.opt_x(0.0)  # where the next one begins
             return [before, before]
         return [self._controller.opt_x_num["_u", period, 0].full()[:, 0] for period in range(2)]
 

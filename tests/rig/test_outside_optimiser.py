@@ -2,7 +2,9 @@
 
 import ast
 import asyncio
+import importlib
 import importlib.util
+import math
 import re
 import subprocess
 import sys
@@ -27,6 +29,7 @@ from rig import cli
 from rig.cosim.endpoints import REQUIRED
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
+from rig.settings import Settings
 from tests.conftest import Coldloop
 from tests.harness.processes import Process, Processes
 
@@ -206,6 +209,23 @@ async def test_do_mpc_holds_the_bands_after_a_load_step_and_no_sequence_is_rejec
     outputs = [(float(level), float(t5)) for level, t5 in re.findall(r"L1 +([\d.]+) %  T5 +([\d.]+) K", said)]
     for values, (low, high) in zip(zip(*outputs, strict=True), (LEVEL_BAND, T5_BAND), strict=True):
         assert low <= min(values) <= max(values) <= high
+
+
+def test_without_a_solution_the_inputs_stay_and_the_next_problem_is_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(WITH_DO_MPC.parent)
+    example = importlib.import_module(WITH_DO_MPC.stem)
+    model = example.read_model(Settings().model.file)
+    controller = example.DoMpc(model)
+    u, x, y = tuple(model.u0), tuple(model.x0), (math.nan,) * len(OUTPUT_NAMES)
+
+    def first_row(load: float) -> tuple[float, ...]:
+        row: tuple[float, ...] = controller(example.Update(1, 0, 0, 0, load, u, y, x))[0]
+        return row
+
+    solved = first_row(445.0)
+    assert solved != u
+    assert first_row(math.nan) == u
+    assert first_row(445.0) == pytest.approx(solved, abs=1e-6)
 
 
 # -- what it knows -----------------------------------------------------------------------------------------------------
