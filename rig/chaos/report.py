@@ -10,6 +10,7 @@ from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.safety import AlarmKind, AlarmState
+from coldloop.service.event_text import alarm_word
 from coldloop.whole_file import whole_text
 from rig.chaos.evaluation import Evaluation, RaisedAlarm, Row
 from rig.chaos.plan import ChaosPlan
@@ -81,7 +82,7 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
     ]
     if trace.ladder is not None:
         lines.append(f"mode at the end: {Mode(trace.ladder.mode).name}, {trace.ladder.events} events")
-    active = [AlarmKind(i).name for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
+    active = [alarm_word(i) for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
     if active:
         lines.append(f"alarms active or unacknowledged: {', '.join(active)}")
     return [*lines, *_resource_lines(trace)]
@@ -135,7 +136,7 @@ def _modes(modes: Sequence[str]) -> str:
 
 def _alarms(alarms: Sequence[RaisedAlarm]) -> str:
     """Return each alarm once: when it was first raised, and how often if more than once."""
-    times = Counter(alarm.name for alarm in alarms)
-    first = {alarm.name: alarm.after_s for alarm in reversed(alarms)}
+    times = Counter(alarm_word(AlarmKind[alarm.name]) for alarm in alarms)
+    first = {alarm_word(AlarmKind[alarm.name]): alarm.after_s for alarm in reversed(alarms)}
     cells = [f"{name} {first[name]:g}" + (f" (x{count})" if count > 1 else "") for name, count in times.items()]
     return ", ".join(cells) or "none"

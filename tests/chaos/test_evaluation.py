@@ -136,7 +136,7 @@ def test_a_run_without_faults_has_a_table_of_headings() -> None:
 def test_the_tables_have_a_line_a_fault(killed: ChaosTrace) -> None:
     text = table(evaluated(killed).rows)
     assert "MPC > HOLD > CLASSICAL > MPC" in text
-    assert "OPTIMIZER_LOST 0.25" in text
+    assert "optimizer lost 0.25" in text
     assert text.count("\n") == 3
 
 
@@ -148,4 +148,4 @@ def test_a_restless_run_still_has_a_table_that_can_be_read() -> None:
     (row,) = evaluated(trace).rows
     assert len(row.modes) == 40
     assert "REST > MPC > (32 more) > REST > MPC" in table([row])
-    assert "SEQUENCE_LATE 2.5 (x20)" in table([row])
+    assert "sequence late 2.5 (x20)" in table([row])

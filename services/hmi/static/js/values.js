@@ -75,7 +75,7 @@ function bindSmallTag(tag) {
 
 function bindTag(tag) {
   if (tag.classList.contains("small")) { bindSmallTag(tag); return; }
-  const name = tag.dataset.signal, width = 100;
+  const name = tag.dataset.signal, width = Number(tag.dataset.width) || 100;
   const frame = shape("rect", { class: "frame", x: -3, y: -1, width: width + 6, height: 32, rx: 2 });
   const ground = shape("rect", { class: "ground", x: -2, y: 0, width: width + 4, height: 30, rx: 2, opacity: 0.85 });
   const label = shape("text", { class: "name", x: 0, y: 14 }, tag.dataset.name);
@@ -116,8 +116,9 @@ export function bindNames(root) {
   for (const one of measured) add(one.name, `y.${one.name}`, one);
   if (load) add("load", "load", load);
   for (const one of root.querySelectorAll("[data-signal], [data-fill]")) {
-    const { signal, ...more } = known.get(one.dataset.signal || one.dataset.fill);
-    if (one.dataset.fill) one.dataset.fill = signal; else one.dataset.signal = signal;
+    const { signal: full, ...more } = known.get(one.dataset.signal || one.dataset.fill), about = signal(full);
+    more.width = Math.max(100, Math.ceil(6.5 * more.name.length + 8 * (8 + about.unit.length))); // room for both
+    if (one.dataset.fill) one.dataset.fill = full; else one.dataset.signal = full;
     if (one.matches(".tag, [data-fill]")) for (const [key, value] of Object.entries(more)) if (!(key in one.dataset)) one.dataset[key] = value;
   }
 }
