@@ -31,6 +31,9 @@ TOLERANCES = {8: 1e-8, 4: 1e-4}
 """What a bound may be missed by, scaled, by the bytes of a number: in single precision a corner of bounds is met no
 better than within 1e-5."""
 
+NO_EFFECT = 1e-9
+"""K of T5 per W held: an input that warms it by less does so by rounding, whose sign differs from machine to machine."""
+
 
 class Rest(NamedTuple):
     """What is at rest with L1 at its operating point, by the scaled inputs."""
@@ -191,7 +194,7 @@ def least_warm_load(c: TargetSearch, low: Array, high: Array) -> float:
         load += c.held[i] * at
         lacking -= c.temperature[i] * at
     while lacking > 0:
-        best, most = -1, low.dtype.type(0.0)
+        best, most = -1, low.dtype.type(NO_EFFECT)
         for i in range(last):
             warms = c.temperature[i] * c.held[i] > 0  # in the direction in which it holds more
             share = abs(c.temperature[i] / c.held[i])
