@@ -32,7 +32,7 @@ TOLERANCES = {8: 1e-8, 4: 1e-4}
 better than within 1e-5."""
 
 NO_EFFECT = 1e-9
-"""K of T5 per W held: an input that warms it by less does so by rounding, whose sign differs from machine to machine."""
+"""K of T5 per W held: an input that warms it by less does so by rounding, whose sign is another on another machine."""
 
 
 class Rest(NamedTuple):
