@@ -1,34 +1,27 @@
 """The ODE-based solver as a folder of C99: sources, constants, golden vectors and a self-test that runs them."""
 
-import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Costs
-from optimizer_plc.solvers.ode import OdeMethod, solve
+from optimizer_plc.solvers.ode import OdeMethod
 from rig.plc_export.c99 import Printer, helpers, identifier, records_in
-from rig.plc_export.reading import Program
+from rig.plc_export.ode_program import PER_PROBLEM, OdeProgram, crc, leaves
 from rig.plc_export.recorded_problems import GoldenVector
-from rig.plc_export.subset import type_of
 from rig.plc_export.tree import Kind
 
 Array = NDArray[Any]
 
-PER_PROBLEM: Final = ("phi", "gamma", "low", "high")
-"""Vectors of a problem that change from one to the next."""
 TEMPLATE: Final = Path(__file__).with_name("self_test.c")
-POWER: Final = frozenset({"power"})
-"""The step size has a cube root by `**`: its last bit is that of the platform's library."""
 
 
 class OdeExport:
-    """The solver for the matrices of one problem and a table of iteration counts.
+    """The solver for the matrices of one problem and a table of iteration counts, as C99.
 
     Args:
         method: Constants of the solver; their type, single or double precision, is that of the export.
@@ -41,17 +34,14 @@ class OdeExport:
 
     def __init__(self, method: OdeMethod, problem: QuadraticProblem, counts: Array) -> None:
         self.method, self.problem, self.counts = method, problem, counts
-        real = problem.phi.dtype.type
-        self.printer = Printer(real)
+        self.program = OdeProgram(method, problem, counts)
+        self.printer = Printer(problem.phi.dtype.type)
         self.real = self.printer.scalars[Kind.REAL]
-        none = Costs(real(np.inf), real(np.inf))
-        types = tuple(map(type_of, (method, problem, np.zeros_like(problem.phi), counts, none)))
-        program = Program(POWER)
-        self.entry = program.function(cast("Dispatcher", solve), types)
+        self.entry = self.program.entry
         self.kernels = "\n".join(
-            self.printer.function(each, "" if each is self.entry else "static ") for each in program.functions
+            self.printer.function(each, "" if each is self.entry else "static ") for each in self.program.functions
         )
-        self.records = "\n".join(map(self.printer.structure, records_in(types)))
+        self.records = "\n".join(map(self.printer.structure, records_in(self.program.types)))
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
@@ -125,8 +115,8 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
         """Return the constant arrays by name."""
         real = self.problem.phi.dtype
         flow = np.array([float(each) for each in self.method.flow], real)
-        return {"Phi": self.problem.Phi, "Gamma": self.problem.Gamma, "counts": self.counts,
-                **arrays_of("matrices", self.method.matrices), "flow": flow}  # fmt: skip
+        matrices = {"_".join(path): values for path, values in leaves(("matrices",), self.method.matrices).items()}
+        return {"Phi": self.problem.Phi, "Gamma": self.problem.Gamma, "counts": self.counts, **matrices, "flow": flow}
 
     def _sum_of_constants(self) -> int:
         real = self.problem.phi.dtype
@@ -204,19 +194,3 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
 
 
 GENERATED: Final = "/* Written by Coldloop from the kernels of its optimiser; changes belong there. */\n"
-
-
-def arrays_of(prefix: str, record: object) -> dict[str, Array]:
-    """Return the arrays of a record of records, by their names joined."""
-    if isinstance(record, np.ndarray):
-        return {prefix: record}
-    found: dict[str, Array] = {}
-    for name, part in zip(record._fields, record, strict=True):  # type: ignore[attr-defined, call-overload]
-        found |= arrays_of(f"{prefix}_{name}", part)
-    return found
-
-
-def crc(values: Array, before: int = 0) -> int:
-    """Return the CRC-32 of numbers, most significant byte first, as the self-test computes it."""
-    wide = values.astype(f">f{values.dtype.itemsize}" if values.dtype.kind == "f" else ">i4")
-    return zlib.crc32(wide.tobytes(), before)

@@ -15,7 +15,8 @@ from optimizer_plc.qp.costs import matrices_of
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Costs
 from optimizer_plc.solvers.ode import Flow, OdeMethod, solve
-from rig.plc_export.folder import PER_PROBLEM, OdeExport
+from rig.plc_export.folder import OdeExport
+from rig.plc_export.ode_program import PER_PROBLEM
 from rig.plc_export.recorded_problems import ITERATIONS, GoldenVector, GoldenVectors, record
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off")
