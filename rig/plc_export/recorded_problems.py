@@ -70,7 +70,12 @@ def record(ticks: int, load: str = "a") -> GoldenVectors:
     model, rig = load_model(settings.model.file), OneProcessRig(settings, compiled=False)
     optimizer = rig.optimizer = _ListeningOptimizer(model, settings.optimizer_plc.program, settings.limits)
     rig.run(Scenario(ticks, find_load(load, model.w0), 0.0, seed=1), Recorder(ticks, []))
-    method, real = cast("OdeMethod", optimizer.method), real_of(Arithmetic.FLOAT32)
+    method = cast("OdeMethod", optimizer.method)
+    return GoldenVectors(method, [answered(method, qp, guess) for qp, guess in optimizer.heard])
+
+
+def answered(method: OdeMethod, problem: QuadraticProblem, guess: Array) -> GoldenVector:
+    """Return a problem with what the kernels answer, in single precision."""
+    real = real_of(Arithmetic.FLOAT32)
     none, counts = Costs(real(np.inf), real(np.inf)), np.arange(1, ITERATIONS + 1)
-    return GoldenVectors(method, [GoldenVector(qp, guess, solve(method, qp, guess, counts, none))
-                                  for qp, guess in optimizer.heard])  # fmt: skip
+    return GoldenVector(problem, guess, solve(method, problem, guess, counts, none))

@@ -23,11 +23,11 @@ COUNT: Final = "count"
 """The parameter of the inner kernel that says how many iterations it does."""
 
 
-def one_iteration_a_call(solve: Function) -> tuple[Function, tuple[str, ...]]:
+def one_iteration_a_call(solve: Function) -> Function:
     """Return the solver as a function that starts where `start` is true and else does one iteration.
 
     The solver calls `follow` at its end, which declares its state and then has a loop over counts: in each round, unless
-    the count is reached, it calls a kernel that does `count` iterations. The second value names what must be kept.
+    the count is reached, it calls a kernel that does `count` iterations.
 
     Raises:
         UnfitKernelError: The solver is built otherwise.
@@ -41,9 +41,10 @@ def one_iteration_a_call(solve: Function) -> tuple[Function, tuple[str, ...]]:
     state = tuple(each for each in follow.function.body if isinstance(each, Declare) and each.variable.name in needed)
     start = (*solve.body[: solve.body.index(follow)], *state)
     body = (If(START, start, iteration),)
-    kept = [each.variable.name for each in start if isinstance(each, Declare)]
+    parameters = tuple(each for each in solve.parameters if each.name in {node.name for node in walk(body)
+                                                                          if isinstance(node, Name)})  # fmt: skip
     summary = "Start where `start` is true, else do one iteration, or none once the profile is stationary."
-    return Function("solver", solve.source, summary, (START, *solve.parameters), body=body), tuple(kept)
+    return Function("solver", solve.source, summary, (START, *parameters), body=body)
 
 
 def _calls(loop: For) -> bool:

@@ -1,6 +1,6 @@
 """Blocks as IEC 61131-3 Structured Text (third edition): REAL and DINT, arrays of one dimension, every literal typed."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Final
 
 import numpy as np
@@ -33,6 +33,7 @@ SCALARS: Final = {Kind.REAL: "REAL", Kind.INT: "DINT", Kind.UNSIGNED: "DINT", Ki
 BYTES: Final = {"REAL": 4, "DINT": 4, "BOOL": 1}
 INFIX: Final = {"and": "AND", "or": "OR", "==": "=", "!=": "<>"}
 FUNCTIONS: Final = {"sqrt": "SQRT", "abs": "ABS", "power": "EXPT", "%": f"{PREFIX}floor_mod", "//": f"{PREFIX}floor_div"}
+NO_NOTES: Final[Mapping[str, str]] = {}
 TABLE: Final = f"{PREFIX}literals"
 
 
@@ -83,24 +84,21 @@ class StructuredTextPrinter(TreePrinter):
         return name
 
     def types(self) -> str:
-        """Return the definitions of the types of arrays so far."""
+        """Return the definitions of the types of arrays so far, and of the table of literals."""
+        self.arrays[f"{TABLE}_table"] = f"ARRAY [0..{len(self.literals) - 1}] OF REAL"
         body = "".join(f"    {name} : {definition};\n" for name, definition in sorted(self.arrays.items()))
         return f"TYPE\n{body}END_TYPE\n"
 
     # -- blocks --------------------------------------------------------------------------------------------------------
 
-    def block(self, block: Block, kept: Sequence[str] = ()) -> str:
-        """Return a function block.
-
-        Args:
-            block: The block.
-            kept: Variables that are put out beside the outputs: what is asked for after a call.
-        """
+    def block(self, block: Block, notes: Mapping[str, str] = NO_NOTES) -> str:
+        """Return a function block; variables that have a note are outputs, too."""
         self._names, self._source, self._uses_literals = Names(), block.source, False
+        self._notes = notes
         inputs, shared = self._declared(block.inputs), self._declared(block.shared)
-        outputs = self._declared([*block.outputs, *(each for each in block.variables if each.name in kept)])
+        outputs = self._declared([*block.outputs, *(each for each in block.variables if each.name in notes)])
         constants = {global_name(path): self.type(self.constants[path]) for path in block.constants}
-        variables = self._declared([each for each in block.variables if each.name not in kept])
+        variables = self._declared([each for each in block.variables if each.name not in notes])
         body = [*self._body(block.body, 1)]
         variables |= {self._instance(each): block_name(each) for each in block.called}
         if self._uses_literals:
@@ -113,7 +111,11 @@ class StructuredTextPrinter(TreePrinter):
         ])  # fmt: skip
 
     def _declared(self, names: Iterable[Name]) -> dict[str, str]:
-        return {self._local(each): self.type(each.type) for each in names}
+        return {self._local(each): self.type(each.type) + self._noted(each) for each in names}
+
+    def _noted(self, name: Name) -> str:
+        note = self._notes.get(name.name)
+        return f" (* {note} *)" if note else ""
 
     def _local(self, name: Name) -> str:
         """Return the name of a variable; those of one name and type are one variable."""

@@ -21,7 +21,7 @@ from rig.plc_export.recorded_problems import ITERATIONS, GoldenVector, GoldenVec
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off")
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
-MINUTE, HOUR = 240, 14400
+HOUR = 14400
 REAL = re.compile(r"(?<=[ {])-?\d\.\d{9}e[+-]\d\df")
 SOURCES = ("kernels.c", "problem.c", "golden.c", "self_test.c")
 
@@ -42,12 +42,6 @@ def compiled(folder: Path, compiler: str, *options: str, sources: tuple[str, ...
 
 def self_test(folder: Path, compiler: str, *options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([compiled(folder, compiler, *options)], capture_output=True, text=True, check=False)
-
-
-@pytest.fixture(scope="module")
-def minute() -> GoldenVectors:
-    """The problems of a minute of load a."""
-    return record(MINUTE)
 
 
 @pytest.fixture(scope="module")
