@@ -44,6 +44,14 @@ def put(array: dict[int, object], index: int, value: object) -> None:
     array[index] = value
 
 
+class Reals(dict[str, np.float32]):
+    """Literals that have been read."""
+
+    def __missing__(self, text: str) -> np.float32:
+        self[text] = np.float32(text)
+        return self[text]
+
+
 class Machine:
     """A loaded library; arrays are dictionaries from index to element."""
 
@@ -51,7 +59,7 @@ class Machine:
         self.library: Library = parsed(*texts)
         self.constants = SimpleNamespace()
         self.names: dict[str, Any] = {"np": np, "power": power, "to_integer": to_integer, "dint": dint, "put": put,
-                                      "quotient": quotient, "constants": self.constants}  # fmt: skip
+                                      "quotient": quotient, "constants": self.constants, "reals": Reals()}  # fmt: skip
         for variable in self.library.constants.values():
             setattr(self.constants, variable.name, self.initial(variable))
         for unit in self.library.units.values():
@@ -146,8 +154,8 @@ class Translation:
                 yield from self.block(body)
             case "case", chosen, list(cases):
                 yield f"case = {self.of(chosen, 'DINT')}"
-                for number, body in cases:
-                    yield f"if case == {number}:"
+                for place, (number, body) in enumerate(cases):
+                    yield f"{'elif' if place else 'if'} case == {number}:"
                     yield from self.block(body)
             case ("return",):
                 yield f"return {self.unit.name}" if self.unit.kind == "FUNCTION" else "return"
@@ -196,7 +204,7 @@ class Translation:
     def typed(self, expression: object) -> tuple[str, str]:  # noqa: PLR0911 one case a kind
         match expression:
             case "real", str(text):
-                return f"np.float32('{text.removeprefix('REAL#')}')", "REAL"
+                return f"reals['{text.removeprefix('REAL#')}']", "REAL"
             case "int", str(text):
                 return text, "DINT"
             case "bool", str(text):
