@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,21 @@ from optimizer_plc.solvers.interface import Costs
 from optimizer_plc.solvers.ode import OdeMethod
 from rig.plc_export.c99 import Printer, helpers, identifier, records_in
 from rig.plc_export.ode_program import PER_PROBLEM, OdeProgram, crc, leaves
-from rig.plc_export.recorded_problems import GoldenVector
-from rig.plc_export.tree import Kind
+from rig.plc_export.recorded_problems import GoldenVector, arrays_in
+from rig.plc_export.tree import ArrayType, Declare, Function, Invocation, Invoke, Kind, walk
 
 Array = NDArray[Any]
 
 TEMPLATE: Final = Path(__file__).with_name("self_test.c")
+
+
+class Sizes(NamedTuple):
+    """Bytes that a program needs."""
+
+    constants: int
+    stack: int
+    """Arrays and numbers of the deepest calls; without what the compiler adds."""
+    self_test: int
 
 
 class OdeExport:
@@ -48,13 +57,26 @@ class OdeExport:
     def write(self, folder: Path, vectors: Iterable[GoldenVector]) -> list[Path]:
         """Write the files, with some golden vectors, into a folder that is made; return their paths."""
         folder.mkdir(parents=True, exist_ok=True)
-        files = {
-            "kernels.h": self._header(), "kernels.c": self._kernels(), "problem.h": self._problem_header(),
-            "problem.c": self._problem(), **self._golden(list(vectors)), "self_test.c": self._self_test(),
-        }  # fmt: skip
+        files = self.files(vectors)
         for name, text in files.items():
             (folder / name).write_text(text, encoding="ascii")
         return [folder / name for name in files]
+
+    def files(self, vectors: Iterable[GoldenVector]) -> dict[str, str]:
+        """Return the texts of the files by their names, with some golden vectors."""
+        return {
+            "kernels.h": self._header(), "kernels.c": self._kernels(), "problem.h": self._problem_header(),
+            "problem.c": self._problem(), **self._golden(list(vectors)), "self_test.c": self._self_test(),
+        }  # fmt: skip
+
+    def sizes(self, vectors: Iterable[GoldenVector]) -> Sizes:
+        """Return the bytes of the constants, of the stack and of golden vectors."""
+        word = self.problem.phi.itemsize
+        constants = word * len(self.printer.literals) + sum(
+            values.size * (word if values.dtype.kind == "f" else 4) for values in self._constants().values()
+        )
+        golden = sum(word * sum(values.size for values in arrays_in(each).values()) for each in vectors)
+        return Sizes(constants, stack(self.entry, word), golden)
 
     def _header(self) -> str:
         signature = self.printer.signature(self.entry)
@@ -194,3 +216,12 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
 
 
 GENERATED: Final = "/* Written by Coldloop from the kernels of its optimiser; changes belong there. */\n"
+
+
+def stack(function: Function, word: int) -> int:
+    """Return the bytes of a function's variables and of the deepest calls in it."""
+    nodes = list(walk(function.body))
+    own = sum(word * (node.variable.type.size if isinstance(node.variable.type, ArrayType) else 1)
+              for node in nodes if isinstance(node, Declare))  # fmt: skip
+    called = {node.function.name: node.function for node in nodes if isinstance(node, Invoke | Invocation)}
+    return own + max((stack(each, word) for each in called.values()), default=0)

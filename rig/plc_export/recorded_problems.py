@@ -19,6 +19,7 @@ from optimizer_plc.solvers.ode import OdeMethod, solve
 from plant.load import find_load
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
+from rig.plc_export.ode_program import PER_PROBLEM
 from rig.results.recording import Recorder
 from rig.settings import Settings
 
@@ -92,3 +93,9 @@ def answered(method: OdeMethod, problem: QuadraticProblem, guess: Array) -> Gold
     real = real_of(Arithmetic.FLOAT32)
     none, counts = Costs(real(np.inf), real(np.inf)), np.arange(1, ITERATIONS + 1)
     return GoldenVector(problem, guess, solve(method, problem, guess, counts, none))
+
+
+def arrays_in(vector: GoldenVector) -> dict[str, Array]:
+    """Return the arrays of a golden vector by their names."""
+    return {**{name: getattr(vector.problem, name) for name in PER_PROBLEM}, "guess": vector.guess,
+            **{name: getattr(vector.answer, name).ravel() for name in ("points", "costs", "iterations")}}  # fmt: skip

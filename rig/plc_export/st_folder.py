@@ -10,7 +10,7 @@ from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.ode import OdeMethod
 from rig.plc_export.lowering import Lowering
 from rig.plc_export.ode_program import PER_PROBLEM, Array, OdeProgram
-from rig.plc_export.recorded_problems import GoldenVector, answered
+from rig.plc_export.recorded_problems import GoldenVector, answered, arrays_in
 from rig.plc_export.slicing import one_iteration_a_call
 from rig.plc_export.structured_text import (
     TABLE,
@@ -92,7 +92,14 @@ class StructuredTextExport:
         vector = sum(np.size(values) for values in arrays_in(self.vectors[0]).values())
         return Sizes(constants, memory(self.solver) + 4 * problem, 4 * vector * (len(self.vectors) + 1))
 
+    def calls(self) -> int:
+        """Return how often the self-test is called until it is done."""
+        return 1 + -(-sum(self._lengths()) // AT_ONCE) + sum(1 + len(each.answer.costs) for each in self.vectors)
+
     # -- constants -----------------------------------------------------------------------------------------------------
+
+    def _lengths(self) -> list[int]:
+        return [len(self.printer.literals), *(values.size for values in self.constants.values())]
 
     def _globals(self) -> dict[str, tuple[str, int, str]]:
         """Return type, bytes and value of each constant."""
@@ -162,11 +169,10 @@ END_CONFIGURATION
         problem, answer = self.vectors[0].problem, self.vectors[0].answer
         globals_ = self._globals()
         n, m, k = len(problem.phi), len(problem.gamma), len(answer.costs)
-        lengths = [len(self.printer.literals), *(values.size for values in self.constants.values())]
+        lengths = self._lengths()
         self.printer.array_type("DINT", len(lengths))
-        calls = sum(lengths) // AT_ONCE + 2 + len(self.vectors) * (k + 1)
         return filled((FOLDER / "self_test.st").read_text(encoding="ascii"), {
-            "CALLS": str(calls), "N": str(n), "M": str(m), "K": str(k), "POINTS": str(n * k), "LAST": str(n - 1),
+            "CALLS": str(self.calls()), "N": str(n), "M": str(m), "K": str(k), "POINTS": str(n * k), "LAST": str(n - 1),
             "EXTERNALS": "\n".join(f"    {name} : {kind};" for name, (kind, _, _) in globals_.items()),
             "INSTANCES": "\n".join(f"    golden_{each} : cl_golden_{each};" for each in range(len(self.vectors))),
             "PARTS": str(len(lengths)), "LENGTHS": ", ".join(map(str, lengths)), "AT_ONCE": str(AT_ONCE),
@@ -206,12 +212,6 @@ def bounded(method: OdeMethod, vector: GoldenVector) -> GoldenVector:
     problem = vector.problem
     return answered(method, problem._replace(low=np.maximum(problem.low, -most), high=np.minimum(problem.high, most)),
                     vector.guess)  # fmt: skip
-
-
-def arrays_in(vector: GoldenVector) -> dict[str, Array]:
-    """Return the arrays of a golden vector by the names of the self-test."""
-    return {**{name: getattr(vector.problem, name) for name in PER_PROBLEM}, "guess": vector.guess,
-            **{name: getattr(vector.answer, name).ravel() for name in ("points", "costs", "iterations")}}  # fmt: skip
 
 
 def scalar_of(values: Array) -> str:
