@@ -12,26 +12,25 @@ import numpy as np
 from coldloop.errors import UsageError
 from optimizer_plc.qp.problem import QuadraticProblem
 from rig.plc_export.folder import OdeExport
-from rig.plc_export.recorded_problems import GoldenVector, GoldenVectors, record
+from rig.plc_export.recorded_problems import TICKS, GoldenVector, GoldenVectors, record
 from rig.plc_export.st_folder import AT_ONCE, StructuredTextExport, filled
 from rig.plc_sizing.operations import Operations, gradient, ode
 from rig.plc_sizing.sizes import dense_sizes
 
-TARGETS: Final = ("c", "st")
 README: Final = "README.md"
 
 
-def export_plc(target: str, ticks: int, folder: Path) -> list[Path]:
+def export_plc(target: str, ticks: int | None, folder: Path) -> list[Path]:
     """Record problems and write the sources for a target; return the paths.
 
     Raises:
         UsageError: The folder is not empty or cannot be written to, or no input moves in so many ticks.
     """
     refuse_taken(folder)
-    recorded = record(ticks)
+    recorded = record(ticks or TICKS)
     vectors = recorded.telling()
     if not vectors:
-        raise UsageError(f"--ticks: no input moves within {ticks} ticks, so there is nothing to test with; record more")
+        raise UsageError(f"--ticks: no input moves within {ticks} ticks, so nothing would be tested; record more")
     texts = structured_text(recorded, vectors) if target == "st" else c99(recorded, vectors)
     write_whole(folder, texts)
     return [folder / name for name in texts]

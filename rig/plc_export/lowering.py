@@ -195,7 +195,7 @@ class FunctionLowering:
 
     # -- expressions ---------------------------------------------------------------------------------------------------
 
-    def _expression(self, expression: Expression) -> Expression:
+    def _expression(self, expression: Expression) -> Expression:  # noqa: PLR0911 one case a kind of expression
         match expression:
             case Name(kind) | Field(kind):
                 path = self._path(expression)

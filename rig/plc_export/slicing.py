@@ -26,8 +26,8 @@ COUNT: Final = "count"
 def one_iteration_a_call(solve: Function) -> Function:
     """Return the solver as a function that starts where `start` is true and else does one iteration.
 
-    The solver calls `follow` at its end, which declares its state and then has a loop over counts: in each round, unless
-    the count is reached, it calls a kernel that does `count` iterations.
+    The solver calls `follow` at its end, which declares its state and then has a loop over counts: in each round,
+    unless the count is reached, it calls a kernel that does `count` iterations.
 
     Raises:
         UnfitKernelError: The solver is built otherwise.

@@ -1,4 +1,4 @@
-"""The ODE-based solver as a folder of Structured Text: types, function blocks, constants, golden vectors, a self-test."""
+"""The ODE-based solver as Structured Text: types, function blocks, constants, golden vectors, a self-test."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ from rig.plc_export.structured_text import (
     section,
 )
 from rig.plc_export.subset import UnfitKernelError, type_of
-from rig.plc_export.tree import Kind, RecordType
+from rig.plc_export.tree import RecordType
 
 LARGEST_LIST: Final = 64 * 1024
 """Bytes of a list of constants: a data block of standard access of an S7-1200 or S7-1500 holds no more."""
@@ -29,9 +29,12 @@ AT_ONCE: Final = 1000
 """Constants that a call of the self-test sums up: less work than an iteration of the solver."""
 PRIME, FACTOR = 65521, 257
 NOTES: Final = {
-    "z": "the profile after the iterations done", "cost": "its augmented cost", "done": "iterations done since the start",
-    "guessed": "cost of the guess", "stalled": "iterations in a row that gained nothing; at 20 the profile is stationary",
-}  # fmt: skip
+    "z": "the profile after the iterations done",
+    "cost": "its augmented cost",
+    "done": "iterations done since the start",
+    "guessed": "cost of the guess",
+    "stalled": "iterations in a row that gained nothing; at 20 the profile is stationary",
+}
 GENERATED: Final = "(* Written by Coldloop from the kernels of its optimiser; changes belong there. *)\n"
 FOLDER: Final = Path(__file__).parent
 
@@ -106,6 +109,7 @@ class StructuredTextExport:
         literals = f"[\n        {', '.join(self.printer.literals)}]"
         found = {TABLE: (f"{TABLE}_table", 4 * len(self.printer.literals), literals)}
         for path, values in self.constants.items():
+            self.printer.where = global_name(path)
             found[global_name(path)] = (self.printer.type(type_of(values[()])), 4 * values.size, self._value(values))
         return found
 
@@ -152,7 +156,7 @@ END_CONFIGURATION
 
     def _golden(self, number: int, vector: GoldenVector) -> str:
         """Return the block that copies a golden vector to where the self-test has it."""
-        arrays = arrays_in(vector)
+        arrays, self.printer.where = arrays_in(vector), f"golden vector {number}"
         kinds = {name: self.printer.array_type(scalar_of(values), values.size) for name, values in arrays.items()}
         constants = {f"the_{name}": f"{kinds[name]} := {self._value(values)}" for name, values in arrays.items()}
         copies = "".join(f"    FOR i := 0 TO {values.size - 1} DO\n        {name}[i] := the_{name}[i];\n    END_FOR;\n"
@@ -179,7 +183,7 @@ END_CONFIGURATION
             "CONSTANTS": "".join(self._item(part, name) for part, name in enumerate(globals_)).rstrip(),
             "SUM": str(self._sum_of_constants()), "VECTOR_COUNT": str(len(self.vectors)),
             "VECTORS": "".join(self._loaded(each) for each in range(len(self.vectors))).rstrip(),
-            "GOLDEN_SUMS": "".join(summed(name, values) for name, values in arrays_in(self.vectors[0]).items()).rstrip(),
+            "GOLDEN_SUMS": "".join(summed(*each) for each in arrays_in(self.vectors[0]).items()).rstrip(),
             "SOLVER": self._problem_passed(),
         })  # fmt: skip
 
@@ -203,11 +207,13 @@ END_CONFIGURATION
 
     def _problem_passed(self) -> str:
         names = interface_names(self.solver, self.printer.type)
-        return ",\n".join(f"                {names[each]} := {each.name.rpartition('.')[2]}" for each in self.solver.shared)
+        return ",\n".join(
+            f"                {names[each]} := {each.name.rpartition('.')[2]}" for each in self.solver.shared
+        )
 
 
 def bounded(method: OdeMethod, vector: GoldenVector) -> GoldenVector:
-    """Return a golden vector without infinite bounds, which have no literal: the largest number is one, with its answer."""
+    """Return a golden vector with the largest number for an infinite bound, which has no literal, and its answer."""
     most = np.finfo(np.float32).max
     problem = vector.problem
     return answered(method, problem._replace(low=np.maximum(problem.low, -most), high=np.minimum(problem.high, most)),

@@ -1,4 +1,4 @@
-"""Blocks as IEC 61131-3 Structured Text (third edition): REAL and DINT, arrays of one dimension, every literal typed."""
+"""Blocks as IEC 61131-3 Structured Text (third edition): REAL and DINT, arrays of one dimension, literals typed."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Final
@@ -32,7 +32,13 @@ from rig.plc_export.tree import (
 SCALARS: Final = {Kind.REAL: "REAL", Kind.INT: "DINT", Kind.UNSIGNED: "DINT", Kind.BOOL: "BOOL"}
 BYTES: Final = {"REAL": 4, "DINT": 4, "BOOL": 1}
 INFIX: Final = {"and": "AND", "or": "OR", "==": "=", "!=": "<>"}
-FUNCTIONS: Final = {"sqrt": "SQRT", "abs": "ABS", "power": "EXPT", "%": f"{PREFIX}floor_mod", "//": f"{PREFIX}floor_div"}
+FUNCTIONS: Final = {
+    "sqrt": "SQRT",
+    "abs": "ABS",
+    "power": "EXPT",
+    "%": f"{PREFIX}floor_mod",
+    "//": f"{PREFIX}floor_div",
+}
 NO_NOTES: Final[Mapping[str, str]] = {}
 TABLE: Final = f"{PREFIX}literals"
 
@@ -51,7 +57,9 @@ class StructuredTextPrinter(TreePrinter):
         self.constants = constants
         self.arrays: dict[str, str] = {}
         """Definition of each type of arrays, by its name."""
-        self._names, self._source, self._uses_literals = Names(), "", False
+        self.where = ""
+        """What is being printed, for refusals."""
+        self._names, self._notes, self._uses_literals = Names(), NO_NOTES, False
 
     # -- numbers and types ---------------------------------------------------------------------------------------------
 
@@ -62,7 +70,7 @@ class StructuredTextPrinter(TreePrinter):
             UnfitKernelError: It is infinite or not a number, for which there is no literal.
         """
         if not np.isfinite(value):
-            raise UnfitKernelError(f"{self._source}: Structured Text has no literal for {value}; use the largest number")
+            raise UnfitKernelError(f"{self.where}: Structured Text has no literal for {value}")
         return f"REAL#{np.float32(value):.9E}"
 
     def literal(self, value: float) -> str:
@@ -93,7 +101,7 @@ class StructuredTextPrinter(TreePrinter):
 
     def block(self, block: Block, notes: Mapping[str, str] = NO_NOTES) -> str:
         """Return a function block; variables that have a note are outputs, too."""
-        self._names, self._source, self._uses_literals = Names(), block.source, False
+        self.where, self._names, self._uses_literals = block.source, Names(), False
         self._notes = notes
         inputs, shared = self._declared(block.inputs), self._declared(block.shared)
         outputs = self._declared([*block.outputs, *(each for each in block.variables if each.name in notes)])
@@ -167,7 +175,7 @@ class StructuredTextPrinter(TreePrinter):
 
     # -- expressions ---------------------------------------------------------------------------------------------------
 
-    def expression(self, expression: Expression) -> str:
+    def expression(self, expression: Expression) -> str:  # noqa: PLR0911 one case a kind of expression
         """Return an expression, with parentheses around each operation."""
         match expression:
             case Literal(Kind.REAL, value):
@@ -176,7 +184,7 @@ class StructuredTextPrinter(TreePrinter):
                 return "TRUE" if value else "FALSE"
             case Literal(_, value):
                 return f"{value}" if value >= 0 else f"({value})"
-            case Name(kind, name):
+            case Name(_, name):
                 path = tuple(name.split("."))
                 return global_name(path) if path in self.constants else self._local(expression)
             case Element(_, array, _):

@@ -1,7 +1,7 @@
-"""Executes Structured Text as the standard has it: REAL as float32, both operands of AND and OR computed, types strict.
+"""Executes Structured Text: REAL as float32, both operands of AND and OR computed, types strict.
 
-Each unit becomes a Python function of the objects that hold its variables. An index beyond its array, an assignment to a
-constant or an input, and operands of two types are errors.
+Each unit becomes a Python function of the objects that hold its variables. An index beyond its array, an assignment to
+a constant or an input, and operands of two types are errors.
 """
 
 import ctypes
@@ -71,7 +71,7 @@ class Machine:
         for variable in self.library.units[name].variables.values():
             if variable.type in self.library.units:
                 setattr(held, variable.name, self.instance(variable.type))
-            elif variable.section != "VAR_IN_OUT" and variable.section != "VAR_EXTERNAL":
+            elif variable.section not in {"VAR_IN_OUT", "VAR_EXTERNAL"}:
                 setattr(held, variable.name, self.initial(variable))
         held.run_ = lambda: self.names[f"run_{name}"](held)
         return held

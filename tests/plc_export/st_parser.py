@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 from typing import Final
 
 TOKEN: Final = re.compile(r"""
-    (?P<space>\s+|\(\*.*?\*\)) | (?P<real>REAL\#[+-]?\d+\.\d+(?:E[+-]?\d+)?) | (?P<time>T\#\d+ms) | (?P<int>\d+(?!\d|\.\d))
-    | (?P<name>[A-Za-z][A-Za-z0-9_]*) | (?P<sign>:=|<>|<=|>=|\.\.|[-+*/=<>()\[\],;:.])
+    (?P<space>\s+|\(\*.*?\*\)) | (?P<real>REAL\#[+-]?\d+\.\d+(?:E[+-]?\d+)?) | (?P<time>T\#\d+ms)
+    | (?P<int>\d+(?!\d|\.\d)) | (?P<name>[A-Za-z][A-Za-z0-9_]*) | (?P<sign>:=|<>|<=|>=|\.\.|[-+*/=<>()\[\],;:.])
 """, re.VERBOSE | re.DOTALL)  # fmt: skip
 SECTIONS: Final = ("VAR_INPUT", "VAR_IN_OUT", "VAR_OUTPUT", "VAR_EXTERNAL", "VAR_GLOBAL", "VAR")
-RESERVED: Final = frozenset("""
+RESERVED: Final = """
     AND ARRAY AT BOOL BY CASE CONFIGURATION CONSTANT D DINT DO DT ELSE ELSIF END_CASE END_FOR END_IF END_WHILE EXIT
-    FALSE FOR FUNCTION FUNCTION_BLOCK IF L LD LIMIT LN LT MAX MIN MOD MUX N NOT OF ON OR P PROGRAM R REAL RESOURCE RETURN S
-    SD SEL SL SQRT ST STEP T TASK THEN TIME TO TOD TRUE TYPE UNTIL VAR WHILE WITH XOR
-""".split())
+    FALSE FOR FUNCTION FUNCTION_BLOCK IF L LD LIMIT LN LT MAX MIN MOD MUX N NOT OF ON OR P PROGRAM R REAL RESOURCE
+    RETURN S SD SEL SL SQRT ST STEP T TASK THEN TIME TO TOD TRUE TYPE UNTIL VAR WHILE WITH XOR
+"""
 LEVELS: Final = (("OR",), ("AND",), ("=", "<>", "<", ">", "<=", ">="), ("+", "-"), ("*", "/", "MOD"))
 Tree = tuple[object, ...]
 
@@ -89,7 +89,7 @@ class Parser:
     def name(self) -> str:
         kind, text = self.tokens[self.at]
         assert kind == "name", text
-        assert text.upper() not in RESERVED, f"{text} is a keyword"
+        assert not re.search(rf"\b{text.upper()}\b", RESERVED), f"{text} is a keyword"
         assert len(text) <= 32, f"{text} is long"
         assert "__" not in text, text
         assert not text.endswith("_"), text
@@ -282,7 +282,7 @@ class Parser:
         return self._named()
 
     def _named(self) -> Tree:
-        name = self.take().lower() if self.next in {"SQRT"} else self.name()
+        name = self.take().lower() if self.next == "SQRT" else self.name()
         if self.skip("("):
             arguments = [self.expression()]
             while self.skip(","):

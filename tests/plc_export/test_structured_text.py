@@ -1,8 +1,7 @@
-"""The exported Structured Text, executed as text, gives the bits of the kernels; its self-test finds what is changed."""
+"""The exported Structured Text, executed as text, gives the bits of the kernels; its self-test finds changes."""
 
 import re
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -72,9 +71,7 @@ def test_an_iteration_a_call_gives_every_bit_of_the_kernels(
 
 
 @pytest.mark.exhaustive
-def test_every_problem_has_the_same_bits_one_after_the_other(
-    files: dict[str, str], recorded: GoldenVectors
-) -> None:
+def test_every_problem_has_the_same_bits_one_after_the_other(files: dict[str, str], recorded: GoldenVectors) -> None:
     solver = Machine(*files.values()).instance("cl_solver")
     for vector in recorded.vectors:
         found = solved(solver, vector)[1:]
@@ -162,8 +159,8 @@ def test_minima_and_maxima_are_those_of_the_kernels(functions: Machine, one: flo
     assert bits(functions.call("cl_max_real", a, b)) == bits(max(a, b))
 
 
-def bits(value: Any) -> bytes:
-    return np.float32(value).tobytes()
+def bits(value: object) -> bytes:
+    return np.asarray(value, np.float32).tobytes()
 
 
 @given(st.floats(width=32, allow_nan=False))

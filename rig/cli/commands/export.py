@@ -1,4 +1,4 @@
-"""`coldloop export`: a recorded run as CSV, MATLAB or HDF5 files, with units; or the solver as source text for a PLC."""
+"""`coldloop export`: a recorded run as CSV, MATLAB or HDF5 files, with units; or the solver as sources for a PLC."""
 
 import argparse
 import sys
@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Final
 
 PLC: Final = Path("plc")
-TICKS: Final = 1440
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -19,12 +18,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
         ("hdf5", "run.h5, with a group for each of them (needs h5py)"),
     ):
         kinds.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, help=text)
-    kinds.add_argument("--target", choices=("c", "st"), help="with plc: the ODE-based solver in single precision as C99, or"
-                       " as Structured Text (IEC 61131-3), with golden vectors and a self-test")  # fmt: skip
+    kinds.add_argument("--target", choices=("c", "st"), help="with plc: the ODE-based solver in single precision, as"
+                       " C99 or Structured Text (IEC 61131-3), with golden vectors and a self-test")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="where to (default: the folder of the run)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--ticks", type=_ticks, metavar="N", help="with plc: length of the run whose problems are the"
-                        f" golden vectors (default: {TICKS}, six minutes)")  # fmt: skip
+                        " golden vectors (default: 1440, six minutes)")  # fmt: skip
 
 
 def _ticks(text: str) -> int:
@@ -60,4 +59,4 @@ def _solver(options: argparse.Namespace) -> list[Path]:
         raise UsageError("export plc: name a new folder with --out; --force does not replace one")
     if not IS_COLD_BOX:
         raise UsageError("export plc: of the cold box alone; leave out --process")
-    return export_plc(options.target, options.ticks or TICKS, options.out)
+    return export_plc(options.target, options.ticks, options.out)
