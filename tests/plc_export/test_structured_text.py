@@ -79,6 +79,14 @@ def test_every_problem_has_the_same_bits_one_after_the_other(files: dict[str, st
         assert [each[2] for each in found] == vector.answer.iterations.tolist()
 
 
+def test_the_golden_vectors_move_every_input(recorded: GoldenVectors) -> None:
+    assert len(recorded.vectors) == 8
+    for vector in recorded.vectors:
+        assert np.count_nonzero(vector.answer.points[-1]) > 21
+        assert vector.answer.costs[-1] < vector.answer.guessed
+        assert vector.answer.iterations[-1] == ITERATIONS
+
+
 def test_the_self_test_passes(files: dict[str, str]) -> None:
     test = self_test(files)
     assert (test.done, test.passed, test.failures, test.what) == (True, True, 0, 0)
