@@ -29,7 +29,7 @@ COMMANDS: Final = {
     "plot": "draw a recorded run again, as PNG, PDF or SVG",
     "report": "one HTML page of a recorded run, with interactive plots",
     "compare": "a table and a figure of several recorded runs",
-    "export": "a recorded run as CSV, MATLAB or HDF5 files",
+    "export": "a recorded run as CSV, MATLAB or HDF5 files; or the solver as C99 or Structured Text for a PLC",
     "chaos": "a run with injected faults, and its evaluation",
     "proxy": "a proxy that delays, loses, damages, cuts or refuses Modbus/TCP traffic",
     "study": "do the runs of a study and draw its figure",

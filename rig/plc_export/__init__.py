@@ -1,1 +1,1 @@
-"""The optimiser's kernels as C99: read from their Python sources, printed, with vectors that prove the same bits."""
+"""The solver for a PLC: kernels read from their Python sources, printed as C99 or Structured Text, with a self-test."""

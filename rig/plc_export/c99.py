@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from rig.plc_export.printing import TreePrinter
 from rig.plc_export.tree import (
     ArrayType,
     Assign,
@@ -44,17 +45,15 @@ def identifier(name: str) -> str:
     return f"{name}_" if re.search(rf"\b{name}\b", KEYWORDS) else name
 
 
-class Printer:
-    """Prints for one floating-point type.
+class Printer(TreePrinter):
+    """Prints for one floating-point type."""
 
-    Numbers with a point are elements of the array `literals`, which the self-test sums up with the other constants.
-    """
+    table = "literals"
 
     def __init__(self, real: type[np.floating]) -> None:
-        self.single = real is np.float32
+        super().__init__(real)
         self.scalars = {Kind.REAL: "float" if self.single else "double", Kind.INT: "int32_t",
                         Kind.UNSIGNED: "int32_t", Kind.BOOL: "bool"}  # fmt: skip
-        self.literals: list[str] = []
         self._loops = 0
 
     # -- numbers -------------------------------------------------------------------------------------------------------
@@ -66,13 +65,6 @@ class Printer:
         if np.isnan(value):
             return "NAN"
         return f"{np.float32(value):.9e}f" if self.single else f"{value:.17e}"
-
-    def literal(self, value: float) -> str:
-        """Return the element of `literals` that has this value."""
-        text = self.number(value)
-        if text not in self.literals:
-            self.literals.append(text)
-        return f"literals[{self.literals.index(text)}]"
 
     # -- types ---------------------------------------------------------------------------------------------------------
 
@@ -182,7 +174,7 @@ class Printer:
             case Field(_, record, name):
                 return f"{self.expression(record)}{'->' if isinstance(record, Name) else '.'}{identifier(name)}"
             case Element():
-                return self._element(expression)
+                return f"{self.expression(expression.array)}[{self.place(expression)}]"
             case Operation():
                 return self._operation(expression)
             case Select(_, condition, one, other):
@@ -191,14 +183,6 @@ class Printer:
                 return f"(({self.scalars[kind]}){self.expression(operand)})"
             case Invocation(_, function, arguments):
                 return self._call(function, arguments, len(arguments))
-
-    def _element(self, element: Element) -> str:
-        assert isinstance(element.array.type, ArrayType)  # noqa: S101 by construction
-        place = ""
-        for index, length in zip(element.indices, element.array.type.shape, strict=True):
-            place = f"{place} * {length} + {self.expression(index)}" if place else self.expression(index)
-            place = f"({place})" if index is not element.indices[-1] and place.count(" ") else place
-        return f"{self.expression(element.array)}[{place}]"
 
     def _operation(self, operation: Operation) -> str:  # noqa: PLR0911 one case an operator
         parts = [self.expression(each) for each in operation.operands]

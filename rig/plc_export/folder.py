@@ -1,34 +1,36 @@
 """The ODE-based solver as a folder of C99: sources, constants, golden vectors and a self-test that runs them."""
 
-import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Costs
-from optimizer_plc.solvers.ode import OdeMethod, solve
+from optimizer_plc.solvers.ode import OdeMethod
 from rig.plc_export.c99 import Printer, helpers, identifier, records_in
-from rig.plc_export.reading import Program
-from rig.plc_export.recorded_problems import GoldenVector
-from rig.plc_export.subset import type_of
-from rig.plc_export.tree import Kind
+from rig.plc_export.ode_program import PER_PROBLEM, OdeProgram, crc, leaves
+from rig.plc_export.recorded_problems import GoldenVector, arrays_in
+from rig.plc_export.tree import ArrayType, Declare, Function, Invocation, Invoke, Kind, walk
 
 Array = NDArray[Any]
 
-PER_PROBLEM: Final = ("phi", "gamma", "low", "high")
-"""Vectors of a problem that change from one to the next."""
 TEMPLATE: Final = Path(__file__).with_name("self_test.c")
-POWER: Final = frozenset({"power"})
-"""The step size has a cube root by `**`: its last bit is that of the platform's library."""
+
+
+class Sizes(NamedTuple):
+    """Bytes that a program needs."""
+
+    constants: int
+    stack: int
+    """Arrays and numbers of the deepest calls; without what the compiler adds."""
+    self_test: int
 
 
 class OdeExport:
-    """The solver for the matrices of one problem and a table of iteration counts.
+    """The solver for the matrices of one problem and a table of iteration counts, as C99.
 
     Args:
         method: Constants of the solver; their type, single or double precision, is that of the export.
@@ -41,30 +43,40 @@ class OdeExport:
 
     def __init__(self, method: OdeMethod, problem: QuadraticProblem, counts: Array) -> None:
         self.method, self.problem, self.counts = method, problem, counts
-        real = problem.phi.dtype.type
-        self.printer = Printer(real)
+        self.program = OdeProgram(method, problem, counts)
+        self.printer = Printer(problem.phi.dtype.type)
         self.real = self.printer.scalars[Kind.REAL]
-        none = Costs(real(np.inf), real(np.inf))
-        types = tuple(map(type_of, (method, problem, np.zeros_like(problem.phi), counts, none)))
-        program = Program(POWER)
-        self.entry = program.function(cast("Dispatcher", solve), types)
+        self.entry = self.program.entry
         self.kernels = "\n".join(
-            self.printer.function(each, "" if each is self.entry else "static ") for each in program.functions
+            self.printer.function(each, "" if each is self.entry else "static ") for each in self.program.functions
         )
-        self.records = "\n".join(map(self.printer.structure, records_in(types)))
+        self.records = "\n".join(map(self.printer.structure, records_in(self.program.types)))
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
     def write(self, folder: Path, vectors: Iterable[GoldenVector]) -> list[Path]:
         """Write the files, with some golden vectors, into a folder that is made; return their paths."""
         folder.mkdir(parents=True, exist_ok=True)
-        files = {
-            "kernels.h": self._header(), "kernels.c": self._kernels(), "problem.h": self._problem_header(),
-            "problem.c": self._problem(), **self._golden(list(vectors)), "self_test.c": self._self_test(),
-        }  # fmt: skip
+        files = self.files(vectors)
         for name, text in files.items():
             (folder / name).write_text(text, encoding="ascii")
         return [folder / name for name in files]
+
+    def files(self, vectors: Iterable[GoldenVector]) -> dict[str, str]:
+        """Return the texts of the files by their names, with some golden vectors."""
+        return {
+            "kernels.h": self._header(), "kernels.c": self._kernels(), "problem.h": self._problem_header(),
+            "problem.c": self._problem(), **self._golden(list(vectors)), "self_test.c": self._self_test(),
+        }  # fmt: skip
+
+    def sizes(self, vectors: Iterable[GoldenVector]) -> Sizes:
+        """Return the bytes of the constants, of the stack and of golden vectors."""
+        word = self.problem.phi.itemsize
+        constants = word * len(self.printer.literals) + sum(
+            values.size * (word if values.dtype.kind == "f" else 4) for values in self._constants().values()
+        )
+        golden = sum(word * sum(values.size for values in arrays_in(each).values()) for each in vectors)
+        return Sizes(constants, stack(self.entry, word), golden)
 
     def _header(self) -> str:
         signature = self.printer.signature(self.entry)
@@ -125,8 +137,8 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
         """Return the constant arrays by name."""
         real = self.problem.phi.dtype
         flow = np.array([float(each) for each in self.method.flow], real)
-        return {"Phi": self.problem.Phi, "Gamma": self.problem.Gamma, "counts": self.counts,
-                **arrays_of("matrices", self.method.matrices), "flow": flow}  # fmt: skip
+        matrices = {"_".join(path): values for path, values in leaves(("matrices",), self.method.matrices).items()}
+        return {"Phi": self.problem.Phi, "Gamma": self.problem.Gamma, "counts": self.counts, **matrices, "flow": flow}
 
     def _sum_of_constants(self) -> int:
         real = self.problem.phi.dtype
@@ -206,17 +218,10 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
 GENERATED: Final = "/* Written by Coldloop from the kernels of its optimiser; changes belong there. */\n"
 
 
-def arrays_of(prefix: str, record: object) -> dict[str, Array]:
-    """Return the arrays of a record of records, by their names joined."""
-    if isinstance(record, np.ndarray):
-        return {prefix: record}
-    found: dict[str, Array] = {}
-    for name, part in zip(record._fields, record, strict=True):  # type: ignore[attr-defined, call-overload]
-        found |= arrays_of(f"{prefix}_{name}", part)
-    return found
-
-
-def crc(values: Array, before: int = 0) -> int:
-    """Return the CRC-32 of numbers, most significant byte first, as the self-test computes it."""
-    wide = values.astype(f">f{values.dtype.itemsize}" if values.dtype.kind == "f" else ">i4")
-    return zlib.crc32(wide.tobytes(), before)
+def stack(function: Function, word: int) -> int:
+    """Return the bytes of a function's variables and of the deepest calls in it."""
+    nodes = list(walk(function.body))
+    own = sum(word * (node.variable.type.size if isinstance(node.variable.type, ArrayType) else 1)
+              for node in nodes if isinstance(node, Declare))  # fmt: skip
+    called = {node.function.name: node.function for node in nodes if isinstance(node, Invoke | Invocation)}
+    return own + max((stack(each, word) for each in called.values()), default=0)

@@ -91,7 +91,8 @@ class KernelReader(ExpressionReader):
         written = self.written & {each.name for each in self.parameters}
         where = f"{self.source.file}:{definition.lineno}"
         results, value = self.returns or (None, None)
-        return Function(name, where, self.parameters, written, self.used, results or (), value, body)
+        summary = (ast.get_docstring(definition) or "").partition("\n")[0]
+        return Function(name, where, summary, self.parameters, written, self.used, results or (), value, body)
 
     # -- statements ----------------------------------------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ from optimizer_plc.solvers.ode import OdeMethod, solve
 from plant.load import find_load
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
+from rig.plc_export.ode_program import PER_PROBLEM
 from rig.results.recording import Recorder
 from rig.settings import Settings
 
@@ -32,6 +33,13 @@ SINGLE: Final = (
 """What the run is made with: the paper's configuration in the arithmetic of its PLC."""
 ITERATIONS: Final = 20
 """Of the solver for each recorded problem; each one is compared."""
+
+TELLING: Final = 8
+"""Golden vectors of an export; each takes 5 kB."""
+LEAST_GAIN: Final = 1e-6
+"""Of the cost: a problem at rest gains less, by rounding alone."""
+TICKS, LOAD = 1440, "e"
+"""Of the run that is recorded: six minutes, in which this load has a large step."""
 
 
 class GoldenVector(NamedTuple):
@@ -47,6 +55,12 @@ class GoldenVectors(NamedTuple):
 
     method: OdeMethod
     vectors: list[GoldenVector]
+
+    def telling(self, most: int = TELLING) -> list[GoldenVector]:
+        """Return the problems that the solver lowers most, in their order; none that leave the inputs at rest."""
+        gains = [float(each.answer.guessed) - float(each.answer.costs[-1]) for each in self.vectors]
+        by_gain = sorted(range(len(gains)), key=lambda place: -gains[place])
+        return [self.vectors[place] for place in sorted(by_gain[:most]) if gains[place] > LEAST_GAIN]
 
 
 class _ListeningOptimizer(OptimizerProgram):
@@ -64,13 +78,24 @@ class _ListeningOptimizer(OptimizerProgram):
         return super().solve()
 
 
-def record(ticks: int, load: str = "a") -> GoldenVectors:
+def record(ticks: int = TICKS, load: str = LOAD) -> GoldenVectors:
     """Return the problems of a run of so many ticks under a named load, adaptive updating period, with the answers."""
     settings = load_configuration(Settings, environment={}, assignments=SINGLE).settings
     model, rig = load_model(settings.model.file), OneProcessRig(settings, compiled=False)
     optimizer = rig.optimizer = _ListeningOptimizer(model, settings.optimizer_plc.program, settings.limits)
     rig.run(Scenario(ticks, find_load(load, model.w0), 0.0, seed=1), Recorder(ticks, []))
-    method, real = cast("OdeMethod", optimizer.method), real_of(Arithmetic.FLOAT32)
+    method = cast("OdeMethod", optimizer.method)
+    return GoldenVectors(method, [answered(method, qp, guess) for qp, guess in optimizer.heard])
+
+
+def answered(method: OdeMethod, problem: QuadraticProblem, guess: Array) -> GoldenVector:
+    """Return a problem with what the kernels answer, in single precision."""
+    real = real_of(Arithmetic.FLOAT32)
     none, counts = Costs(real(np.inf), real(np.inf)), np.arange(1, ITERATIONS + 1)
-    return GoldenVectors(method, [GoldenVector(qp, guess, solve(method, qp, guess, counts, none))
-                                  for qp, guess in optimizer.heard])  # fmt: skip
+    return GoldenVector(problem, guess, solve(method, problem, guess, counts, none))
+
+
+def arrays_in(vector: GoldenVector) -> dict[str, Array]:
+    """Return the arrays of a golden vector by their names."""
+    return {**{name: getattr(vector.problem, name) for name in PER_PROBLEM}, "guess": vector.guess,
+            **{name: getattr(vector.answer, name).ravel() for name in ("points", "costs", "iterations")}}  # fmt: skip

@@ -1,6 +1,7 @@
 """The typed tree between the kernels' Python and what is printed from it: functions of fixed shapes, no Python left."""
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
 from typing import TypeAlias
 
@@ -181,7 +182,28 @@ class Return:
     value: Expression | None = None
 
 
-Statement: TypeAlias = Declare | Assign | Invoke | For | While | If | Return
+@dataclass(frozen=True)
+class Count:
+    """A counted loop that includes its last value; only in blocks (`lowering.py`)."""
+
+    variable: Name
+    first: Expression
+    last: Expression
+    step: int
+    body: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call of a block, with its arguments by name and the variables that get its outputs; only in blocks."""
+
+    block: "Block"
+    arguments: tuple[tuple[Name, Expression], ...]
+    results: tuple[tuple[Name, Name], ...]
+    """Variable, output."""
+
+
+Statement: TypeAlias = Declare | Assign | Invoke | For | While | If | Return | Count | Call
 
 
 @dataclass
@@ -194,6 +216,8 @@ class Function:
     name: str
     source: str
     """File and line of the kernel."""
+    summary: str
+    """What it does, in a sentence."""
     parameters: tuple[Name, ...]
     written: set[str] = field(default_factory=set)
     """Array parameters that it writes to."""
@@ -201,3 +225,43 @@ class Function:
     results: tuple[Name, ...] = ()
     value: Kind | None = None
     body: tuple[Statement, ...] = ()
+
+
+Path: TypeAlias = tuple[str, ...]
+"""A record's field: the names from the first record to it."""
+
+
+@dataclass(eq=False)
+class Block:
+    """A function without records, whose every call is a statement: what a function block is printed from."""
+
+    name: str
+    source: str
+    summary: str
+    inputs: tuple[Name, ...]
+    """Numbers."""
+    shared: tuple[Name, ...]
+    """Arrays of the caller, read or written."""
+    outputs: tuple[Name, ...]
+    variables: tuple[Name, ...]
+    constants: tuple[Path, ...]
+    body: tuple[Statement, ...]
+
+    @property
+    def called(self) -> list["Block"]:
+        """Blocks that it calls, each once."""
+        return list(dict.fromkeys(node.block for node in walk(self.body) if isinstance(node, Call)))
+
+
+def walk(node: object) -> Iterator[object]:
+    """Yield a node and those below it; not what is called."""
+    yield node
+    if isinstance(node, tuple):
+        parts: Iterator[object] = iter(node)
+    elif is_dataclass(node):
+        parts = (getattr(node, each.name) for each in fields(node))
+    else:
+        return
+    for part in parts:
+        if not isinstance(part, Function | Block):
+            yield from walk(part)

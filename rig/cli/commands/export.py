@@ -1,13 +1,16 @@
-"""`coldloop export`: a recorded run as CSV, MATLAB or HDF5 files, with units."""
+"""`coldloop export`: a recorded run as CSV, MATLAB or HDF5 files, with units; or the solver as sources for a PLC."""
 
 import argparse
 import sys
 from pathlib import Path
+from typing import Final
+
+PLC: Final = Path("plc")
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run; or plc, with --target: the solver")
     kinds = parser.add_mutually_exclusive_group(required=True)
     for kind, text in (
         ("csv", "a CSV file for each of trace, updates, events"),
@@ -15,14 +18,45 @@ def declare(parser: argparse.ArgumentParser) -> None:
         ("hdf5", "run.h5, with a group for each of them (needs h5py)"),
     ):
         kinds.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, help=text)
+    kinds.add_argument("--target", choices=("c", "st"), help="with plc: the ODE-based solver in single precision, as"
+                       " C99 or Structured Text (IEC 61131-3), with golden vectors and a self-test")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="where to (default: the folder of the run)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
+    parser.add_argument("--ticks", type=_ticks, metavar="N", help="with plc: length of the run whose problems are the"
+                        " golden vectors (default: 1440, six minutes)")  # fmt: skip
+
+
+def _ticks(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
+    return int(text)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Write the files."""
-    from rig.results.export import export
-
-    paths = export(options.run, options.kind, options.out or options.run, force=options.force)
+    paths = _recorded_run(options) if options.target is None else _solver(options)
     sys.stdout.writelines(f"{path}\n" for path in paths)
     return 0
+
+
+def _recorded_run(options: argparse.Namespace) -> list[Path]:
+    from coldloop.errors import UsageError
+    from rig.results.export import export
+
+    if options.ticks is not None:
+        raise UsageError("--ticks: is for coldloop export plc --target")
+    return export(options.run, options.kind, options.out or options.run, force=options.force)
+
+
+def _solver(options: argparse.Namespace) -> list[Path]:
+    from coldloop.errors import UsageError
+    from coldloop.process.loaded import IS_COLD_BOX
+    from rig.cli.plc_folder import export_plc
+
+    if options.run != PLC:
+        raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
+    if options.out is None or options.force:
+        raise UsageError("export plc: name a new folder with --out; --force does not replace one")
+    if not IS_COLD_BOX:
+        raise UsageError("export plc: of the cold box alone; leave out --process")
+    return export_plc(options.target, options.ticks, options.out)

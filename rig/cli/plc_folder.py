@@ -1,0 +1,111 @@
+"""The solver's source text for a PLC as a folder: sources, golden vectors, self-test, and a README for who loads it."""
+
+import shutil
+import tempfile
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from coldloop.errors import UsageError
+from optimizer_plc.qp.problem import QuadraticProblem
+from rig.plc_export.folder import OdeExport
+from rig.plc_export.recorded_problems import TICKS, GoldenVector, GoldenVectors, record
+from rig.plc_export.st_folder import AT_ONCE, StructuredTextExport, filled
+from rig.plc_sizing.operations import Operations, gradient, ode
+from rig.plc_sizing.sizes import dense_sizes
+
+README: Final = "README.md"
+
+
+def export_plc(target: str, ticks: int | None, folder: Path) -> list[Path]:
+    """Record problems and write the sources for a target; return the paths.
+
+    Raises:
+        UsageError: The folder is not empty or cannot be written to, or no input moves in so many ticks.
+    """
+    refuse_taken(folder)
+    recorded = record(ticks or TICKS)
+    vectors = recorded.telling()
+    if not vectors:
+        raise UsageError(f"--ticks: no input moves within {ticks} ticks, so nothing would be tested; record more")
+    texts = structured_text(recorded, vectors) if target == "st" else c99(recorded, vectors)
+    write_whole(folder, texts)
+    return [folder / name for name in texts]
+
+
+def structured_text(recorded: GoldenVectors, vectors: list[GoldenVector]) -> dict[str, str]:
+    """Return the files of Structured Text by their names."""
+    export = StructuredTextExport(recorded.method, vectors[0].problem, vectors)
+    texts, sizes = export.files(), export.sizes()
+    return {**texts, README: readme("readme_st.md", vectors, texts, {
+        "AT_ONCE": str(AT_ONCE), "CALLS": str(export.calls()), "CONSTANTS": f"{sizes.constants:,}",
+        "SOLVER": f"{sizes.solver:,}", "SELF_TEST": f"{sizes.self_test:,}",
+    })}  # fmt: skip
+
+
+def c99(recorded: GoldenVectors, vectors: list[GoldenVector]) -> dict[str, str]:
+    """Return the files of C99 by their names."""
+    export = OdeExport(recorded.method, vectors[0].problem, np.arange(1, len(vectors[0].answer.costs) + 1))
+    texts, sizes = export.files(vectors), export.sizes(vectors)
+    return {**texts, README: readme("readme_c.md", vectors, texts, {
+        "CONSTANTS": f"{sizes.constants:,}", "STACK": f"{sizes.stack:,}", "SELF_TEST": f"{sizes.self_test:,}",
+    })}  # fmt: skip
+
+
+def readme(template: str, vectors: list[GoldenVector], texts: Mapping[str, str], parts: Mapping[str, str]) -> str:
+    """Return the README: a template of the export with its figures."""
+    problem = vectors[0].problem
+    text = files("rig.plc_export").joinpath(template).read_text(encoding="ascii")
+    return filled(text, {
+        "N": str(len(problem.phi)), "M": str(len(problem.gamma)), "K": str(len(vectors[0].answer.costs)),
+        "VECTORS": str(len(vectors)), "FILES": ", ".join(f"`{name}`" for name in texts),
+        "FEWEST": f"{operations(problem, 0):,}", "MOST": f"{operations(problem, len(problem.gamma)):,}", **parts,
+    })  # fmt: skip
+
+
+def operations(problem: QuadraticProblem, active: int) -> int:
+    """Return the operations of an iteration with so many active rows, no zero left out, where a bound cuts the step.
+
+    That takes the velocity four times: before, in between, behind, and behind once more at the bound.
+    """
+    n, m = len(problem.phi), len(problem.gamma)
+    sizes = dense_sizes(n, m, n)
+    return round(ode(sizes, active).plus(gradient(sizes, active), Operations(n)).flops)
+
+
+def refuse_taken(folder: Path) -> None:
+    """Refuse a folder that has something in it, and what is no folder.
+
+    Raises:
+        UsageError: It is so.
+    """
+    if not str(folder).isprintable():
+        raise UsageError(f"{str(folder)!a}: a name that cannot be printed; choose another --out")
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UsageError(f"{folder}: is not an empty folder; name a new one with --out")
+    except OSError as error:
+        raise UsageError(f"{folder}: {error.strerror}; choose another --out") from None
+
+
+def write_whole(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write files into a folder that appears with all of them, or not at all.
+
+    Raises:
+        UsageError: It cannot be written, or something has been put there meanwhile.
+    """
+    draft = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        for name, text in texts.items():
+            (draft / name).write_text(text, encoding="ascii")
+        draft.chmod(0o755)
+        draft.replace(folder)
+    except OSError as error:
+        if draft:
+            shutil.rmtree(draft, ignore_errors=True)
+        raise UsageError(f"{folder}: {error.strerror}; choose another --out") from None

@@ -1,0 +1,12 @@
+"""Problems that the tests of the export have in common."""
+
+import pytest
+
+from rig.plc_export.recorded_problems import GoldenVectors, record
+
+
+@pytest.fixture(scope="package")
+def recorded() -> GoldenVectors:
+    """The most telling problems of a short run."""
+    found = record()
+    return found._replace(vectors=found.telling())

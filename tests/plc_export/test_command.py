@@ -1,0 +1,109 @@
+"""`coldloop export plc`: a folder that is whole, with a README; a refusal in one line and nothing written."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rig.cli import plc_folder
+from tests.plc_export.st_interpreter import Machine
+
+if TYPE_CHECKING:
+    from tests.conftest import Coldloop
+
+FILES = {
+    "c": ["kernels.h", "kernels.c", "problem.h", "problem.c", "golden.h", "golden.c", "self_test.c", "README.md"],
+    "st": ["types.st", "functions.st", "kernels.st", "golden.st", "self_test.st", "configuration.st", "README.md"],
+}
+
+
+@pytest.mark.parametrize("target", FILES)
+def test_the_sources_and_a_readme_are_written(coldloop: "Coldloop", tmp_path: Path, target: str) -> None:
+    out = tmp_path / "new" / target
+    outcome = coldloop("export", "plc", "--target", target, "--out", out)
+    assert outcome.code == 0, outcome.complaints
+    assert outcome.out.splitlines() == [str(out / name) for name in FILES[target]]
+    assert sorted(path.name for path in out.iterdir()) == sorted(FILES[target])
+    readme = (out / "README.md").read_text()
+    assert "@" not in readme
+    assert all(name in readme for name in FILES[target] if name != "README.md")
+    assert [path.name for path in out.parent.iterdir()] == [target]
+
+
+def test_the_written_structured_text_passes_its_self_test_in_as_many_calls_as_the_readme_says(
+    coldloop: "Coldloop", tmp_path: Path
+) -> None:
+    out = tmp_path / "st"
+    assert coldloop("export", "plc", "--target", "st", "--out", out, "--ticks", 800).code == 0
+    test = Machine(*((out / name).read_text() for name in FILES["st"][:-1])).instance("cl_self_test")
+    test.run, calls = True, 0
+    while not test.done:
+        test.run_()
+        calls += 1
+    assert test.passed
+    found = re.search(r"After (\d+) calls", (out / "README.md").read_text())
+    assert found
+    assert calls == int(found[1])
+
+
+@pytest.mark.skipif(not shutil.which("gcc"), reason="no C compiler: gcc is not installed")
+def test_the_written_c_passes_its_self_test(coldloop: "Coldloop", tmp_path: Path) -> None:
+    out = tmp_path / "c"
+    assert coldloop("export", "plc", "--target", "c", "--out", out).code == 0
+    command = ["gcc", "-std=c99", "-ffp-contract=off", *out.glob("*.c"), "-lm", "-o", out / "self_test"]
+    subprocess.run(command, check=True)
+    assert subprocess.run([out / "self_test"], capture_output=True, text=True, check=True).stdout.endswith(
+        ", 0 failures\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("plc", "--target", "st"), "name a new folder with --out"),
+        (("plc", "--target", "st", "--out", "taken"), "taken: is not an empty folder"),
+        (("plc", "--target", "st", "--out", "taken/file"), "taken/file: is not an empty folder"),
+        (("plc", "--target", "st", "--out", "taken/file/new"), "taken/file/new: "),
+        (("plc", "--target", "st", "--out", "new", "--force"), "--force does not replace one"),
+        (("plc", "--target", "ladder", "--out", "new"), "invalid choice: 'ladder'"),
+        (("plc", "--target", "c", "--out", "new", "--ticks", "0"), "is not a whole number of at least 1"),
+        (("plc", "--target", "c", "--out", "new", "--ticks", "40"), "no input moves within 40 ticks"),
+        (("runs", "--target", "c", "--out", "new"), "runs: has no target"),
+        (("runs", "--csv", "--ticks", "40"), "--ticks: is for coldloop export plc"),
+        (("plc", "--out", "new"), "--target is required"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line_and_nothing_is_written(
+    coldloop: "Coldloop",
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    arguments: tuple[str, ...],
+    complaint: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "file").write_text("precious")
+    outcome = coldloop("export", *arguments)
+    assert outcome.code == 2
+    assert len(outcome.complaints) == 1
+    assert complaint in outcome.complaints[0]
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["taken", "taken/file"]
+
+
+def test_a_folder_that_cannot_be_finished_is_not_begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(plc_folder.UsageError, match="No space left"):
+        plc_folder.write_whole(tmp_path / "new", {"a.st": ""})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_empty_folder_is_filled(tmp_path: Path) -> None:
+    plc_folder.refuse_taken(tmp_path)
+    plc_folder.write_whole(tmp_path, {"a.st": "one"})
+    assert [path.name for path in tmp_path.iterdir()] == ["a.st"]
