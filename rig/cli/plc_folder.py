@@ -3,7 +3,6 @@
 import shutil
 import tempfile
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +12,7 @@ from coldloop.errors import UsageError
 from optimizer_plc.qp.problem import QuadraticProblem
 from rig.plc_export.folder import OdeExport
 from rig.plc_export.recorded_problems import TICKS, GoldenVector, GoldenVectors, record
-from rig.plc_export.st_folder import AT_ONCE, StructuredTextExport, filled
+from rig.plc_export.st_folder import AT_ONCE, StructuredTextExport, filled, template
 from rig.plc_sizing.operations import Operations, gradient, ode
 from rig.plc_sizing.sizes import dense_sizes
 
@@ -55,11 +54,10 @@ def c99(recorded: GoldenVectors, vectors: list[GoldenVector]) -> dict[str, str]:
     })}  # fmt: skip
 
 
-def readme(template: str, vectors: list[GoldenVector], texts: Mapping[str, str], parts: Mapping[str, str]) -> str:
-    """Return the README: a template of the export with its figures."""
+def readme(name: str, vectors: list[GoldenVector], texts: Mapping[str, str], parts: Mapping[str, str]) -> str:
+    """Return the README: the template of this name with its figures."""
     problem = vectors[0].problem
-    text = files("rig.plc_export").joinpath(template).read_text(encoding="ascii")
-    return filled(text, {
+    return filled(template(name), {
         "N": str(len(problem.phi)), "M": str(len(problem.gamma)), "K": str(len(vectors[0].answer.costs)),
         "VECTORS": str(len(vectors)), "FILES": ", ".join(f"`{name}`" for name in texts),
         "FEWEST": f"{operations(problem, 0):,}", "MOST": f"{operations(problem, len(problem.gamma)):,}", **parts,

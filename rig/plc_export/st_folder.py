@@ -1,7 +1,7 @@
 """The ODE-based solver as Structured Text: types, function blocks, constants, golden vectors, a self-test."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
+from importlib.resources import files
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from rig.plc_export.structured_text import (
     section,
 )
 from rig.plc_export.subset import UnfitKernelError, type_of
-from rig.plc_export.tree import RecordType
+from rig.plc_export.tree import Path, RecordType
 
 LARGEST_LIST: Final = 64 * 1024
 """Bytes of a list of constants: a data block of standard access of an S7-1200 or S7-1500 holds no more."""
@@ -36,7 +36,6 @@ NOTES: Final = {
     "stalled": "iterations in a row that gained nothing; at 20 the profile is stationary",
 }
 GENERATED: Final = "(* Written by Coldloop from the kernels of its optimiser; changes belong there. *)\n"
-FOLDER: Final = Path(__file__).parent
 
 
 class Sizes(NamedTuple):
@@ -64,17 +63,18 @@ class StructuredTextExport:
     def __init__(self, method: OdeMethod, problem: QuadraticProblem, vectors: Iterable[GoldenVector]) -> None:
         self.vectors = [bounded(method, each) for each in vectors]
         program = OdeProgram(method, problem, np.arange(1, len(self.vectors[0].answer.costs) + 1))
-        self.constants = {path: np.asarray(values) for path, values in program.constants().items()}
-        self.printer = StructuredTextPrinter({path: type_of(values) for path, values in program.constants().items()})
-        function = one_iteration_a_call(program.entry)
-        lowering = Lowering(self.constants)
+        constants = program.constants()
+        self.printer = StructuredTextPrinter({path: type_of(values) for path, values in constants.items()})
+        function, lowering = one_iteration_a_call(program.entry), Lowering(constants)
         records = {each.name: (each.name,) for each in function.parameters if isinstance(each.type, RecordType)}
         self.solver = lowering.block(function, records)
         self.kernels = "\n".join(
             self.printer.block(each, NOTES if each is self.solver else {}) for each in lowering.blocks
         )
         used = {path for each in lowering.blocks for path in each.constants}
-        self.constants = {path: values for path, values in self.constants.items() if path in used}
+        self.constants: dict[Path, Array] = {
+            path: np.asarray(values) for path, values in constants.items() if path in used
+        }
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
@@ -83,7 +83,7 @@ class StructuredTextExport:
         golden = "\n".join(self._golden(number, each) for number, each in enumerate(self.vectors))
         test = self._self_test()
         configuration = self._configuration()
-        functions = (FOLDER / "functions.st").read_text(encoding="ascii")
+        functions = template("functions.st")
         texts = {"types.st": self.printer.types(), "functions.st": functions, "kernels.st": self.kernels,
                  "golden.st": golden, "self_test.st": test, "configuration.st": configuration}  # fmt: skip
         return {name: GENERATED + text for name, text in texts.items()}
@@ -175,7 +175,7 @@ END_CONFIGURATION
         n, m, k = len(problem.phi), len(problem.gamma), len(answer.costs)
         lengths = self._lengths()
         self.printer.array_type("DINT", len(lengths))
-        return filled((FOLDER / "self_test.st").read_text(encoding="ascii"), {
+        return filled(template("self_test.st"), {
             "CALLS": str(self.calls()), "N": str(n), "M": str(m), "K": str(k), "POINTS": str(n * k), "LAST": str(n - 1),
             "EXTERNALS": "\n".join(f"    {name} : {kind};" for name, (kind, _, _) in globals_.items()),
             "INSTANCES": "\n".join(f"    golden_{each} : cl_golden_{each};" for each in range(len(self.vectors))),
@@ -253,8 +253,13 @@ def summed(name: str, values: Array) -> str:
             "            END_FOR;\n")  # fmt: skip
 
 
-def filled(template: str, parts: Mapping[str, str]) -> str:
+def template(name: str) -> str:
+    """Return a file of this package."""
+    return files(__package__ or "").joinpath(name).read_text(encoding="ascii")
+
+
+def filled(text: str, parts: Mapping[str, str]) -> str:
     """Return a template with its parts."""
-    for name, text in parts.items():
-        template = template.replace(f"@{name}@", text)
-    return template
+    for name, part in parts.items():
+        text = text.replace(f"@{name}@", part)
+    return text

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rig.plc_export import st_folder
 from rig.plc_export.ode_program import PER_PROBLEM
 from rig.plc_export.recorded_problems import ITERATIONS, GoldenVector, GoldenVectors
 from rig.plc_export.st_folder import StructuredTextExport, sum_of
@@ -204,6 +205,17 @@ def test_a_literal_is_read_back_with_its_bits(value: float) -> None:
 def test_what_has_no_literal_is_refused(value: float) -> None:
     with pytest.raises(UnfitKernelError, match="no literal"):
         StructuredTextPrinter({}).number(value)
+
+
+def test_constants_are_in_lists_that_tools_take(export: StructuredTextExport, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = {"cl_phi": 4 * 49 * 49, "cl_gamma": 4 * 94 * 49}
+    monkeypatch.setattr(st_folder, "LARGEST_LIST", sizes["cl_gamma"])
+    lists = export.files()["configuration.st"].split("VAR_GLOBAL CONSTANT")[1:]
+    assert len(lists) > 4
+    assert not any("cl_phi :" in each and "cl_gamma :" in each for each in lists)
+    monkeypatch.setattr(st_folder, "LARGEST_LIST", sizes["cl_gamma"] - 1)
+    with pytest.raises(UnfitKernelError, match="cl_gamma: 18424 bytes, and a list of constants has at most 18423"):
+        export.files()
 
 
 def test_names_are_no_keywords_and_differ_in_more_than_capitals() -> None:
