@@ -24,16 +24,18 @@ from plant.helium.interpolation import (
     read_surface,
     read_surface_slopes,
 )
-from plant.numeric import at_least, at_most
+from plant.numeric import Array, at_least, at_most
 
 GAS_CONSTANT = 2077.26  # J/(kg K), of helium
 ISOBAR_PRESSURE = 16e5  # Pa
 LOWEST_SATURATION, HIGHEST_SATURATION = 0.3e5, 2.25e5  # Pa, ends of the saturation line's table
-LOWEST_DEPARTURE, HIGHEST_DEPARTURE = -11.0, 3.0  # bar from there; beyond, properties are held
+LOWEST_DEPARTURE, HIGHEST_DEPARTURE = -11.0, 3.0  # bar from there; beyond, h is held and rho in proportion to P
+LOWEST_SUPPLY, HIGHEST_SUPPLY = ISOBAR_PRESSURE + 1e5 * LOWEST_DEPARTURE, ISOBAR_PRESSURE + 1e5 * HIGHEST_DEPARTURE
 WARMEST_ISOBAR = 300.0  # K; above it the gas has the heat capacity that it has there
 LARGEST_SUPERHEAT, LARGEST_EXCESS = 115.0, 600e3  # K and J/kg, the same for the vapour
 EDGE_TEMPERATURE = 118.0  # K, of vapour with that excess
 WARM_CP = 5193.2  # J/(kg K), of helium there
+ALUMINIUM_ENTHALPY = 4  # its place in `Helium.isobar`
 SUPERHEAT_OFFSET = 0.3  # K, keeps the logarithm of the superheat finite on the saturation line
 EXCESS_OFFSET = 1500.0  # J/kg, the same for the enthalpy above that of the saturated vapour
 
@@ -132,10 +134,21 @@ def _departure(P: float, function: int, i: int, weights: Weights, helium: Helium
 
 
 @inlined
+def thinned(P: float, density: float) -> float:
+    """Return `density` in proportion to `P` (Pa) below 5 and above 19 bar, where its table ends."""
+    if P.real < LOWEST_SUPPLY:
+        return density * (P / LOWEST_SUPPLY)
+    if P.real > HIGHEST_SUPPLY:
+        return density * (P / HIGHEST_SUPPLY)
+    return density
+
+
+@inlined
 def supply_enthalpy_and_density(P: float, T: float, helium: Helium) -> tuple[float, float]:
     """Return h (J/kg) and rho (kg/m3) of the high-pressure gas at `P` (Pa, 5e5 to 19e5) and `T` (K, 2.5 to 350).
 
-    At 16 bar they are those of the isobar's table, to the bit. Elsewhere h is within 0.1 K times cp and rho within 5 %
+    At 16 bar they are those of the isobar's table, to the bit; below 5 and above 19 bar rho goes on in proportion to P.
+    Elsewhere h is within 0.1 K times cp and rho within 5 %
     of CoolProp from 6 to 8 K, where cp has its peak, within 0.03 K and 3 % else below 10 K, within 0.01 K and 1 % from
     there to 80 K, and above within 1e-5.
     """
@@ -146,7 +159,7 @@ def supply_enthalpy_and_density(P: float, T: float, helium: Helium) -> tuple[flo
     rho = read_curve(table.nodes, i, 1, weights) + 0.0 * P
     if P != ISOBAR_PRESSURE:
         h += _departure(P, 0, i, weights, helium)
-        rho += _departure(P, 1, i, weights, helium)
+        rho = thinned(P, rho + _departure(P, 1, i, weights, helium))
     if T.real > WARMEST_ISOBAR:
         return h + WARM_CP * (T - WARMEST_ISOBAR), rho * WARMEST_ISOBAR / T
     return h, rho
@@ -168,10 +181,58 @@ def supply_cell(P: float, T: float, helium: Helium) -> tuple[float, float, float
     c_wall = read_curve(nodes, i, 3, weights)
     if P != ISOBAR_PRESSURE:
         h += _departure(P, 0, i, weights, helium)
-        rho_cp += _departure(P, 2, i, weights, helium)
+        rho_cp = thinned(P, rho_cp + _departure(P, 2, i, weights, helium))
     if T.real > WARMEST_ISOBAR:
         return h + WARM_CP * (T - WARMEST_ISOBAR), rho_cp * WARMEST_ISOBAR / T, c_wall
     return h, rho_cp, c_wall
+
+
+@inlined
+def _tabulated(i: int, weights: Weights, function: int, power: int, helium: Helium) -> float:
+    """Return the coefficient of `power` of the cubic in bar from 16 bar: 0 for h, 1 for rho."""
+    if power == 0:
+        return read_curve(helium.isobar.nodes, i, function, weights)
+    return read_curve(helium.departure.nodes, i, 3 * function + power - 1, weights)
+
+
+@kernel
+def supply_cubics(T: float, helium: Helium, row: Array) -> None:
+    """Write what does not depend on the pressure of the high-pressure gas and its wall at `T` (K) into `row` (18).
+
+    Coefficients of the cubics in bar from 16 bar for h (J/kg), their slopes (per K), the same for rho (kg/m3); heat
+    capacity (J/(kg K)) and enthalpy (J/kg) of aluminium. They are those of `supply_enthalpy_and_density`, and
+    derivatives of one another to rounding: beyond the table h and the wall's enthalpy go on with their slopes, below it
+    rho is held.
+    """
+    table = helium.isobar
+    i, t = locate(np.log(T), table.start, table.step, table.before, table.nodes.shape[0])
+    weights, slopes = hermite_weights(t), hermite_slope_weights(t)
+    warmer = at_least(T - WARMEST_ISOBAR, 0.0)
+    inside = T - warmer
+    colder = 0.0 * T
+    if i == 0 and t.real <= 0.0:
+        coldest = np.exp(table.start - table.before * table.step)
+        colder = T - coldest
+        inside = coldest + 0.0 * T
+    per_kelvin = 1.0 / (table.step * inside)
+    beyond = colder + warmer
+    for power in range(4):
+        slope = _tabulated(i, slopes, 0, power, helium) * per_kelvin
+        if warmer.real > 0.0:
+            slope = 0.0 * slope + (WARM_CP if power == 0 else 0.0)
+        row[power] = _tabulated(i, weights, 0, power, helium) + slope * beyond
+        row[4 + power] = slope
+        rho = _tabulated(i, weights, 1, power, helium)
+        rho_T = _tabulated(i, slopes, 1, power, helium) * per_kelvin
+        if warmer.real > 0.0:
+            rho = rho * WARMEST_ISOBAR / T
+            rho_T = -rho / T
+        elif colder.real < 0.0:
+            rho_T = 0.0 * rho_T
+        row[8 + power] = rho
+        row[12 + power] = rho_T
+    row[16] = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, slopes) * per_kelvin
+    row[17] = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, weights) + row[16] * beyond
 
 
 @inlined
