@@ -15,9 +15,16 @@ import numpy as np
 from coldloop.kernels.compiled import kernel
 from plant.cold_box.physics import ColdBox, Streams
 from plant.components.gas_volume import SECOND_VIRIAL
+from plant.components.cell_account import SETTLED_ENERGY
 from plant.components.passes import (
+    CAPACITY,
     COLUMNS,
     CUBICS,
+    ENERGY,
+    EXPANSION,
+    GAIN,
+    INFLOW,
+    MASS,
     H,
     Passing,
     Supply,
@@ -32,13 +39,16 @@ from plant.components.passes import (
 )
 from plant.helium.properties import GAS_CONSTANT, ISOBAR_PRESSURE, Helium, supply_cubics
 from plant.numeric import Array, at_least
-from plant.refrigerator.compression_station import CompressionStation
 from plant.refrigerator.precooler import Precooler
 
 FIRST: Final = 2
 """Index of the first cell among the states."""
+COARSE_PRESSURE: Final = 1e3
+"""Pa; where a step moves the pressure by less, and no cell by much, nothing is corrected."""
 MOST_STEPS: Final = 40
 """Of Newton's method for the pressure."""
+MOST_CORRECTIONS: Final = 6
+"""Of the temperatures after a step."""
 MOST_TURNS: Final = 6
 """Within which the directions of the flows are found."""
 
@@ -79,6 +89,15 @@ class Filling(NamedTuple):
     """Enthalpy that this carries, J/kg."""
     cells: Array
     """What the cells hold and gain, see `Held`."""
+
+
+class Gains(NamedTuple):
+    """What the cells held at the start of a step, and the sums of their weighted gains over its stages."""
+
+    start: Array
+    """Columns of `plant.components.passes` at the first stage."""
+    gained: Array
+    """Mass (kg/s) and energy (W) of each cell, shape (states up to the coil, 2)."""
 
 
 @kernel
@@ -203,7 +222,7 @@ def fill_passes(
     gained: float,
     T_hot: float,
     cold: Streams,
-    station: CompressionStation,
+    volume: float,
     pipes: PipedPasses,
     held: Held,
     helium: Helium,
@@ -216,7 +235,7 @@ def fill_passes(
         gained: By the whole high-pressure side, kg/s.
         T_hot: Temperature of the line, K.
         cold: Flows at the cold ends.
-        station: With the line.
+        volume: Of the line, m3.
         pipes: The passes.
         held: From `read_passes`; its cells are overwritten.
         helium: Tables.
@@ -227,7 +246,7 @@ def fill_passes(
     hold_passes(at, pipes, held)
     hot = np.empty(CUBICS, dx.dtype)
     supply_cubics(T_hot + 0.0 * P, helium, hot)
-    _, in_line_P = line_mass(station.hp.volume, P, T_hot)
+    _, in_line_P = line_mass(volume, P, T_hot)
     forwards = np.ones(coil, np.bool_)
     ends = _march(dx, cold, cubic(hot, 0, at.bar), pipes, cells, forwards)
     dP = (gained + cold.m_jt + cold.m_t - ends.hot.m) / (in_line_P + ends.hot.m_P)
@@ -244,3 +263,76 @@ def fill_passes(
     m = ends.coil.m + ends.coil.m_P * dP
     dx[coil] = (m * (ends.nef6.h - ends.coil.h) - dx[coil]) / pipes.precooler.nef5.capacity
     return Filling(P, dP, ends.hot.m + ends.hot.m_P * dP, ends.hot.h, cells)
+
+
+@kernel
+def start_gains(filling: Filling) -> Gains:
+    """Begin to keep account of a step whose first stage is `filling`, with the weight 1."""
+    gains = Gains(filling.cells, np.zeros((filling.cells.shape[0], 2)))
+    add_gains(gains, filling, 1.0)
+    return gains
+
+
+@kernel
+def add_gains(gains: Gains, filling: Filling, weight: float) -> None:
+    """Add what the cells gain at a stage."""
+    for i in range(FIRST, filling.cells.shape[0] - 1):
+        gains.gained[i, 0] += weight * filling.cells[i, INFLOW]
+        gains.gained[i, 1] += weight * filling.cells[i, GAIN]
+
+
+@kernel
+def settle_passes(
+    M: float, gains: Gains, weight: float, T_hot: float, volume: float, pipes: PipedPasses, x: Array, helium: Helium
+) -> None:
+    """Correct the temperatures of the cells in `x` (48) so that they hold what the stages of a step brought.
+
+    The flow into a cell is corrected with them by what its mass is off, and carries the enthalpy of the cell before.
+
+    Args:
+        M: What line and passes hold after the step, kg.
+        gains: Of this step.
+        weight: Of a stage of weight 1, s.
+        T_hot: Of the line, K.
+        volume: Of the line, m3.
+        pipes: The passes.
+        x: State after the step.
+        helium: Tables.
+    """
+    nef2, nef34, nef6, coil = pipes.nef2, pipes.nef34, pipes.nef6, pipes.coil
+    T_coil = x[coil]
+    hot = np.empty(CUBICS)
+    supply_cubics(T_hot, helium, hot)
+    for _ in range(MOST_CORRECTIONS):
+        held = read_passes(x, pipes, helium)
+        at = supply_at(side_pressure(volume, M, T_hot, held.mass))
+        hold_passes(at, pipes, held)
+        cells = held.cells
+        flow, worst_1 = _settled(FIRST, nef2, 0.0, cells[nef34 - 1, H], gains, weight, cells, x)
+        flow, worst_2 = _settled(nef2, nef34, flow, cells[nef6 - 1, H], gains, weight, cells, x)
+        flow, worst_34 = _settled(nef34, nef6, flow, cells[coil, H], gains, weight, cells, x)
+        x[coil] = T_coil + flow * (cells[coil - 1, H] - cells[coil, H]) / pipes.precooler.nef5.capacity
+        _, worst_6 = _settled(nef6, coil, flow, cubic(hot, 0, at.bar), gains, weight, cells, x)
+        if max(worst_1, worst_2, worst_34, worst_6) <= SETTLED_ENERGY:
+            break
+
+
+@kernel
+def _settled(
+    first: int, last: int, flow: float, h_before: float, gains: Gains, weight: float, cells: Array, x: Array
+) -> tuple[float, float]:
+    """Correct the cells from `first` to `last` - 1, out of which `flow` (kg) more flows than the stages let out.
+
+    Returns what more flows into them (kg), and the most that was missing in one (J).
+    """
+    worst = 0.0
+    for i in range(last - 1, first - 1, -1):
+        cell, start = cells[i], gains.start[i]
+        entering = flow + cell[MASS] - start[MASS] - weight * gains.gained[i, 0]
+        h_in = cells[i - 1, H] if i > first else h_before
+        missing = start[ENERGY] + weight * gains.gained[i, 1] + entering * h_in - flow * cell[H] - cell[ENERGY]
+        warmer = missing / (cell[CAPACITY] * (1.0 - cell[EXPANSION] * (h_in - cell[H])))
+        x[i] += warmer
+        worst = max(worst, abs(missing))
+        flow = entering + cell[CAPACITY] * cell[EXPANSION] * warmer
+    return flow, worst

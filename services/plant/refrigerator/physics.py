@@ -21,11 +21,10 @@ import numpy as np
 from coldloop.kernels.compiled import kernel
 from coldloop.process import signals as process
 from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, flows_and_heats
-from plant.cold_box.settling import settle_box
-from plant.components.cell_account import settle_cells
+from plant.components.cell_account import COARSE, WILD, widest_move
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
-from plant.components.phase_separator import Content, add_to_account, content, start_account
+from plant.components.phase_separator import Content, add_to_account, content, settle_account, start_account
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import Array, RealArray
 from plant.refrigerator.compression_station import (
@@ -39,11 +38,17 @@ from plant.refrigerator.compression_station import (
     station_rates,
 )
 from plant.refrigerator.high_pressure import (
+    COARSE_PRESSURE,
+    FIRST,
     Filling,
+    add_gains,
     fill_passes,
     piped,
     read_passes,
+    settle_passes,
+    side_mass,
     side_pressure,
+    start_gains,
 )
 from plant.refrigerator.precooler import (
     PRECOOLER_STATE_UNITS,
@@ -140,7 +145,7 @@ def evaluate_refrigerator(
     flows = station_rates(
         x[STATION:], v, P, high.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station, dx[STATION:]
     )
-    filling = fill_passes(P.HP, dx[STATION], T_hot, cold, station, pipes, held, helium, dx)
+    filling = fill_passes(P.HP, dx[STATION], T_hot, cold, station.hp.volume, pipes, held, helium, dx)
     dx[STATION + 3] += relief
     signals[0], signals[1], signals[2] = P.LP / 1e5, P.HP / 1e5, P.buffer / 1e5
     signals[3], signals[4] = cooling.warm_end.T, x[pipes.coil - 1]
@@ -173,6 +178,14 @@ def inventory(x: Array, plant: Refrigerator, helium: Helium) -> float:
 
 
 @kernel
+def high_pressure_mass(x: Array, P: float, T_ambient: float, plant: Refrigerator, helium: Helium) -> float:
+    """Return what the high-pressure line and the passes hold (kg) at `P` (Pa), the passes as warm as in `x`."""
+    held = read_passes(x, piped(plant.box, plant.precooler), helium)
+    mass, _ = side_mass(plant.station.hp.volume, P, T_ambient + plant.station.cooler_approach, held.mass)
+    return mass
+
+
+@kernel
 def rates(x: Array, u: Array, v: Array, d: Array, plant: Refrigerator, helium: Helium) -> Array:
     """Return dx/dt, shape (48,), in `STATE_UNITS` per second."""
     dx = np.empty_like(x)
@@ -200,30 +213,36 @@ def advance_refrigerator(
     n = x.shape[0]
     slope, y, signals = np.empty(n), np.empty(22), np.empty(SIGNALS)
     stage, total = np.empty(n), np.empty(n)
-    stages, slopes = np.empty((4, n)), np.empty((4, n))
+    stages = np.empty((4, n))
     crossing = evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
-    account = start_account(crossing.bath, slope)
+    account, gains = start_account(crossing.bath, slope), start_gains(crossing.filling)
+    P = crossing.filling.P
+    swing: float = 0.0
     for i in range(n):
-        stages[0, i], slopes[0, i] = x[i], slope[i]
+        stages[0, i] = x[i]
         total[i] = slope[i]
         stage[i] = x[i] + 0.5 * dt * slope[i]
     for k, fraction in ((1, 0.5), (2, 1.0)):
         crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
         account = add_to_account(account, crossing.bath, slope, 2.0)
+        add_gains(gains, crossing.filling, 2.0)
+        swing = max(swing, abs(crossing.filling.P - P))
         for i in range(n):
-            stages[k, i], slopes[k, i] = stage[i], slope[i]
+            stages[k, i] = stage[i]
             total[i] += 2.0 * slope[i]
             stage[i] = x[i] + fraction * dt * slope[i]
     crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
     account = add_to_account(account, crossing.bath, slope, 1.0)
+    add_gains(gains, crossing.filling, 1.0)
+    swing = max(swing, abs(crossing.filling.P - P))
     for i in range(n):
-        stages[3, i], slopes[3, i] = stage[i], slope[i]
+        stages[3, i] = stage[i]
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
-    P = np.empty(4)
-    for k in range(4):
-        P[k] = station_pressures(stages[k, STATION:], plant.station, d[1]).HP
-    settle_box(plant.box, account, P, stages, slopes, dt, stage, helium)
-    settle_cells(plant.precooler.nef6, BOX_STATES, P, stages, slopes, dt, stage, helium)
+    settle_account(plant.box.separator, account, dt / 6.0, stage, helium)
+    pipes = piped(plant.box, plant.precooler)
+    if swing > COARSE_PRESSURE or COARSE < widest_move(stages, stage, FIRST, pipes.coil) < WILD:
+        T_hot = d[1] + plant.station.cooler_approach
+        settle_passes(stage[STATION], gains, dt / 6.0, T_hot, plant.station.hp.volume, pipes, stage, helium)
     return stage
 
 

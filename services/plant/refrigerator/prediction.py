@@ -82,7 +82,7 @@ def _closed(J: RealArray, K: RealArray, lag_s: float) -> RealArray:
     A[HP, kept] = -1.0  # the bypass flow leaves the high-pressure line
     A[LP, kept : kept + 2] = 1.0  # and reaches, with that from the buffer, the low-pressure line
     pressures = np.zeros((2, kept + 4))
-    pressures[0, HP], pressures[1, LP] = (J[row, line] for row, line in zip(PRESSURE_ROWS, LINES, strict=True))
+    pressures[:, :kept] = J[np.ix_(PRESSURE_ROWS, KEPT)]  # the high pressure also follows the passes' temperatures
     loop = np.vstack([pressures, np.zeros((4, kept + 4))])
     loop[2:, kept:] = np.eye(4)
     A[kept : kept + 2] = -K @ loop / lag_s
