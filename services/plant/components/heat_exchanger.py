@@ -127,13 +127,3 @@ def cell_rates(exchanger: HeatExchanger, T: Array, high: HighPressureFlow, heliu
         capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
         dT[i] = (high.mass_flow * (h_before - h_cell) - dT[i]) / capacity
         h_cell, rho_cp, c_wall = h_before, rho_cp_before, c_wall_before
-
-
-@kernel
-def exchange(
-    exchanger: HeatExchanger, T: Array, high: HighPressureFlow, low: LowPressureFlow, helium: Helium, dT: Array
-) -> LowPressureFlow:
-    """Write the rates of the cell temperatures into `dT` (K/s) and return the low-pressure flow at the hot end."""
-    leaving = transfer(exchanger, T, high, low, helium, dT)
-    cell_rates(exchanger, T, high, helium, dT)
-    return leaving
