@@ -51,7 +51,7 @@ class CompressionStation(NamedTuple):
     """Of each of the three valves."""
     hp_relief: ReliefValve = ReliefValve(18e5, 1e5, Valve(1.2e-4))
     lp_relief: ReliefValve = ReliefValve(1.5e5, 0.2e5, Valve(2.5e-3))
-    buffer_relief: ReliefValve = ReliefValve(12e5, 1e5, Valve(1e-4))
+    buffer_relief: ReliefValve = ReliefValve(13e5, 1e5, Valve(1e-4))
     cooler_approach: float = 5.0
     """By how much the compressed gas is warmer than the surroundings, K."""
     run_up: float = 6.0
