@@ -41,7 +41,7 @@ M_LOST = STATE_NAMES.index("M_lost")
 LAW = station_law(StationSettings(), FILE.reference, PLANT.station).equipment
 LP, TO_BOX, COMPRESSED = (SIGNAL_NAMES.index(name) for name in ("P11", "M12", "M_NC"))
 V1 = OUTPUT_NAMES.index("V1")
-CELLS = slice(FIRST, STATE_NAMES.index("T_nef5"))
+COIL = STATE_NAMES.index("T_nef5")
 PLAIN, TABLES = plain_tuples(PLANT), plain_tuples(HELIUM)
 
 percent = st.floats(0.0, 100.0)
@@ -98,11 +98,11 @@ def held(
             sums[3] = max(sums[3], abs(stored - inwards))
             given -= WEIGHTS[k] * (crossing.filling.entering - crossing.high.mass_flow)
             if k == 0:
-                given -= np.sum(crossing.filling.cells[CELLS, MASS])
+                given -= np.sum(crossing.filling.cells[FIRST:COIL, MASS])
             stage = x + AHEAD[k] * slope
         x = advance_refrigerator(x, acting.u, v, acting.d, 0.25, acting.plant, helium)
         filling = evaluate_refrigerator(x, acting.u, v, acting.d, acting.plant, helium, slope, y, signals).filling
-        given += np.sum(filling.cells[CELLS, MASS])
+        given += np.sum(filling.cells[FIRST:COIL, MASS])
         sums[0] += given * supply_cell(filling.P, T_hot, helium)[0]
     return x, sums
 
