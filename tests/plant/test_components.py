@@ -7,7 +7,14 @@ from hypothesis import strategies as st
 
 from plant.cold_box.physics import REFERENCE
 from plant.components.gas_valve import CRITICAL_RATIO
-from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow, cell_rates, driving_difference, take_up, transfer
+from plant.components.heat_exchanger import (
+    HighPressureFlow,
+    LowPressureFlow,
+    cell_rates,
+    driving_difference,
+    take_up,
+    transfer,
+)
 from plant.components.phase_separator import content, level, separate
 from plant.components.return_line import return_flow
 from plant.components.turbine import expand, turbine_flow

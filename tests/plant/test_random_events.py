@@ -10,8 +10,8 @@ from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.balance import energy_gained, energy_rates
 from plant.cold_box.physics import REFERENCE, cold_box_of, derivative
-from plant.components.phase_separator import content, start_account
 from plant.components.passes import MASS
+from plant.components.phase_separator import content, start_account
 from plant.helium.properties import helium_of, load_helium, supply_cell
 from plant.integrator import advance, plain_tuples
 from plant.numeric import RealArray

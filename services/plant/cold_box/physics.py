@@ -132,7 +132,8 @@ def flows_and_heats(
 ) -> tuple[Streams, LowPressureFlow, float, Content]:
     """Write the rates of the bath into `dx` (28, per second) and the outputs into `y` (22, `OUTPUT_UNITS`).
 
-    In the place of the rates of the cells is the heat that they give to the low-pressure gas (W). Returns the flows, what leaves at the warm end of the low-pressure side, what the bath's relief valve blows into the
+    In the place of the rates of the cells is the heat that they give to the low-pressure gas (W). Returns the
+    flows, what leaves at the warm end of the low-pressure side, what the bath's relief valve blows into the
     recovery line (kg/s), and what the bath holds.
     """
     s = streams(x, u, box, helium)

@@ -30,8 +30,8 @@ CUBICS = 18
 """Columns of `supply_cubics`."""
 H, CAPACITY, EXPANSION, COMPRESSION, WORK, MASS, ENERGY, M_IN, M_IN_P, H_IN, INFLOW, GAIN = range(12)
 COLUMNS = 12
-"""Of a cell: h (J/kg), C (J/K), v rho_T/C (kg/J), v rho_P (kg/Pa), v (1 - rho h_P) (J/Pa), M (kg), U (J); m_in at constant
-pressure (kg/s), its slope in dP/dt (kg/Pa), h_in (J/kg); dM/dt (kg/s), dU/dt (W)."""
+"""Of a cell: h (J/kg), C (J/K), v rho_T/C (kg/J), v rho_P (kg/Pa), v (1 - rho h_P) (J/Pa), M (kg), U (J); m_in at
+constant pressure (kg/s), its slope in dP/dt (kg/Pa), h_in (J/kg); dM/dt (kg/s), dU/dt (W)."""
 MOST_FILLING = 0.8
 """Share of what enters that a cell keeps at most because that is colder; more, and cells of one temperature each cannot
 be solved from the cold end. What enters then brings the heat that remains from the cell before."""
@@ -124,7 +124,7 @@ class Passing(NamedTuple):
 
     m: float
     """At constant pressure, kg/s; positive from the hot to the cold end."""
-    m_P: float
+    slope: float
     """Slope in dP/dt, kg/Pa."""
     h: float
     """J/kg."""
@@ -151,7 +151,7 @@ def march_flows(
         forwards: Whether the flow into each cell comes from its hot side, shape (cells,).
         cells: From `hold_cells`.
     """
-    m, m_P, h_out = leaving.m, leaving.m_P, leaving.h
+    m, m_P, h_out = leaving.m, leaving.slope, leaving.h
     for i in range(exchanger.cells - 1, -1, -1):
         cell = cells[i]
         warmth = 0.0 * h_before
@@ -170,14 +170,13 @@ def march_flows(
 
 
 @kernel
-def pass_rates(
-    exchanger: HeatExchanger, leaving: Passing, tapped: float, dP: float, cells: Array, dT: Array
-) -> None:
+def pass_rates(exchanger: HeatExchanger, leaving: Passing, tapped: float, dP: float, cells: Array, dT: Array) -> None:
     """Replace the heat of each cell (W) in `dT` by the rate of its temperature (K/s) at dP/dt (Pa/s).
 
-    What it takes of mass and energy goes into the last columns of `cells`; `leaving` and `tapped` are those of `march_flows`.
+    What it takes of mass and energy goes into the last columns of `cells`; `leaving` and `tapped` are those of
+    `march_flows`.
     """
-    m_out, h_out = leaving.m + leaving.m_P * dP, leaving.h
+    m_out, h_out = leaving.m + leaving.slope * dP, leaving.h
     for i in range(exchanger.cells - 1, -1, -1):
         cell, heat = cells[i], dT[i]
         m_in, h_in = cell[M_IN] + cell[M_IN_P] * dP, cell[H_IN]

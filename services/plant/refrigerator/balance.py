@@ -1,7 +1,7 @@
 """The energy balance of the refrigerator's cold part: cold box, NEF6, NEF5's coil.
 
-Stored are the bath's internal energy and that of gas and wall in each cell, whose mass and pressure move. The station is
-isothermal.
+Stored are the bath's internal energy and that of gas and wall in each cell, whose mass and pressure move. The station
+is isothermal.
 """
 
 from coldloop.kernels.compiled import kernel
@@ -27,7 +27,7 @@ def refrigerator_energy_rates(
     filling, cold, leaving, cooling = crossing.filling, crossing.cold, crossing.leaving, crossing.cooling
     bath = content(box.separator, x[0], x[1], helium)
     stored = bath.U_P * dx[0] + bath.U_V * dx[1] + plant.precooler.nef5.capacity * dx[pipes.coil]
-    stored += stored_in_passes(x, dx, filling.P, filling.dP, plant, helium)
+    stored += stored_in_passes(x, dx, filling.P, filling.P_rate, plant, helium)
     top = outflow(box.separator, x[0], x[1], saturation(x[0], helium), helium)
     h_turbine, _, _ = supply_cell(filling.P, x[BOX_STATES - 1], helium)
     inwards = filling.entering * filling.h - leaving.mass_flow * leaving.h - crossing.relief * top.h
@@ -37,9 +37,7 @@ def refrigerator_energy_rates(
 
 
 @kernel
-def stored_in_passes(
-    x: RealArray, dx: RealArray, P: float, dP: float, plant: Refrigerator, helium: Helium
-) -> float:
+def stored_in_passes(x: RealArray, dx: RealArray, P: float, dP: float, plant: Refrigerator, helium: Helium) -> float:
     """Return how fast the energy of gas and walls in the passes rises (W), from their properties alone.
 
     At `P` (Pa), which rises by `dP` (Pa/s).

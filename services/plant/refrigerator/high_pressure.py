@@ -14,8 +14,8 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from plant.cold_box.physics import ColdBox, Streams
-from plant.components.gas_volume import SECOND_VIRIAL
 from plant.components.cell_account import SETTLED_ENERGY
+from plant.components.gas_volume import SECOND_VIRIAL
 from plant.components.passes import (
     CAPACITY,
     COLUMNS,
@@ -81,7 +81,7 @@ class Filling(NamedTuple):
 
     P: float
     """Pa."""
-    dP: float
+    P_rate: float
     """Pa/s."""
     entering: float
     """From the line into NEF6, kg/s; below 0 the passes give back."""
@@ -198,10 +198,8 @@ def _march(heat: Array, cold: Streams, h_hot: float, pipes: PipedPasses, cells: 
     out_5 = march_flows(
         box.nef34, heat[nef34:nef6], out_34, cold.m_t, cells[coil, H], forwards[nef34:nef6], cells[nef34:nef6]
     )
-    out_6 = Passing(out_5.m, out_5.m_P, cells[coil - 1, H] if forwards[nef34] else cells[coil, H])
-    hot = march_flows(
-        pipes.precooler.nef6, heat[nef6:coil], out_6, none, h_hot, forwards[nef6:coil], cells[nef6:coil]
-    )
+    out_6 = Passing(out_5.m, out_5.slope, cells[coil - 1, H] if forwards[nef34] else cells[coil, H])
+    hot = march_flows(pipes.precooler.nef6, heat[nef6:coil], out_6, none, h_hot, forwards[nef6:coil], cells[nef6:coil])
     return _Ends(out_1, out_2, out_34, out_5, out_6, hot)
 
 
@@ -249,20 +247,20 @@ def fill_passes(
     _, in_line_P = line_mass(volume, P, T_hot)
     forwards = np.ones(coil, np.bool_)
     ends = _march(dx, cold, cubic(hot, 0, at.bar), pipes, cells, forwards)
-    dP = (gained + cold.m_jt + cold.m_t - ends.hot.m) / (in_line_P + ends.hot.m_P)
+    dP = (gained + cold.m_jt + cold.m_t - ends.hot.m) / (in_line_P + ends.hot.slope)
     turns = 0
     while _turned(dP, pipes, cells, forwards) and turns < MOST_TURNS:
         ends = _march(dx, cold, cubic(hot, 0, at.bar), pipes, cells, forwards)
-        dP = (gained + cold.m_jt + cold.m_t - ends.hot.m) / (in_line_P + ends.hot.m_P)
+        dP = (gained + cold.m_jt + cold.m_t - ends.hot.m) / (in_line_P + ends.hot.slope)
         turns += 1
     none = 0.0 * dP
     pass_rates(box.nef1, ends.nef1, none, dP, cells[FIRST:nef2], dx[FIRST:nef2])
     pass_rates(box.nef2, ends.nef2, none, dP, cells[nef2:nef34], dx[nef2:nef34])
     pass_rates(box.nef34, ends.nef34, cold.m_t, dP, cells[nef34:nef6], dx[nef34:nef6])
     pass_rates(pipes.precooler.nef6, ends.nef6, none, dP, cells[nef6:coil], dx[nef6:coil])
-    m = ends.coil.m + ends.coil.m_P * dP
+    m = ends.coil.m + ends.coil.slope * dP
     dx[coil] = (m * (ends.nef6.h - ends.coil.h) - dx[coil]) / pipes.precooler.nef5.capacity
-    return Filling(P, dP, ends.hot.m + ends.hot.m_P * dP, ends.hot.h, cells)
+    return Filling(P, dP, ends.hot.m + ends.hot.slope * dP, ends.hot.h, cells)
 
 
 @kernel

@@ -56,8 +56,8 @@ from plant.refrigerator.precooler import (
     Precooler,
     Precooling,
     check_precooler,
-    precooler_of,
     precooler_flows,
+    precooler_of,
 )
 
 BOX_STATES: Final = len(process.STATE_NAMES)

@@ -80,7 +80,7 @@ def _closed(J: RealArray, K: RealArray, lag_s: float) -> RealArray:
     LP = kept - 1
     A = np.zeros((kept + 4, kept + 4))
     A[:kept, :kept] = J[np.ix_(KEPT, KEPT)]
-    A[:kept, kept] = J[KEPT, CV956] / -J[M_HP, CV956]  # the bypass flow leaves the high-pressure line, whose passes cool,
+    A[:kept, kept] = J[KEPT, CV956] / -J[M_HP, CV956]  # the bypass flow leaves the high-pressure side, whose gas cools,
     A[LP, kept : kept + 2] = 1.0  # and reaches, with that from the buffer, the low-pressure line
     pressures = np.zeros((2, kept + 4))
     pressures[:, :kept] = J[np.ix_(PRESSURE_ROWS, KEPT)]  # the high pressure also follows the passes' temperatures
