@@ -31,6 +31,7 @@ ISOBAR_PRESSURE = 16e5  # Pa
 LOWEST_SATURATION, HIGHEST_SATURATION = 0.3e5, 2.25e5  # Pa, ends of the saturation line's table
 LOWEST_DEPARTURE, HIGHEST_DEPARTURE = -11.0, 3.0  # bar from there; beyond, h is held and rho in proportion to P
 LOWEST_SUPPLY, HIGHEST_SUPPLY = ISOBAR_PRESSURE + 1e5 * LOWEST_DEPARTURE, ISOBAR_PRESSURE + 1e5 * HIGHEST_DEPARTURE
+COLDEST = 1.0  # K, below the table; for the logarithm
 WARMEST_ISOBAR = 300.0  # K; above it the gas has the heat capacity that it has there
 LARGEST_SUPERHEAT, LARGEST_EXCESS = 115.0, 600e3  # K and J/kg, the same for the vapour
 EDGE_TEMPERATURE = 118.0  # K, of vapour with that excess
@@ -153,7 +154,7 @@ def supply_enthalpy_and_density(P: float, T: float, helium: Helium) -> tuple[flo
     there to 80 K, and above within 1e-5.
     """
     table = helium.isobar
-    i, t = locate(np.log(T), table.start, table.step, table.before, table.nodes.shape[0])
+    i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, table.nodes.shape[0])
     weights = hermite_weights(t)
     h = read_curve(table.nodes, i, 0, weights) + 0.0 * P
     rho = read_curve(table.nodes, i, 1, weights) + 0.0 * P
@@ -173,7 +174,7 @@ def supply_cell(P: float, T: float, helium: Helium) -> tuple[float, float, float
     (9 % from 12 to 19 bar) and 6 % above.
     """
     table = helium.isobar
-    i, t = locate(np.log(T), table.start, table.step, table.before, table.nodes.shape[0])
+    i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, table.nodes.shape[0])
     weights = hermite_weights(t)
     nodes = table.nodes
     h = read_curve(nodes, i, 0, weights) + 0.0 * P
@@ -205,7 +206,7 @@ def supply_cubics(T: float, helium: Helium, row: Array) -> None:
     rho is held.
     """
     table = helium.isobar
-    i, t = locate(np.log(T), table.start, table.step, table.before, table.nodes.shape[0])
+    i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, table.nodes.shape[0])
     weights, slopes = hermite_weights(t), hermite_slope_weights(t)
     warmer = at_least(T - WARMEST_ISOBAR, 0.0)
     inside = T - warmer

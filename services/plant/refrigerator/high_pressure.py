@@ -43,8 +43,9 @@ from plant.refrigerator.precooler import Precooler
 
 FIRST: Final = 2
 """Index of the first cell among the states."""
-COARSE_PRESSURE: Final = 1e3
-"""Pa; where a step moves the pressure by less, and no cell by much, nothing is corrected."""
+COARSE_PRESSURE: Final = 200.0
+COARSE_CELL: Final = 0.01
+"""Pa and K; where a step moves the pressure and all cells by less, nothing is corrected."""
 MOST_STEPS: Final = 40
 """Of Newton's method for the pressure."""
 MOST_CORRECTIONS: Final = 6

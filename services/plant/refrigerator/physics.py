@@ -21,7 +21,7 @@ import numpy as np
 from coldloop.kernels.compiled import kernel
 from coldloop.process import signals as process
 from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, flows_and_heats
-from plant.components.cell_account import COARSE, WILD, widest_move
+from plant.components.cell_account import WILD, widest_move
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
 from plant.components.phase_separator import Content, add_to_account, content, settle_account, start_account
@@ -38,6 +38,7 @@ from plant.refrigerator.compression_station import (
     station_rates,
 )
 from plant.refrigerator.high_pressure import (
+    COARSE_CELL,
     COARSE_PRESSURE,
     FIRST,
     Filling,
@@ -240,7 +241,7 @@ def advance_refrigerator(
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
     settle_account(plant.box.separator, account, dt / 6.0, stage, helium)
     pipes = piped(plant.box, plant.precooler)
-    if swing > COARSE_PRESSURE or COARSE < widest_move(stages, stage, FIRST, pipes.coil) < WILD:
+    if swing > COARSE_PRESSURE or COARSE_CELL < widest_move(stages, stage, FIRST, pipes.coil) < WILD:
         T_hot = d[1] + plant.station.cooler_approach
         settle_passes(stage[STATION], gains, dt / 6.0, T_hot, plant.station.hp.volume, pipes, stage, helium)
     return stage
