@@ -189,14 +189,6 @@ def supply_cell(P: float, T: float, helium: Helium) -> tuple[float, float, float
 
 
 @inlined
-def _tabulated(i: int, weights: Weights, function: int, power: int, helium: Helium) -> float:
-    """Return the coefficient of `power` of the cubic in bar from 16 bar: 0 for h, 1 for rho."""
-    if power == 0:
-        return read_curve(helium.isobar.nodes, i, function, weights)
-    return read_curve(helium.departure.nodes, i, 3 * function + power - 1, weights)
-
-
-@kernel
 def supply_cubics(T: float, helium: Helium, row: Array) -> None:
     """Write what does not depend on the pressure of the high-pressure gas and its wall at `T` (K) into `row` (18).
 
@@ -205,35 +197,40 @@ def supply_cubics(T: float, helium: Helium, row: Array) -> None:
     derivatives of one another to rounding: beyond the table h and the wall's enthalpy go on with their slopes, below it
     rho is held.
     """
-    table = helium.isobar
+    table, further = helium.isobar, helium.departure.nodes
     i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, table.nodes.shape[0])
-    weights, slopes = hermite_weights(t), hermite_slope_weights(t)
-    warmer = at_least(T - WARMEST_ISOBAR, 0.0)
-    inside = T - warmer
-    colder = 0.0 * T
-    if i == 0 and t.real <= 0.0:
-        coldest = np.exp(table.start - table.before * table.step)
-        colder = T - coldest
-        inside = coldest + 0.0 * T
+    w, d = hermite_weights(t), hermite_slope_weights(t)
+    inside = T
+    if T.real > WARMEST_ISOBAR:
+        inside = WARMEST_ISOBAR + 0.0 * T
+    elif i == 0 and t.real <= 0.0:
+        inside = np.exp(table.start - table.before * table.step) + 0.0 * T
     per_kelvin = 1.0 / (table.step * inside)
-    beyond = colder + warmer
+    w_T = (d[0] * per_kelvin, d[1] * per_kelvin, d[2] * per_kelvin, d[3] * per_kelvin)
+    row[0], row[4] = read_curve(table.nodes, i, 0, w), read_curve(table.nodes, i, 0, w_T)
+    row[8], row[12] = read_curve(table.nodes, i, 1, w), read_curve(table.nodes, i, 1, w_T)
+    for power in range(3):
+        row[1 + power], row[5 + power] = read_curve(further, i, power, w), read_curve(further, i, power, w_T)
+        row[9 + power], row[13 + power] = read_curve(further, i, 3 + power, w), read_curve(further, i, 3 + power, w_T)
+    row[16] = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, w_T)
+    row[17] = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, w)
+    if inside.real != T.real:
+        _go_on(T, inside, row)
+
+
+@kernel
+def _go_on(T: float, edge: float, row: Array) -> None:
+    """Continue what `supply_cubics` wrote at the end `edge` of the table (K) to `T` (K)."""
+    warm = T.real > WARMEST_ISOBAR
     for power in range(4):
-        slope = _tabulated(i, slopes, 0, power, helium) * per_kelvin
-        if warmer.real > 0.0:
-            slope = 0.0 * slope + (WARM_CP if power == 0 else 0.0)
-        row[power] = _tabulated(i, weights, 0, power, helium) + slope * beyond
-        row[4 + power] = slope
-        rho = _tabulated(i, weights, 1, power, helium)
-        rho_T = _tabulated(i, slopes, 1, power, helium) * per_kelvin
-        if warmer.real > 0.0:
-            rho = rho * WARMEST_ISOBAR / T
-            rho_T = -rho / T
-        elif colder.real < 0.0:
-            rho_T = 0.0 * rho_T
-        row[8 + power] = rho
-        row[12 + power] = rho_T
-    row[16] = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, slopes) * per_kelvin
-    row[17] = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, weights) + row[16] * beyond
+        if warm:
+            row[4 + power] = 0.0 * T + (WARM_CP if power == 0 else 0.0)
+            row[8 + power] = row[8 + power] * WARMEST_ISOBAR / T
+            row[12 + power] = -row[8 + power] / T
+        else:
+            row[12 + power] = 0.0 * T
+        row[power] += row[4 + power] * (T - edge)
+    row[17] += row[16] * (T - edge)
 
 
 @inlined

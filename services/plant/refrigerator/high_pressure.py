@@ -149,12 +149,12 @@ def side_pressure(volume: float, M: float, T: float, mass: Array) -> float:
     real = mass.real.copy()
     full, _ = side_mass(volume, ISOBAR_PRESSURE, T.real, real)
     P = ISOBAR_PRESSURE * M.real / full
+    if P <= 0.0:
+        return 0.0 * M * T
     for _ in range(MOST_STEPS):
-        if P <= 0.0:
-            return 0.0 * M * T
         found, slope = side_mass(volume, P, T.real, real)
         step = (M.real - found) / slope
-        P += step
+        P = max(P + step, 0.5 * P)  # below 5 bar cold passes give more helium for a bar than above
         if abs(step) <= 1e-9 * P:
             break
     found, slope = side_mass(volume, P + 0.0 * M, T, mass)
