@@ -14,7 +14,6 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from plant.cold_box.physics import ColdBox, Streams
-from plant.components.cell_account import SETTLED_ENERGY
 from plant.components.gas_volume import SECOND_VIRIAL
 from plant.components.passes import (
     CAPACITY,
@@ -43,13 +42,15 @@ from plant.refrigerator.precooler import Precooler
 
 FIRST: Final = 2
 """Index of the first cell among the states."""
-COARSE_PRESSURE: Final = 200.0
-COARSE_CELL: Final = 0.01
+COARSE_PRESSURE: Final = 100.0
+COARSE_CELL: Final = 0.002
 """Pa and K; where a step moves the pressure and all cells by less, nothing is corrected."""
 MOST_STEPS: Final = 40
 """Of Newton's method for the pressure."""
 MOST_CORRECTIONS: Final = 6
 """Of the temperatures after a step."""
+SETTLED_ENERGY: Final = 1e-4
+"""J that was missing in a cell, from which on the correction for it is the last: it leaves a hundredth or so."""
 MOST_TURNS: Final = 6
 """Within which the directions of the flows are found."""
 
