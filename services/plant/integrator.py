@@ -50,7 +50,7 @@ def advance_along(
     for i in range(n):
         stages[3, i], slopes[3, i] = stage[i], slope[i]
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
-    settle_box(box, account, np.full(4, box.P_HP), stages, slopes, dt, stage, helium)
+    settle_box(box, account, stages, slopes, dt, stage, helium)
     return stage
 
 

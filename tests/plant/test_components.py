@@ -7,7 +7,14 @@ from hypothesis import strategies as st
 
 from plant.cold_box.physics import REFERENCE
 from plant.components.gas_valve import CRITICAL_RATIO
-from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow, driving_difference, exchange, take_up
+from plant.components.heat_exchanger import (
+    HighPressureFlow,
+    LowPressureFlow,
+    cell_rates,
+    driving_difference,
+    take_up,
+    transfer,
+)
 from plant.components.phase_separator import content, level, separate
 from plant.components.return_line import return_flow
 from plant.components.turbine import expand, turbine_flow
@@ -90,7 +97,9 @@ def test_what_an_exchanger_takes_from_one_stream_it_gives_to_the_other(
     h_low, _ = vapour_enthalpy_and_cp(1.15e5, T_low, saturation(1.15e5, HELIUM).T, HELIUM.vapour)
     entering = LowPressureFlow(m_low, 1.15e5, T_low, h_low)
     dT = np.empty(exchanger.cells)
-    leaving = exchange(exchanger, T, HighPressureFlow(m_high, T_high, 16e5), entering, HELIUM, dT)
+    high = HighPressureFlow(m_high, T_high, 16e5)
+    leaving = transfer(exchanger, T, high, entering, HELIUM, dT)
+    cell_rates(exchanger, T, high, HELIUM, dT)
     stored = 0.0
     for T_cell, rate in zip(T, dT, strict=True):
         _, rho_cp, c_wall = supply_cell(16e5, T_cell, HELIUM)

@@ -10,14 +10,16 @@ from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.balance import energy_gained, energy_rates
 from plant.cold_box.physics import REFERENCE, cold_box_of, derivative
+from plant.components.passes import MASS
 from plant.components.phase_separator import content, start_account
-from plant.helium.properties import helium_of, load_helium
+from plant.helium.properties import helium_of, load_helium, supply_cell
 from plant.integrator import advance, plain_tuples
 from plant.numeric import RealArray
 from plant.own_model import own_header
-from plant.refrigerator.balance import refrigerator_energy_rates
+from plant.refrigerator.balance import refrigerator_energy_rates, stored_energy
 from plant.refrigerator.equipment import EquipmentLaw, act, resting_equipment
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from plant.refrigerator.high_pressure import FIRST
 from plant.refrigerator.physics import (
     REFERENCE_REFRIGERATOR,
     SIGNAL_NAMES,
@@ -39,6 +41,7 @@ M_LOST = STATE_NAMES.index("M_lost")
 LAW = station_law(StationSettings(), FILE.reference, PLANT.station).equipment
 LP, TO_BOX, COMPRESSED = (SIGNAL_NAMES.index(name) for name in ("P11", "M12", "M_NC"))
 V1 = OUTPUT_NAMES.index("V1")
+COIL = STATE_NAMES.index("T_nef5")
 PLAIN, TABLES = plain_tuples(PLANT), plain_tuples(HELIUM)
 
 percent = st.floats(0.0, 100.0)
@@ -76,15 +79,16 @@ def held(
     """Return the state after some ticks, and sums over their stages; `equipment` is overwritten.
 
     What crossed the boundary and its size (J), what the bath's rates brought it (J), and the largest difference between
-    what crosses and what is stored (W).
+    what crosses and what is stored (W). What the line gives the passes beyond the flows of the stages crosses, too.
     """
     plant, helium = refrigerator_of(plain), helium_of(tables)
+    T_hot = d[1] + plant.station.cooler_approach
     sums, slope, y, signals = np.zeros(4), np.empty(x.shape[0]), np.empty(22), np.empty(len(SIGNAL_NAMES))
     evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
     for _ in range(ticks):
         taken = signals[TO_BOX] / max(signals[COMPRESSED], 0.1)
         acting = act(law, equipment, u, d, signals[LP], taken, y[V1], plant)
-        stage = x
+        stage, given = x, 0.0
         for k in range(4):
             crossing = evaluate_refrigerator(stage, acting.u, v, acting.d, acting.plant, helium, slope, y, signals)
             stored, inwards = refrigerator_energy_rates(stage, slope, crossing, d[0], acting.plant, helium)
@@ -92,8 +96,14 @@ def held(
             sums[1] += WEIGHTS[k] * abs(inwards)
             sums[2] += WEIGHTS[k] * start_account(crossing.bath, slope).heat
             sums[3] = max(sums[3], abs(stored - inwards))
+            given -= WEIGHTS[k] * (crossing.filling.entering - crossing.high.mass_flow)
+            if k == 0:
+                given -= np.sum(crossing.filling.cells[FIRST:COIL, MASS])
             stage = x + AHEAD[k] * slope
         x = advance_refrigerator(x, acting.u, v, acting.d, 0.25, acting.plant, helium)
+        filling = evaluate_refrigerator(x, acting.u, v, acting.d, acting.plant, helium, slope, y, signals).filling
+        given += np.sum(filling.cells[FIRST:COIL, MASS])
+        sums[0] += given * supply_cell(filling.P, T_hot, helium)[0]
     return x, sums
 
 
@@ -103,6 +113,7 @@ def balances_over_random_events(course: Course) -> None:
     before = inventory(x, PLANT, HELIUM)
     in_bath = content(BATH, x[0], x[1], HELIUM).energy
     for ticks, u, v, d in course:
+        energy = stored_energy(x, d[1], PLANT, HELIUM)
         x, sums = held(x, equipment, np.array(u), np.array(v), np.array(d), ticks, PLAIN, TABLES, LAW)
         assert np.all(np.isfinite(x))
         assert inventory(x, PLANT, HELIUM) + x[M_LOST] == pytest.approx(before, rel=1e-9)
@@ -110,6 +121,7 @@ def balances_over_random_events(course: Course) -> None:
         gained = content(BATH, x[0], x[1], HELIUM).energy - in_bath
         assert gained == pytest.approx(sums[2], abs=1e-6 * sums[1] + 1e-6)
         in_bath += gained
+        assert stored_energy(x, d[1], PLANT, HELIUM) - energy == pytest.approx(sums[0], abs=1e-6 * sums[1] + 1e-2)
 
 
 @given(course=st.lists(pieces, min_size=2, max_size=4))

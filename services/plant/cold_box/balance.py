@@ -1,7 +1,6 @@
 """The energy balance of the cold box: what it stores, and what crosses its boundary.
 
-Stored are the bath's internal energy and, in each cell, that of gas and wall at constant pressure. Mass and pressure
-work in the exchangers' passes are left out, as in `physics`: where P_HP moves, they are what is missing here too.
+Stored are the bath's internal energy and, in each cell, that of gas and wall at constant pressure and constant mass.
 """
 
 import numpy as np

@@ -15,7 +15,7 @@ import numpy as np
 
 from coldloop.kernels.compiled import inlined, kernel
 from plant.components.gas_valve import CRITICAL_RATIO, cold_valve_flow
-from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow, exchange
+from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow, cell_rates, transfer
 from plant.components.phase_separator import (
     Content,
     PhaseSeparator,
@@ -127,12 +127,13 @@ def mix(vapour: LowPressureFlow, s: Streams, helium: Helium) -> LowPressureFlow:
 
 
 @kernel
-def evaluate(
+def flows_and_heats(
     x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Array, y: Array
 ) -> tuple[Streams, LowPressureFlow, float, Content]:
-    """Write the rates of the states into `dx` (28, per second) and the outputs into `y` (22, `OUTPUT_UNITS`).
+    """Write the rates of the bath into `dx` (28, per second) and the outputs into `y` (22, `OUTPUT_UNITS`).
 
-    Returns the flows, what leaves at the warm end of the low-pressure side, what the bath's relief valve blows into the
+    In the place of the rates of the cells is the heat that they give to the low-pressure gas (W). Returns the
+    flows, what leaves at the warm end of the low-pressure side, what the bath's relief valve blows into the
     recovery line (kg/s), and what the bath holds.
     """
     s = streams(x, u, box, helium)
@@ -147,12 +148,12 @@ def evaluate(
 
     vapour = LowPressureFlow(s.m_v, x[0], top.T, top.h)
     into_nef1 = HighPressureFlow(s.m_jt, x[first34 - 1], box.P_HP)
-    cold = exchange(box.nef1, x[2:first2], into_nef1, vapour, helium, dx[2:first2])
+    cold = transfer(box.nef1, x[2:first2], into_nef1, vapour, helium, dx[2:first2])
     mixed = mix(cold, s, helium)
     into_nef2 = HighPressureFlow(s.m_jt, x[first34 + box.nef34.cells - 1], box.P_HP)
-    middle = exchange(box.nef2, x[first2:first34], into_nef2, mixed, helium, dx[first2:first34])
+    middle = transfer(box.nef2, x[first2:first34], into_nef2, mixed, helium, dx[first2:first34])
     into_nef34 = HighPressureFlow(s.m_jt + s.m_t, box.T_in, box.P_HP)
-    warm = exchange(box.nef34, x[first34:], into_nef34, middle, helium, dx[first34:])
+    warm = transfer(box.nef34, x[first34:], into_nef34, middle, helium, dx[first34:])
 
     exhaust_saturation = saturation(s.P_mix, helium)
     y[0] = level(box.separator, x[1])
@@ -168,6 +169,23 @@ def evaluate(
     y[10] = box.T_in
     y[11] = warm.T
     _write_pressures(x[0], s, box, y[12:])
+    return s, warm, relief, bath
+
+
+@kernel
+def evaluate(
+    x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Array, y: Array
+) -> tuple[Streams, LowPressureFlow, float, Content]:
+    """Write the rates of the states into `dx` (28, per second), the supply at constant pressure; else as above."""
+    s, warm, relief, bath = flows_and_heats(x, u, w, box, helium, dx, y)
+    first2 = 2 + box.nef1.cells
+    first34 = first2 + box.nef2.cells
+    into_nef1 = HighPressureFlow(s.m_jt, x[first34 - 1], box.P_HP)
+    cell_rates(box.nef1, x[2:first2], into_nef1, helium, dx[2:first2])
+    into_nef2 = HighPressureFlow(s.m_jt, x[first34 + box.nef34.cells - 1], box.P_HP)
+    cell_rates(box.nef2, x[first2:first34], into_nef2, helium, dx[first2:first34])
+    into_nef34 = HighPressureFlow(s.m_jt + s.m_t, box.T_in, box.P_HP)
+    cell_rates(box.nef34, x[first34:], into_nef34, helium, dx[first34:])
     return s, warm, relief, bath
 
 

@@ -12,7 +12,6 @@ from plant.numeric import RealArray
 def settle_box(
     box: ColdBox,
     account: Account,
-    P: RealArray,
     stages: RealArray,
     slopes: RealArray,
     dt: float,
@@ -24,7 +23,6 @@ def settle_box(
     Args:
         box: Parameters.
         account: Of the bath in this step, with the weights 1, 2, 2, 1.
-        P: Supply pressure at the stages, Pa, shape (4,).
         stages: States at the stages, shape (4, N).
         slopes: Their rates, shape (4, N).
         dt: Step, s.
@@ -35,6 +33,6 @@ def settle_box(
     first2 = 2 + box.nef1.cells
     if widest_move(stages, x, 2, first2 + box.nef2.cells + box.nef34.cells) <= COARSE:
         return  # as nearly always
-    settle_cells(box.nef1, 2, P, stages, slopes, dt, x, helium)
-    settle_cells(box.nef2, first2, P, stages, slopes, dt, x, helium)
-    settle_cells(box.nef34, first2 + box.nef2.cells, P, stages, slopes, dt, x, helium)
+    settle_cells(box.nef1, 2, box.P_HP, stages, slopes, dt, x, helium)
+    settle_cells(box.nef2, first2, box.P_HP, stages, slopes, dt, x, helium)
+    settle_cells(box.nef34, first2 + box.nef2.cells, box.P_HP, stages, slopes, dt, x, helium)

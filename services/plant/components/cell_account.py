@@ -44,7 +44,7 @@ def widest_move(stages: RealArray, x: RealArray, first: int, last: int) -> float
 def settle_cells(
     exchanger: HeatExchanger,
     first: int,
-    P: RealArray,
+    P: float,
     stages: RealArray,
     slopes: RealArray,
     dt: float,
@@ -58,7 +58,7 @@ def settle_cells(
     Args:
         exchanger: Parameters.
         first: Index of its first cell in `x`.
-        P: Supply pressure at the stages, Pa, shape (4,).
+        P: Supply pressure, Pa.
         stages: States at the stages, shape (4, N).
         slopes: Their rates, shape (4, N).
         dt: Step, s.
@@ -73,13 +73,13 @@ def settle_cells(
             brought: float = 0.0
             for k in range(4):
                 weight = dt / 6.0 if k in (0, 3) else dt / 3.0
-                brought += weight * heat_capacity(exchanger, P[k], stages[k, i], helium) * slopes[k, i]
-            missing = brought - _held_between(exchanger, P[1], stages[0, i], x[i], helium)
+                brought += weight * heat_capacity(exchanger, P, stages[k, i], helium) * slopes[k, i]
+            missing = brought - _held_between(exchanger, P, stages[0, i], x[i], helium)
             if abs(missing) <= LEAST_ENERGY:
                 continue
             for _ in range(MOST_CORRECTIONS):
-                x[i] += missing / heat_capacity(exchanger, P[1], x[i], helium)
-                missing = brought - _held_between(exchanger, P[1], stages[0, i], x[i], helium)
+                x[i] += missing / heat_capacity(exchanger, P, x[i], helium)
+                missing = brought - _held_between(exchanger, P, stages[0, i], x[i], helium)
                 if abs(missing) <= SETTLED_ENERGY:
                     break
 

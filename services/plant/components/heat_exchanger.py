@@ -86,10 +86,10 @@ def take_up(
 
 
 @kernel
-def exchange(
-    exchanger: HeatExchanger, T: Array, high: HighPressureFlow, low: LowPressureFlow, helium: Helium, dT: Array
+def transfer(
+    exchanger: HeatExchanger, T: Array, high: HighPressureFlow, low: LowPressureFlow, helium: Helium, heat: Array
 ) -> LowPressureFlow:
-    """Write the rates of the cell temperatures into `dT` (K/s) and return the low-pressure flow at the hot end.
+    """Write what each cell gives to the low-pressure gas into `heat` (W) and return that gas at the hot end.
 
     `T` holds the temperatures of gas and wall in each cell, hot end first (K). The low-pressure side is marched from
     the cold end; in a cell it approaches the mean T_m of the gas that enters and the gas that leaves:
@@ -102,18 +102,28 @@ def exchange(
     moving = at_most(high.mass_flow / STILL, 1.0)
     T_low, h_low = low.T, low.h
     _, cp_low = vapour_enthalpy_and_cp(low.P, T_low, sat.T, helium.vapour)
-    h_cell, rho_cp, c_wall = supply_cell(high.P, T[exchanger.cells - 1], helium)
     for i in range(exchanger.cells - 1, -1, -1):
         T_before = T[i - 1] if i > 0 else high.T
-        h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, helium)
         T_ahead = T_before if moving.real >= 1.0 else T[i] + moving * (T_before - T[i])
         drive = driving_difference(T_ahead, T[i], T_low)
         T_low, h_next, cp_low = take_up(
             LowPressureFlow(sweeping, low.P, T_low, h_low), cp_low, drive, UA, sat, helium.vapour
         )
-        heat = low.mass_flow * (h_next - h_low)
-        capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
-        dT[i] = (high.mass_flow * (h_before - h_cell) - heat) / capacity
+        heat[i] = low.mass_flow * (h_next - h_low)
         h_low = h_next
-        h_cell, rho_cp, c_wall = h_before, rho_cp_before, c_wall_before
     return LowPressureFlow(low.mass_flow, low.P, T_low, h_low)
+
+
+@kernel
+def cell_rates(exchanger: HeatExchanger, T: Array, high: HighPressureFlow, helium: Helium, dT: Array) -> None:
+    """Replace what each cell gives to the low-pressure gas (W) in `dT` by the rate of its temperature (K/s).
+
+    The mass of the gas in the cells, as their pressure, is constant.
+    """
+    h_cell, rho_cp, c_wall = supply_cell(high.P, T[exchanger.cells - 1], helium)
+    for i in range(exchanger.cells - 1, -1, -1):
+        T_before = T[i - 1] if i > 0 else high.T
+        h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, helium)
+        capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
+        dT[i] = (high.mass_flow * (h_before - h_cell) - dT[i]) / capacity
+        h_cell, rho_cp, c_wall = h_before, rho_cp_before, c_wall_before

@@ -16,6 +16,7 @@ from coldloop.kernels.compiled import inlined, kernel
 from plant.components.gas_valve import CHOKED
 from plant.helium.interpolation import hermite_slope_weights, hermite_weights, locate, read_curve
 from plant.helium.properties import (
+    ALUMINIUM_ENTHALPY,
     WARM_CP,
     WARMEST_ISOBAR,
     Helium,
@@ -30,7 +31,6 @@ from plant.numeric import Array, at_least, at_most
 SUPERHEAT = 5e4  # J/kg, of the vapour in a dry vessel at V_l = -V: mass and energy then bend little where it runs dry
 CARRY_OVER = 0.97  # share of the vessel from which on the vapour carries liquid along
 COLD_WALL = 4.0  # K, the wall's temperature where the vapour is saturated; it has next to no heat capacity there
-ALUMINIUM_ENTHALPY = 4  # its place in `Helium.isobar`
 LEAST_MASS, LEAST_ENERGY = 2e-12, 1e-7  # kg and J in a step: what is less is left alone
 ROUNDING = 1e-14  # share of mass and energy to which `holding` solves: a hot wall has 1e7 J
 MAX_NEWTON_STEPS = 30

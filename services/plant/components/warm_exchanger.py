@@ -10,7 +10,7 @@ import numpy as np
 from coldloop.kernels.compiled import kernel
 from plant.components.heat_exchanger import STILL, TRICKLE, HeatExchanger, HighPressureFlow, LowPressureFlow
 from plant.components.parameters import require
-from plant.helium.properties import WARM_CP, Helium, supply_cell
+from plant.helium.properties import WARM_CP
 from plant.numeric import Array, at_least, at_most
 
 SMALL = 1e-3
@@ -42,10 +42,10 @@ def exchanged_heat(UA: float, C_high: float, C_low: float, difference: float) ->
 
 
 @kernel
-def exchange_warm(
-    exchanger: HeatExchanger, T: Array, high: HighPressureFlow, low: LowPressureFlow, helium: Helium, dT: Array
+def transfer_warm(
+    exchanger: HeatExchanger, T: Array, high: HighPressureFlow, low: LowPressureFlow, heat: Array
 ) -> LowPressureFlow:
-    """Write the rates of the cell temperatures into `dT` (K/s) and return the low-pressure flow at the hot end.
+    """Write what each cell gives to the low-pressure gas into `heat` (W) and return that gas at the hot end.
 
     `T` holds the temperature at which the high-pressure gas leaves each cell, hot end first (K), and of its wall. As
     the high-pressure flow comes to rest, the low-pressure gas takes its heat from the wall.
@@ -56,18 +56,14 @@ def exchange_warm(
     moving, sweeping = at_most(high.mass_flow / STILL, 1.0), at_most(low.mass_flow / TRICKLE, 1.0)
     by_wall = (1.0 - moving) * C_low * (1.0 - np.exp(-2.0 * UA / C_low))
     T_low, h_low = low.T, low.h
-    h_cell, rho_cp, c_wall = supply_cell(high.P, T[exchanger.cells - 1], helium)
     for i in range(exchanger.cells - 1, -1, -1):
         T_before = T[i - 1] if i > 0 else high.T
-        h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, helium)
-        heat = exchanged_heat(UA, C_high, C_low, T_before - T_low)
+        given = exchanged_heat(UA, C_high, C_low, T_before - T_low)
         if moving.real < 1.0:
-            heat = sweeping * (moving * heat + by_wall * (T[i] - T_low))
-        capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
-        dT[i] = (high.mass_flow * (h_before - h_cell) - heat) / capacity
-        T_low = T_low + heat / C_low
-        h_low = h_low + heat / at_least(low.mass_flow, TRICKLE)
-        h_cell, rho_cp, c_wall = h_before, rho_cp_before, c_wall_before
+            given = sweeping * (moving * given + by_wall * (T[i] - T_low))
+        heat[i] = given
+        T_low = T_low + given / C_low
+        h_low = h_low + given / at_least(low.mass_flow, TRICKLE)
     return LowPressureFlow(low.mass_flow, low.P, T_low, h_low)
 
 

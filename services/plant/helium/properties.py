@@ -24,16 +24,19 @@ from plant.helium.interpolation import (
     read_surface,
     read_surface_slopes,
 )
-from plant.numeric import at_least, at_most
+from plant.numeric import Array, at_least, at_most
 
 GAS_CONSTANT = 2077.26  # J/(kg K), of helium
 ISOBAR_PRESSURE = 16e5  # Pa
 LOWEST_SATURATION, HIGHEST_SATURATION = 0.3e5, 2.25e5  # Pa, ends of the saturation line's table
-LOWEST_DEPARTURE, HIGHEST_DEPARTURE = -11.0, 3.0  # bar from there; beyond, properties are held
+LOWEST_DEPARTURE, HIGHEST_DEPARTURE = -11.0, 3.0  # bar from there; beyond, h is held and rho in proportion to P
+LOWEST_SUPPLY, HIGHEST_SUPPLY = ISOBAR_PRESSURE + 1e5 * LOWEST_DEPARTURE, ISOBAR_PRESSURE + 1e5 * HIGHEST_DEPARTURE
+COLDEST = 1.0  # K, below the table; for the logarithm
 WARMEST_ISOBAR = 300.0  # K; above it the gas has the heat capacity that it has there
 LARGEST_SUPERHEAT, LARGEST_EXCESS = 115.0, 600e3  # K and J/kg, the same for the vapour
 EDGE_TEMPERATURE = 118.0  # K, of vapour with that excess
 WARM_CP = 5193.2  # J/(kg K), of helium there
+ALUMINIUM_ENTHALPY = 4  # its place in `Helium.isobar`
 SUPERHEAT_OFFSET = 0.3  # K, keeps the logarithm of the superheat finite on the saturation line
 EXCESS_OFFSET = 1500.0  # J/kg, the same for the enthalpy above that of the saturated vapour
 
@@ -132,21 +135,32 @@ def _departure(P: float, function: int, i: int, weights: Weights, helium: Helium
 
 
 @inlined
+def thinned(P: float, density: float) -> float:
+    """Return `density` in proportion to `P` (Pa) below 5 and above 19 bar, where its table ends."""
+    if P.real < LOWEST_SUPPLY:
+        return density * (P / LOWEST_SUPPLY)
+    if P.real > HIGHEST_SUPPLY:
+        return density * (P / HIGHEST_SUPPLY)
+    return density
+
+
+@inlined
 def supply_enthalpy_and_density(P: float, T: float, helium: Helium) -> tuple[float, float]:
     """Return h (J/kg) and rho (kg/m3) of the high-pressure gas at `P` (Pa, 5e5 to 19e5) and `T` (K, 2.5 to 350).
 
-    At 16 bar they are those of the isobar's table, to the bit. Elsewhere h is within 0.1 K times cp and rho within 5 %
+    At 16 bar they are those of the isobar's table, to the bit; below 5 and above 19 bar rho goes on in proportion to P.
+    Elsewhere h is within 0.1 K times cp and rho within 5 %
     of CoolProp from 6 to 8 K, where cp has its peak, within 0.03 K and 3 % else below 10 K, within 0.01 K and 1 % from
     there to 80 K, and above within 1e-5.
     """
     table = helium.isobar
-    i, t = locate(np.log(T), table.start, table.step, table.before, table.nodes.shape[0])
+    i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, table.nodes.shape[0])
     weights = hermite_weights(t)
     h = read_curve(table.nodes, i, 0, weights) + 0.0 * P
     rho = read_curve(table.nodes, i, 1, weights) + 0.0 * P
     if P != ISOBAR_PRESSURE:
         h += _departure(P, 0, i, weights, helium)
-        rho += _departure(P, 1, i, weights, helium)
+        rho = thinned(P, rho + _departure(P, 1, i, weights, helium))
     if T.real > WARMEST_ISOBAR:
         return h + WARM_CP * (T - WARMEST_ISOBAR), rho * WARMEST_ISOBAR / T
     return h, rho
@@ -160,7 +174,7 @@ def supply_cell(P: float, T: float, helium: Helium) -> tuple[float, float, float
     (9 % from 12 to 19 bar) and 6 % above.
     """
     table = helium.isobar
-    i, t = locate(np.log(T), table.start, table.step, table.before, table.nodes.shape[0])
+    i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, table.nodes.shape[0])
     weights = hermite_weights(t)
     nodes = table.nodes
     h = read_curve(nodes, i, 0, weights) + 0.0 * P
@@ -168,10 +182,55 @@ def supply_cell(P: float, T: float, helium: Helium) -> tuple[float, float, float
     c_wall = read_curve(nodes, i, 3, weights)
     if P != ISOBAR_PRESSURE:
         h += _departure(P, 0, i, weights, helium)
-        rho_cp += _departure(P, 2, i, weights, helium)
+        rho_cp = thinned(P, rho_cp + _departure(P, 2, i, weights, helium))
     if T.real > WARMEST_ISOBAR:
         return h + WARM_CP * (T - WARMEST_ISOBAR), rho_cp * WARMEST_ISOBAR / T, c_wall
     return h, rho_cp, c_wall
+
+
+@inlined
+def supply_cubics(T: float, helium: Helium, row: Array) -> None:
+    """Write what does not depend on the pressure of the high-pressure gas and its wall at `T` (K) into `row` (18).
+
+    Coefficients of the cubics in bar from 16 bar for h (J/kg), their slopes (per K), the same for rho (kg/m3); heat
+    capacity (J/(kg K)) and enthalpy (J/kg) of aluminium. They are those of `supply_enthalpy_and_density`, and
+    derivatives of one another to rounding: beyond the table h and the wall's enthalpy go on with their slopes, below it
+    rho is held.
+    """
+    table, further = helium.isobar, helium.departure.nodes
+    i, t = locate(np.log(at_least(T, COLDEST)), table.start, table.step, table.before, table.nodes.shape[0])
+    w, d = hermite_weights(t), hermite_slope_weights(t)
+    inside = T
+    if T.real > WARMEST_ISOBAR:
+        inside = WARMEST_ISOBAR + 0.0 * T
+    elif i == 0 and t.real <= 0.0:
+        inside = np.exp(table.start - table.before * table.step) + 0.0 * T
+    per_kelvin = 1.0 / (table.step * inside)
+    w_T = (d[0] * per_kelvin, d[1] * per_kelvin, d[2] * per_kelvin, d[3] * per_kelvin)
+    row[0], row[4] = read_curve(table.nodes, i, 0, w), read_curve(table.nodes, i, 0, w_T)
+    row[8], row[12] = read_curve(table.nodes, i, 1, w), read_curve(table.nodes, i, 1, w_T)
+    for power in range(3):
+        row[1 + power], row[5 + power] = read_curve(further, i, power, w), read_curve(further, i, power, w_T)
+        row[9 + power], row[13 + power] = read_curve(further, i, 3 + power, w), read_curve(further, i, 3 + power, w_T)
+    row[16] = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, w_T)
+    row[17] = read_curve(table.nodes, i, ALUMINIUM_ENTHALPY, w)
+    if inside.real != T.real:
+        _go_on(T, inside, row)
+
+
+@kernel
+def _go_on(T: float, edge: float, row: Array) -> None:
+    """Continue what `supply_cubics` wrote at the end `edge` of the table (K) to `T` (K)."""
+    warm = T.real > WARMEST_ISOBAR
+    for power in range(4):
+        if warm:
+            row[4 + power] = 0.0 * T + (WARM_CP if power == 0 else 0.0)
+            row[8 + power] = row[8 + power] * WARMEST_ISOBAR / T
+            row[12 + power] = -row[8 + power] / T
+        else:
+            row[12 + power] = 0.0 * T
+        row[power] += row[4 + power] * (T - edge)
+    row[17] += row[16] * (T - edge)
 
 
 @inlined

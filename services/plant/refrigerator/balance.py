@@ -1,15 +1,17 @@
 """The energy balance of the refrigerator's cold part: cold box, NEF6, NEF5's coil.
 
-As in `plant.cold_box.balance`, gas and wall of a cell are taken at constant pressure. The station is isothermal.
+Stored are the bath's internal energy and that of gas and wall in each cell, whose mass and pressure move. The station
+is isothermal.
 """
 
 from coldloop.kernels.compiled import kernel
-from plant.cold_box.balance import stored_in_cells, stored_rate
 from plant.components.heat_exchanger import TRICKLE
-from plant.components.phase_separator import outflow
+from plant.components.passes import CAPACITY, COMPRESSION, ENERGY, EXPANSION, WORK, H, supply_at
+from plant.components.phase_separator import content, outflow
 from plant.helium.properties import WARM_CP, Helium, saturation, supply_cell
 from plant.numeric import RealArray, at_least
-from plant.refrigerator.physics import BOX_STATES, Crossing, Refrigerator
+from plant.refrigerator.high_pressure import FIRST, hold_passes, piped, read_passes, side_pressure
+from plant.refrigerator.physics import BOX_STATES, STATION, Crossing, Refrigerator
 
 
 @kernel
@@ -21,16 +23,45 @@ def refrigerator_energy_rates(
     `dx` and `crossing` are from `evaluate_refrigerator` at `x`; `load` in W. Nitrogen and the turbine's shaft take
     heat and work, the relief valve and the low-pressure line helium.
     """
-    box, precooler = plant.box, plant.precooler
-    coil = BOX_STATES + precooler.nef6.cells
-    supply, cold, leaving, cooling = crossing.entering, crossing.cold, crossing.leaving, crossing.cooling
-    stored = stored_rate(x, dx, box, supply.P, helium)
-    stored += stored_in_cells(precooler.nef6, supply.P, x[BOX_STATES:coil], dx[BOX_STATES:coil], helium)
-    stored += precooler.nef5.capacity * dx[coil]
+    box, pipes = plant.box, piped(plant.box, plant.precooler)
+    filling, cold, leaving, cooling = crossing.filling, crossing.cold, crossing.leaving, crossing.cooling
+    bath = content(box.separator, x[0], x[1], helium)
+    stored = bath.U_P * dx[0] + bath.U_V * dx[1] + plant.precooler.nef5.capacity * dx[pipes.coil]
+    stored += stored_in_passes(x, dx, filling.P, filling.P_rate, plant, helium)
     top = outflow(box.separator, x[0], x[1], saturation(x[0], helium), helium)
-    h_in, _, _ = supply_cell(supply.P, supply.T, helium)
-    h_turbine, _, _ = supply_cell(supply.P, x[BOX_STATES - 1], helium)
-    inwards = supply.mass_flow * h_in - leaving.mass_flow * leaving.h - crossing.relief * top.h
+    h_turbine, _, _ = supply_cell(filling.P, x[BOX_STATES - 1], helium)
+    inwards = filling.entering * filling.h - leaving.mass_flow * leaving.h - crossing.relief * top.h
     inwards -= at_least(leaving.mass_flow, TRICKLE) * WARM_CP * (cooling.warm_end.T - leaving.T)
     inwards += at_least(crossing.heater, 0.0) + load - cold.m_t * (h_turbine - cold.exhaust.h_out)
     return stored, inwards - cooling.boiling.heat
+
+
+@kernel
+def stored_in_passes(x: RealArray, dx: RealArray, P: float, dP: float, plant: Refrigerator, helium: Helium) -> float:
+    """Return how fast the energy of gas and walls in the passes rises (W), from their properties alone.
+
+    At `P` (Pa), which rises by `dP` (Pa/s).
+    """
+    pipes = piped(plant.box, plant.precooler)
+    held = read_passes(x, pipes, helium)
+    hold_passes(supply_at(P), pipes, held)
+    total: float = 0.0
+    for i in range(FIRST, pipes.coil):
+        cell = held.cells[i]
+        total += cell[CAPACITY] * (1.0 + cell[EXPANSION] * cell[H]) * dx[i]
+        total += (cell[COMPRESSION] * cell[H] - cell[WORK]) * dP
+    return total
+
+
+@kernel
+def stored_energy(x: RealArray, T_ambient: float, plant: Refrigerator, helium: Helium) -> float:
+    """Return the energy in bath, coil and passes (J)."""
+    pipes = piped(plant.box, plant.precooler)
+    held = read_passes(x, pipes, helium)
+    T_hot = T_ambient + plant.station.cooler_approach
+    hold_passes(supply_at(side_pressure(plant.station.hp.volume, x[STATION], T_hot, held.mass)), pipes, held)
+    total: float = content(plant.box.separator, x[0], x[1], helium).energy
+    total += plant.precooler.nef5.capacity * x[pipes.coil]
+    for i in range(FIRST, pipes.coil):
+        total += held.cells[i, ENERGY]
+    return total

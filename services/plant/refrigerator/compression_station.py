@@ -2,7 +2,8 @@
 
 Sizes are those of a station for the flow that the cold box takes, 93.4 g/s from 1.05 to 16 bar; `docs/refrigerator.md`
 gives the reason of each. States, `STATION_STATES`: what the volumes hold and what was lost (kg), the speeds of the
-compressors (share of the full one), the openings of the valves (%).
+compressors (share of the full one), the openings of the valves (%). The exchangers' passes belong to the high-pressure
+line: its mass is theirs, too, and its pressure that of `plant.refrigerator.high_pressure`.
 """
 
 from typing import Any, Final, NamedTuple
@@ -50,7 +51,7 @@ class CompressionStation(NamedTuple):
     """Of each of the three valves."""
     hp_relief: ReliefValve = ReliefValve(18e5, 1e5, Valve(1.2e-4))
     lp_relief: ReliefValve = ReliefValve(1.5e5, 0.2e5, Valve(2.5e-3))
-    buffer_relief: ReliefValve = ReliefValve(12e5, 1e5, Valve(1e-4))
+    buffer_relief: ReliefValve = ReliefValve(13e5, 1e5, Valve(1e-4))
     cooler_approach: float = 5.0
     """By how much the compressed gas is warmer than the surroundings, K."""
     run_up: float = 6.0
@@ -90,10 +91,10 @@ class Pressures(NamedTuple):
 
 
 @kernel
-def station_pressures(x: Array, station: CompressionStation, T_ambient: float) -> Pressures:
-    """Return the pressures that follow from the masses in `x` (9, `STATION_STATES`)."""
+def station_pressures(HP: float, x: Array, station: CompressionStation, T_ambient: float) -> Pressures:
+    """Return the high pressure `HP` (Pa) and those that follow from the masses in `x` (9, `STATION_STATES`)."""
     return Pressures(
-        gas_pressure(station.hp, x[0], T_ambient + station.cooler_approach),
+        HP,
         gas_pressure(station.lp, x[1], T_ambient),
         gas_pressure(station.buffer, x[2], T_ambient),
     )
@@ -134,7 +135,7 @@ def station_rates(
         x: States, `STATION_STATES`.
         command: Openings that are asked of CV956, CV952, CV953, %.
         P: From `station_pressures`.
-        to_box: What the cold box takes from the high-pressure line, kg/s.
+        to_box: What the cold box takes out of line and passes, kg/s.
         from_box: What it returns to the low-pressure line, kg/s.
         T_ambient: K.
         leak: From the high-pressure line into the air, kg/s when that is at 16 bar.

@@ -107,7 +107,7 @@ def _wrong_flows(cold: Equilibrium, file: RefrigeratorPlantFile, helium: Helium)
 def _why_restless(cold: Equilibrium, file: RefrigeratorPlantFile, helium: Helium) -> str:
     """Return why no rest was found: a part is too fast, or a valve too small, as with a wider one there is a rest."""
     plant, P_buffer = file.refrigerator, file.station.buffer_bar * PA_PER_BAR
-    x, n = first_guess(cold, plant, P_buffer), len(STATE_NAMES)
+    x, n = first_guess(cold, plant, helium, P_buffer), len(STATE_NAMES)
     v, d = np.zeros(len(COMMAND_NAMES)), np.array([cold.w, AMBIENT, 0.0, 1.0, 1.0, 1.0])
     for obstacle in _too_fast(jacobian(x, cold.u, v, d, plant, helium)[:n, :n], STATE_NAMES, STATE_UNITS):
         return obstacle

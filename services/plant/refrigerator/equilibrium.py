@@ -1,8 +1,9 @@
 """The refrigerator's operating point: the state at rest at given pressures, levels and inputs.
 
 Unknown beside the states are the load, the opening of the bypass and that of the nitrogen feed; in their place the
-levels, the two pressures and the buffer's content are given. The mass of the whole circuit is constant, so one
-equation follows from the others, and the steps of Newton's method are those of least squares.
+levels, the two pressures and the buffer's content are given; the mass of the high-pressure side follows from its
+pressure and the temperatures of the passes. The mass of the whole circuit is constant, so one equation follows from the
+others, and the steps of Newton's method are those of least squares.
 """
 
 from math import isfinite
@@ -10,6 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError
 from plant.components.gas_volume import gas_mass
 from plant.components.nitrogen_bath import LIQUID_DENSITY
@@ -19,9 +21,11 @@ from plant.refrigerator.linearisation import jacobian, rate_scales
 from plant.refrigerator.physics import (
     COMMAND_NAMES,
     DISTURBANCE_NAMES,
+    SIGNAL_NAMES,
     STATE_NAMES,
     Refrigerator,
     advance_refrigerator,
+    high_pressure_mass,
     rates,
     read,
 )
@@ -40,7 +44,9 @@ V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2 = (
 CV956, CV167 = STATE_NAMES.index("CV956"), STATE_NAMES.index("CV167")
 AS_ASKED: Final = tuple(STATE_NAMES.index(name) for name in ("NC1", "NC2", "CV952", "CV953"))
 """Compressors run, and both valves of the buffer are shut, to the bit."""
-GIVEN: Final = (V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2, *AS_ASKED)
+GIVEN: Final = (V_L, M_LP, M_BUFFER, M_LOST, M_N2, *AS_ASKED)
+P12: Final = len(STATE_NAMES) + len(OUTPUT_NAMES) + SIGNAL_NAMES.index("P12")
+"""Row of the Jacobian that is that of the high pressure."""
 
 
 class Rest(NamedTuple):
@@ -72,11 +78,11 @@ def find_refrigerator_equilibrium(
     Raises:
         NoEquilibriumError: Newton's method does not converge.
     """
-    start = first_guess(cold, plant, P_buffer)
+    start = first_guess(cold, plant, helium, P_buffer)
     d = np.array([cold.w, AMBIENT, 0.0, 1.0, 1.0, 1.0])
     v = np.array([start[CV956], 0.0, 0.0, start[CV167]])
     x = _relaxed(start, cold.u, v, d, plant, helium)
-    free = [i for i in range(len(STATE_NAMES)) if i not in GIVEN]
+    free = [i for i in range(len(STATE_NAMES)) if i not in (*GIVEN, M_HP)]
     scales = rate_scales(plant)
     for _ in range(MAX_STEPS):
         dx = rates(x, cold.u, v, d, plant, helium) / scales
@@ -85,7 +91,7 @@ def find_refrigerator_equilibrium(
             return Rest(x, cold.u, v, d, *read(x, cold.u, v, d, plant, helium), residual)
         if not isfinite(residual):
             break
-        J = jacobian(x, cold.u, v, d, plant, helium)[: len(STATE_NAMES)] / scales[:, np.newaxis]
+        J = _at_constant_pressure(jacobian(x, cold.u, v, d, plant, helium))[: len(STATE_NAMES)] / scales[:, np.newaxis]
         load = len(STATE_NAMES) + 3 + len(COMMAND_NAMES) + DISTURBANCE_NAMES.index("NCR22_HL")
         bypass, feed = len(STATE_NAMES) + 3, len(STATE_NAMES) + 6
         step = np.linalg.lstsq(J[:, [*free, load, bypass, feed]], -dx, rcond=1e-13)[0]
@@ -93,9 +99,16 @@ def find_refrigerator_equilibrium(
         step *= min(1.0, LONGEST_STEP_K / float(np.max(np.abs(step[temperatures]))))
         x, v, d = x.copy(), v.copy(), d.copy()
         x[free] += step[:-3]
+        x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, plant, helium)
         d[0] += step[-3]
         v[0], v[3] = v[0] + step[-2], v[3] + step[-1]
     raise NoEquilibriumError(f"the refrigerator has no equilibrium: the residual stays at {residual:.2g} per second")
+
+
+def _at_constant_pressure(J: RealArray) -> RealArray:
+    """Return the Jacobian where the mass of the high-pressure side follows the temperatures, its pressure given."""
+    follows = -J[P12] / J[P12, M_HP]
+    return J + np.outer(J[:, M_HP], follows)
 
 
 def _relaxed(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refrigerator, helium: Helium) -> RealArray:
@@ -104,18 +117,21 @@ def _relaxed(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refr
     for _ in range(round(RELAXATION_S / RELAXATION_STEP_S)):
         x = advance_refrigerator(x, u, v, d, RELAXATION_STEP_S, plant, helium)
         x[list(GIVEN)] = given
+        x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, plant, helium)
     return x
 
 
-def first_guess(cold: Equilibrium, plant: Refrigerator, P_buffer: float) -> RealArray:
+def first_guess(cold: Equilibrium, plant: Refrigerator, helium: Helium, P_buffer: float) -> RealArray:
     """Return the state from which the search sets out."""
     station, precooler = plant.station, plant.precooler
     hot = AMBIENT + station.cooler_approach
     nitrogen = NITROGEN_LEVEL / 100.0 * precooler.nef5.volume * LIQUID_DENSITY
     masses = [
-        gas_mass(station.hp, plant.box.P_HP, hot),
+        0.0,
         gas_mass(station.lp, plant.box.P_LP, AMBIENT),
         gas_mass(station.buffer, P_buffer, AMBIENT),
     ]
     exchanger = np.linspace(hot - 25.0, 84.0, precooler.nef6.cells)
-    return np.concatenate([cold.x, exchanger, [80.0, nitrogen, 30.0], masses, [0.0, 1.0, 1.0, 25.0, 0.0, 0.0]])
+    x = np.concatenate([cold.x, exchanger, [80.0, nitrogen, 30.0], masses, [0.0, 1.0, 1.0, 25.0, 0.0, 0.0]])
+    x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, plant, helium)
+    return x

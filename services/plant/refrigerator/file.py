@@ -19,6 +19,8 @@ from plant.refrigerator.station_settings import LqWeights
 
 KIND: Final = "refrigerator"
 SHIPPED = Path(__file__).with_name("refrigerator.json")
+EQUATIONS: Final = b"M_HP is the mass in the line and in the passes"
+"""What the equations changed about the states, part of the digest: a file from before has another mass."""
 REMEDY = "make a new one with `python -m plant.refrigerator.model FILE`"
 
 
@@ -102,8 +104,9 @@ def rest_in(document: dict[str, Any], plant: Refrigerator, path: str) -> Refrige
 
 
 def refrigerator_digest(plant: Refrigerator, helium: Helium) -> str:
-    """Return the SHA-256 over all parameters and tables, in hexadecimal."""
+    """Return the SHA-256 over all parameters, tables and what the states mean, in hexadecimal."""
     digest = hashlib.sha256(parameters_digest(plant.box, helium).encode())
     digest.update(helium.departure.nodes.astype("<f8").tobytes())
     digest.update(repr((plant.precooler, plant.station)).encode())
+    digest.update(EQUATIONS)
     return digest.hexdigest()

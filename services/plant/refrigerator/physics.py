@@ -10,8 +10,8 @@ All functions are kernels, of real or complex numbers, and take
 * v: 4 commands of the warm valves, `COMMAND_NAMES`, %;
 * d: 6 disturbances, `DISTURBANCE_NAMES`.
 
-In the circuit the exchangers' passes hold a constant mass, as in the cold box, and lines have no pressure drop besides
-that of the cold box's return.
+The exchangers' passes take and give helium as the high pressure moves (`plant.refrigerator.high_pressure`); lines have
+no pressure drop besides that of the cold box's return.
 """
 
 from typing import Any, Final, NamedTuple
@@ -20,12 +20,11 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process import signals as process
-from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, evaluate
-from plant.cold_box.settling import settle_box
-from plant.components.cell_account import settle_cells
+from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, flows_and_heats
+from plant.components.cell_account import WILD, widest_move
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
-from plant.components.phase_separator import Content, add_to_account, content, start_account
+from plant.components.phase_separator import Content, add_to_account, content, settle_account, start_account
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import Array, RealArray
 from plant.refrigerator.compression_station import (
@@ -38,14 +37,28 @@ from plant.refrigerator.compression_station import (
     station_pressures,
     station_rates,
 )
+from plant.refrigerator.high_pressure import (
+    COARSE_CELL,
+    COARSE_PRESSURE,
+    FIRST,
+    Filling,
+    add_gains,
+    fill_passes,
+    piped,
+    read_passes,
+    settle_passes,
+    side_mass,
+    side_pressure,
+    start_gains,
+)
 from plant.refrigerator.precooler import (
     PRECOOLER_STATE_UNITS,
     PRECOOLER_STATES,
     Precooler,
     Precooling,
     check_precooler,
+    precooler_flows,
     precooler_of,
-    precooler_rates,
 )
 
 BOX_STATES: Final = len(process.STATE_NAMES)
@@ -76,8 +89,10 @@ REFERENCE_REFRIGERATOR: Final = Refrigerator()
 class Crossing(NamedTuple):
     """Streams over the boundary of the cold part, and within it."""
 
-    entering: HighPressureFlow
-    """From the compressors."""
+    high: HighPressureFlow
+    """Through CV155 and CV156, as it would come from the compressors, were nothing stored on the way."""
+    filling: Filling
+    """How line and passes take and give helium."""
     cold: Streams
     """Of the cold box."""
     leaving: LowPressureFlow
@@ -114,35 +129,37 @@ def evaluate_refrigerator(
 
     Returns the streams that cross the boundary of its cold part, for `plant.refrigerator.balance`.
     """
-    station, precooler = plant.station, plant.precooler
-    coil = BOX_STATES + precooler.nef6.cells
-    P = station_pressures(x[STATION:], station, d[1])
-    box = plant.box
+    station, precooler, box = plant.station, plant.precooler, plant.box
+    pipes = piped(box, precooler)
+    held = read_passes(x, pipes, helium)
+    T_hot = d[1] + station.cooler_approach
+    HP = side_pressure(station.hp.volume, x[STATION], T_hot, held.mass)
+    P = station_pressures(HP, x[STATION:], station, d[1])
     joined = ColdBox(
-        box.separator, box.jt_valve, box.turbine, box.nef1, box.nef2, box.nef34, box.return_line, P.HP, P.LP, x[coil]
-    )
+        box.separator, box.jt_valve, box.turbine, box.nef1, box.nef2, box.nef34, box.return_line, P.HP, P.LP,
+        x[pipes.coil],
+    )  # fmt: skip
     inputs = u if d[4].real + d[5].real > 0.0 else 0.0 * u
-    cold, leaving, relief, bath = evaluate(x[:BOX_STATES], inputs, d[0], joined, helium, dx[:BOX_STATES], y)
-    entering = HighPressureFlow(cold.m_jt + cold.m_t, d[1] + station.cooler_approach, P.HP)
-    cooling = precooler_rates(
-        x[BOX_STATES:STATION], v[3], entering, leaving, d[3], precooler, helium, dx[BOX_STATES:STATION]
-    )
+    cold, leaving, relief, bath = flows_and_heats(x[:BOX_STATES], inputs, d[0], joined, helium, dx[:BOX_STATES], y)
+    high = HighPressureFlow(cold.m_jt + cold.m_t, T_hot, P.HP)
+    cooling = precooler_flows(x[BOX_STATES:STATION], v[3], high, leaving, d[3], precooler, dx[BOX_STATES:STATION])
     flows = station_rates(
-        x[STATION:], v, P, entering.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station, dx[STATION:]
+        x[STATION:], v, P, high.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station, dx[STATION:]
     )
+    filling = fill_passes(P.HP, dx[STATION], T_hot, cold, station.hp.volume, pipes, held, helium, dx)
     dx[STATION + 3] += relief
     signals[0], signals[1], signals[2] = P.LP / 1e5, P.HP / 1e5, P.buffer / 1e5
-    signals[3], signals[4] = cooling.warm_end.T, x[coil - 1]
-    signals[5] = 1e3 * entering.mass_flow
+    signals[3], signals[4] = cooling.warm_end.T, x[pipes.coil - 1]
+    signals[5] = 1e3 * filling.entering
     _write_flows(flows, signals[6:])
     signals[10] += 1e3 * relief
-    signals[13] = nitrogen_level(precooler.nef5, x[coil + 1])
-    signals[14] = x[coil + 2]
+    signals[13] = nitrogen_level(precooler.nef5, x[pipes.coil + 1])
+    signals[14] = x[pipes.coil + 2]
     signals[15] = 1e3 * cooling.boiling.boil_off
     signals[16] = inventory(x, plant, helium)
     signals[17] = x[STATION + 3]
     signals[18] = d[1]
-    return Crossing(entering, cold, leaving, relief, bath, cooling, inputs[1])
+    return Crossing(high, filling, cold, leaving, relief, bath, cooling, inputs[1])
 
 
 @kernel
@@ -155,10 +172,18 @@ def _write_flows(flows: StationFlows, signals: Array) -> None:
 
 @kernel
 def inventory(x: Array, plant: Refrigerator, helium: Helium) -> float:
-    """Return the helium (kg) in lines, buffer and bath; what was lost is not in it."""
+    """Return the helium (kg) in lines, passes, buffer and bath; what was lost is not in it."""
     in_bath = content(plant.box.separator, x[0], x[1], helium).mass
     total: float = x[STATION] + x[STATION + 1] + x[STATION + 2] + in_bath
     return total
+
+
+@kernel
+def high_pressure_mass(x: Array, P: float, T_ambient: float, plant: Refrigerator, helium: Helium) -> float:
+    """Return what the high-pressure line and the passes hold (kg) at `P` (Pa), the passes as warm as in `x`."""
+    held = read_passes(x, piped(plant.box, plant.precooler), helium)
+    mass, _ = side_mass(plant.station.hp.volume, P, T_ambient + plant.station.cooler_approach, held.mass)
+    return mass
 
 
 @kernel
@@ -189,30 +214,36 @@ def advance_refrigerator(
     n = x.shape[0]
     slope, y, signals = np.empty(n), np.empty(22), np.empty(SIGNALS)
     stage, total = np.empty(n), np.empty(n)
-    stages, slopes = np.empty((4, n)), np.empty((4, n))
+    stages = np.empty((4, n))
     crossing = evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
-    account = start_account(crossing.bath, slope)
+    account, gains = start_account(crossing.bath, slope), start_gains(crossing.filling)
+    P = crossing.filling.P
+    swing: float = 0.0
     for i in range(n):
-        stages[0, i], slopes[0, i] = x[i], slope[i]
+        stages[0, i] = x[i]
         total[i] = slope[i]
         stage[i] = x[i] + 0.5 * dt * slope[i]
     for k, fraction in ((1, 0.5), (2, 1.0)):
         crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
         account = add_to_account(account, crossing.bath, slope, 2.0)
+        add_gains(gains, crossing.filling, 2.0)
+        swing = max(swing, abs(crossing.filling.P - P))
         for i in range(n):
-            stages[k, i], slopes[k, i] = stage[i], slope[i]
+            stages[k, i] = stage[i]
             total[i] += 2.0 * slope[i]
             stage[i] = x[i] + fraction * dt * slope[i]
     crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
     account = add_to_account(account, crossing.bath, slope, 1.0)
+    add_gains(gains, crossing.filling, 1.0)
+    swing = max(swing, abs(crossing.filling.P - P))
     for i in range(n):
-        stages[3, i], slopes[3, i] = stage[i], slope[i]
+        stages[3, i] = stage[i]
         stage[i] = x[i] + dt / 6.0 * (total[i] + slope[i])
-    P = np.empty(4)
-    for k in range(4):
-        P[k] = station_pressures(stages[k, STATION:], plant.station, d[1]).HP
-    settle_box(plant.box, account, P, stages, slopes, dt, stage, helium)
-    settle_cells(plant.precooler.nef6, BOX_STATES, P, stages, slopes, dt, stage, helium)
+    settle_account(plant.box.separator, account, dt / 6.0, stage, helium)
+    pipes = piped(plant.box, plant.precooler)
+    if swing > COARSE_PRESSURE or COARSE_CELL < widest_move(stages, stage, FIRST, pipes.coil) < WILD:
+        T_hot = d[1] + plant.station.cooler_approach
+        settle_passes(stage[STATION], gains, dt / 6.0, T_hot, plant.station.hp.volume, pipes, stage, helium)
     return stage
 
 

@@ -163,7 +163,7 @@ class LpReliefSection(ReliefSection):
 class BufferReliefSection(ReliefSection):
     """That of the buffer."""
 
-    pressure_bar: ReliefPressure = 12.0
+    pressure_bar: ReliefPressure = 13.0
     span_bar: ReliefSpan = 1.0
     area_mm2: Area = 100.0
 

@@ -11,8 +11,8 @@ from plant.components.actuator import Actuator, check_actuator, opening_rate
 from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import Boiling, NitrogenBath, boil, check_nitrogen_bath
 from plant.components.valve import Valve
-from plant.components.warm_exchanger import check_warm_exchanger, exchange_warm
-from plant.helium.properties import WARM_CP, Helium, supply_cell
+from plant.components.warm_exchanger import check_warm_exchanger, transfer_warm
+from plant.helium.properties import WARM_CP
 from plant.numeric import Array
 
 NEF6_CELLS: Final = 8
@@ -51,17 +51,18 @@ class Precooling(NamedTuple):
 
 
 @kernel
-def precooler_rates(
+def precooler_flows(
     x: Array,
     command: float,
     high: HighPressureFlow,
     low: LowPressureFlow,
     supply: float,
     precooler: Precooler,
-    helium: Helium,
     dx: Array,
 ) -> Precooling:
-    """Write the rates of the pre-cooler's states into `dx` (11, per second); return what it does.
+    """Write the rates of the nitrogen and its valve into `dx` (11, per second); return what the pre-cooler does.
+
+    In the place of the rates of the exchangers' temperatures is the heat that they give (W).
 
     Args:
         x: States, `PRECOOLER_STATES`.
@@ -70,15 +71,12 @@ def precooler_rates(
         low: From the cold box.
         supply: 1 with nitrogen in the tank, 0 without.
         precooler: Parameters.
-        helium: Tables.
-        dx: Rates.
+        dx: Heats and rates.
     """
     cells = precooler.nef6.cells
-    warm_end = exchange_warm(precooler.nef6, x[:cells], high, low, helium, dx[:cells])
-    h_in, _, _ = supply_cell(high.P, x[cells - 1], helium)
-    h_out, _, _ = supply_cell(high.P, x[cells], helium)
+    warm_end = transfer_warm(precooler.nef6, x[:cells], high, low, dx[:cells])
     boiling = boil(precooler.nef5, x[cells + 1], high.mass_flow, WARM_CP, x[cells - 1], x[cells], x[cells + 2], supply)
-    dx[cells] = (high.mass_flow * (h_in - h_out) - boiling.heat) / precooler.nef5.capacity
+    dx[cells] = boiling.heat
     dx[cells + 1] = boiling.feed - boiling.boil_off
     dx[cells + 2] = opening_rate(precooler.actuator, x[cells + 2], command)
     return Precooling(warm_end, boiling)

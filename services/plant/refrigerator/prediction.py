@@ -32,6 +32,7 @@ from plant.refrigerator.station_design import LINES, PRESSURE_ROWS
 
 KEPT: Final = (*range(STATE_NAMES.index("T_nef5") + 1), *LINES)
 """States of the refrigerator that are states of the model; the lines come last."""
+M_HP, CV956 = (STATE_NAMES.index(name) for name in ("M_HP", "CV956"))
 LOOP_NAMES: Final = ("bypass", "inventory", "integral_HP", "integral_LP")
 LOOP_UNITS: Final = ("kg/s", "kg/s", "bar s", "bar s")
 
@@ -76,13 +77,13 @@ def prediction_model(
 def _closed(J: RealArray, K: RealArray, lag_s: float) -> RealArray:
     """Return dx/dt over x of the kept states and the loop, whose flows follow -K (pressures, flows, integrals)."""
     kept = len(KEPT)
-    HP, LP = kept - 2, kept - 1
+    LP = kept - 1
     A = np.zeros((kept + 4, kept + 4))
     A[:kept, :kept] = J[np.ix_(KEPT, KEPT)]
-    A[HP, kept] = -1.0  # the bypass flow leaves the high-pressure line
+    A[:kept, kept] = J[KEPT, CV956] / -J[M_HP, CV956]  # the bypass flow leaves the high-pressure side, whose gas cools,
     A[LP, kept : kept + 2] = 1.0  # and reaches, with that from the buffer, the low-pressure line
     pressures = np.zeros((2, kept + 4))
-    pressures[0, HP], pressures[1, LP] = (J[row, line] for row, line in zip(PRESSURE_ROWS, LINES, strict=True))
+    pressures[:, :kept] = J[np.ix_(PRESSURE_ROWS, KEPT)]  # the high pressure also follows the passes' temperatures
     loop = np.vstack([pressures, np.zeros((4, kept + 4))])
     loop[2:, kept:] = np.eye(4)
     A[kept : kept + 2] = -K @ loop / lag_s

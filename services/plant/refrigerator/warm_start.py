@@ -1,7 +1,7 @@
 """A refrigerator before its cool-down: everything at ambient temperature, and its helium in the buffer.
 
 No compressor runs. The low-pressure line is at its set point and the bath, a vessel of vapour, with it; what is left of
-the helium of the operating point is in the high-pressure line and the buffer, at one pressure. The nitrogen bath is
+the helium of the operating point is on the high-pressure side and in the buffer, at one pressure. The nitrogen bath is
 empty.
 """
 
@@ -14,7 +14,7 @@ from plant.components.gas_volume import gas_mass
 from plant.components.phase_separator import SUPERHEAT, content
 from plant.helium.properties import Helium, saturation, vapour_enthalpy_and_cp
 from plant.numeric import RealArray
-from plant.refrigerator.physics import BOX_STATES, STATE_NAMES, STATION, Refrigerator, inventory
+from plant.refrigerator.physics import BOX_STATES, STATE_NAMES, STATION, Refrigerator, high_pressure_mass, inventory
 
 FIRST_CELL: Final = STATE_NAMES.index("T_nef1_1")
 COIL, M_LOST = STATE_NAMES.index("T_nef5"), STATE_NAMES.index("M_lost")
@@ -44,7 +44,7 @@ def warm_state(
     elsewhere = total - lp_line - content(bath, x[0], x[1], helium).mass
     pressure = low_pressure
     for _ in range(TRIALS):  # masses are nearly in proportion to the pressure
-        hp_line = gas_mass(station.hp, pressure, ambient + station.cooler_approach)
-        pressure *= elsewhere / (hp_line + gas_mass(station.buffer, pressure, ambient))
-    x[STATION:M_LOST] = hp_line, lp_line, elsewhere - hp_line
+        high = high_pressure_mass(x, pressure, ambient, plant, helium)
+        pressure *= elsewhere / (high + gas_mass(station.buffer, pressure, ambient))
+    x[STATION:M_LOST] = high, lp_line, elsewhere - high
     return x
