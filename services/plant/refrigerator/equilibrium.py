@@ -13,7 +13,7 @@ import numpy as np
 
 from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError
-from plant.components.gas_volume import gas_mass
+from plant.components.gas_volume import GasVolume, gas_mass
 from plant.components.nitrogen_bath import LIQUID_DENSITY
 from plant.helium.properties import Helium
 from plant.numeric import RealArray
@@ -37,6 +37,8 @@ TOLERANCE: Final = 1e-10
 MAX_STEPS: Final = 60
 LONGEST_STEP_K: Final = 10.0
 RELAXATION_S, RELAXATION_STEP_S = 5000.0, 0.25
+STEADY_LINE: Final = GasVolume(1e6)
+"""In which nothing changes the pressure."""
 
 V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2 = (
     STATE_NAMES.index(name) for name in ("V_l", "M_HP", "M_LP", "M_buffer", "M_lost", "M_N2")
@@ -81,7 +83,7 @@ def find_refrigerator_equilibrium(
     start = first_guess(cold, plant, helium, P_buffer)
     d = np.array([cold.w, AMBIENT, 0.0, 1.0, 1.0, 1.0])
     v = np.array([start[CV956], 0.0, 0.0, start[CV167]])
-    x = _relaxed(start, cold.u, v, d, plant, helium)
+    x = _relaxed(start.copy(), cold.u, v, d, plant, helium)
     free = [i for i in range(len(STATE_NAMES)) if i not in (*GIVEN, M_HP)]
     scales = rate_scales(plant)
     for _ in range(MAX_STEPS):
@@ -112,12 +114,19 @@ def _at_constant_pressure(J: RealArray) -> RealArray:
 
 
 def _relaxed(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refrigerator, helium: Helium) -> RealArray:
-    """Return the state after a time in which what is given is held."""
-    given = x[list(GIVEN)]
+    """Return the state after a time in which what is given is held.
+
+    In the place of the high-pressure line is a very large one, so that its pressure stays whatever enters and leaves:
+    no work of the pressure warms the passes.
+    """
+    steady = plant._replace(station=plant.station._replace(hp=STEADY_LINE))
+    x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, steady, helium)
+    held = [*GIVEN, M_HP]
+    given = x[held]
     for _ in range(round(RELAXATION_S / RELAXATION_STEP_S)):
-        x = advance_refrigerator(x, u, v, d, RELAXATION_STEP_S, plant, helium)
-        x[list(GIVEN)] = given
-        x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, plant, helium)
+        x = advance_refrigerator(x, u, v, d, RELAXATION_STEP_S, steady, helium)
+        x[held] = given
+    x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, plant, helium)
     return x
 
 
