@@ -37,7 +37,7 @@ TOLERANCE: Final = 1e-10
 MAX_STEPS: Final = 60
 LONGEST_STEP_K: Final = 10.0
 RELAXATION_S, RELAXATION_STEP_S = 5000.0, 0.25
-STEADY_LINE: Final = GasVolume(1e6)
+LARGE_LINE: Final = GasVolume(1e6)
 """In which nothing changes the pressure."""
 
 V_L, M_HP, M_LP, M_BUFFER, M_LOST, M_N2 = (
@@ -49,6 +49,7 @@ AS_ASKED: Final = tuple(STATE_NAMES.index(name) for name in ("NC1", "NC2", "CV95
 GIVEN: Final = (V_L, M_LP, M_BUFFER, M_LOST, M_N2, *AS_ASKED)
 P12: Final = len(STATE_NAMES) + len(OUTPUT_NAMES) + SIGNAL_NAMES.index("P12")
 """Row of the Jacobian that is that of the high pressure."""
+BYPASS_FLOW: Final = SIGNAL_NAMES.index("M_CV956")
 
 
 class Rest(NamedTuple):
@@ -84,6 +85,7 @@ def find_refrigerator_equilibrium(
     d = np.array([cold.w, AMBIENT, 0.0, 1.0, 1.0, 1.0])
     v = np.array([start[CV956], 0.0, 0.0, start[CV167]])
     x = _relaxed(start.copy(), cold.u, v, d, plant, helium)
+    x[CV956] = v[0] = _balancing_bypass(x, cold.u, v, d, plant, helium)
     free = [i for i in range(len(STATE_NAMES)) if i not in (*GIVEN, M_HP)]
     scales = rate_scales(plant)
     for _ in range(MAX_STEPS):
@@ -107,6 +109,15 @@ def find_refrigerator_equilibrium(
     raise NoEquilibriumError(f"the refrigerator has no equilibrium: the residual stays at {residual:.2g} per second")
 
 
+def _balancing_bypass(
+    x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refrigerator, helium: Helium
+) -> float:
+    """Return the opening (%) with which the high-pressure side keeps its mass; else it works on the passes."""
+    _, signals = read(x, u, v, d, plant, helium)
+    surplus = 1e3 * rates(x, u, v, d, plant, helium)[M_HP]
+    return max(0.0, float(x[CV956] * (1.0 + surplus / signals[BYPASS_FLOW])))
+
+
 def _at_constant_pressure(J: RealArray) -> RealArray:
     """Return the Jacobian where the mass of the high-pressure side follows the temperatures, its pressure given."""
     follows = -J[P12] / J[P12, M_HP]
@@ -116,16 +127,19 @@ def _at_constant_pressure(J: RealArray) -> RealArray:
 def _relaxed(x: RealArray, u: RealArray, v: RealArray, d: RealArray, plant: Refrigerator, helium: Helium) -> RealArray:
     """Return the state after a time in which what is given is held.
 
-    In the place of the high-pressure line is a very large one, so that its pressure stays whatever enters and leaves:
-    no work of the pressure warms the passes.
+    In the place of the two lines are very large ones, so that their pressures stay whatever enters and leaves, and no
+    work of the pressure warms the passes.
     """
-    steady = plant._replace(station=plant.station._replace(hp=STEADY_LINE))
-    x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, steady, helium)
+    large = plant._replace(station=plant.station._replace(hp=LARGE_LINE, lp=LARGE_LINE))
     held = [*GIVEN, M_HP]
+    in_low_pressure_line = x[M_LP]
+    x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, large, helium)
+    x[M_LP] = gas_mass(LARGE_LINE, plant.box.P_LP, AMBIENT)
     given = x[held]
     for _ in range(round(RELAXATION_S / RELAXATION_STEP_S)):
-        x = advance_refrigerator(x, u, v, d, RELAXATION_STEP_S, steady, helium)
+        x = advance_refrigerator(x, u, v, d, RELAXATION_STEP_S, large, helium)
         x[held] = given
+    x[M_LP] = in_low_pressure_line
     x[M_HP] = high_pressure_mass(x, plant.box.P_HP, AMBIENT, plant, helium)
     return x
 
