@@ -1,18 +1,17 @@
 """A rig of another process that is up, seen through the registers that are listed for it."""
 
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.registers.control_plc import Mode
 from tests.harness.processes import Process, Processes
+from tests.harness.waiting import eventually
 from tests.process.outside_client import ACCEPTED, BEGIN_AGAIN, Blocks, Loop, Optimiser, Plant, Service, blocks_of
 from tests.process.runs import started
 
 EXAMPLES: Final = Path(__file__).parents[2] / "examples" / "processes"
-PATIENCE_S: Final = 120.0
 TICK_S: Final = 0.05
 """Real time of a tick."""
 PERIOD: Final = 20
@@ -72,14 +71,19 @@ class Site(NamedTuple):
     def modes_until(self, last: Mode) -> list[int]:
         """Watch the ladder and the plant; return the modes until one, each once."""
         modes = [self.mode()]
-        end = time.monotonic() + PATIENCE_S
-        while modes[-1] != last:
-            assert time.monotonic() < end, modes
-            time.sleep(TICK_S)
-            self.plant.look()
-            if (mode := self.mode()) != modes[-1]:
+
+        def arrived() -> bool:
+            if self.looked() and (mode := self.mode()) != modes[-1]:
                 modes.append(mode)
+            return modes[-1] == last
+
+        eventually(arrived, f"mode {last.name}")
         return modes
+
+    def looked(self) -> bool:
+        """Look at the plant, so that no tick is missed."""
+        self.plant.look()
+        return True
 
     def assert_no_step(self) -> None:
         """Every tick was seen; all inputs were within their bounds, and moved by a rate at most in any two ticks."""
@@ -104,17 +108,9 @@ def up(
     shortened = ("--set", "plant.rate_limited=false", "--set", f"control_plc.ladder.hold_s={2 * PERIOD * case.tick_s}")
     words = ("up", "--port-base", base, "--load", "a", "--factor", case.tick_s / TICK_S, *shortened, *options)
     rig = processes.coldloop(*process, *words, more={"XDG_RUNTIME_DIR": str(folder), **(more or {})})
-    wait_until(lambda: "the rig is up" in rig.said or not rig.alive)
+    eventually(lambda: "the rig is up" in rig.said or not rig.alive, "the rig is up")
     assert rig.alive, rig.said
     plant, control = Plant(blocks_of(listing, "plant"), base), Service(blocks_of(listing, "control_plc"), base + 1)
     with plant, control:
         yield Site(case, control.blocks, base + 1, plant, control, rig)
     assert rig.interrupt() in {0, 130}
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    """Wait until a condition holds."""
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(TICK_S)

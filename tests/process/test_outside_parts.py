@@ -9,6 +9,7 @@ import pytest
 
 from coldloop.registers.control_plc import Mode
 from tests.harness.processes import Processes
+from tests.harness.waiting import eventually
 from tests.process.runs import run, started
 from tests.process.site import TANK, up
 
@@ -78,8 +79,8 @@ def test_when_a_solver_raises_the_ladder_acts_without_a_step_and_the_service_is_
 ) -> None:
     options = ("--outside-solver", "raising", "--updating-period", "5")
     with up(TANK, processes, tmp_path, *options, more=raising) as site:
-        site.modes_until(Mode.MPC)
-        assert site.modes_until(Mode.REST) == [Mode.MPC, Mode.REST]
+        eventually(lambda: site.looked() and REASON in site.rig.said, "the service says why it ends")
+        eventually(lambda: site.looked() and site.mode() != Mode.MPC, "the ladder acts")
         site.modes_until(Mode.MPC)
         said = site.rig.said
         site.assert_no_step()

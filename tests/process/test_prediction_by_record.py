@@ -58,7 +58,7 @@ def written(folder: Path, seed: int = 1) -> Path:
     """Write the tank's process file with a model from a record of the tank."""
     lines = [",".join(f"{value:.6g}" for value in row) for row in step_test(seed)]
     (folder / "record.csv").write_text("\n".join(["time_s,v1,v2,leak,h1,h2", *lines]) + "\n", encoding="utf-8")
-    for name in ("quadruple_tank.py", "quadruple_tank.toml"):
+    for name in ("quadruple_tank.py", "quadruple_tank.toml", "quadruple_tank.svg"):
         (folder / name).write_text((EXAMPLES / name).read_text(encoding="utf-8"), encoding="utf-8")
     file = folder / "quadruple_tank.toml"
     text = file.read_text(encoding="utf-8")
