@@ -47,8 +47,8 @@ COARSE_CELL: Final = 0.002
 """Pa and K; where a step moves the pressure and all cells by less, nothing is corrected."""
 MOST_STEPS: Final = 40
 """Of Newton's method for the pressure."""
-MOST_CORRECTIONS: Final = 6
-"""Of the temperatures after a step."""
+MOST_CORRECTIONS: Final = 30
+"""Of the temperatures after a step; one to three are enough but where the tables end, at 5 and 19 bar."""
 SETTLED_ENERGY: Final = 1e-4
 """J that was missing in a cell, from which on the correction for it is the last: it leaves a hundredth or so."""
 MOST_TURNS: Final = 6
