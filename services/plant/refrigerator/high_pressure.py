@@ -42,8 +42,8 @@ from plant.refrigerator.precooler import Precooler
 
 FIRST: Final = 2
 """Index of the first cell among the states."""
-COARSE_PRESSURE: Final = 100.0
-COARSE_CELL: Final = 0.002
+COARSE_PRESSURE: Final = 20.0
+COARSE_CELL: Final = 0.0004
 """Pa and K; where a step moves the pressure and all cells by less, nothing is corrected."""
 MOST_STEPS: Final = 40
 """Of Newton's method for the pressure."""
