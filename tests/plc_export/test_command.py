@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 FILES = {
     "c": ["kernels.h", "kernels.c", "problem.h", "problem.c", "golden.h", "golden.c", "self_test.c", "README.md"],
     "st": ["types.st", "functions.st", "kernels.st", "golden.st", "self_test.st", "configuration.st", "README.md"],
+    "plcopen": ["solver.xml", "README.md"],
 }
 
 
