@@ -51,13 +51,10 @@ def _recorded_run(options: argparse.Namespace) -> list[Path]:
 
 def _solver(options: argparse.Namespace) -> list[Path]:
     from coldloop.errors import UsageError
-    from coldloop.process.loaded import IS_COLD_BOX
     from rig.cli.plc_folder import export_plc
 
     if options.run != PLC:
         raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
     if options.out is None or options.force:
         raise UsageError("export plc: name a new folder with --out; --force does not replace one")
-    if not IS_COLD_BOX:
-        raise UsageError("export plc: of the cold box alone; leave out --process")
     return export_plc(options.target, options.ticks, options.out)
