@@ -1,5 +1,6 @@
 """A process file: what it is made into, against closed forms, and what it refuses, in one line each."""
 
+from dataclasses import replace
 from math import sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -102,6 +103,13 @@ def test_what_is_wrong_with_a_process_is_said_in_words(tmp_path: Path) -> None:
     assert "band: temperature rests at" in described(made(tmp_path, ONE_BY_ONE.replace("320.0, 330.0", "340.0, 350.0")))
     kink = HEATER.replace("(u[0] -", "(abs(u[0] - 50.0) + 50.0 -")
     assert "kink" in described(made(tmp_path, plant=kink)) or "controllability" in described(made(tmp_path, plant=kink))
+
+
+def test_an_integrator_that_grows_by_rounding_alone_is_not_called_unstable(tmp_path: Path) -> None:
+    found = made(tmp_path)
+    text = described(replace(found, linear=found.linear._replace(A=np.array([[1.73e-18]]))))
+    assert "modes      0 /s" in text
+    assert "unstable" not in text
 
 
 def changed(before: str, after: str) -> str:
