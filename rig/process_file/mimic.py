@@ -4,7 +4,8 @@ Whatever is not drawing is left out, where an editor has written it, or refused,
 """
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree as ET
@@ -27,7 +28,9 @@ INSIDE: Final = re.compile(r"url\(\s*(['\"]?)#([^'\")\s]*)\1\s*\)", re.IGNORECAS
 LONGEST: Final = 500_000
 """Characters: the drawing is in the model file."""
 DEEPEST: Final = 100
-"""Levels of elements within elements."""
+"""Levels of elements within elements, and of what they use."""
+MOST_DRAWN: Final = 50_000
+"""Elements, each counted as often as it is used: more keep a browser busy for minutes."""
 VIEW_BOX: Final = 4
 """Numbers: left, top, width, height."""
 QUOTED: Final = 60
@@ -47,6 +50,9 @@ def drawing_of(path: Path, signals: Collection[str]) -> str:
         UsageError: One line that names file, element and remedy.
     """
     root = _parsed(path)
+    named = {one.get("id"): one for one in root.iter()}
+    if sum(1 for _ in islice(_drawn(root, path, named), MOST_DRAWN + 1)) > MOST_DRAWN:
+        raise UsageError(f"{path}: more than {MOST_DRAWN} elements, as often as they are used; draw less")
     _keep_drawing(root, path)
     for one in [each for each in root.iter() if each.tag in TEXTS]:
         _show_named(one)
@@ -81,10 +87,18 @@ def _parsed(path: Path) -> ET.Element:
     return root
 
 
-def _keep_drawing(parent: ET.Element, path: Path, depth: int = 1) -> None:
-    """Leave out what editors add; refuse what acts."""
-    if depth > DEEPEST:
+def _drawn(one: ET.Element, path: Path, named: Mapping[str | None, ET.Element], level: int = 1) -> Iterator[ET.Element]:
+    """Yield an element and all within it, each time that it is used."""
+    if level > DEEPEST:
         raise UsageError(f"{path}: elements within elements on more than {DEEPEST} levels; ungroup some")
+    yield one
+    used = named.get(one.get("href", one.get(XLINK_HREF, "#"))[1:]) if one.tag == f"{SVG}use" else None
+    for each in (*one, *(() if used is None else (used,))):
+        yield from _drawn(each, path, named, level + 1)
+
+
+def _keep_drawing(parent: ET.Element, path: Path) -> None:
+    """Leave out what editors add; refuse what acts."""
     parent.attrib = _attributes(parent, path)
     for child in list(parent):
         space, _, name = str(child.tag).rpartition("}")
@@ -93,7 +107,7 @@ def _keep_drawing(parent: ET.Element, path: Path, depth: int = 1) -> None:
         elif name not in ELEMENTS:
             raise UsageError(f"{path}: <{name}> has no place in a drawing of the page; remove it, or draw it otherwise")
         else:
-            _keep_drawing(child, path, depth + 1)
+            _keep_drawing(child, path)
 
 
 def _attributes(element: ET.Element, path: Path) -> dict[str, str]:

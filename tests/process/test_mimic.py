@@ -70,6 +70,7 @@ def test_what_an_editor_adds_is_left_out_and_style_becomes_attributes(tmp_path: 
     assert 'href="#mimic-view"' in text
 
 
+USE: Final = "<use href='#a?'/>"
 REFUSED: Final = {
     "<script>alert(1)</script>": "<script> has no place in a drawing",
     "<foreignObject/>": "<foreignObject> has no place",
@@ -92,6 +93,9 @@ REFUSED: Final = {
     "<rect height='5' data-fill='h1' data-low='empty'/>": "data-low and data-high are two different numbers",
     "<rect height='5' data-fill='h1' data-low='1' data-high='1'/>": "data-low and data-high are two different numbers",
     101 * "<g>" + 101 * "</g>": "more than 100 levels",
+    "<g id='a'><use href='#a'/></g>": "more than 100 levels",
+    "<g id='a0'/>"
+    + "".join(f"<g id='a{k}'>{10 * USE}</g>".replace("?", f"{k - 1}") for k in range(1, 7)): "more than 50000",
     "<rect data-fill='T5'/>": "T5 is no signal",
     "<rect>": "not an SVG file: mismatched tag",
 }
