@@ -1,9 +1,8 @@
 """What load and other disturbances are over time, for the simulated plant and as the optimiser expects: CSV files."""
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from coldloop.errors import UsageError
 from coldloop.process.declaration import Forecast
@@ -45,8 +44,11 @@ def _steps(one: LoadSection | DisturbanceSection, path: Path, tick_s: float) -> 
     """Return ticks and values of a CSV file with time_s and the name of a signal."""
     times, values = (column.tolist() for column in columns(path, [TIME, one.name]).T)
     ticks = [round(time / tick_s) for time in times]
-    if ticks[0] != 0 or (np.diff(ticks) <= 0).any():
-        raise UsageError(f"{path}: {TIME} begins at 0 and rises by at least a tick, {tick_s:g} s, from line to line")
+    if ticks[0] != 0:
+        raise UsageError(f"{path}: {TIME} begins at {times[0]:g}; it begins at 0, which is when a session begins")
+    at = next((at for at, (before, tick) in zip(times[1:], pairwise(ticks), strict=True) if tick <= before), None)
+    if at is not None:
+        raise UsageError(f"{path}: {TIME} = {at:g}: it rises by at least a tick, {tick_s:g} s, from line to line")
     low, high = one.span
     wrong = next((value for value in values if not low <= value <= high), None)
     if wrong is not None:

@@ -12,6 +12,8 @@ from coldloop.errors import UsageError
 Array = NDArray[np.float64]
 
 TIME: Final = "time_s"
+QUOTED: Final = 80
+"""Characters of a file in a message."""
 
 
 def columns(path: Path, wanted: list[str]) -> Array:
@@ -23,7 +25,13 @@ def columns(path: Path, wanted: list[str]) -> Array:
     names = header(path)
     missing = [name for name in wanted if name not in names]
     if missing:
-        raise UsageError(f"{path}: no column {', '.join(missing)}; the first line names {', '.join(wanted)}")
+        raise UsageError(
+            f"{path}: no column {', '.join(missing)}; its first line is {','.join(names)[:QUOTED]!r}, and should name "
+            f"{', '.join(wanted)} with commas between them, and points in numbers"
+        )
+    twice = next((name for name in wanted if names.count(name) > 1), None)
+    if twice is not None:
+        raise UsageError(f"{path}: two columns are named {twice}; remove one")
     places = [names.index(name) for name in wanted]
     rows = []
     for number, cells in enumerate(csv.reader(_text(path)[1:]), 2):

@@ -58,6 +58,7 @@ def _rest(made: Made) -> list[str]:
 
 def _modes(made: Made) -> list[str]:
     values = sorted(np.linalg.eigvals(made.own_A), key=lambda value: -value.real)
+    values = [complex(v.real * (abs(v.real) > NOTHING), v.imag) for v in values]
     texts = [f"{v.real:.3g}" if abs(v.imag) < 1e-12 else f"{v.real:.3g}{v.imag:+.3g}i" for v in values]
     lines = [f"modes      {'  '.join(texts[i : i + 8])} /s" for i in range(0, len(texts), 8)]
     if made.linear.error:
@@ -112,7 +113,7 @@ def _warnings(made: Made) -> list[str]:
     sample_s = process.tick_s * process.ticks_per_sample
     poles = np.linalg.eigvals(made.own_A)
     fastest, slowest = -poles.real.min(), -poles.real.max()
-    if poles.real.max() > 0:
+    if poles.real.max() > NOTHING:
         found.append(f"unstable: a mode grows with {poles.real.max():.3g} /s; nothing may be late for longer")
     elif slowest * SETTLED > 0 and process.decision_instants[-1] * sample_s * slowest < 1.0:
         found.append(f"horizon: it ends before the slowest mode, {1 / slowest:.3g} s, has moved much")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
+from coldloop.process.lti_model import discretise
 from plant.own.disturbances import outside
 from plant.own.maker import FMU, LINEAR, PYTHON, TRANSFER_FUNCTIONS
 from plant.own.python_class import Equations, equations_of, evaluated
@@ -21,6 +22,10 @@ Array = NDArray[np.float64]
 
 AT_REST: Final = 1e-8
 """Largest change of a state in a sampling period, over its size, that still counts as rest."""
+SEEN: Final = 0.1
+"""Gain over the largest of an output, from which on a record must show it."""
+ALIKE: Final = (0.5, 2.0)
+"""Gains of a record's model over those of the plant."""
 PADE_ORDER: Final = 2
 """Of the approximation of a dead time in the prediction model; the simulated plant has it exactly."""
 
@@ -43,22 +48,35 @@ def linearised(file: ProcessFile, folder: Path) -> Linearised:
     else:
         found = _from_lags(file, plant)
     if file.prediction.step_test is not None:
-        found = _by_record(found, from_step_test(file, folder / file.prediction.step_test))
+        found = _by_record(file, found, from_step_test(file, folder / file.prediction.step_test))
     for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
         if not np.isfinite(getattr(found, name)).all():
             raise UsageError(f"plant: {name} of the linear model is not finite; look at the plant's equations there")
     return with_disturbances(file, found)
 
 
-def _by_record(plant: Linearised, model: Linearised) -> Linearised:
+def _by_record(file: ProcessFile, plant: Linearised, model: Linearised) -> Linearised:
     """Return the model of a record, for a plant that hides its states."""
     hidden = dict(plant.parameters)
     if plant.kind == PYTHON:
         hidden["rest"] = plant.x0.tolist()
     elif plant.kind == FMU:
         hidden["wiring"] = {**hidden["wiring"], "states": ()}
-    notes = (*plant.notes, *model.notes)
+    notes = (*plant.notes, *model.notes, *_gains_compared(file, plant, model))
     return model._replace(kind=plant.kind, parameters=hidden, digest=plant.digest, notes=notes)
+
+
+def _gains_compared(file: ProcessFile, plant: Linearised, model: Linearised) -> list[str]:
+    """Return which gains of a record's model, after the horizon, are far from those of the plant that it is for."""
+    horizon_s = file.prediction.decision_instants[-1] * file.tick_s * file.ticks_per_sample
+    true, found = (one.C @ discretise(one.A, one.B, one.F[:, 0], horizon_s).B + one.D for one in (plant, model))
+    seen = np.abs(true) > SEEN * np.abs(true).max(axis=1, keepdims=True)
+    return [
+        f"warning    gain: of {file.outputs[i].name} by {file.inputs[j].name} {found[i, j]:.3g}, of the plant itself "
+        f"{true[i, j]:.3g}; is the record of this plant, in the units of this file?"
+        for i, j in np.argwhere(seen)
+        if not ALIKE[0] <= found[i, j] / true[i, j] <= ALIKE[1]
+    ]
 
 
 # -- a class with equations ------------------------------------------------------------------------------------------

@@ -4,7 +4,8 @@ Whatever is not drawing is left out, where an editor has written it, or refused,
 """
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree as ET
@@ -17,12 +18,23 @@ ELEMENTS: Final = frozenset((
     "svg", "g", "defs", "symbol", "use", "title", "desc", "path", "rect", "circle", "ellipse", "line", "polyline",
     "polygon", "text", "tspan", "clipPath", "mask", "marker", "pattern", "linearGradient", "radialGradient", "stop",
 ))  # fmt: skip
-BINDINGS: Final = ("data-signal", "data-fill")
-"""Attributes that name a signal: whose value a text or a tag shows, or how far a rectangle is filled."""
-NAMED: Final = re.compile(r"\s*\{([A-Za-z]\w*)\}\s*")
-REFERENCE: Final = re.compile(r"url\(\s*['\"]?(?!#)")
+TEXTS: Final = (f"{SVG}text", f"{SVG}tspan")
+SIGNAL, FILL, ENDS = "data-signal", "data-fill", ("data-low", "data-high")
+"""Attributes: a signal whose value a text or a tag shows, one that fills a rectangle, and the ends of its bar."""
+NAMED: Final = re.compile(r"\{(\w+)\}")
+OUTSIDE: Final = re.compile(r"\\|url\((?!\s*['\"]?#)|(?:src|image|image-set)\(", re.IGNORECASE)
+"""What reaches outside the drawing; a backslash may write any of it."""
+INSIDE: Final = re.compile(r"url\(\s*(['\"]?)#([^'\")\s]*)\1\s*\)", re.IGNORECASE)
 LONGEST: Final = 500_000
 """Characters: the drawing is in the model file."""
+DEEPEST: Final = 100
+"""Levels of elements within elements, and of what they use."""
+MOST_DRAWN: Final = 50_000
+"""Elements, each counted as often as it is used: more keep a browser busy for minutes."""
+VIEW_BOX: Final = 4
+"""Numbers: left, top, width, height."""
+QUOTED: Final = 60
+"""Characters of a value in a message."""
 PREFIX: Final = "mimic-"
 """Of the names of its elements, which are others than those of the page."""
 
@@ -37,10 +49,31 @@ def drawing_of(path: Path, signals: Collection[str]) -> str:
     Raises:
         UsageError: One line that names file, element and remedy.
     """
+    root = _parsed(path)
+    named = {one.get("id"): one for one in root.iter()}
+    if sum(1 for _ in islice(_drawn(root, path, named), MOST_DRAWN + 1)) > MOST_DRAWN:
+        raise UsageError(f"{path}: more than {MOST_DRAWN} elements, as often as they are used; draw less")
+    _keep_drawing(root, path)
+    for one in [each for each in root.iter() if each.tag in TEXTS]:
+        _show_named(one)
+    for one in root.iter():
+        _check_bound(one, path, signals)
+    size = [_number(part) for part in root.get("viewBox", "").replace(",", " ").split()]
+    if len(size) != VIEW_BOX or None in size:
+        raise UsageError(f"{path}: no viewBox of 4 numbers, so the page would not know its size; save it as plain SVG")
+    for length in ("width", "height"):
+        root.attrib.pop(length, None)
+    ET.register_namespace("", SVG.strip("{}"))
+    return ET.tostring(root, encoding="unicode")
+
+
+def _parsed(path: Path) -> ET.Element:
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path}: {error}; mimic names an SVG file beside the process file") from None
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{path}: not UTF-8 text (byte {error.start}); save it as plain SVG, not compressed") from None
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}; mimic names an SVG file beside the process file") from None
     if len(text) > LONGEST:
         raise UsageError(f"{path}: {len(text)} characters; a drawing has {LONGEST} at most")
     if "<!ENTITY" in text:
@@ -51,15 +84,17 @@ def drawing_of(path: Path, signals: Collection[str]) -> str:
         raise UsageError(f"{path}: not an SVG file: {error}") from None
     if root.tag != f"{SVG}svg":
         raise UsageError(f"{path}: not an SVG file: it begins with {root.tag}")
-    _keep_drawing(root, path)
-    for one in root.iter():
-        _bind(one, path, signals)
-    if "viewBox" not in root.attrib:
-        raise UsageError(f"{path}: no viewBox: the page would not know its size; save it as plain SVG, or add one")
-    for size in ("width", "height"):
-        root.attrib.pop(size, None)
-    ET.register_namespace("", SVG.strip("{}"))
-    return ET.tostring(root, encoding="unicode")
+    return root
+
+
+def _drawn(one: ET.Element, path: Path, named: Mapping[str | None, ET.Element], level: int = 1) -> Iterator[ET.Element]:
+    """Yield an element and all within it, each time that it is used."""
+    if level > DEEPEST:
+        raise UsageError(f"{path}: elements within elements on more than {DEEPEST} levels; ungroup some")
+    yield one
+    used = named.get(one.get("href", one.get(XLINK_HREF, "#"))[1:]) if one.tag == f"{SVG}use" else None
+    for each in (*one, *(() if used is None else (used,))):
+        yield from _drawn(each, path, named, level + 1)
 
 
 def _keep_drawing(parent: ET.Element, path: Path) -> None:
@@ -84,21 +119,55 @@ def _attributes(element: ET.Element, path: Path) -> dict[str, str]:
         key = "href" if name == XLINK_HREF else name
         if key.startswith("{") or key == "style" or not re.fullmatch(r"[A-Za-z][A-Za-z0-9-]*", key):
             continue
-        if key.lower().startswith("on") or (key == "href" and not value.startswith("#")) or REFERENCE.search(value):
-            raise UsageError(f'{path}: {key}="{value}" reaches outside the drawing; remove it')
-        found[key] = PREFIX + value if key == "id" else value.replace("url(#", f"url(#{PREFIX}")
+        if key.startswith("data-") and key not in (SIGNAL, FILL, *ENDS):
+            continue
+        if key.lower().startswith("on") or (key == "href" and not value.startswith("#")) or OUTSIDE.search(value):
+            raise UsageError(f'{path}: {key}="{value[:QUOTED]}" reaches outside the drawing; remove it')
+        found[key] = PREFIX + value if key == "id" else INSIDE.sub(rf"url(#{PREFIX}\2)", value)
     if "href" in found:
         found["href"] = f"#{PREFIX}{found['href'][1:]}"
     return found
 
 
-def _bind(one: ET.Element, path: Path, signals: Collection[str]) -> None:
-    """Make a text such as {h1} one that shows this signal, and check names."""
-    named = NAMED.fullmatch(one.text or "")
-    if named is not None and not len(one):
-        one.text = ""
-        one.set("data-signal", named[1])
-    for attribute in BINDINGS:
-        name = one.get(attribute)
-        if name is not None and name not in signals:
-            raise UsageError(f"{path}: {name} is no signal of this process: {', '.join(signals)}")
+def _show_named(text: ET.Element) -> None:
+    """Make {h1}, a text or a part of it, one that shows this signal."""
+    named = NAMED.fullmatch((text.text or "").strip())
+    if named is not None and not len(text):
+        text.text = ""
+        text.set(SIGNAL, named[1])
+        return
+    children = list(text)
+    words = [text.text or "", *(child.tail or "" for child in children)]
+    text.text, text[:] = "", []
+    for child, piece in zip([None, *children], words, strict=True):
+        before, *named_and_after = NAMED.split(piece)
+        if child is None:
+            text.text = before
+        else:
+            child.tail = before
+            text.append(child)
+        for name, after in zip(named_and_after[::2], named_and_after[1::2], strict=True):
+            ET.SubElement(text, f"{SVG}tspan", {SIGNAL: name}).tail = after
+
+
+def _check_bound(one: ET.Element, path: Path, signals: Collection[str]) -> None:
+    """Check that an element that shows a signal can, and that there is this signal."""
+    for name in {SIGNAL, FILL} & set(one.attrib):
+        signal = one.attrib[name]
+        if signal not in signals:
+            raise UsageError(f"{path}: {signal[:QUOTED]} is no signal of this process: {', '.join(signals)}")
+        what = f'{path}: <{one.tag.removeprefix(SVG)} {name}="{signal}">'
+        if name == SIGNAL and one.tag not in TEXTS and "tag" not in one.get("class", "").split():
+            raise UsageError(f'{what}: a value is shown by a text, or by <g class="tag">')
+        if name == FILL and (one.tag != f"{SVG}rect" or None in map(_number, (one.get("y", "0"), one.get("height")))):
+            raise UsageError(f"{what}: what is filled is a rect, with y and height in plain numbers")
+        ends = [_number(one.get(end, default)) for end, default in zip(ENDS, ("-inf", "inf"), strict=True)]
+        if None in ends or ends[0] == ends[1]:
+            raise UsageError(f"{what}: data-low and data-high are two different numbers")
+
+
+def _number(text: str | None) -> float | None:
+    try:
+        return float(text or "")
+    except ValueError:
+        return None

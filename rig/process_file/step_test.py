@@ -32,6 +32,7 @@ def from_step_test(file: ProcessFile, path: Path) -> Linearised:
     names = [one.name for one in (*file.inputs, *moved)]
     rows = columns(path, [TIME, *names, *(one.name for one in file.outputs)])
     period_s = _period(path, rows[:, 0])
+    _check_readings(file, path, rows[:, 1 + len(names) :])
     every = max(1, round(file.tick_s * file.ticks_per_sample / period_s))
     inputs, outputs = rows[:, 1 : 1 + len(names)], rows[:, 1 + len(names) :]
     count = len(rows) // every
@@ -91,6 +92,24 @@ def _outputs(file: ProcessFile, found: Identified) -> Array:
     return np.array(
         [rest if one.at is None else one.at for one, rest in zip(file.outputs, found.constant, strict=True)]
     )
+
+
+def _check_readings(file: ProcessFile, path: Path, outputs: Array) -> None:
+    """Check that readings are such as the file's sensors give.
+
+    Raises:
+        UsageError: A record is in another unit, or an output never moves.
+    """
+    for one, column in zip(file.outputs, outputs.T, strict=True):
+        low, high = one.range
+        wrong = column[(column < low) | (column > high)]
+        if wrong.size:
+            raise UsageError(
+                f"{path}: {one.name} = {wrong[0]:g} is outside the range of its sensor, {low:g} to {high:g}; "
+                "give the record in the unit of the process file, without failed readings"
+            )
+        if np.ptp(column) == 0.0:
+            raise UsageError(f"{path}: {one.name} never moves; what acts on it cannot be told")
 
 
 def _period(path: Path, times: Array) -> float:

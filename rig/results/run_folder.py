@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coldloop.errors import UsageError
+from coldloop.process.cold_box import COLD_BOX
+from coldloop.process.declaration import Process
+from coldloop.process.loaded import PROCESS
+from coldloop.process.model_file import read_document
 from rig.results.arrow_arrays import numbers_of
 from rig.results.columns import FORMAT
 
@@ -110,6 +114,28 @@ class RunFolder:
         except (OSError, pa.ArrowException) as error:
             raise UsageError(f"{self.path / name}: {str(error).splitlines()[0]}") from None
 
+    @property
+    def process(self) -> Process:
+        """The process that was run, as it was then."""
+        return Process.of(self._process) if self._process else COLD_BOX
+
+    @property
+    def remedy(self) -> str:
+        """What to do where it is not the one that is loaded."""
+        return f"use --process {self.path / str(self._model)}" if self._process else "leave out --process"
+
+    @property
+    def _process(self) -> dict[str, Any]:
+        """Declaration of the process, from the copy of its model; empty for the cold box."""
+        found: dict[str, Any] = {}
+        return read_document(self.path / self._model, "restore it").get("process", found) if self._model else found
+
+    @property
+    def _model(self) -> str | None:
+        """Place of the copy of its model; None for the shipped one of the cold box."""
+        place: str | None = self.manifest["inputs"].get("model", {}).get("file")
+        return place
+
     @contextmanager
     def reading(self, name: str) -> Iterator[pq.ParquetFile]:
         """Open a Parquet file of the run; a damaged one is a one-line error.
@@ -121,6 +147,10 @@ class RunFolder:
             with self.file(name) as file:
                 yield file
         except (OSError, pa.ArrowException, KeyError) as error:
+            if self.process.name != PROCESS.name:
+                raise UsageError(
+                    f"{self.path}: a run of {self.process.name}, and not of {PROCESS.name}; {self.remedy}"
+                ) from None
             reason = (str(error) or type(error).__name__).splitlines()[0]
             raise UsageError(f"{self.path / name}: damaged, or of something else: {reason}") from None
 

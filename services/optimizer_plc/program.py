@@ -310,7 +310,8 @@ class OptimizerProgram:
         """Return how the plant differs from the model, as the filter has estimated it at the last update."""
         belief, n_y = self.state.belief, len(OUTPUT_NAMES)
         constants = np.zeros(n_y + len(INPUT_NAMES))
-        constants[list(self.disturbances)] = belief.x[belief.x.size - len(self.disturbances) :]
+        end = self._prediction.n_estimated
+        constants[list(self.disturbances)] = belief.x[end - len(self.disturbances) : end]
         return ModelDeviation(
             float(belief.numbers[0]["mismatch"]), tuple(constants[n_y:].tolist()), tuple(constants[:n_y].tolist()),
             tuple(np.sqrt(belief.surprise).tolist()),

@@ -30,6 +30,8 @@ MOST_LEVELS: Final = 32
 """Tables and arrays within one another that a TOML text may have."""
 MOST_BYTES: Final = 1_000_000
 """Size of a configuration file, at most."""
+WHOLE: Final = "configuration"
+"""What is wrong if no key is, but several together."""
 MOST_SHOWN: Final = 200
 """Characters of a wrong value that a message shows."""
 
@@ -132,10 +134,10 @@ def load_configuration(
     try:
         settings = model.model_validate(layers.values)
     except ValidationError as error:
-        alone = all(source == str(file) for source in layers.sources.values())
-        missing = file is not None and alone and error.errors()[0]["type"] == "missing"
-        where = f"{file}: " if missing else ""
-        raise ConfigurationError(where + explained(error, layers.sources, model, listing)) from None
+        text = explained(error, layers.sources, model, listing)
+        if file is not None and all(source == str(file) for source in layers.sources.values()):
+            text = f"{file}: {text.removeprefix(f'{file}: ').removeprefix(f'{WHOLE}: ')}"
+        raise ConfigurationError(text) from None
     for key, value in flattened(settings.model_dump()).items():
         if not _is_finite(value):
             raise ConfigurationError(f"{_where(key, layers.sources)}: input should be finite (got {value!r})")
@@ -247,7 +249,7 @@ def _read_toml(file: Path, option: str) -> dict[str, Any]:
             data = content.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
             raise ConfigurationError(f"{file}: not a configuration: more than {MOST_BYTES} bytes")
-        return parsed_toml(data.decode("utf-8"))
+        return parsed_toml(data.decode("utf-8-sig"))
     except OSError as error:
         raise ConfigurationError(f"{file}: {error.strerror}; name a readable TOML file with {option}") from None
     except UnicodeDecodeError:
@@ -297,6 +299,8 @@ def explained(
     if first["type"] == "missing":
         return f"{where}: is missing; {listing}"
     message = first["msg"].removeprefix("Value error, ")
+    if isinstance(first["input"], Mapping):  # a section, of which the message says enough
+        return f"{where}: {message[0].lower()}{message[1:]}"
     given = repr(first["input"])
     if len(given) > MOST_SHOWN:
         given = f"{given[:MOST_SHOWN]}... of {len(given)} characters"
@@ -306,4 +310,4 @@ def explained(
 def _where(key: str, sources: Mapping[str, str]) -> str:
     """Name a key and the source of its value, or of a part of it, or of what it is a part of."""
     source = next((s for k, s in sources.items() if k == key or k.startswith(f"{key}.") or key.startswith(f"{k}.")), "")
-    return f"{source}: {key}" if source and not source.endswith(key) else source or key or "configuration"
+    return f"{source}: {key}" if source and not source.endswith(key) else source or key or WHOLE

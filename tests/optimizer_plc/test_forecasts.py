@@ -1,18 +1,24 @@
 """What is forecast: changes by parts of the horizon, and the problem that knows them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from coldloop.process.declaration import Forecast
+from coldloop.process.limits import InputLimits
+from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import TICKS_PER_SAMPLE
+from coldloop.process.signals import OUTPUT_NAMES, T5, TICKS_PER_SAMPLE
 from optimizer_plc.computing_settings import EstimatorSettings
 from optimizer_plc.estimator import estimator_of
 from optimizer_plc.forecasts import Forecasts
+from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.condensing import condense
 from optimizer_plc.qp.design import ControlDesign
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.profile import interpolation
+from optimizer_plc.settings import ProgramSettings
 
 DESIGN = ControlDesign()
 WEIGHTS = interpolation(DESIGN.decision_instants, np.arange(1.0, DESIGN.horizon + 1))
@@ -71,3 +77,17 @@ def test_the_filter_leaves_alone_what_is_forecast(prediction: PredictionModel) -
     assert not gains[:, :, n : n + len(PARTS)].any()
     assert np.array_equal(np.delete(gains, [n, n + 1], axis=2), plain.stationary.gains)
     assert gains.shape[0] == TICKS_PER_SAMPLE
+
+
+def test_what_is_forecast_is_not_said_to_be_an_error_of_a_sensor(
+    model: LtiModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The registers of the model's deviation: T5 reads 0.4 K too much, and the load will rise."""
+    rise = Forecast(name=PROCESS.load.name, ticks=(0, 30), values=(400.0, 460.0))
+    for module in ("program", "qp.prediction"):
+        monkeypatch.setattr(f"optimizer_plc.{module}.PROCESS", replace(PROCESS, forecasts=(rise,)))
+    settings = ProgramSettings(estimator=EstimatorSettings(disturbances=("T5",)))
+    program = OptimizerProgram(model, settings, InputLimits())
+    program.state.belief.x[:] = 60.0
+    program.state.belief.x[len(model.x0)] = 0.4
+    assert program.model_deviation().y == tuple(0.4 * (place == T5) for place in range(len(OUTPUT_NAMES)))

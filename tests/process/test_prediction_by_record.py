@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError
+from rig.process_file.judgement import described
 from rig.process_file.making import made_from
 from tests.harness.processes import Processes
 from tests.process.runs import run
@@ -66,6 +67,27 @@ def written(folder: Path, seed: int = 1) -> Path:
         text = text.replace(f'name = "{name}"', f'name = "{name}"\nat = {value}')
     file.write_text(text + '\n[prediction]\nstep_test = "record.csv"\n', encoding="utf-8")
     return file
+
+
+def test_a_record_of_another_plant_is_told_by_its_gains(tmp_path: Path) -> None:
+    """Levels upside down; and a pump's voltage in tenths."""
+    file = written(tmp_path)
+    record = tmp_path / "record.csv"
+    assert "warning" not in described(made_from(file))
+    header, *lines = record.read_text(encoding="utf-8").splitlines()
+    rows = np.array([line.split(",") for line in lines], float)
+    for changed, told in (
+        ([1, 1, 1, 1, -1, 1], "gain: of h1 by v1 -5"),
+        ([1, 0.1, 1, 1, 1, 1], "gain: of h2 by v1 26"),
+    ):
+        moved = rows.mean(axis=0) + (rows - rows.mean(axis=0)) * changed
+        moved[:, 0] = rows[:, 0]
+        lines = [",".join(f"{value:.6g}" for value in row) for row in moved]
+        record.write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
+        text = described(made_from(file))
+        assert f"warning    {told}" in text
+        assert "of h2 by v2" not in text
+        assert "is the record of this plant" in text
 
 
 @pytest.mark.parametrize("load", ["a", "c"])

@@ -1,5 +1,6 @@
 """A process file: what it is made into, against closed forms, and what it refuses, in one line each."""
 
+from dataclasses import replace
 from math import sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -104,6 +105,13 @@ def test_what_is_wrong_with_a_process_is_said_in_words(tmp_path: Path) -> None:
     assert "kink" in described(made(tmp_path, plant=kink)) or "controllability" in described(made(tmp_path, plant=kink))
 
 
+def test_an_integrator_that_grows_by_rounding_alone_is_not_called_unstable(tmp_path: Path) -> None:
+    found = made(tmp_path)
+    text = described(replace(found, linear=found.linear._replace(A=np.array([[1.73e-18]]))))
+    assert "modes      0 /s" in text
+    assert "unstable" not in text
+
+
 def changed(before: str, after: str) -> str:
     """Return the file with a line changed."""
     assert before in ONE_BY_ONE
@@ -114,7 +122,7 @@ BAD_FILES = {
     "no table": ("name = 3 = 4", "process.toml"),
     "no inputs": (changed("[[inputs]]", "[[input]]"), "input"),
     "a name with spaces": (changed('name = "power"', 'name = "the power"'), "inputs"),
-    "a name twice": (changed('name = "temperature"', 'name = "POWER"'), "POWER"),
+    "a name twice": (changed('name = "temperature"', 'name = "POWER"'), "toml: power: two signals"),
     "a name of registers": (changed('name = "power"', 'name = "session"'), "session"),
     "bounds the wrong way round": (changed("high = 100.0", "high = -1.0"), "power"),
     "an operating point outside": (changed("at = 50.0", "at = 150.0"), "power"),
@@ -228,3 +236,21 @@ def test_loops_and_dead_times_are_looked_at(tmp_path: Path) -> None:
     assert "wrong sign" not in described(made(tmp_path, ONE_BY_ONE + loop.replace("-5.0", "5.0")))
     column = (EXAMPLES / "wood_berry.toml").read_text(encoding="utf-8").replace("delay_s = 60.0", "delay_s = 61.0")
     assert "xD after reflux, 61 s, is simulated as 60 s" in described(made(tmp_path, column))
+
+
+def test_what_is_wrong_with_a_file_as_a_whole_is_said_of_this_file_and_without_its_content(tmp_path: Path) -> None:
+    made(tmp_path)
+    file = next(tmp_path.glob("*.toml"))
+    text = file.read_text(encoding="utf-8")
+    for wrong, why in (
+        (text.replace('name = "power"', 'name = "temperature"'), "temperature: two signals have this name"),
+        (text.replace("rate =", "# rate ="), "inputs.0.rate: is missing"),
+        (text.replace("low = 0.0", "low = 900.0"), "inputs.0: power: low, high: give the lower end first"),
+    ):
+        file.write_text(wrong, encoding="utf-8")
+        with pytest.raises(ColdloopError) as refused:
+            made_from(file)
+        assert str(refused.value).startswith(f"{file}: {why}")
+        assert "{" not in str(refused.value)
+    file.write_text(text, encoding="utf-8-sig")
+    assert made_from(file).process.name == "heater"

@@ -106,6 +106,24 @@ def test_a_model_of_another_process_is_refused_in_one_line(processes: Processes,
     assert len(complaints.splitlines()) == 1
 
 
+def test_a_run_is_repeated_with_its_process_as_it_was_then(processes: Processes, tmp_path: Path) -> None:
+    """A process file that says something else since, or none, is not taken for it; nor when the run is drawn."""
+    folder = tmp_path / "run"
+    run(processes, TANK, folder, "--in-process", "--load", "a", "--duration", "60s")
+    for name in ("quadruple_tank.py", "quadruple_tank.svg"):
+        (tmp_path / name).write_text((TANK.parent / name).read_text(encoding="utf-8"), encoding="utf-8")
+    changed, remedy = tmp_path / "tank.toml", f"use --process {folder / 'inputs' / 'model.json'}"
+    changed.write_text(TANK.read_text(encoding="utf-8").replace("[12.0, 12.6]", "[11.0, 12.6]"), encoding="utf-8")
+    for words in (("--process", changed, "rerun"), ("rerun",), ("plot",)):
+        code, _, complaints = started(processes, *words, folder)
+        assert code != 0
+        assert "a run of quadruple-tank" in complaints
+        assert complaints.endswith(f"{remedy}\n")
+    code, told, _ = started(processes, "--process", folder / "inputs" / "model.json", "rerun", folder)
+    assert code == 0, told
+    assert "the same trace" in told
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("plan", ["kill", "drop"])
 @pytest.mark.parametrize(("file", "duration"), [(TANK, "30min"), (COLUMN, "2h")], ids=["tank", "column"])

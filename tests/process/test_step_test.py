@@ -1,5 +1,6 @@
 """A step test as the source of a plant: what is found in a record, against the system that made it."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -187,6 +188,16 @@ def test_a_load_that_is_no_column_is_said_to_be_unknown(tmp_path: Path) -> None:
 # -- what is refused --------------------------------------------------------------------------------------------------
 
 
+CHANGED: Final[dict[str, tuple[int, Callable[[list[str]], str]]]] = {
+    "an input that never moves": (2, lambda _: "5"),
+    "inputs that move together": (2, lambda row: str(float(row[1]) / 2)),
+    "an output that never moves": (3, lambda _: "7"),
+    "another unit": (3, lambda row: str(1000.0 * float(row[3]))),
+    "time that stands still": (0, lambda _: "0"),
+}
+"""A column, and what is in it from line to line."""
+
+
 def edited(lines: list[str], case: str) -> list[str]:
     """Return the lines of a record with something wrong."""
     cells = [line.split(",") for line in lines]
@@ -200,23 +211,23 @@ def edited(lines: list[str], case: str) -> list[str]:
         cells[30][2] = ""
     if case == "text":
         cells[30][4] = "Bad Input"
-    if case == "an input that never moves":
-        cells[1:] = [[*row[:2], "5", *row[3:]] for row in cells[1:]]
-    if case == "inputs that move together":
-        cells[1:] = [[*row[:2], str(float(row[1]) / 2), *row[3:]] for row in cells[1:]]
-    if case == "time that stands still":
-        cells[1:] = [["0", *row[1:]] for row in cells[1:]]
+    if case in CHANGED:
+        column, value = CHANGED[case]
+        for row in cells[1:]:
+            row[column] = value(row)
     return [",".join(row) for row in cells]
 
 
 REFUSED: Final = {
     "too short": "39 samples of 5 s are too short a record",
     "a gap": "line 51: 55 s after the line before, others are 5 s apart",
-    "no column": "no column y;",
+    "no column": "no column y; its first line is 'time_s,a,b,yy,z'",
     "an empty cell": "line 31, b: '' is no number",
     "text": "line 31, z: 'Bad Input' is no number",
     "an input that never moves": "b never moves",
     "inputs that move together": "a and b move together",
+    "an output that never moves": "y never moves",
+    "another unit": "is outside the range of its sensor, -100 to 200; give the record in the unit of the process file",
     "time that stands still": "time_s does not rise",
 }
 
