@@ -110,7 +110,8 @@ def follow(c: Constants, m: OptimizerState, latched: Latched) -> int:
 def knows_what_is_played(m: OptimizerState, number: int) -> bool:
     """Return whether the control PLC plays something of ours, or has not begun to."""
     played, sent = m.playing.numbers[0], m.sent.numbers[0]
-    return played.length == 0 or played.number == number or (sent.length > 0 and sent.number == number)
+    known: bool = played.length == 0 or played.number == number or (sent.length > 0 and sent.number == number)
+    return known
 
 
 @kernel
