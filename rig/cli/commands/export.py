@@ -3,13 +3,19 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+from coldloop.service.command_line import add_configuration_options
+
+if TYPE_CHECKING:
+    from rig.settings import Settings
 
 PLC: Final = Path("plc")
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    add_configuration_options(parser)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run; or plc, with --target: the solver")
     kinds = parser.add_mutually_exclusive_group(required=True)
     for kind, text in (
@@ -18,8 +24,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
         ("hdf5", "run.h5, with a group for each of them (needs h5py)"),
     ):
         kinds.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, help=text)
-    kinds.add_argument("--target", choices=("c", "st"), help="with plc: the ODE-based solver in single precision, as"
-                       " C99 or Structured Text (IEC 61131-3), with golden vectors and a self-test")  # fmt: skip
+    kinds.add_argument("--target", choices=("c", "st"), help="with plc: as C99 the whole optimiser in single precision"
+                       " and its ODE-based solver, as Structured Text (IEC 61131-3) the solver; with golden vectors and"
+                       " self-tests")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="where to (default: the folder of the run)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--ticks", type=_ticks, metavar="N", help="with plc: length of the run whose problems are the"
@@ -45,6 +52,8 @@ def _recorded_run(options: argparse.Namespace) -> list[Path]:
 
     if options.ticks is not None:
         raise UsageError("--ticks: is for coldloop export plc --target")
+    if options.config or options.assignments:
+        raise UsageError("--config and --set: are for coldloop export plc --target")
     return export(options.run, options.kind, options.out or options.run, force=options.force)
 
 
@@ -59,4 +68,14 @@ def _solver(options: argparse.Namespace) -> list[Path]:
         raise UsageError("export plc: name a new folder with --out; --force does not replace one")
     if not IS_COLD_BOX:
         raise UsageError("export plc: of the cold box alone; leave out --process")
-    return export_plc(options.target, options.ticks, options.out)
+    return export_plc(options.target, options.ticks, options.out, _settings(options))
+
+
+def _settings(options: argparse.Namespace) -> "Settings":
+    """Return the settings of the optimiser: those of the paper's PLC, unless the user says otherwise."""
+    from coldloop.config import load_configuration
+    from rig.plc_export.recorded_problems import SINGLE
+    from rig.settings import Settings
+
+    assignments = [*SINGLE, *options.assignments]
+    return load_configuration(Settings, file=options.config, assignments=assignments).settings
