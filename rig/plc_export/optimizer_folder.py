@@ -46,7 +46,6 @@ class OptimizerExport:
         golden: Updates with their answers.
 
     Raises:
-        UsageError: The settings ask for something that is not exported.
         UnfitKernelError: A kernel uses what is not in the subset.
     """
 

@@ -6,7 +6,6 @@ from typing import Any, Final, cast
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from coldloop.errors import UsageError
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.updating_periods import LONGEST_TICKS
 from optimizer_plc import decisions, scheme
@@ -16,7 +15,6 @@ from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.rules import make_rule
 from optimizer_plc.rules.interface import DECISIONS, decide_by
-from optimizer_plc.solvers import KernelSolver
 from optimizer_plc.solvers.kernel_solver import KERNELS, solve_by
 from rig.plc_export.reading import Program
 from rig.plc_export.subset import type_of
@@ -37,12 +35,10 @@ class OptimizerKernels:
         optimizer: Of the settings that are exported.
 
     Raises:
-        UsageError: They ask for something that is not exported.
         UnfitKernelError: A kernel uses what is not in the subset.
     """
 
     def __init__(self, optimizer: OptimizerProgram) -> None:
-        refuse(optimizer)
         real = real_of(Arithmetic.FLOAT32)
         self.rules = [make_rule(optimizer.settings, optimizer.budget, ticks, real)
                       for ticks in range(LONGEST_TICKS + 1)]  # fmt: skip
@@ -67,20 +63,3 @@ class OptimizerKernels:
         self.functions = program.functions
         """Callees before their callers."""
         self.types: tuple[Type, ...] = tuple(parameter.type for each in self.functions for parameter in each.parameters)
-
-
-def refuse(optimizer: OptimizerProgram) -> None:
-    """Refuse what cannot be exported.
-
-    Raises:
-        UsageError: It is asked for.
-    """
-    settings = optimizer.settings
-    if settings.arithmetic is not Arithmetic.FLOAT32:
-        raise UsageError("export plc: in single precision alone: --set optimizer_plc.program.arithmetic=float32")
-    if settings.outside.names:
-        raise UsageError(f"export plc: {settings.outside.names[0]} is not a part of Coldloop, and cannot be exported")
-    if not isinstance(optimizer.solver, KernelSolver):
-        raise UsageError(f"export plc: the solver {settings.solver_name} is a library's; ode can be exported")
-    if optimizer.forecasts:
-        raise UsageError("export plc: what is forecast cannot be exported")

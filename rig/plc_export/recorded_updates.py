@@ -2,13 +2,16 @@
 
 from typing import NamedTuple
 
+from coldloop.errors import UsageError
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.signals import TICK_S
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import Plan, Update
 from coldloop.safety.sequence import InputSequence
+from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.rules import UpdatingRule
+from optimizer_plc.settings import ProgramSettings
 from plant.load import find_load
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
@@ -25,6 +28,18 @@ class GoldenUpdate(NamedTuple):
     plan: Plan
     sequence: InputSequence | None
     """None if it was interrupted before."""
+
+
+def refuse(settings: ProgramSettings) -> None:
+    """Refuse what cannot be exported.
+
+    Raises:
+        UsageError: It is asked for.
+    """
+    if settings.arithmetic is not Arithmetic.FLOAT32:
+        raise UsageError("export plc: in single precision alone: --set optimizer_plc.program.arithmetic=float32")
+    if settings.outside.names:
+        raise UsageError(f"export plc: {settings.outside.names[0]} is not a part of Coldloop, and cannot be exported")
 
 
 class _ListeningOptimizer(OptimizerProgram):
@@ -51,10 +66,17 @@ class _ListeningOptimizer(OptimizerProgram):
 
 
 class UpdateRecorder:
-    """Records runs of the optimiser that some settings are of."""
+    """Records runs of an optimiser that can be exported.
+
+    Args:
+        settings: Of the run.
+
+    Raises:
+        UsageError: They ask for something that is not exported.
+    """
 
     def __init__(self, settings: Settings) -> None:
-        self._settings = settings
+        refuse(settings.optimizer_plc.program)
         self.model = load_model(settings.model.file)
         self.optimizer = _ListeningOptimizer(self.model, settings.optimizer_plc.program, settings.limits)
         self._rig = OneProcessRig(settings, compiled=False)

@@ -59,7 +59,7 @@ class OptimizerProgram:
             self._real = real_of(settings.arithmetic)
             self.disturbances = settings.estimator.disturbed
             self._prediction = prediction = prediction_of(model, self.disturbances, settings.design)
-            self.forecasts = Forecasts(PROCESS.forecasts, settings.design.decision_instants)
+            self._forecasts = Forecasts(PROCESS.forecasts, settings.design.decision_instants)
             self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
             self.solver = make_solver(settings)
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
@@ -140,7 +140,7 @@ class OptimizerProgram:
 
     def _ahead(self, tick: int) -> Array:
         """Return what is forecast from a tick on."""
-        return self.forecasts.changes(tick).astype(self._real) if len(self.forecasts) else self._nothing_ahead
+        return self._forecasts.changes(tick).astype(self._real) if len(self._forecasts) else self._nothing_ahead
 
     @property
     def plans_by_steps(self) -> bool:
@@ -181,7 +181,7 @@ class OptimizerProgram:
     def solve(self) -> InputSequence:
         """Predict the state at t_{i+1}, shift the profile, iterate; return the sequence to play from there."""
         n = self._iterations
-        if ahead := len(self.forecasts):
+        if ahead := len(self._forecasts):
             self.state.belief.x[-ahead:] = self._ahead(int(self._now["tick"]) + int(self._now["ticks"]))
         if isinstance(self.solver, KernelSolver):
             scheme.solve(self.constants, self.method, self.state)
