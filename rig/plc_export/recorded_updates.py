@@ -38,8 +38,6 @@ def refuse(settings: ProgramSettings) -> None:
     """
     if settings.arithmetic is not Arithmetic.FLOAT32:
         raise UsageError("export plc: in single precision alone: --set optimizer_plc.program.arithmetic=float32")
-    if settings.outside.names:
-        raise UsageError(f"export plc: {settings.outside.names[0]} is not a part of Coldloop, and cannot be exported")
 
 
 class _ListeningOptimizer(OptimizerProgram):
