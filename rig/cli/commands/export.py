@@ -66,6 +66,8 @@ def _solver(options: argparse.Namespace) -> list[Path]:
         raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
     if options.out is None or options.force:
         raise UsageError("export plc: name a new folder with --out; --force does not replace one")
+    if options.target == "st" and (options.config or options.assignments):
+        raise UsageError("--config and --set: are of the whole optimiser, which is --target c")
     if not IS_COLD_BOX:
         raise UsageError("export plc: of the cold box alone; leave out --process")
     return export_plc(options.target, options.ticks, options.out, _settings(options))
