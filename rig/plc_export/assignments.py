@@ -91,6 +91,7 @@ class AssignmentReader(CallReader):
         if len(target.elts) != len(value.elts):
             raise self.source.refusal(target, "several values come from as many, or from the call of a kernel")
         written: set[str] = set()
+        members: set[tuple[Type, str]] = set()
         statements: list[Statement] = []
         for one, part in zip(target.elts, value.elts, strict=True):
             read = {ast.unparse(node) for node in ast.walk(part) if isinstance(node, ast.Name | ast.Attribute)}
@@ -98,10 +99,16 @@ class AssignmentReader(CallReader):
                 raise self.source.refusal(target, "a value is read behind its assignment: two statements say the order")
             root = one.value if isinstance(one, ast.Subscript) else one
             written.add(ast.unparse(root))
-            statements += self.assigned(one, part)
-            targets = [each.target for each in walk(tuple(statements[:-1])) if isinstance(each, Assign)]
-            if statements and any(each in walk(statements[-1]) for each in targets if isinstance(each, Member)):
+            before = len(self.before)
+            new = self.assigned(one, part)
+            if statements and len(self.before) > before:
+                raise self.source.refusal(target, "a call behind another assignment: two statements say the order")
+            values = walk(tuple(each.value for each in new if isinstance(each, Assign)))
+            if members & {(each.struct.type, each.name) for each in values if isinstance(each, Member)}:
                 raise self.source.refusal(target, "a number of a record is read behind its assignment")
+            places = [each.target for each in new if isinstance(each, Assign)]
+            members |= {(each.struct.type, each.name) for each in places if isinstance(each, Member)}
+            statements += new
         return statements
 
     # -- results of calls ----------------------------------------------------------------------------------------------
@@ -183,7 +190,7 @@ class AssignmentReader(CallReader):
                 raise self.source.refusal(target, "a record is made once, and has a type with a name")
             self.scopes[-1][target.id] = self.recorded(node, value, target.id)
             return []
-        if isinstance(value, View) and once:
+        if isinstance(value, View | Item) and once:
             variable = Name(value.type, target.id)
             self.scopes[-1][target.id] = variable
             self.pointers[target.id] = value

@@ -214,7 +214,7 @@ class Printer(TreePrinter):
         return f"{self.declaration(kind, name)} = {initial};"
 
     def _pointed(self, point: Point) -> str:
-        root: Expression = point.view.array
+        root: Expression = point.part.array if isinstance(point.part, View) else point.part.rows
         while isinstance(root, Field):
             root = root.record
         name = point.variable.name
@@ -222,7 +222,7 @@ class Printer(TreePrinter):
         if constant:
             self._constant.add(name)
         declared = self.declaration(point.variable.type, identifier(name), constant=constant)
-        return f"{declared} = {self._argument(point.view)};"
+        return f"{declared} = {self._argument(point.part)};"
 
     def _target(self, target: Target) -> str:
         if isinstance(target, Name) and target in self._results:

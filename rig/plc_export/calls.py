@@ -75,8 +75,8 @@ class CallReader(ExpressionReader):
         self.alone: set[int] = set()
         """Nodes of calls that may write: a statement is about their result alone."""
         self.written: set[str] = set()
-        self.pointers: dict[str, View] = {}
-        """Names of parts of arrays."""
+        self.pointers: dict[str, View | Item] = {}
+        """Names of parts of arrays, and of records in them."""
         self.intermediate = 0
 
     def _call(self, node: ast.Call) -> Value:  # noqa: C901, PLR0911 one case for what can be called
@@ -230,7 +230,7 @@ class CallReader(ExpressionReader):
         match target:
             case Field(_, record):
                 return not (isinstance(record.type, RecordType) and record.type.state) or self.is_constant(record)
-            case View(_, array):
+            case View(_, array) | Item(_, array):
                 return self.is_constant(array)
         return False
 

@@ -185,15 +185,8 @@ class ExpressionReader:
         if isinstance(base, Shape):
             return Known(base.lengths[self.known_integer(node.slice)])
         if isinstance(base, Name | Field) and isinstance(base.type, RowsType):
-            return Item(base.type.struct, base, self._fixed_index(node.slice, base.type.length))
+            return Item(base.type.struct, base, self.index(node.slice, base.type.length))
         return self.element(node)
-
-    def _fixed_index(self, node: ast.expr, length: int) -> Expression:
-        """Return an index that stays what it is."""
-        index = self.index(node, length)
-        if not isinstance(index, Literal) and not (isinstance(index, Name) and index.name in self.loop_variables):
-            raise self.source.refusal(node, "a record in an array is named by a number or by the variable of a loop")
-        return index
 
     def element(self, node: ast.Subscript) -> Element | View:
         """Return an element or, with a slice or fewer indices than dimensions, a part of an array."""

@@ -187,10 +187,10 @@ class Assign:
 
 @dataclass(frozen=True)
 class Point:
-    """A name for a part of an array."""
+    """A name for a part of an array, or for a record in one."""
 
     variable: Name
-    view: View
+    part: View | Item
     constant: bool
 
 

@@ -132,7 +132,7 @@ def advance(c: Table, m: State, z: Array, row: int) -> None:
 @kernel
 def reads_behind(m: State) -> None:
     now = m.numbers[0]
-    now.count, now.sum = 7, m.one.z[now.count]
+    now.count, now.sum = 7, m.one.z[m.numbers[0].count]
 
 
 # -- in C --------------------------------------------------------------------------------------------------------------

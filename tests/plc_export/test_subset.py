@@ -18,6 +18,10 @@ def plain(x):
     return x
 
 @kernel
+def doubled(z):
+    return z + z
+
+@kernel
 def bad(z, A, k):
 """
 REFUSED = {
@@ -48,6 +52,7 @@ REFUSED = {
     "an argument that is returned": "    return z  #!",
     "a break": "    while k > 0:\n        break  #!",
     "a swap": "    x = z[0]\n    y = z[1]\n    x, y = y, x  #!",
+    "a call behind another assignment": "    x, y = z[0], doubled(z)  #!\n    return x + y[0]",
     "a text": "    y = 'gamma'  #!",
     "a lambda": "    y = lambda: k  #!",
     "a number for truth": "    while k:  #!\n        k -= 1",
