@@ -31,6 +31,7 @@ from coldloop.registers.optimizer_plc import (
     UpdatingRuleStatus,
 )
 from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.runtime import HEARTBEAT_S, LOOK_OUT_S
 from rig.plc_export.c99_text import GENERATED
 from rig.plc_export.optimizer_program import OptimizerKernels
 from rig.plc_export.st_folder import filled, template
@@ -92,6 +93,8 @@ def _header(
         "SEQUENCE_ROW_LETTERS": f'"{BLOCKS["SEQUENCE"][2]}"',
         "USUAL_PERIOD": round(optimizer.settings.updating_period_s / TICK_S),
         "OPTIMIZER_LOW_FIRST": str(order is WordOrder.LOW_FIRST).lower(),
+        "PREPARATION_S": repr(float(times["preparation"])), "ITERATION_S": repr(float(times["iteration"])),
+        "LOOK_OUT_S": repr(LOOK_OUT_S), "HEARTBEAT_S": repr(HEARTBEAT_S),
     }  # fmt: skip
     defined = "".join(f"#define {name} {value}\n" for name, value in names.items())
     return f"""{GENERATED}#ifndef REGISTERS_H

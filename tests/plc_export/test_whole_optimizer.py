@@ -128,7 +128,7 @@ class CPlan(ctypes.Structure):
 
     _fields_ = (
         ("update", ctypes.c_int32), ("next_update_tick", ctypes.c_int32), ("load_step", ctypes.c_float),
-        ("shortage", ctypes.c_float), ("suspects", ctypes.c_int32),
+        ("shortage", ctypes.c_float), ("suspects", ctypes.c_int32), ("iterations", ctypes.c_int32),
     )  # fmt: skip
 
 
@@ -154,7 +154,7 @@ class Exported:
                         update.x)  # fmt: skip
         plan = CPlan()
         known = self.library.optimizer_plan(ctypes.byref(given), ctypes.byref(plan))
-        return tuple(getattr(plan, name) for name, _ in CPlan._fields_) if known else None
+        return tuple(getattr(plan, name) for name, _ in CPlan._fields_[:-1]) if known else None
 
     def solve(self) -> tuple[Any, ...] | None:
         made = CSequence()

@@ -35,6 +35,7 @@ bool optimizer_plan(const Update *update, Plan *plan) {
     plan->next_update_tick = update->tick + state.numbers[0].ticks;
     plan->shortage = state.numbers[0].shortage;
     plan->suspects = state.numbers[0].suspects;
+    plan->iterations = state.numbers[0].iterations;
     return true;
 }
 

@@ -41,7 +41,8 @@ typedef struct {
     int32_t next_update_tick;
     float load_step; /* a load that moves by more ends the period; 0 is never */
     float shortage;
-    int32_t suspects; /* readings that are not used: bit i is output i */
+    int32_t suspects;   /* readings that are not used: bit i is output i */
+    int32_t iterations; /* of the solver: what fits into the period on the reference PLC */
 } Plan;
 
 typedef struct {

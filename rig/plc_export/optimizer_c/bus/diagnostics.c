@@ -50,6 +50,14 @@ int32_t diagnostics_period(uint32_t of_session, int32_t usual) {
     return get_u32(words) == of_session ? (int32_t)words[5] : usual;
 }
 
+float diagnostics_factor(void) {
+    uint16_t words[PACE_WORDS];
+    pthread_mutex_lock(&lock);
+    get_block(PACE, PACE_LETTERS, words, PACE_WORDS);
+    pthread_mutex_unlock(&lock);
+    return words[2] != 0 ? get_f32(words + 3) : 0.0F;
+}
+
 void diagnostics_session(uint32_t number, int32_t fixed_ticks) {
     uint16_t asked[SESSION_WORDS], words[UPDATING_RULE_WORDS], pace[PACE_WORDS] = {0};
     pthread_mutex_lock(&lock);

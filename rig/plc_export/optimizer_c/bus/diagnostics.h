@@ -12,6 +12,9 @@ bool diagnostics_serve(int port, bool with_parent);
 /* The fixed updating period in ticks, 0 for adaptive, that was asked for a session; else `usual`. */
 int32_t diagnostics_period(uint32_t session, int32_t usual);
 
+/* Seconds of plant time in one of real time; 0 in lock-step. */
+float diagnostics_factor(void);
+
 void diagnostics_session(uint32_t session, int32_t fixed_ticks);
 void diagnostics_link(bool up, uint32_t holder);
 void diagnostics_update(const Report *report, int verdict);

@@ -1,7 +1,7 @@
 @GENERATED@
 /* The exported optimiser in the place of Coldloop's: a client of the control PLC, and a server of its diagnostics.
  *
- * An answer is sent as soon as it is computed; how long the reference PLC would take is not imitated. */
+ * In real time an answer is sent when the reference PLC would have it. */
 #include <fcntl.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -17,8 +17,8 @@ static const char *host = "127.0.0.1";
 static int control_port = CONTROL_PORT, own_port = OPTIMIZER_PORT;
 static bool with_parent = false;
 
-static void pause_ms(long ms) {
-    const struct timespec time = {ms / 1000, (ms % 1000) * 1000000L};
+static void pause_ms(int64_t ms) {
+    const struct timespec time = {(time_t)(ms / 1000), (long)(ms % 1000) * 1000000L};
     nanosleep(&time, NULL);
 }
 
@@ -33,16 +33,49 @@ static void fail(const char *why) {
     exit(2);
 }
 
+/* In real time, wait until the reference PLC would have the answer to an update that came at `arrived`, ms, and give
+ * signs of life; `cut_off` where a load step or another session ends the computation before. */
+static bool wait_for_plc(
+    ControlPlc *plc, uint32_t session, const Update *update, const Plan *plan, int64_t arrived, bool *cut_off) {
+    const double factor = (double)diagnostics_factor();
+    const bool interruptible = plan->load_step > 0;
+    *cut_off = false;
+    if (factor <= 0) {
+        return true;
+    }
+    const double seconds = (PREPARATION_S + plan->iterations * ITERATION_S) / factor;
+    const double spacing = 1000 * (interruptible ? LOOK_OUT_S : HEARTBEAT_S) / factor;
+    const int64_t look = spacing < 1 ? 1 : spacing > 1000 ? 1000 : (int64_t)spacing;
+    const int64_t ready = arrived + (int64_t)(1000 * seconds);
+    for (int64_t left = ready - now_ms(); left > 0; left = ready - now_ms()) {
+        pause_ms(left < look ? left : look);
+        if (interruptible || left > look) {
+            uint32_t newest_session, newest;
+            if (!control_newest(plc, &newest_session, &newest)) {
+                return false;
+            }
+            if (newest_session != session || (interruptible && newest > (uint32_t)update->update)) {
+                *cut_off = true;
+                return true;
+            }
+        }
+    }
+    return true;
+}
+
 /* Plan, solve, send; find out which update is to be asked for next. False where the link is lost. */
-static bool answer(ControlPlc *plc, uint32_t session, const Update *update, bool *fresh) {
+static bool answer(ControlPlc *plc, uint32_t session, const Update *update, int64_t arrived, bool *fresh) {
     static Sequence sequence;
     Plan plan;
     Report report;
-    int verdict;
+    bool cut_off;
+    int verdict = 0;
     if (!optimizer_plan(update, &plan)) {
         fail("a tick or a number is beyond what its 32 bits hold: begin another session");
     }
-    if (!control_plan(plc, &plan) || !optimizer_solve(&sequence) || !control_send(plc, &sequence, &verdict)) {
+    if (!control_plan(plc, &plan) || !optimizer_solve(&sequence) ||
+        !wait_for_plc(plc, session, update, &plan, arrived, &cut_off) ||
+        (!cut_off && !control_send(plc, &sequence, &verdict))) {
         return false;
     }
     optimizer_report(&report);
@@ -71,12 +104,13 @@ static void serve_updates(ControlPlc *plc, uint32_t *current) {
         if (!control_await(plc, session, number, &got, &update)) {
             return;
         }
+        const int64_t arrived = now_ms();
         const bool old = got == session && (uint32_t)update.update < number;
         if (got == 0 || old) {
             if (got == 0 || (uint32_t)update.update + 1U < number) { /* another session, which counts from 0 */
                 session = number = 0;
             }
-            if (now_ms() - asked < 20) {
+            if (arrived - asked < 20) {
                 pause_ms(20);
             }
             continue;
@@ -88,7 +122,7 @@ static void serve_updates(ControlPlc *plc, uint32_t *current) {
             *current = got;
         }
         bool fresh;
-        if (!answer(plc, got, &update, &fresh)) {
+        if (!answer(plc, got, &update, arrived, &fresh)) {
             return;
         }
         session = fresh ? 0 : got;
