@@ -8,21 +8,38 @@ from typing import Final
 
 import numpy as np
 
+from coldloop.config import selected
 from coldloop.errors import UsageError
+from coldloop.process.loaded import IS_COLD_BOX
 from optimizer_plc.qp.problem import QuadraticProblem
+from optimizer_plc.settings import SHOWN
+from rig.plc_export.bus_registers import bus_files
+from rig.plc_export.exported_optimizer import FOLDER as OPTIMIZER
+from rig.plc_export.exported_optimizer import MANIFEST, manifest_of
 from rig.plc_export.folder import OdeExport
+from rig.plc_export.optimizer_folder import OptimizerExport
 from rig.plc_export.plcopen import plcopen_xml
-from rig.plc_export.recorded_problems import TICKS, GoldenVector, GoldenVectors, record
+from rig.plc_export.recorded_problems import LOAD, TICKS, GoldenVector, GoldenVectors, record
+from rig.plc_export.recorded_updates import UpdateRecorder
 from rig.plc_export.st_folder import AT_ONCE, StructuredTextExport, filled, template
 from rig.plc_sizing.operations import Operations, gradient, ode
 from rig.plc_sizing.sizes import dense_sizes
+from rig.settings import Settings
 
 README: Final = "README.md"
 PROJECT: Final = "solver.xml"
+FIXED_S: Final = 2.5
+"""Updating period of the second half of the golden updates; that of the first is adaptive."""
 
 
-def export_plc(target: str, ticks: int | None, folder: Path) -> list[Path]:
+def export_plc(target: str, ticks: int | None, folder: Path, settings: Settings) -> list[Path]:
     """Record problems and write the sources for a target; return the paths.
+
+    Args:
+        target: c, st or plcopen.
+        ticks: Length of the run that is recorded.
+        folder: Where they are written to.
+        settings: Of the optimiser.
 
     Raises:
         UsageError: The folder is not empty or cannot be written to, or no input moves in so many ticks.
@@ -33,6 +50,8 @@ def export_plc(target: str, ticks: int | None, folder: Path) -> list[Path]:
     if not vectors:
         raise UsageError(f"--ticks: no input moves within {ticks} ticks, so nothing would be tested; record more")
     texts = c99(recorded, vectors) if target == "c" else structured_text(recorded, vectors, xml=target == "plcopen")
+    if target == "c" and IS_COLD_BOX:
+        texts |= whole_optimizer(settings, ticks or TICKS)
     write_whole(folder, texts)
     return [folder / name for name in texts]
 
@@ -58,6 +77,23 @@ def c99(recorded: GoldenVectors, vectors: list[GoldenVector]) -> dict[str, str]:
     return {**texts, README: readme("readme_c.md", vectors, texts, {
         "CONSTANTS": f"{sizes.constants:,}", "STACK": f"{sizes.stack:,}", "SELF_TEST": f"{sizes.self_test:,}",
     })}  # fmt: skip
+
+
+def whole_optimizer(settings: Settings, ticks: int) -> dict[str, str]:
+    """Return the files of the whole optimiser by their names, with its golden updates."""
+    recorder = UpdateRecorder(settings)
+    golden = [each for period_s in (0.0, FIXED_S) for each in recorder.record(ticks, LOAD, period_s)]
+    export = OptimizerExport(recorder.optimizer, golden)
+    shown = selected(settings, SHOWN)
+    order = settings.optimizer_plc.word_order
+    texts = {**export.files(), **bus_files(recorder.optimizer, export.kernels, order, shown)}
+    sizes = export.sizes()
+    texts[README] = filled(template("readme_optimizer.md"), {
+        "GOLDEN": str(len(golden)), "CONSTANTS": f"{sizes.constants:,}", "STATE": f"{sizes.state:,}",
+        "STACK": f"{sizes.stack:,}",
+    })  # fmt: skip
+    texts[MANIFEST] = manifest_of(settings, texts)
+    return {f"{OPTIMIZER}/{name}": text for name, text in texts.items()}
 
 
 def readme(name: str, vectors: list[GoldenVector], texts: Mapping[str, str], parts: Mapping[str, str]) -> str:
@@ -107,6 +143,7 @@ def write_whole(folder: Path, texts: Mapping[str, str]) -> None:
         folder.parent.mkdir(parents=True, exist_ok=True)
         draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         for name, text in texts.items():
+            (draft / name).parent.mkdir(parents=True, exist_ok=True)
             (draft / name).write_text(text, encoding="ascii")
         draft.chmod(0o755)
         draft.replace(folder)

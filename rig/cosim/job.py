@@ -28,6 +28,8 @@ class Job:
     """Of a rig that is up, to attach to."""
     conduct: Conduct | None = None
     """How it is done, in a way that the others do not describe."""
+    optimizer: tuple[str, ...] = ()
+    """A program that takes the place of our optimiser, with its options."""
 
 
 class StopRequest:

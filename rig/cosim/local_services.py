@@ -36,6 +36,7 @@ class LocalServices:
         detours: Where something is between clients and servers.
         ports: Where they listen; by default on free ports.
         services: Which ones are started; the others are somebody else's.
+        optimizer: A program that takes the place of our optimiser, with its options.
     """
 
     def __init__(
@@ -46,10 +47,17 @@ class LocalServices:
         detours: Detours | None = None,
         ports: Sequence[int] | None = None,
         services: Sequence[str] = SERVICES,
+        optimizer: Sequence[str] = (),
     ) -> None:
         self._ports = ReservedPorts(len(SERVICES) if ports is None else 0)
         self.endpoints = endpoints_on(ports or self._ports.numbers, settings)
-        self._environment = to_environment(wired(settings, self.endpoints, detours))
+        placed = wired(settings, self.endpoints, detours)
+        self._environment = to_environment(placed)
+        self._commands: dict[str, tuple[str, ...]] = {service: (*PYTHON, "-m", service) for service in services}
+        if optimizer:
+            control, server = placed.optimizer_plc.control_plc, placed.optimizer_plc.server
+            where = ("--host", control.host, "--port", str(control.port), "--listen", str(server.port))
+            self._commands["optimizer_plc"] = (*optimizer, *where)
         self._logs = log_folder
         self.services = tuple(services)
         self._processes: dict[str, asyncio.subprocess.Process] = {}
@@ -89,7 +97,7 @@ class LocalServices:
             may_end: Its end by itself does not end the run.
         """
         with self.log(service).open("ab") as log:
-            process = await start_program(service, {**self._environment, **(environment or {})}, log)
+            process = await start_program(self._commands[service], {**self._environment, **(environment or {})}, log)
         self._processes[service] = process
         if may_end:
             return
@@ -190,14 +198,16 @@ def last_line(log: Path) -> str:
     return lines[-1] if lines else "no reason given"
 
 
-async def start_program(module: str, configured: Mapping[str, str], log: IO[bytes]) -> asyncio.subprocess.Process:
+async def start_program(
+    command: Sequence[str], configured: Mapping[str, str], log: IO[bytes]
+) -> asyncio.subprocess.Process:  # fmt: skip
     """Start one of our programs, configured by these variables alone; it ends with this process.
 
     It has a session of its own: a Ctrl-C is the rig's to answer, in good order.
     """
     others = {name: value for name, value in os.environ.items() if not name.startswith(PREFIX)}
     return await asyncio.create_subprocess_exec(
-        *PYTHON, "-m", module, "--with-parent", env={**others, **configured}, start_new_session=True,
+        *command, "--with-parent", env={**others, **configured}, start_new_session=True,
         stdin=asyncio.subprocess.PIPE, stdout=log, stderr=log,
     )  # fmt: skip
 
@@ -219,13 +229,15 @@ async def wait_for_end(process: asyncio.subprocess.Process) -> None:
         await process.wait()
 
 
-async def run_on_localhost(settings: Settings, scenario: Scenario, recorder: Recorder, log_folder: Path) -> None:
-    """Run a scenario on three services started for it.
+async def run_on_localhost(
+    settings: Settings, scenario: Scenario, recorder: Recorder, log_folder: Path, optimizer: Sequence[str] = ()
+) -> None:  # fmt: skip
+    """Run a scenario on three services started for it; another program may take the optimiser's place.
 
     Raises:
         LinkError: A service ended, or one could not be reached.
     """
-    async with LocalServices(settings, log_folder) as services:
+    async with LocalServices(settings, log_folder, optimizer=optimizer) as services:
         rig = SessionClient(services.endpoints, settings)
 
         async def work() -> None:

@@ -83,7 +83,7 @@ def _run(job: Job, recorder: Recorder, folder: Path) -> Awaitable[None]:
         return _looked_at(RigEndpoints(*job.endpoints), settings, scenario, recorder)
     if job.way is Way.ATTACHED:
         return _attached(RigEndpoints(*job.endpoints), settings, scenario, recorder)
-    return run_on_localhost(settings, scenario, recorder, folder / "logs")
+    return run_on_localhost(settings, scenario, recorder, folder / "logs", job.optimizer)
 
 
 async def _stoppable(run: Awaitable[None], stop: StopRequest) -> int:

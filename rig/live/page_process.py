@@ -15,6 +15,7 @@ from hmi.users import PageRole, write_user
 from rig.cosim.endpoints import RigEndpoints
 from rig.cosim.kept_up import end_of
 from rig.cosim.local_services import last_line, start_program, terminate, wait_for_end
+from rig.interpreter import PYTHON
 from rig.live.private_folder import new_own
 
 LOOK_S: Final = 0.05
@@ -130,7 +131,9 @@ class PageProcess:
         """Start it, or start it again."""
         self._log.parent.mkdir(parents=True, exist_ok=True)
         with new_own(self._log) as log:
-            self._process = await start_program("hmi", to_environment(HmiSettings(hmi=self._section)), log)
+            self._process = await start_program(
+                (*PYTHON, "-m", "hmi"), to_environment(HmiSettings(hmi=self._section)), log
+            )
 
     async def __aexit__(self, *_: object) -> None:
         """End it."""

@@ -35,6 +35,7 @@ class UpRig:
 
     A service or page that ends is started again (`rig.cosim.kept_up`), and resumes from its retained state.
     `services` are those that are started; where the optimiser is not one of them, another client takes its place.
+    `optimizer` is a program that is started in the place of ours.
     """
 
     def __init__(
@@ -46,7 +47,9 @@ class UpRig:
         page: bool = False,
         cuttable: bool = False,
         services: Sequence[str] = SERVICES,
+        optimizer: Sequence[str] = (),
     ) -> None:
+        self._optimizer = tuple(optimizer)
         self.folder = make_own_folder(str(ports[0]))
         self._settings = retaining(settings, self.folder, always=False)
         self._scenario = make_scenario(settings)
@@ -71,6 +74,7 @@ class UpRig:
             ports=self._ports,
             detours=None if links is None else links.detours,
             services=self._services,
+            optimizer=self._optimizer,
         )
         async with links or nullcontext(), services:
             if links is not None:

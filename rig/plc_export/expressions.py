@@ -2,101 +2,68 @@
 
 import ast
 import builtins
-import math
-import operator
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple, TypeAlias, cast
+from typing import cast
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 
 from rig.plc_export.subset import Source
 from rig.plc_export.tree import (
     ArrayType,
-    Convert,
     Element,
     Expression,
     Field,
-    Function,
-    Invocation,
-    Invoke,
+    Item,
     Kind,
     Literal,
+    Member,
     Name,
     Operation,
     RecordType,
+    RowsType,
     Select,
     Statement,
     Storage,
-    Type,
+    StructType,
+    View,
+)
+from rig.plc_export.values import (
+    BINARY,
+    COMPARISONS,
+    DTYPES,
+    LARGEST_INTEGER,
+    OF_INTEGERS,
+    OF_PLATFORM,
+    OF_REALS,
+    DType,
+    Elementwise,
+    Known,
+    Python,
+    Record,
+    Shape,
+    Value,
+    array_type,
+    named,
 )
 
-BINARY: Final[dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]]] = {
-    ast.Add: ("+", operator.add), ast.Sub: ("-", operator.sub), ast.Mult: ("*", operator.mul),
-    ast.Div: ("/", operator.truediv), ast.Mod: ("%", operator.mod), ast.FloorDiv: ("//", operator.floordiv),
-    ast.Pow: ("power", operator.pow),
-}  # fmt: skip
-COMPARISONS: Final[dict[type[ast.cmpop], str]] = {
-    ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
-}  # fmt: skip
-OF_INTEGERS, OF_REALS = ("+", "-", "*", "%", "//"), ("+", "-", "*", "/", "power")
-FUNCTIONS: Final = {abs: "abs", min: "min", max: "max", np.sqrt: "sqrt", math.sqrt: "sqrt"}
-LARGEST_INTEGER: Final = 2**31 - 1
-
-
-class Known(NamedTuple):
-    """A number that is known before a run, as Python computes it."""
-
-    value: Any
-    """An integer, a float (Python's or numpy's) or a truth value."""
-
-
-class DType(NamedTuple):
-    """A type used as a value."""
-
-    kind: Kind
-
-
-class Elementwise(NamedTuple):
-    """A new array, element by element."""
-
-    type: ArrayType
-    at: Callable[[tuple[Expression, ...]], Expression]
-
-
-class Shape(NamedTuple):
-    """The shape of an array."""
-
-    lengths: tuple[int, ...]
-
-
-class Python(NamedTuple):
-    """What a global name means: a module, a kernel, a function of Python's or numpy's."""
-
-    value: object
-
-
-Value: TypeAlias = Known | DType | Elementwise | Shape | Python | Expression
+ZERO = Literal(Kind.INT, 0)
 
 
 class ExpressionReader:
-    """Reads expressions; `reading.py` has the statements.
+    """Reads expressions without calls; `calls.py` has those, `reading.py` the statements.
 
     Args:
         source: The kernel.
-        specialised: Returns the function of a kernel for arguments of these types.
         platform: Operators whose bits are the platform's library's and that are accepted all the same.
     """
 
-    def __init__(
-        self, source: Source, specialised: Callable[[Dispatcher, tuple[Type, ...]], Function], platform: frozenset[str]
-    ) -> None:
-        self.source, self.specialised, self.platform = source, specialised, platform
+    def __init__(self, source: Source, platform: frozenset[str]) -> None:
+        self.source, self.platform = source, platform
         self.scopes: list[dict[str, Value]] = [{}]
         self.before: list[Statement] = []
         """Statements that an expression needs before it: calls whose results are arrays."""
         self.conditional = 0
-        self.written: set[str] = set()
+        self.loop_variables: list[str] = []
         self.used: set[str] = set()
 
     # -- kinds of results ----------------------------------------------------------------------------------------------
@@ -106,7 +73,7 @@ class ExpressionReader:
         value = self.read(node)
         if isinstance(value, Known):
             return self.literal(node, value)
-        if isinstance(value, DType | Elementwise | Shape | Python) or not isinstance(value.type, Kind):
+        if isinstance(value, DType | Elementwise | Shape | Python | Record) or not isinstance(value.type, Kind):
             raise self.source.refusal(node, "this is not a number")
         return value
 
@@ -132,9 +99,11 @@ class ExpressionReader:
         return value
 
     def storage(self, node: ast.expr) -> Storage:
-        """Return an array or a record that has a name."""
+        """Return an array or a record that has a name, or a part of one."""
         value = self.read(node)
-        if not isinstance(value, Name | Field) or isinstance(value.type, Kind):
+        if isinstance(value, Record) and value.variable:
+            return value.variable
+        if not isinstance(value, Name | Field | View | Item) or isinstance(value.type, Kind):
             raise self.source.refusal(node, "an array or a record with a name is expected")
         return value
 
@@ -173,7 +142,7 @@ class ExpressionReader:
             raise self.source.refusal(node, f"{node.id} is not known")
         return Known(meaning) if isinstance(meaning, int | float | np.number) else Python(meaning)
 
-    def _attribute(self, node: ast.Attribute) -> Value:
+    def _attribute(self, node: ast.Attribute) -> Value:  # noqa: C901, PLR0911 one case a kind of value
         base = self.read(node.value)
         if isinstance(base, Python):
             found = getattr(base.value, node.attr, None)
@@ -182,44 +151,80 @@ class ExpressionReader:
             return Known(found) if isinstance(found, int | float) else Python(found)
         if isinstance(base, DType) and node.attr == "type":
             return base
+        if isinstance(base, Record):
+            return self._part(node, base)
         base_type = None if isinstance(base, Known | DType | Shape) else base.type
-        if isinstance(base, Name | Field) and isinstance(base_type, RecordType):
+        if isinstance(base_type, RecordType | StructType):
             for name, kind in base_type.fields:
                 if name == node.attr:
-                    return Field(kind, base, name)
+                    return self._field(kind, base, name)
+        if isinstance(base_type, RowsType) and node.attr == "shape":
+            return Shape((base_type.length,))
         if isinstance(base_type, ArrayType) and node.attr == "shape":
             return Shape(base_type.shape)
+        if isinstance(base_type, ArrayType) and node.attr == "size":
+            return Known(base_type.size)
         if isinstance(base_type, ArrayType) and node.attr == "dtype":
             return DType(base_type.kind)
         raise self.source.refusal(node, f"the attribute {node.attr} is not in the subset")
+
+    def _part(self, node: ast.Attribute, record: Record) -> Value:
+        for name, part in record.parts:
+            if name == node.attr:
+                return part
+        raise self.source.refusal(node, f"{record.name or 'a tuple'} has no {node.attr}")
+
+    @staticmethod
+    def _field(kind: object, base: Value, name: str) -> Value:
+        if isinstance(kind, Kind) and isinstance(base, Name | Item) and isinstance(base.type, StructType):
+            return Member(kind, base, name)
+        return Field(cast("Kind", kind), cast("Name", base), name)
 
     def _subscript(self, node: ast.Subscript) -> Value:
         base = self.read(node.value)
         if isinstance(base, Shape):
             return Known(base.lengths[self.known_integer(node.slice)])
-        element = self.element(node)
-        if not isinstance(element, Element):
-            raise self.source.refusal(node, "a part of an array is not in the subset: a loop over its elements is")
-        return element
+        if isinstance(base, Name | Field) and isinstance(base.type, RowsType):
+            return Item(base.type.struct, base, self.index(node.slice, base.type.length))
+        return self.element(node)
 
-    def element(self, node: ast.Subscript) -> Element | Elementwise:
-        """Return an element; of an array with more dimensions than there are indices, its row."""
+    def element(self, node: ast.Subscript) -> Element | View:
+        """Return an element or, with a slice or fewer indices than dimensions, a part of an array."""
         array = self.storage(node.value)
         if not isinstance(array.type, ArrayType):
             raise self.source.refusal(node, "a record is read by the names of its fields")
+        kind, shape = array.type.kind, array.type.shape
+        if isinstance(node.slice, ast.Slice):
+            return self._sliced(node, node.slice, array, array.type)
         places = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
-        indices = tuple(self.index(place, length) for place, length in zip(places, array.type.shape, strict=False))
-        if len(places) > len(array.type.shape):
+        if len(places) > len(shape):
             raise self.source.refusal(node, "more indices than the array has")
-        kind, rest = array.type.kind, array.type.shape[len(places) :]
-        if not rest:
-            return Element(kind, array, indices)
-        return Elementwise(ArrayType(kind, rest), lambda inner: Element(kind, array, indices + inner))
+        indices = tuple(self.index(place, length) for place, length in zip(places, shape, strict=False))
+        if len(indices) == len(shape):
+            return Element(kind, cast("Name", array), indices)
+        offset: Expression = ZERO
+        for index, length in zip((*indices, ZERO), shape, strict=False):
+            offset = added(scaled(offset, length), index)
+        rest = ArrayType(kind, shape[len(indices) :])
+        for length in rest.shape[1:]:
+            offset = scaled(offset, length)
+        return view_of(rest, array, offset)
+
+    def _sliced(self, node: ast.Subscript, part: ast.Slice, array: Storage, whole: ArrayType) -> View:
+        if not (part.lower or part.upper or part.step):
+            return view_of(whole, array, ZERO)
+        if len(whole.shape) != 1 or part.step:
+            raise self.source.refusal(node, "only arrays of one dimension are cut, without a step")
+        length = whole.size
+        first = self.known_integer(part.lower) if part.lower else 0
+        end = self.known_integer(part.upper) if part.upper else length
+        first, end = (place + length if place < 0 else place for place in (first, end))
+        if not 0 <= first <= end <= length:
+            raise self.source.refusal(node, f"{first} to {end} of an array of length {length}")
+        return view_of(ArrayType(whole.kind, (end - first,)), array, Literal(Kind.INT, first))
 
     def index(self, node: ast.expr, length: int) -> Expression:
         """Return an index, which does not count from the end."""
-        if isinstance(node, ast.Slice):
-            raise self.source.refusal(node, "a slice is not in the subset: a loop over its elements is")
         index = self.scalar(node)
         if index.type not in {Kind.INT, Kind.UNSIGNED}:
             raise self.source.refusal(node, "an index is an integer")
@@ -235,7 +240,7 @@ class ExpressionReader:
         value = self.read(node.operand)
         if isinstance(value, Known):
             return Known(-value.value)
-        return self._each(node, lambda parts: self._negative(node, parts[0]), (value,))
+        return self.each(node, lambda parts: self._negative(node, parts[0]), (value,))
 
     def _negative(self, node: ast.expr, operand: Expression) -> Expression:
         if operand.type not in {Kind.REAL, Kind.INT}:
@@ -250,7 +255,7 @@ class ExpressionReader:
         if isinstance(one, Known) and isinstance(other, Known):
             return Known(compute(one.value, other.value))
         parts = (self.typed(node.left, one), self.typed(node.right, other))
-        return self._each(node, lambda both: self.operation(node, sign, *both), parts)
+        return self.each(node, lambda both: self.operation(node, sign, *both), parts)
 
     def typed(self, node: ast.expr, value: Value) -> Value:
         """Return a value with numbers that are known made literals."""
@@ -264,19 +269,22 @@ class ExpressionReader:
             raise self.source.refusal(node, f"{sign} of type {named(one.type)} is not in the subset")
         if sign not in (OF_REALS if one.type is Kind.REAL else OF_INTEGERS):
             raise self.source.refusal(node, f"{sign} of type {named(one.type)} is not in the subset")
-        if sign == "power" and sign not in self.platform:
-            raise self.source.refusal(node, "the bits of ** are those of the platform's library")
+        self.refuse_platform(node, sign)
         if sign in {"%", "//"} and not (isinstance(other, Literal) and other.value > 0):
             raise self.source.refusal(node, f"{sign} by anything but a positive literal is not in the subset")
         return Operation(cast("Kind", one.type), sign, (one, other))
 
-    def _each(
+    def refuse_platform(self, node: ast.AST, name: str) -> None:
+        """Refuse an operator whose bits are the platform's, unless it is accepted."""
+        if name in OF_PLATFORM and name not in self.platform:
+            raise self.source.refusal(node, f"the bits of {name} are those of the platform's library")
+
+    def each(
         self, node: ast.expr, combine: Callable[[tuple[Expression, ...]], Expression], parts: tuple[Value, ...]
     ) -> Value:  # fmt: skip
         """Return an operation on numbers, or the array of it where there are arrays of one shape."""
-        arrays = [part.type for part in parts if isinstance(part, Name | Field | Elementwise)
-                  and isinstance(part.type, ArrayType)]  # fmt: skip
-        if any(isinstance(part, DType | Shape | Python | Known) for part in parts):
+        arrays = [kind for part in parts if (kind := array_type(part))]
+        if any(isinstance(part, DType | Shape | Python | Known | Record) for part in parts):
             raise self.source.refusal(node, "this is not a number")
         if not arrays:
             return combine(cast("tuple[Expression, ...]", parts))
@@ -284,23 +292,33 @@ class ExpressionReader:
             raise self.source.refusal(node, "arrays of different shapes")
 
         def at(indices: tuple[Expression, ...]) -> Expression:
-            return combine(tuple(
-                part.at(indices) if isinstance(part, Elementwise)
-                else Element(part.type.kind, part, indices)
-                if isinstance(part, Name | Field) and isinstance(part.type, ArrayType) else cast("Expression", part)
-                for part in parts
-            ))  # fmt: skip
+            return combine(tuple(element_of(part, indices) for part in parts))
 
-        zero = tuple(Literal(Kind.INT, 0) for _ in arrays[0].shape)
+        zero = tuple(ZERO for _ in arrays[0].shape)
         return Elementwise(ArrayType(cast("Kind", at(zero).type), arrays[0].shape), at)
 
     def _compare(self, node: ast.Compare) -> Value:
-        if len(node.ops) != 1 or type(node.ops[0]) not in COMPARISONS:
+        operands = [node.left, *node.comparators]
+        result: Expression | None = None
+        for sign, left, right in zip(node.ops, operands, operands[1:], strict=False):
+            one = self._compared(node, sign, left, right)
+            result = Operation(Kind.BOOL, "and", (result, one)) if result else one
+        return cast("Expression", result)
+
+    def _compared(self, node: ast.Compare, sign: ast.cmpop, left: ast.expr, right: ast.expr) -> Expression:
+        if type(sign) not in COMPARISONS:
             raise self.source.refusal(node, "this comparison is not in the subset")
-        one, other = self.scalar(node.left), self.scalar(node.comparators[0])
+        read = [self.read(left), self.read(right)]
+        real = any(is_real(each) for each in read)
+        one, other = (
+            Literal(Kind.REAL, each.value)
+            if real and isinstance(each, Known) and is_exact(each)
+            else self.scalar(operand)
+            for each, operand in zip(read, (left, right), strict=True)
+        )
         if one.type is not other.type or one.type is Kind.BOOL:
             raise self.source.refusal(node, f"{named(one.type)} compared with {named(other.type)}")
-        return Operation(Kind.BOOL, COMPARISONS[type(node.ops[0])], (one, other))
+        return Operation(Kind.BOOL, COMPARISONS[type(sign)], (one, other))
 
     def _boolop(self, node: ast.BoolOp) -> Value:
         sign = "and" if isinstance(node.op, ast.And) else "or"
@@ -320,132 +338,46 @@ class ExpressionReader:
             raise self.source.refusal(node, f"{named(one.type)} or {named(other.type)}")
         return Select(cast("Kind", one.type), condition, one, other)
 
-    # -- calls ---------------------------------------------------------------------------------------------------------
 
-    def _call(self, node: ast.Call) -> Value:
-        if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
-            raise self.source.refusal(node, "arguments are given by their places")
-        if isinstance(node.func, ast.Attribute) and node.func.attr == "copy" and not node.args:
-            return self._copy(node, self.storage(node.func.value))
-        called = self.read(node.func)
-        if isinstance(called, DType):
-            return self._converted(node, called.kind)
-        if not isinstance(called, Python):
-            raise self.source.refusal(node, "this cannot be called")
-        if isinstance(called.value, Dispatcher):
-            return self._invocation(node, called.value)
-        if called.value in FUNCTIONS:
-            return self._function(node, FUNCTIONS[called.value])
-        if called.value in NEW_ARRAYS:
-            return self._new_array(node)
-        name = ast.unparse(node.func)
-        raise self.source.refusal(
-            node, f"{name} is not in the subset: its order of operations or its bits are not defined"
-        )
-
-    def _copy(self, node: ast.expr, array: Storage) -> Value:
-        if not isinstance(array.type, ArrayType):
-            raise self.source.refusal(node, "only arrays are copied")
-        kind = array.type.kind
-        return Elementwise(array.type, lambda indices: Element(kind, array, indices))
-
-    def _converted(self, node: ast.Call, kind: Kind) -> Value:
-        if len(node.args) != 1:
-            raise self.source.refusal(node, "a type takes one argument")
-        value = self.read(node.args[0])
-        if isinstance(value, Known):
-            return Literal(kind, value.value)
-        operand = self.scalar(node.args[0])
-        if operand.type is kind:
-            return operand
-        if operand.type is not Kind.INT:
-            raise self.source.refusal(node, f"{named(operand.type)} to {kind.value} is not in the subset")
-        return Convert(kind, operand)
-
-    def _function(self, node: ast.Call, name: str) -> Value:
-        operands = [self.scalar(argument) for argument in node.args]
-        least = 2 if name in {"min", "max"} else 1
-        if len(operands) < least or any(one.type is not operands[0].type for one in operands):
-            raise self.source.refusal(node, f"{name} of operands of different types, or of too few")
-        kind = cast("Kind", operands[0].type)
-        if name in {"sqrt", "abs"} and (kind is not Kind.REAL or len(operands) != 1):
-            raise self.source.refusal(node, f"{name} of type {kind.value} is not in the subset")
-        result = operands[0] if least > 1 else Operation(kind, name, (operands[0],))
-        for operand in operands[1:]:
-            result = Operation(kind, name, (result, operand))
-        return result
-
-    def _new_array(self, node: ast.Call) -> Value:
-        name = cast("ast.Attribute", node.func).attr
-        if name.endswith("_like"):
-            like = self.storage(node.args[0])
-            if not isinstance(like.type, ArrayType):
-                raise self.source.refusal(node, "an array is expected")
-            made = like.type
-        else:
-            if len(node.args) != 2:
-                raise self.source.refusal(node, "a new array needs its type")
-            dtype = self.read(node.args[1])
-            if not isinstance(dtype, DType):
-                raise self.source.refusal(node, "a new array needs its type")
-            lengths = node.args[0].elts if isinstance(node.args[0], ast.Tuple) else [node.args[0]]
-            made = ArrayType(dtype.kind, tuple(map(self.known_integer, lengths)))
-        return Elementwise(made, lambda _indices: Literal(made.kind, 0))
-
-    def call(self, node: ast.Call, kernel: Dispatcher) -> tuple[Function, tuple[Expression, ...]]:
-        """Return the function that is called, and its arguments; those that are new arrays get names."""
-        arguments = tuple(self._argument(argument) for argument in node.args)
-        function = self.specialised(kernel, tuple(argument.type for argument in arguments))
-        if len(arguments) != len(function.parameters):
-            raise self.source.refusal(node, f"{function.name} takes {len(function.parameters)} arguments")
-        for parameter, argument in zip(function.parameters, arguments, strict=True):
-            if parameter.name in function.written:
-                self.write_to(node, cast("Storage", argument))
-        return function, arguments
-
-    def _argument(self, node: ast.expr) -> Expression:
-        value = self.typed(node, self.read(node))
-        if isinstance(value, Elementwise):
-            return self.named_array(node, value)
-        if isinstance(value, DType | Shape | Python | Known):
-            raise self.source.refusal(node, "arguments are arrays, records and numbers")
-        return value
-
-    def write_to(self, node: ast.AST, target: Storage) -> None:
-        """Note that an array is written to."""
-        if isinstance(target, Field):
-            raise self.source.refusal(node, "arrays in records are constant")
-        self.written.add(target.name)
-
-    def _invocation(self, node: ast.Call, kernel: Dispatcher) -> Value:
-        function, arguments = self.call(node, kernel)
-        if function.value is not None and not function.written:
-            return Invocation(function.value, function, arguments)
-        if (
-            function.value is not None
-            or len(function.results) != 1
-            or not isinstance(function.results[0].type, ArrayType)
-        ):
-            raise self.source.refusal(
-                node, f"the call of {function.name} is a statement: it writes, or has several results"
-            )
-        result = self.new_name(node, function.results[0].type)
-        self.before.append(Invoke(function, arguments, (result,)))
-        return result
-
-    def new_name(self, node: ast.AST, kind: Type) -> Name:
-        """Return a new variable for an intermediate array."""
-        raise NotImplementedError
-
-    def named_array(self, node: ast.AST, value: Elementwise) -> Name:
-        """Return a new variable that has the elements of an array."""
-        raise NotImplementedError
+def added(one: Expression, other: Expression) -> Expression:
+    """Return the sum of two integers; nothing is added to 0."""
+    if one == ZERO:
+        return other
+    if other == ZERO:
+        return one
+    if isinstance(one, Literal) and isinstance(other, Literal):
+        return Literal(Kind.INT, one.value + other.value)
+    return Operation(Kind.INT, "+", (one, other))
 
 
-DTYPES: Final[dict[object, Kind]] = {np.int64: Kind.INT, np.uint64: Kind.UNSIGNED, np.bool_: Kind.BOOL}
-NEW_ARRAYS: Final = (np.empty, np.zeros, np.empty_like, np.zeros_like)
+def scaled(index: Expression, length: int) -> Expression:
+    """Return an integer times a length."""
+    if isinstance(index, Literal):
+        return Literal(Kind.INT, index.value * length)
+    return Operation(Kind.INT, "*", (index, Literal(Kind.INT, length)))
 
 
-def named(kind: Type) -> str:
-    """Return how a message names a type."""
-    return kind.value if isinstance(kind, Kind) else "array" if isinstance(kind, ArrayType) else kind.name
+def view_of(kind: ArrayType, array: Storage, offset: Expression) -> View:
+    """Return a part of an array, which may be a part itself."""
+    if isinstance(array, View):
+        return View(kind, array.array, added(array.offset, offset))
+    return View(kind, cast("Name", array), offset)
+
+
+def element_of(part: Value, indices: tuple[Expression, ...]) -> Expression:
+    """Return an element of an array; a number as it is."""
+    if isinstance(part, Elementwise):
+        return part.at(indices)
+    if isinstance(part, Name | Field | View) and isinstance(part.type, ArrayType):
+        return Element(part.type.kind, part, indices)
+    return cast("Expression", part)
+
+
+def is_real(value: Value) -> bool:
+    """Return whether a value is a number with a point and a type."""
+    return not isinstance(value, Known | DType | Shape | Python | Record | Elementwise) and value.type is Kind.REAL
+
+
+def is_exact(known: Known) -> bool:
+    """Return whether a number is the same in single precision, so that comparing it needs no type."""
+    return not isinstance(known.value, bool) and bool(np.float32(known.value) == known.value)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Costs
 from optimizer_plc.solvers.ode import OdeMethod
-from rig.plc_export.c99 import Printer, helpers, identifier, records_in
+from rig.plc_export.c99 import Printer, identifier
+from rig.plc_export.c99_text import GENERATED, helpers, records_in
 from rig.plc_export.ode_program import PER_PROBLEM, OdeProgram, crc, leaves
 from rig.plc_export.recorded_problems import GoldenVector, arrays_in
 from rig.plc_export.tree import ArrayType, Declare, Function, Invocation, Invoke, Kind, walk
@@ -150,7 +151,7 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
 
     def _problem(self) -> str:
         constants = self._constants()
-        arrays = "\n".join(self._array(name, values) for name, values in constants.items())
+        arrays = "\n".join(self.printer.array(name, values) for name, values in constants.items())
         sums = "\n".join(
             f"    sum = sum_of_{'reals' if values.dtype.kind == 'f' else 'integers'}(sum, {name}, {values.size});"
             for name, values in constants.items()
@@ -167,7 +168,15 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
         none = "\n".join(f"    before.{name} = INFINITY;" for name in Costs._fields)
         vectors = "\n".join(f"    qp.{identifier(name)} = {identifier(name)};" for name in PER_PROBLEM)
         head = TEMPLATE.with_name("problem.c").read_text(encoding="ascii")
-        body = {"ARRAYS": arrays, "SUMS": sums, "METHOD": f"{matrices}\n{settings}", "BEFORE": none, "VECTORS": vectors}
+        bytes_ = TEMPLATE.with_name("sums.c").read_text(encoding="ascii")
+        body = {
+            "SUMS_OF_BYTES": bytes_,
+            "ARRAYS": arrays,
+            "SUMS": sums,
+            "METHOD": f"{matrices}\n{settings}",
+            "BEFORE": none,
+            "VECTORS": vectors,
+        }
         return self._filled(head, body)
 
     def _golden(self, vectors: list[GoldenVector]) -> dict[str, str]:
@@ -181,14 +190,15 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
             "iterations": np.array([each.answer.iterations for each in vectors]),
         }  # fmt: skip
         declared = "".join(
-            f"extern const {self._scalar(values)} golden_{name}[{values.size}];\n" for name, values in stacked.items()
+            f"extern const {self.printer.scalar(values)} golden_{name}[{values.size}];\n"
+            for name, values in stacked.items()
         )
         sum_ = 0
         for values in stacked.values():
             sum_ = crc(values, sum_)
         header = (f"{GENERATED}#include <stdint.h>\n\n#define N_GOLDEN {len(vectors)}\n"
                   f"#define SUM_OF_GOLDEN UINT32_C({sum_})\n{declared}")  # fmt: skip
-        arrays = "\n".join(self._array(f"golden_{name}", values, "") for name, values in stacked.items())
+        arrays = "\n".join(self.printer.array(f"golden_{name}", values, "") for name, values in stacked.items())
         return {"golden.h": header, "golden.c": f'{GENERATED}#include <math.h>\n\n#include "golden.h"\n\n{arrays}'}
 
     def _self_test(self) -> str:
@@ -196,26 +206,12 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
 
     def _filled(self, text: str, parts: Mapping[str, str]) -> str:
         single = self.printer.single
-        parts = {"REAL": self.real, "BITS": "uint32_t" if single else "uint64_t", "BYTES": "4" if single else "8",
-                 "SMALLEST": "FLT_MIN" if single else "DBL_MIN", "GENERATED\n": GENERATED, **parts}  # fmt: skip
+        bits, size, smallest = ("uint32_t", "4", "FLT_MIN") if single else ("uint64_t", "8", "DBL_MIN")
+        parts = {**parts, "REAL": self.real, "BITS": bits, "BYTES": size, "SMALLEST": smallest,
+                 "GENERATED\n": GENERATED}  # fmt: skip
         for name, value in parts.items():
             text = text.replace(f"@{name}" if name.endswith("\n") else f"@{name}@", value)
         return text
-
-    def _scalar(self, values: Array) -> str:
-        return self.real if values.dtype.kind == "f" else "int32_t"
-
-    def _array(self, name: str, values: Array, storage: str = "static ") -> str:
-        """Return the definition of a constant array."""
-        if values.dtype.kind == "f":
-            printed = [self.printer.number(each) for each in values.ravel()]
-        else:
-            printed = [str(int(each)) for each in values.ravel()]
-        rows = "".join(f"    {', '.join(printed[place : place + 6])},\n" for place in range(0, len(printed), 6))
-        return f"{storage}const {self._scalar(values)} {name}[{values.size}] = {{\n{rows}}};\n"
-
-
-GENERATED: Final = "/* Written by Coldloop from the kernels of its optimiser; changes belong there. */\n"
 
 
 def stack(function: Function, word: int) -> int:

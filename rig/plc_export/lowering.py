@@ -9,7 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, cast
 
+from rig.plc_export.subset import UnfitKernelError
 from rig.plc_export.tree import (
+    BEYOND_BLOCKS,
     ArrayType,
     Assign,
     Block,
@@ -34,7 +36,6 @@ from rig.plc_export.tree import (
     Return,
     Select,
     Statement,
-    Storage,
     Type,
     While,
     walk,
@@ -59,6 +60,8 @@ class Lowering:
 
     def block(self, function: Function, bindings: Bindings) -> Block:
         """Return the block of a function whose records are certain ones."""
+        if any(isinstance(node, BEYOND_BLOCKS) for node in walk(function.body)):
+            raise UnfitKernelError(f"{function.source}: records of numbers and parts of arrays are for C99 alone")
         key = (function.name, tuple(sorted(bindings.items())))
         if key not in self._known:
             made = FunctionLowering(self, function, bindings).block()
@@ -201,7 +204,7 @@ class FunctionLowering:
                 path = self._path(expression)
                 return self._field(path, kind) if path else expression
             case Element(kind, array, indices):
-                return Element(kind, cast("Storage", self._expression(array)), tuple(map(self._expression, indices)))
+                return Element(kind, cast("Name", self._expression(array)), tuple(map(self._expression, indices)))
             case Operation(_, "and" | "or"):
                 return self._logical(expression)
             case Operation(kind, operator, operands):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rig.plc_export.tree import ArrayType, Element, Expression
+from rig.plc_export.tree import ArrayType, Element, Expression, Kind, Literal, View
 
 
 class TreePrinter:
@@ -40,4 +40,6 @@ class TreePrinter:
         for index, length in zip(element.indices, element.array.type.shape, strict=True):
             place = f"{place} * {length} + {self.expression(index)}" if place else self.expression(index)
             place = f"({place})" if index is not element.indices[-1] and place.count(" ") else place
+        if isinstance(element.array, View) and element.array.offset != Literal(Kind.INT, 0):
+            return f"{self.expression(element.array.offset)} + {place}"
         return place

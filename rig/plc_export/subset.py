@@ -11,7 +11,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from coldloop.errors import UsageError
-from rig.plc_export.tree import ArrayType, Kind, RecordType, Type
+from rig.plc_export.tree import ArrayType, Kind, RecordType, RowsType, StructType, Type
 
 KINDS = {"f": Kind.REAL, "i": Kind.INT, "u": Kind.UNSIGNED, "b": Kind.BOOL}
 RESERVED = re.compile(r"(new|result|at|stop)_\d")
@@ -59,6 +59,14 @@ class Source:
         return set(names), {name for name in names if names.count(name) == 1} - parameters
 
 
+def rows_of(name: str, value: object) -> RowsType | None:
+    """Return the type of a structured array, whose records get this name; of anything else None."""
+    if not (isinstance(value, np.ndarray) and value.dtype.fields):
+        return None
+    fields = tuple((field, KINDS[kind.kind]) for field, (kind, *_) in value.dtype.fields.items())
+    return RowsType(StructType(name, fields), len(value))
+
+
 def type_of(value: object) -> Type:
     """Return the type of an argument: an array, a NamedTuple, or a number.
 
@@ -68,8 +76,11 @@ def type_of(value: object) -> Type:
     if isinstance(value, np.ndarray) and value.dtype.kind in KINDS and value.ndim:
         return ArrayType(KINDS[value.dtype.kind], value.shape)
     if isinstance(value, tuple) and hasattr(value, "_fields"):
-        fields = tuple((name, type_of(part)) for name, part in zip(value._fields, value, strict=True))
-        return RecordType(type(value).__name__, fields)
+        own = type(value).__name__
+        fields = tuple((name, rows_of(f"{own}{name.capitalize()}", part) or type_of(part))
+                       for name, part in zip(value._fields, value, strict=True))  # fmt: skip
+        state = any(isinstance(kind, RowsType) or (isinstance(kind, RecordType) and kind.state) for _, kind in fields)
+        return RecordType(own, fields, state)
     if isinstance(value, bool | np.bool_):
         return Kind.BOOL
     if isinstance(value, int | np.integer):

@@ -34,14 +34,32 @@ class ArrayType:
 
 
 @dataclass(frozen=True)
+class StructType:
+    """A record of numbers, all of which may be written to: an element of a structured array."""
+
+    name: str
+    fields: tuple[tuple[str, Kind], ...]
+
+
+@dataclass(frozen=True)
+class RowsType:
+    """An array of such records."""
+
+    struct: StructType
+    length: int
+
+
+@dataclass(frozen=True)
 class RecordType:
-    """A NamedTuple: constant, and so are its arrays."""
+    """A NamedTuple: constant, and so are its arrays, unless it is a state."""
 
     name: str
     fields: tuple[tuple[str, "Type"], ...]
+    state: bool = False
+    """It has arrays of records of numbers: all of its arrays are its own, and may be written to."""
 
 
-Type: TypeAlias = Kind | ArrayType | RecordType
+Type: TypeAlias = Kind | ArrayType | StructType | RowsType | RecordType
 
 # -- expressions -------------------------------------------------------------------------------------------------------
 
@@ -72,17 +90,44 @@ class Field:
 
 
 @dataclass(frozen=True)
+class View:
+    """A part of an array in a row, from the element `offset` on; all dimensions counted."""
+
+    type: ArrayType
+    array: "Name | Field"
+    offset: "Expression"
+
+
+@dataclass(frozen=True)
+class Item:
+    """A record of numbers in an array of them."""
+
+    type: StructType
+    rows: "Name | Field"
+    index: "Expression"
+
+
+@dataclass(frozen=True)
+class Member:
+    """A number of a record of numbers."""
+
+    type: Kind
+    struct: "Item | Name"
+    name: str
+
+
+@dataclass(frozen=True)
 class Element:
     """An element of an array."""
 
     type: Kind
-    array: "Name | Field"
+    array: "Name | Field | View"
     indices: tuple["Expression", ...]
 
 
 @dataclass(frozen=True)
 class Operation:
-    """An operator with one or two operands, in Python's spelling; or sqrt, abs, min, max, power."""
+    """An operator with one or two operands, in Python's spelling; or the name of a function, such as sqrt."""
 
     type: Kind
     operator: str
@@ -101,7 +146,7 @@ class Select:
 
 @dataclass(frozen=True)
 class Convert:
-    """An integer as another type."""
+    """A number or a truth value as another type."""
 
     type: Kind
     operand: "Expression"
@@ -116,8 +161,10 @@ class Invocation:
     arguments: tuple["Expression", ...]
 
 
-Expression: TypeAlias = Literal | Name | Field | Element | Operation | Select | Convert | Invocation
-Storage: TypeAlias = Name | Field
+Place: TypeAlias = Name | Field | View | Item | Member | Element
+Expression: TypeAlias = Literal | Place | Operation | Select | Convert | Invocation
+Storage: TypeAlias = Name | Field | View | Item
+Target: TypeAlias = Name | Element | Member
 
 # -- statements --------------------------------------------------------------------------------------------------------
 
@@ -132,10 +179,35 @@ class Declare:
 
 @dataclass(frozen=True)
 class Assign:
-    """A new value of a variable or an element."""
+    """A new value of a variable, of an element or of a number in a record."""
 
-    target: Name | Element
+    target: Target
     value: Expression
+
+
+@dataclass(frozen=True)
+class Point:
+    """A name for a part of an array, or for a record in one."""
+
+    variable: Name
+    part: View | Item
+    constant: bool
+
+
+@dataclass(frozen=True)
+class Make:
+    """A new constant record, of numbers and of arrays that have names."""
+
+    variable: Name
+    parts: tuple[tuple[str, Expression], ...]
+
+
+@dataclass(frozen=True)
+class Copy:
+    """All numbers of a record become those of another."""
+
+    target: Item | Name
+    source: Item | Name
 
 
 @dataclass(frozen=True)
@@ -203,7 +275,21 @@ class Call:
     """Variable, output."""
 
 
-Statement: TypeAlias = Declare | Assign | Invoke | For | While | If | Return | Count | Call
+Statement: TypeAlias = Declare | Assign | Point | Make | Copy | Invoke | For | While | If | Return | Count | Call
+
+BEYOND_BLOCKS = (View, Item, Member, Point, Make, Copy)
+"""What blocks do not have."""
+
+# -- results -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Group:
+    """Results that belong together: a tuple, or a NamedTuple of this name with its fields."""
+
+    name: str
+    parts: tuple[tuple[str, "Name | Field | Group"], ...]
+    """Results of the function, or fields of its parameters."""
 
 
 @dataclass
@@ -220,9 +306,11 @@ class Function:
     """What it does, in a sentence."""
     parameters: tuple[Name, ...]
     written: set[str] = field(default_factory=set)
-    """Array parameters that it writes to."""
+    """Parameters that it writes to: arrays and states."""
     used: set[str] = field(default_factory=set)
     results: tuple[Name, ...] = ()
+    returned: Name | Field | Group | None = None
+    """How they belong together."""
     value: Kind | None = None
     body: tuple[Statement, ...] = ()
 

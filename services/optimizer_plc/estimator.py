@@ -16,7 +16,16 @@ from optimizer_plc.computing_settings import (
     NoiseReference,
     PlausibilitySettings,
 )
-from optimizer_plc.plausibility import Plausibility, imputed, judge, new_readings, note_surprise, plausibility_of
+from optimizer_plc.plausibility import (
+    USED,
+    Plausibility,
+    are_finite,
+    imputed,
+    judge,
+    new_readings,
+    note_surprise,
+    plausibility_of,
+)
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.linear_algebra import add_transposed_product, cholesky, cholesky_solve, multiply, respond
 from optimizer_plc.qp.prediction import PredictionModel, Transition
@@ -80,24 +89,6 @@ class Belief(NamedTuple):
     readings: Any
     """Records, shape (n_y,): which of them are believed, and since when."""
 
-    def forget(self) -> None:
-        """Begin at the operating point."""
-        self.x[:] = self.predicted[:] = self.surprise[:] = 0.0
-        self.numbers[0] = (0.0, 0.0, 1)
-        self.readings[:] = np.zeros(1, self.readings.dtype)
-
-    def begin_at_rest(self, rest: Array, u: Array, load: float | None, level: float) -> None:
-        """Begin where the plant would rest with the inputs u (3,), load and L1, deviations; `rest` is `rest_map`'s.
-
-        A load that is measured (not None) may have moved just now: it then says more than what would let L1 rest.
-        """
-        self.forget()
-        found = rest @ np.array([*u, load or 0.0, level])
-        self.predicted[: len(found) - 1] = found[:-1]
-        self.x[:] = self.predicted
-        if load is None:
-            self.numbers["mismatch"] = found[-1]
-
 
 def estimator_of(
     prediction: PredictionModel,
@@ -134,8 +125,40 @@ def no_belief(n_states: int, real: Real = DOUBLE) -> Belief:
         numbers, np.zeros(n_states, real), np.zeros(n_states, real), np.zeros(len(OUTPUT_NAMES), real),
         new_readings(real),
     )  # fmt: skip
-    belief.forget()
+    forget(belief)
     return belief
+
+
+@kernel
+def forget(belief: Belief) -> None:
+    """Begin at the operating point."""
+    b, zero = belief.numbers[0], belief.x.dtype.type(0.0)
+    belief.x[:] = zero
+    belief.predicted[:] = zero
+    belief.surprise[:] = zero
+    b.w, b.mismatch, b.since = zero, zero, 1
+    for i in range(belief.readings.shape[0]):
+        r = belief.readings[i]
+        r.state, r.since_s, r.agreed_s = USED, zero, zero
+
+
+@kernel
+def begin_at_rest(rest: Array, belief: Belief, u: Array, load: float, load_known: bool, level: float) -> None:  # noqa: FBT001
+    """Begin where the plant would rest with the inputs u (3,), load and L1, deviations; `rest` is `rest_map`'s.
+
+    A load that is measured may have moved just now: it then says more than what would let L1 rest.
+    """
+    forget(belief)
+    last, inputs = rest.shape[0] - 1, u.shape[0]
+    for i in range(last + 1):
+        found = rest[i, inputs] * load + rest[i, inputs + 1] * level
+        for j in range(inputs):
+            found += rest[i, j] * u[j]
+        if i < last:
+            belief.predicted[i] = found
+        elif not load_known:
+            belief.numbers[0].mismatch = found
+    belief.x[:] = belief.predicted
 
 
 @kernel
@@ -147,7 +170,8 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     b = belief.numbers[0]
     known = load - c.w0 if c.load_known else belief.x.dtype.type(0.0)
     if not c.kalman:
-        belief.x[:] = x - c.x0
+        for i in range(x.shape[0]):
+            belief.x[i] = x[i] - c.x0[i]
         b.w, b.mismatch = known, belief.x.dtype.type(0.0)
         return
     real, period, maps = belief.x.dtype.type, min(b.since, c.stationary.gains.shape[0]) - 1, c.outputs
@@ -159,7 +183,7 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
             c.plausible, belief.readings, belief.surprise, belief.predicted, innovation, J,
             real(b.since) * c.tick_s,
         )  # fmt: skip
-    if not np.isfinite(innovation).all():
+    if not are_finite(innovation):
         innovation = imputed(innovation, J)
     if b.since <= c.stationary.gains.shape[0]:  # J is for no longer time
         note_surprise(belief.surprise, innovation, J, real(b.since) * real(1.0 / MEMORY_TICKS))
@@ -167,7 +191,7 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     add_transposed_product(c.stationary.gains[period], innovation, correction)
     belief.x[:] = belief.predicted + correction[:-1]
     belief.predicted[:] = belief.x
-    b.mismatch += correction[-1]
+    b.mismatch += correction[belief.x.size]
     b.w = known + b.mismatch
 
 

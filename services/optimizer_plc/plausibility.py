@@ -99,6 +99,15 @@ def residual_of(output: int, innovation: Array, J: Array) -> float:
 
 
 @kernel
+def are_finite(values: Array) -> bool:
+    """Return whether all of them (n,) are."""
+    finite = True
+    for i in range(values.shape[0]):
+        finite = finite and np.isfinite(values[i])
+    return finite
+
+
+@kernel
 def imputed(innovation: Array, inverse_covariance: Array) -> Array:
     """Return the innovation (n_y,), its elements that are not finite replaced by their mean given the others.
 
@@ -111,12 +120,12 @@ def imputed(innovation: Array, inverse_covariance: Array) -> Array:
     for i in range(n):
         if finite[i]:
             M[i, i], mean[i] = real(1.0), innovation[i]
-            continue
-        for j in range(n):
-            if finite[j]:
-                mean[i] -= inverse_covariance[i, j] * innovation[j]
-            else:
-                M[i, j] = inverse_covariance[i, j]
+        else:
+            for j in range(n):
+                if finite[j]:
+                    mean[i] -= inverse_covariance[i, j] * innovation[j]
+                else:
+                    M[i, j] = inverse_covariance[i, j]
     cholesky_solve(M, cholesky(M), mean)
     return mean
 
@@ -183,21 +192,19 @@ def take_back(
     expected = imputed(believed, J)
     for i in range(innovation.shape[0]):
         r, difference = readings[i], innovation[i] - expected[i]
-        if r.state == USED or not np.isfinite(difference):
-            continue
-        if abs(difference) > p.allowance[i] + p.sigmas / np.sqrt(J[i, i]):
-            r.agreed_s = 0.0
-        else:
-            r.agreed_s += elapsed_s
-        agrees = r.state == SUSPECT and r.agreed_s >= p.agreeing_s
-        model_fails = contradicting > (0 if p.constants[i] >= 0 else 1)
-        if not (agrees or model_fails or r.state == MISSING or r.since_s >= p.longest_s):
-            continue
-        believed[i] = innovation[i]
-        if not agrees and p.constants[i] >= 0:
-            predicted[p.constants[i]] += difference
-            believed[i] = expected[i]
-        enter(r, USED)
+        if r.state != USED and np.isfinite(difference):
+            if abs(difference) > p.allowance[i] + p.sigmas / np.sqrt(J[i, i]):
+                r.agreed_s = 0.0
+            else:
+                r.agreed_s += elapsed_s
+            agrees = r.state == SUSPECT and r.agreed_s >= p.agreeing_s
+            model_fails = contradicting > (0 if p.constants[i] >= 0 else 1)
+            if agrees or model_fails or r.state == MISSING or r.since_s >= p.longest_s:
+                believed[i] = innovation[i]
+                if not agrees and p.constants[i] >= 0:
+                    predicted[p.constants[i]] += difference
+                    believed[i] = expected[i]
+                enter(r, USED)
 
 
 @kernel
@@ -206,10 +213,8 @@ def suspect_some(p: Plausibility, readings: Any, believed: Array, J: Array, only
 
     Where one says that the model does not hold it is the `only` one that may be wrong itself; -1: any may.
     """
-    before, expected, out = believed.copy(), believed, 0
-    for i in range(believed.shape[0]):
-        out += readings[i].state == SUSPECT
-    if not np.isfinite(believed).all():
+    before, expected, out = believed.copy(), believed.copy(), count_suspects(readings)
+    if not are_finite(believed):
         expected = imputed(believed, J)
     worst = least_plausible(p, readings, believed, expected, J, only)
     if worst < 0:
@@ -232,11 +237,21 @@ def suspect_some(p: Plausibility, readings: Any, believed: Array, J: Array, only
 
 
 @kernel
+def count_suspects(readings: Any) -> int:  # noqa: ANN401 records
+    """Return how many readings are suspects."""
+    count = 0
+    for i in range(readings.shape[0]):
+        if readings[i].state == SUSPECT:
+            count += 1
+    return count
+
+
+@kernel
 def least_plausible(p: Plausibility, readings: Any, believed: Array, expected: Array, J: Array, only: int) -> int:  # noqa: ANN401
     """Return the reading with the largest residual of those that are too large, or -1; new ones are not judged."""
     worst, largest = -1, p.sigmas
     for i in range(believed.shape[0]):
-        if np.isfinite(believed[i]) and readings[i].since_s >= p.settled_s and only in (-1, i):
+        if np.isfinite(believed[i]) and readings[i].since_s >= p.settled_s and (only < 0 or only == i):
             size = abs(residual_of(i, expected, J)) - p.allowance[i] * np.sqrt(J[i, i])
             if size > largest:
                 worst, largest = i, size

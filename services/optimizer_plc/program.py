@@ -1,12 +1,9 @@
 """The optimiser PLC's program: the implementation scheme of the paper's section II, steps (1) to (5).
 
 For each update the control PLC latches, `plan` decides the updating period and `solve` computes the sequence that is
-played from its end on. Here are the decisions; the arithmetic is that of `scheme.py`, on the one state of the session.
-Pure: no sockets, no clock, no sleeping.
+played from its end on. Decisions are those of `decisions.py`, the arithmetic is that of `scheme.py`, on the one state
+of the session. Pure: no sockets, no clock, no sleeping.
 """
-
-import math
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +12,8 @@ from coldloop.kernels.first_use import kernels_of
 from coldloop.process.limits import InputLimits
 from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
-from coldloop.process.signals import CONTROLLED, INPUT_NAMES, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
-from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, SequenceRow, Update, Verdict
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
+from coldloop.registers.control_plc import Plan, SequenceHeader, SequenceRow, Update, Verdict
 from coldloop.registers.optimizer_plc import (
     INPUT_SAMPLES,
     PREDICTED_SAMPLES,
@@ -27,9 +24,10 @@ from coldloop.registers.optimizer_plc import (
     UpdatingRuleStatus,
 )
 from coldloop.safety.sequence import InputSequence, with_checksum
-from optimizer_plc import scheme
+from optimizer_plc import decisions, scheme
 from optimizer_plc.budget import PlcBudget
 from optimizer_plc.computing_settings import Arithmetic
+from optimizer_plc.decisions import Latched, Starts
 from optimizer_plc.estimator import correct, estimator_of
 from optimizer_plc.forecasts import Forecasts
 from optimizer_plc.outside_estimator import OutsideEstimator
@@ -45,12 +43,6 @@ from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers import KernelSolver, make_solver
 
 Array = NDArray[np.float64]
-
-PROVEN: Final = 8
-"""Answers in time, one after the other, after which the next is tried with half of what is allowed for late ones: where
-some ticks are needed for good, one answer in nine is late."""
-LONGEST_GAP_TICKS: Final = 4 * SEQUENCE_ROWS
-"""After a longer time without an update nothing is predicted from the last one."""
 
 
 def _described(settings: ProgramSettings) -> str:
@@ -73,13 +65,14 @@ class OptimizerProgram:
             self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
             self.state = empty_state(prediction.n_states, self.problem.size, self._real)
             estimator = estimator_of(prediction, settings.estimator, self._real, settings.plausibility)
-            self._rest_map = rest_map(prediction, self._real)
+            self._nothing_ahead = np.zeros(0, self._real)
             at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
             self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
             target = target_search(prediction, settings.design, limits, self._real)
             self.constants = scheme.constants_of(
-                estimator, self.problem, target, self.solver.alpha, settings, self.budget
-            )
+                estimator, self.problem, target, self.solver.alpha, settings, self.budget,
+                rest_map(prediction, self._real),
+            )  # fmt: skip
             self._compile_kernels(model)
         self.restart(settings.updating_period_s)
 
@@ -110,20 +103,12 @@ class OptimizerProgram:
             part[:] = np.zeros(1, part.dtype)
         for array in (*self.state.playing[1:], *self.state.sent[1:], self.state.u, self.state.target, self.state.rule):
             array[:] = 0
-        self.state.belief.forget()
-        self._now["guessed_before"] = self._now["delivered_before"] = np.inf
-        self._playing["ticks"], self._playing["share"] = TICKS_PER_SAMPLE, self.constants.rate_shares[TICKS_PER_SAMPLE]
+        decisions.begin_session(self.constants, self.state)
 
     @property
     def _now(self) -> np.void:
         """Numbers of the period under way."""
         record: np.void = self.state.numbers[0]
-        return record
-
-    @property
-    def _playing(self) -> np.void:
-        """Numbers of what is played."""
-        record: np.void = self.state.playing.numbers[0]
         return record
 
     @property
@@ -136,105 +121,50 @@ class OptimizerProgram:
 
     def plan(self, update: Update) -> Plan:
         """Take the update latched at t_i and decide the updating period that begins there."""
-        now, state, estimator = self._now, self.state, self.constants.estimator
-        u = np.asarray(update.u, self._real) - estimator.u0
-        elapsed = update.tick - int(now["tick"]) if now["planned"] else 0
-        known = now["planned"] or update.tick == 0  # a session begins at the operating point
-        if not (known and 0 <= elapsed <= LONGEST_GAP_TICKS and self._knows_what_is_played(update)):
-            self._begin_again(update, u)
-        elif 0 < elapsed != now["ticks"]:
-            scheme.predict_played(self.constants, state, elapsed)
-        interrupted = self._is_interrupted(update)
-        in_time = self._follow(update, u)
-        now["sequences"] = max(int(now["sequences"]), update.playing)
-        state.u[:] = u
-        self._look_ahead(state.belief.predicted, update.tick)
-        self._take(self._wanted(interrupted=interrupted, in_time=in_time), update)
-        # a load that keeps moving must not keep the control PLC waiting for ever
-        load_step = 0.0 if interrupted else self.settings.interrupting_load_step_w
+        c, m, latched = self.constants, self.state, self._latched(update)
+        if self.plans_by_steps:
+            load_step = self._plan_by_steps(latched)
+        else:
+            starts = Starts(self.rule.first, self.rule.after_interruption())
+            load_step = decisions.take_update(c, self.rule, starts, m, latched)
+        now = self._now
         return Plan(
-            update.update, update.tick + int(now["ticks"]), load_step, float(now["shortage"]), int(now["suspects"])
-        )
+            update.update, update.tick + int(now["ticks"]), float(load_step), float(now["shortage"]),
+            int(now["suspects"]),
+        )  # fmt: skip
 
-    def _look_ahead(self, x: Array, tick: int) -> None:
-        """Write into a state (n,) what is forecast from `tick` on."""
-        if ahead := len(self._forecasts):
-            x[-ahead:] = self._forecasts.changes(tick)
+    def _latched(self, update: Update) -> Latched:
+        u_before, u, y, x = (np.array(values, self._real) for values in (update.u_before, update.u, update.y, update.x))
+        load, ahead = self._real(update.load), self._ahead(update.tick)
+        return Latched(update.update, update.tick, update.playing, load, u_before, u, y, x, ahead)
+
+    def _ahead(self, tick: int) -> Array:
+        """Return what is forecast from a tick on."""
+        return self._forecasts.changes(tick).astype(self._real) if len(self._forecasts) else self._nothing_ahead
 
     @property
     def plans_by_steps(self) -> bool:
-        """Whether estimator or rule are not ours, and called between the kernels that `scheme.plan` calls."""
+        """Whether estimator or rule are not ours, and called between the kernels that `take_update` calls."""
         return self._estimator is not None or isinstance(self.rule, OutsideRule)
 
-    def _take(self, wanted: int, update: Update) -> None:
-        """Take a measurement and decide the period, by `scheme.plan` or step by step."""
-        c, m, load = self.constants, self.state, self._real(update.load)
-        u_before, y, x = (np.array(values, self._real) for values in (update.u_before, update.y, update.x))
-        if not self.plans_by_steps:
-            scheme.plan(c, self.rule, m, wanted, update.update, update.tick, u_before, load, y, x)
-            return
+    def _plan_by_steps(self, latched: Latched) -> float:
+        """Do what `take_update` does; return the load step that ends the period, or 0."""
+        c, m = self.constants, self.state
+        wanted, load_step = decisions.follow(c, m, latched), float(c.load_step)
+        if wanted == decisions.FIRST:
+            wanted = self.rule.first
+        elif wanted == decisions.AFTER_A_STEP:
+            wanted, load_step = self.rule.after_interruption(), 0.0
         scheme.end_period(m)
         if self._estimator is None:
-            correct(c.estimator, m.belief, u_before, load, y, x)
+            correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y, latched.x)
         else:
-            self._estimator.correct(c.estimator, m.belief, u_before, load, y)
-        effective = scheme.judge_played(c, m, load, y)
+            self._estimator.correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y)
+        effective = scheme.judge_played(c, m, latched.load, latched.y)
         if wanted == scheme.BY_THE_RULE:
             wanted = decide_by(self.rule, m.rule, *scheme.assess_period(c, m, effective))
-        scheme.begin_period(c, m, wanted, update.update, update.tick, load, effective)
-
-    def _knows_what_is_played(self, update: Update) -> bool:
-        """Return whether the control PLC plays something of ours, or has not begun to."""
-        ours = [one["number"] for one in (self._playing, self._sent) if one["length"]]
-        return not self._playing["length"] or update.playing in ours
-
-    def _begin_again(self, update: Update, u: Array) -> None:
-        """Forget what was sent: others have moved the inputs since, from which the next profile sets out.
-
-        For want of a past the plant is believed to rest: a filter that began at the operating point would take minutes.
-        """
-        estimator = self.constants.estimator
-        load = update.load - estimator.w0 if estimator.load_known else None
-        first = CONTROLLED[0]
-        level = update.y[first] - estimator.y0[first] if math.isfinite(update.y[first]) else 0.0
-        self.state.belief.begin_at_rest(self._rest_map, u, load, level)
-        playing = self.state.playing
-        playing.z[:], playing.u_before[:] = self.problem.hold(u), u
-        self._playing["first_tick"], self._playing["length"] = update.tick, 0
-        self._sent["length"] = 0
-        self._now["planned"] = False
-
-    def _is_interrupted(self, update: Update) -> bool:
-        """Return whether a load step has cut the last period off."""
-        now = self._now
-        if not now["planned"]:
-            return False
-        elapsed = update.tick - int(now["tick"])
-        stepped = abs(update.load - float(now["load"])) > self.settings.interrupting_load_step_w > 0
-        return stepped and 0 < elapsed < int(now["ticks"])
-
-    def _follow(self, update: Update, u: Array) -> bool:
-        """Find out which profile is played from this instant on; return whether it is the last answer, in time."""
-        sent, playing = self._sent, self.state.playing
-        late = 0
-        if begun := bool(sent["length"] and sent["number"] == update.playing):
-            scheme.begin_sent(self.state)
-            late = update.tick - int(sent["first_tick"])  # scans were missed: it began before this instant
-        elif self._now["planned"] and not self._playing["length"]:  # others may have moved the inputs again
-            playing.z[:], playing.u_before[:] = self.problem.hold(u), u
-        elif self._now["planned"]:
-            late = update.tick - int(self._now["tick"])
-        if late > 0:
-            playing.z[:] = self.problem.shifted(playing.z, late)
-        return begun and late == 0
-
-    def _wanted(self, *, interrupted: bool, in_time: bool) -> int:
-        """Return the q of the period, which the rule decides unless the last sequence never took effect."""
-        if not self._now["planned"]:
-            return self.rule.first
-        if interrupted:
-            return self.rule.after_interruption(self.state.rule)
-        return scheme.BY_THE_RULE if in_time else int(self._now["q"])
+        scheme.begin_period(c, m, wanted, latched.update, latched.tick, latched.load, effective)
+        return load_step
 
     # -- step (3): during the updating period -------------------------------------------------------------------------
 
@@ -251,7 +181,8 @@ class OptimizerProgram:
     def solve(self) -> InputSequence:
         """Predict the state at t_{i+1}, shift the profile, iterate; return the sequence to play from there."""
         n = self._iterations
-        self._look_ahead(self.state.belief.x, int(self._now["tick"]) + int(self._now["ticks"]))
+        if ahead := len(self._forecasts):
+            self.state.belief.x[-ahead:] = self._ahead(int(self._now["tick"]) + int(self._now["ticks"]))
         if isinstance(self.solver, KernelSolver):
             scheme.solve(self.constants, self.method, self.state)
         else:
@@ -276,18 +207,8 @@ class OptimizerProgram:
         return with_checksum(header, [inputs[tick // TICKS_PER_SAMPLE] for tick in range(length)])
 
     def answered(self, *, late: bool) -> None:
-        """Note how an answer came: after a late one adaptive periods get longer, after one in time shorter again.
-
-        The budget is what the PLC should need; this is what machine and link really take. Each late answer doubles
-        what is allowed for them, `PROVEN` in time halve it. Where a period is fixed, or is the longest, there are fewer
-        iterations instead.
-        """
-        now, allowance = self._now, int(self._now["allowance"])
-        now["in_time"] = 0 if late else (now["in_time"] + 1) % PROVEN
-        if late:
-            now["allowance"] = min(max(1, 2 * allowance), int(now["ticks"]))
-        elif not now["in_time"]:
-            now["allowance"] = allowance // 2
+        """Note how an answer came."""
+        decisions.note_answer(self.state, late)
 
     # -- diagnostics --------------------------------------------------------------------------------------------------
 

@@ -1,7 +1,7 @@
 """The implementation scheme as kernels: steps (2) to (5) of the paper's section II on the state of a session.
 
 `plan` are steps (4), (5) and (2); `solve`, which is `pose`, a solver and `deliver`, is step (3). They take single and
-double precision alike. Decisions outside the arithmetic are in `program.py`.
+double precision alike. Decisions outside the arithmetic are in `decisions.py`.
 """
 
 import math
@@ -18,7 +18,7 @@ from optimizer_plc.plausibility import suspects_of
 from optimizer_plc.qp.costs import OutputMaps, augmented_cost, output_maps, predicted_indicators
 from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
-from optimizer_plc.qp.profile import inputs_of, shifted
+from optimizer_plc.qp.profile import shifted, write_inputs
 from optimizer_plc.qp.target import CV155, TargetSearch, bounds_at, find_target, least_warm_load, loads_held
 from optimizer_plc.rules.assessment import Assessment, Observation, assessed
 from optimizer_plc.rules.interface import UpdatingRule, decide_by
@@ -45,6 +45,10 @@ class Constants(NamedTuple):
     maps: Maps
     shifts: Array
     """Shape (ticks + 1, knots, knots)."""
+    knots: Array
+    """Decision instants, shape (knots,)."""
+    rest: Array
+    """`rest_map`."""
     predicted: OutputMaps
     weights: Array
     """Of the knots in each sample, shape (horizon, knots)."""
@@ -69,6 +73,8 @@ class Constants(NamedTuple):
     opening_per_k: float
     opening_from: float
     """A deviation, %."""
+    load_step: float
+    """What the load may move by until an updating period is interrupted, W; 0 is never."""
     sequence_ticks: int
     fixed_ticks: int
     """Fixed updating period; 0 is adaptive."""
@@ -87,12 +93,14 @@ def constants_of(
     alpha: float,
     settings: ProgramSettings,
     budget: PlcBudget,
+    rest: Array,
 ) -> Constants:  # fmt: skip
     """Return the constants of a session with adaptive periods."""
     real = problem.Phi.dtype.type
     return Constants(
         estimator=estimator, target=target,
         Phi=problem.Phi, Gamma=problem.Gamma, maps=problem.maps, shifts=problem.shifts,
+        knots=problem.knots, rest=rest,
         predicted=output_maps(problem),
         weights=problem.knots_to_samples, input_scale=problem.input_scale, rate=problem.rate,
         scaled_rate=problem.scaled_rate,
@@ -105,7 +113,7 @@ def constants_of(
         approach=real(settings.cold_end.approach_k or np.inf),
         opening_per_k=real(settings.cold_end.opening_per_k),
         opening_from=real(settings.cold_end.opening_from - estimator.u0[CV155]),
-        sequence_ticks=settings.sequence_ticks,
+        load_step=real(settings.interrupting_load_step_w), sequence_ticks=settings.sequence_ticks,
         fixed_ticks=0, most=len(budget.ladder), periods=np.array([0, *budget.ladder]),
         fitting=np.array([budget.iterations(ticks) for ticks in range(MAX_PERIOD_TICKS + 1)]),
     )  # fmt: skip
@@ -205,7 +213,8 @@ def solve(c: Constants, method: Any, m: OptimizerState) -> None:  # noqa: ANN401
     """Pose the problem, do q iterations by the method of a solver of our own, deliver the answer."""
     now = m.numbers[0]
     qp, guess = pose(c, m)
-    counts = np.array([now.iterations - 1, now.iterations])
+    counts = np.empty(2, np.int64)
+    counts[0], counts[1] = now.iterations - 1, now.iterations
     deliver(c, m, qp, solve_by(method, qp, guess, counts, Costs(now.guessed_before, now.delivered_before)))
 
 
@@ -215,7 +224,8 @@ def write_rows(c: Constants, z: Array, ticks: int, rows: NDArray[np.float32]) ->
     length = max(c.sequence_ticks, 2 * ticks)
     per_sample = c.fitting.shape[0] - 1
     samples = (length + per_sample - 1) // per_sample
-    inputs = inputs_of(c.weights[:samples], z, c.input_scale, c.estimator.u0, c.rate)
+    inputs = np.empty((rows.shape[0] // per_sample, rows.shape[1]), z.dtype)
+    write_inputs(c.weights, z, c.input_scale, c.estimator.u0, c.rate, samples, inputs)
     for tick in range(length):
         for i in range(inputs.shape[1]):
             rows[tick, i] = inputs[tick // per_sample, i]
@@ -343,6 +353,7 @@ def begin_period(
     """Begin the period of a q, step (5): its length, and what fits; then step (2), what was sent is played."""
     now = m.numbers[0]
     now.q = min(wanted, c.most)
-    now.ticks = c.fixed_ticks or min(c.periods[now.q] + now.allowance, c.fitting.shape[0] - 1)
+    adaptive = min(c.periods[now.q] + now.allowance, c.fitting.shape[0] - 1)
+    now.ticks = c.fixed_ticks if c.fixed_ticks > 0 else adaptive
     now.iterations = c.fitting[max(now.ticks - now.allowance, 0)]  # where a period cannot grow, they are fewer
     now.update, now.tick, now.load, now.effective, now.planned = update, tick, load, effective, True

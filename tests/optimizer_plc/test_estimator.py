@@ -11,7 +11,7 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import L1
 from coldloop.registers.control_plc import Update
 from optimizer_plc.computing_settings import EstimatorKind, EstimatorSettings, NoiseReference
-from optimizer_plc.estimator import begin_prediction, correct, estimator_of, no_belief, predict
+from optimizer_plc.estimator import begin_at_rest, begin_prediction, correct, estimator_of, no_belief, predict
 from optimizer_plc.qp.linear_algebra import respond
 from optimizer_plc.qp.prediction import PredictionModel
 from optimizer_plc.qp.rest import rest_map
@@ -243,7 +243,7 @@ def test_a_filter_without_a_past_begins_where_the_plant_rests_with_its_inputs_an
 ) -> None:
     """What load that takes is the mismatch where none is measured; one that is measured may have stepped just now."""
     belief = no_belief(prediction.n_states)
-    belief.begin_at_rest(rest_map(prediction), np.array(u), load, level)
+    begin_at_rest(rest_map(prediction), belief, np.array(u), load or 0.0, load is not None, level)
     x, (_, mismatch, _) = belief.predicted, belief.numbers[0].tolist()
     step, applied = prediction.sample, np.array(u)
     moved = x - respond(step.A, step.B, step.F, x, applied, 0.0)
@@ -256,6 +256,6 @@ def test_a_filter_without_a_past_begins_where_the_plant_rests_with_its_inputs_an
 
 def test_at_the_operating_point_that_is_the_operating_point(prediction: PredictionModel) -> None:
     belief = no_belief(prediction.n_states)
-    belief.begin_at_rest(rest_map(prediction), np.zeros(3), 0.0, 0.0)
+    begin_at_rest(rest_map(prediction), belief, np.zeros(3), 0.0, load_known=True, level=0.0)
     assert not belief.x.any()
     assert belief.numbers[0].tolist() == (0.0, 0.0, 1)

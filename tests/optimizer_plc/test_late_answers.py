@@ -8,7 +8,8 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import TICK_S
 from coldloop.registers.control_plc import Update, Verdict
 from optimizer_plc.budget import MAX_PERIOD_TICKS
-from optimizer_plc.program import PROVEN, OptimizerProgram
+from optimizer_plc.decisions import PROVEN
+from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.settings import ProgramSettings
 
 

@@ -80,8 +80,7 @@ class NotingRule(NamedTuple):
     def status(self) -> UpdatingRuleStatus:
         return UpdatingRuleStatus(UpdatingRuleKind.FIXED)
 
-    def after_interruption(self, memory: Array) -> int:
-        memory[0] += 1.0
+    def after_interruption(self) -> int:
         return INTERRUPTED
 
 

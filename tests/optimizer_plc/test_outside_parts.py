@@ -175,16 +175,16 @@ def test_the_conformance_suite_finds_what_a_solver_does_not_keep() -> None:
 
 @pytest.mark.usefixtures("named")
 def test_a_rule_that_is_not_ours_decides_q() -> None:
-    rule, memory = OutsideRule("Shorter", BUDGET), np.zeros(2)
+    rule = OutsideRule("Shorter", BUDGET)
     most = len(BUDGET.ladder)
-    assert (rule.first, rule.decide(SURPRISED, assess(SURPRISED)), rule.after_interruption(memory)) == (most, 4, most)
+    assert (rule.first, rule.decide(SURPRISED, assess(SURPRISED)), rule.after_interruption()) == (most, 4, most)
     assert rule.status[:4] == (UpdatingRuleKind.OUTSIDE, most, 1, most)
 
 
 @pytest.mark.usefixtures("named")
 def test_what_is_no_number_of_a_period_leaves_q_as_it_is_and_is_the_longest_at_a_beginning() -> None:
     rule, most = OutsideRule("Wild", BUDGET), len(BUDGET.ladder)
-    assert (rule.first, rule.after_interruption(np.zeros(2))) == (most, most)
+    assert (rule.first, rule.after_interruption()) == (most, most)
     decided = {rule.decide(SURPRISED, assess(SURPRISED)) for _ in range(100)}
     assert decided <= {SURPRISED.q, *range(1, most + 1)}
     with pytest.raises(ConfigurationError, match=r"^rule Silent: TypeError: "):

@@ -19,7 +19,7 @@ from optimizer_plc.rules import (
     make_rule,
 )
 from optimizer_plc.rules.assessment import assessed
-from optimizer_plc.rules.interface import MEMORY, decide_by
+from optimizer_plc.rules.interface import MEMORY, OF_PROBLEM, decide_by
 from optimizer_plc.settings import ProgramSettings
 
 RULE = Algorithm1(q_first=9, q_min=2, q_max=19, delta=2)
@@ -36,7 +36,8 @@ class Deciding:
         return decide_by(self.rule, self.memory, observation, a), a
 
     def after_interruption(self) -> int:
-        return self.rule.after_interruption(self.memory)
+        self.memory[OF_PROBLEM] = 0.0  # as `decisions.follow` does
+        return self.rule.after_interruption()
 
 
 costs = st.floats(1.0, 1e8)

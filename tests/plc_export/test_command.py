@@ -18,7 +18,40 @@ if TYPE_CHECKING:
 
 TANK = Path(__file__).parents[2] / "examples" / "processes" / "quadruple_tank.toml"
 FILES = {
-    "c": ["kernels.h", "kernels.c", "problem.h", "problem.c", "golden.h", "golden.c", "self_test.c", "README.md"],
+    "c": [
+        "kernels.h",
+        "kernels.c",
+        "problem.h",
+        "problem.c",
+        "golden.h",
+        "golden.c",
+        "self_test.c",
+        "README.md",
+        *(
+            f"optimizer/{name}"
+            for name in (
+                "kernels.h",
+                "kernels.c",
+                "constants.h",
+                "constants.c",
+                "golden.h",
+                "golden.c",
+                "optimizer.h",
+                "optimizer.c",
+                "self_test.c",
+                "bus/main.c",
+                "bus/control_plc.c",
+                "bus/control_plc.h",
+                "bus/diagnostics.c",
+                "bus/diagnostics.h",
+                "bus/words.c",
+                "bus/words.h",
+                "bus/registers.h",
+                "README.md",
+                "manifest.json",
+            )
+        ),
+    ],
     "st": ["types.st", "functions.st", "kernels.st", "golden.st", "self_test.st", "configuration.st", "README.md"],
     "plcopen": ["solver.xml", "README.md"],
 }
@@ -30,10 +63,12 @@ def test_the_sources_and_a_readme_are_written(coldloop: "Coldloop", tmp_path: Pa
     outcome = coldloop("export", "plc", "--target", target, "--out", out)
     assert outcome.code == 0, outcome.complaints
     assert outcome.out.splitlines() == [str(out / name) for name in FILES[target]]
-    assert sorted(path.name for path in out.iterdir()) == sorted(FILES[target])
+    written = sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file())
+    assert written == sorted(FILES[target])
     readme = (out / "README.md").read_text()
     assert "@" not in readme
-    assert all(name in readme for name in FILES[target] if name != "README.md")
+    assert all(name in readme for name in FILES[target] if name != "README.md" and "/" not in name)
+    assert all("@" not in file.read_text() for file in out.rglob("optimizer/**/*.*"))
     assert [path.name for path in out.parent.iterdir()] == [target]
 
 
@@ -54,14 +89,14 @@ def test_the_written_structured_text_passes_its_self_test_in_as_many_calls_as_th
 
 
 @pytest.mark.skipif(not shutil.which("gcc"), reason="no C compiler: gcc is not installed")
-def test_the_written_c_passes_its_self_test(coldloop: "Coldloop", tmp_path: Path) -> None:
+def test_the_written_c_passes_its_self_tests(coldloop: "Coldloop", tmp_path: Path) -> None:
     out = tmp_path / "c"
-    assert coldloop("export", "plc", "--target", "c", "--out", out).code == 0
-    command = ["gcc", "-std=c99", "-ffp-contract=off", *out.glob("*.c"), "-lm", "-o", out / "self_test"]
-    subprocess.run(command, check=True)
-    assert subprocess.run([out / "self_test"], capture_output=True, text=True, check=True).stdout.endswith(
-        ", 0 failures\n"
-    )
+    assert coldloop("export", "plc", "--target", "c", "--out", out, "--ticks", 600).code == 0
+    for folder in (out, out / "optimizer"):
+        command = ["gcc", "-std=c99", "-ffp-contract=off", *folder.glob("*.c"), "-lm", "-o", folder / "self_test"]
+        subprocess.run(command, check=True)
+        said = subprocess.run([folder / "self_test"], capture_output=True, text=True, check=True).stdout
+        assert said.endswith(", 0 failures\n")
 
 
 def test_it_is_the_solver_of_the_process_that_is_named(processes: Processes, tmp_path: Path) -> None:
@@ -88,6 +123,12 @@ def test_it_is_the_solver_of_the_process_that_is_named(processes: Processes, tmp
         (("plc", "--target", "c", "--out", "new", "--ticks", "40"), "no input moves within 40 ticks"),
         (("runs", "--target", "c", "--out", "new"), "runs: has no target"),
         (("runs", "--csv", "--ticks", "40"), "--ticks: is for coldloop export plc"),
+        (("plc", "--target", "st", "--out", "new", "--set", "plant.seed=2"), "are of the whole optimiser"),
+        (("runs", "--csv", "--set", "plant.seed=2"), "--config and --set: are for coldloop export plc"),
+        (
+            ("plc", "--target", "c", "--out", "new", "--set", "optimizer_plc.program.arithmetic=float64"),
+            "in single precision alone",
+        ),
         (("plc", "--out", "new"), "--target is required"),
     ],
 )

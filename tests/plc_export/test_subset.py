@@ -18,6 +18,10 @@ def plain(x):
     return x
 
 @kernel
+def doubled(z):
+    return z + z
+
+@kernel
 def bad(z, A, k):
 """
 REFUSED = {
@@ -31,9 +35,10 @@ REFUSED = {
     "an integer among reals": "    return z[0] * k  #!",
     "a quotient of integers": "    return k / 2  #!",
     "a remainder by a variable": "    return 7 % k  #!",
-    "a slice": "    z[1:] = z[0]  #!",
-    "a view": "    row = A[0]  #!",
     "a second name of an array": "    y = z  #!",
+    "a slice with a step": "    z[::2] = z[0]  #!",
+    "a slice of rows": "    A[1:] = A[0]  #!",
+    "a view that changes": "    row = A[0]  #!\n    row = A[1]",
     "an index from the end": "    return z[-1]  #!",
     "a loop over elements": "    for x in z:  #!\n        pass",
     "a try": "    try:  #!\n        z[0] = z[1]\n    except IndexError:\n        pass",
@@ -43,11 +48,11 @@ REFUSED = {
     "an array of a length that is not known": "    y = np.zeros(k, z.dtype)  #!\n    return y",
     "a variable that may have no value": "    if k > 0:\n        y = z[0]\n    return y  #!",
     "a variable of two types": "    y = z[0]\n    y = k  #!",
-    "a chained comparison": "    return z[0] < z[1] < z[2]  #!",
     "arrays of two lengths": "    y = z + np.zeros(7, z.dtype)  #!",
     "an argument that is returned": "    return z  #!",
     "a break": "    while k > 0:\n        break  #!",
     "a swap": "    x = z[0]\n    y = z[1]\n    x, y = y, x  #!",
+    "a call behind another assignment": "    x, y = z[0], doubled(z)  #!\n    return x + y[0]",
     "a text": "    y = 'gamma'  #!",
     "a lambda": "    y = lambda: k  #!",
     "a number for truth": "    while k:  #!\n        k -= 1",

@@ -3,13 +3,19 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+from coldloop.service.command_line import add_configuration_options
+
+if TYPE_CHECKING:
+    from rig.settings import Settings
 
 PLC: Final = Path("plc")
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    add_configuration_options(parser)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run; or plc, with --target: the solver")
     kinds = parser.add_mutually_exclusive_group(required=True)
     for kind, text in (
@@ -18,9 +24,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
         ("hdf5", "run.h5, with a group for each of them (needs h5py)"),
     ):
         kinds.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, help=text)
-    kinds.add_argument("--target", choices=("c", "st", "plcopen"), help="with plc: the ODE-based solver in single"
-                       " precision, as C99, Structured Text (IEC 61131-3) or PLCopen XML of it, with golden vectors and"
-                       " a self-test")  # fmt: skip
+    kinds.add_argument("--target", choices=("c", "st", "plcopen"), help="with plc: as C99 the whole optimiser in single"
+                       " precision and its ODE-based solver, as Structured Text (IEC 61131-3) or PLCopen XML of it the"
+                       " solver; with golden vectors and self-tests")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="where to (default: the folder of the run)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--ticks", type=_ticks, metavar="N", help="with plc: length of the run whose problems are the"
@@ -46,15 +52,30 @@ def _recorded_run(options: argparse.Namespace) -> list[Path]:
 
     if options.ticks is not None:
         raise UsageError("--ticks: is for coldloop export plc --target")
+    if options.config or options.assignments:
+        raise UsageError("--config and --set: are for coldloop export plc --target")
     return export(options.run, options.kind, options.out or options.run, force=options.force)
 
 
 def _solver(options: argparse.Namespace) -> list[Path]:
     from coldloop.errors import UsageError
+    from coldloop.process.loaded import IS_COLD_BOX
     from rig.cli.plc_folder import export_plc
 
     if options.run != PLC:
         raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
     if options.out is None or options.force:
         raise UsageError("export plc: name a new folder with --out; --force does not replace one")
-    return export_plc(options.target, options.ticks, options.out)
+    if not (options.target == "c" and IS_COLD_BOX) and (options.config or options.assignments):
+        raise UsageError("--config and --set: are of the whole optimiser, which is --target c without --process")
+    return export_plc(options.target, options.ticks, options.out, _settings(options))
+
+
+def _settings(options: argparse.Namespace) -> "Settings":
+    """Return the settings of the optimiser: those of the paper's PLC, unless the user says otherwise."""
+    from coldloop.config import load_configuration
+    from rig.plc_export.recorded_problems import SINGLE
+    from rig.settings import Settings
+
+    assignments = [*SINGLE, *options.assignments]
+    return load_configuration(Settings, file=options.config, assignments=assignments).settings

@@ -129,6 +129,19 @@ def add_result_options(parser: argparse.ArgumentParser, folder: str) -> None:
                         help="png, pdf, svg (default: png)")  # fmt: skip
 
 
+def exported(given: str | None, settings: "Settings") -> tuple[str, ...]:
+    """Return the program of `--optimizer`; nothing without it.
+
+    Raises:
+        UsageError: It cannot take the optimiser's place in this run.
+    """
+    if given is None:
+        return ()
+    from rig.plc_export.exported_optimizer import exported_optimizer
+
+    return exported_optimizer(given, settings)
+
+
 def tell(text: str) -> None:
     """Write a line about progress; a closed output does not stop the command."""
     with suppress(BrokenPipeError):

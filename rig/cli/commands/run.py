@@ -14,6 +14,7 @@ from rig.cli.commands.options import (
     check_load,
     configuration,
     endpoint,
+    exported,
     refuse_ineffective,
 )
 from rig.durations import duration
@@ -31,6 +32,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--in-process", action="store_true", help="one process and direct calls instead of Modbus/TCP")
     way.add_argument("--attach", nargs=3, type=endpoint, metavar="HOST:PORT",
                      help="use a rig that is up: plant, control PLC, optimiser PLC")  # fmt: skip
+    way.add_argument("--optimizer", metavar="export:FOLDER",
+                     help="the exported optimiser in the place of ours (docs/plc-export.md)")  # fmt: skip
     parser.add_argument("--duration", type=duration, help="plant time, such as 2h or 90s (default: that of the load)")
     add_loop_options(parser, "another draw such as a@2, or a CSV file time_s,load_w")
     add_result_options(parser, "<load>")
@@ -80,4 +83,4 @@ def _job(options: argparse.Namespace) -> "Job":
     if options.in_process:
         return Job(effective, scenario, Way.IN_PROCESS)
     check_certificates(settings)
-    return Job(effective, scenario, Way.LOCALHOST)
+    return Job(effective, scenario, Way.LOCALHOST, optimizer=exported(options.optimizer, settings))

@@ -19,8 +19,11 @@ def declare(parser: argparse.ArgumentParser) -> None:
                         help="first of three consecutive ports (default: 5020)")  # fmt: skip
     parser.add_argument("--page", action="store_true", help="serve the operator's page, too")
     parser.add_argument("--page-port", type=int, metavar="PORT", help="its port (default: 8020); implies --page")
-    parser.add_argument("--without", choices=WITHOUT, metavar="|".join(WITHOUT),
-                        help="leave its place to a client of your own (docs/your-optimiser.md)")  # fmt: skip
+    other = parser.add_mutually_exclusive_group()
+    other.add_argument("--without", choices=WITHOUT, metavar="|".join(WITHOUT),
+                       help="leave its place to a client of your own (docs/your-optimiser.md)")  # fmt: skip
+    other.add_argument("--optimizer", metavar="export:FOLDER",
+                       help="the exported optimiser in the place of ours (docs/plc-export.md)")  # fmt: skip
     parser.add_argument("--cuttable", action="store_true",
                         help="put a proxy into each link, for `coldloop fault cut`")  # fmt: skip
     parser.add_argument("--detach", action="store_true", help="return when it is up; `coldloop down` ends it")
@@ -32,7 +35,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Start the rig; end it with Ctrl-C."""
     check_load(options.load)
-    from rig.cli.commands.options import configuration
+    from rig.cli.commands.options import configuration, exported
     from rig.live.started_rigs import RigLock, check_ports, detached, ports_from
     from rig.runs.running import check_certificates
 
@@ -41,6 +44,7 @@ def execute(options: argparse.Namespace) -> int:
         effective, {**dict.fromkeys(PLACES, "give --port-base"), "session.autostart": "it begins a session"}
     )
     check_certificates(effective.settings)
+    optimizer = exported(options.optimizer, effective.settings)
     ports = ports_from(options.port_base)
     lock = RigLock(ports[0], options.locked)
     check_ports(ports)
@@ -57,6 +61,7 @@ def execute(options: argparse.Namespace) -> int:
     from rig.until_interrupted import run_until_interrupted
 
     services = REQUIRED if options.without else SERVICES
-    rig = UpRig(effective.settings, ports, options.tls, page=page, cuttable=options.cuttable, services=services)
+    rig = UpRig(effective.settings, ports, options.tls, page=page, cuttable=options.cuttable, services=services,
+                optimizer=optimizer)  # fmt: skip
     run_until_interrupted(lambda: rig.run(announce=not options.quiet))
     return 0

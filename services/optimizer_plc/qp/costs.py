@@ -181,7 +181,8 @@ def predicted_indicators(
 def deviation_cost(qp: QuadraticProblem, z: Array, n_inputs: int) -> float:
     """Return J_0 of the inputs alone, without slacks and without the constant."""
     slackless = z.copy()
-    slackless[n_inputs:] = z.dtype.type(0.0)
+    for i in range(n_inputs, z.shape[0]):
+        slackless[i] = z.dtype.type(0.0)
     return quadratic_cost(qp.Phi, qp.phi, slackless)
 
 

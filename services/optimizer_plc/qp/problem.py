@@ -20,7 +20,7 @@ from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.linear_algebra import add_transposed_product
 from optimizer_plc.qp.penalties import DEFAULT_PENALTIES, PenaltySettings
 from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.profile import inputs_of, interpolation, shift, shifted
+from optimizer_plc.qp.profile import hold, inputs_of, interpolation, shift, shift_from, shifted
 from optimizer_plc.qp.target import rest_of
 
 Array = NDArray[np.float64]
@@ -94,6 +94,7 @@ class PredictiveProblem:
             rest = rest_of(prediction, design).states
         self.maps = Maps(*map(self._rounded, self._maps(condensed, outputs, rates, u0, first_rate, rest)))
         self.scaled_rate = self._rounded(scaled_rate)
+        self.knots = np.array(design.decision_instants, real)
         self.knots_to_samples = self._rounded(weights)
         self.shifts = self._rounded(
             np.array([shift(design.decision_instants, ticks / TICKS_PER_SAMPLE) for ticks in range(SHIFTS + 1)])
@@ -166,7 +167,7 @@ class PredictiveProblem:
         """Return the profile z shifted by `ticks` ticks."""
         if ticks <= SHIFTS:
             return shifted(self.shifts[ticks], z, self.n_inputs)
-        return shifted(self._rounded(shift(self.design.decision_instants, ticks / TICKS_PER_SAMPLE)), z, self.n_inputs)
+        return shifted(shift_from(self.knots, self._real(ticks) / self._real(TICKS_PER_SAMPLE)), z, self.n_inputs)
 
     def within_first_rate(self, z: Array, parameters: QpParameters) -> Array:
         """Return the profile z with its first knot within the rate of the input before it, as it can be sent."""
@@ -193,6 +194,6 @@ class PredictiveProblem:
 
     def hold(self, u: Array) -> Array:
         """Return the profile that keeps the input deviation u, without slack."""
-        return np.concatenate(
-            [np.tile(u / self.input_scale, self.n_knots), np.zeros(N_SLACKS * self.n_knots, self._real)]
-        )
+        z = np.zeros(self.size, self._real)
+        hold(u, self.input_scale, self.n_inputs, z)
+        return z

@@ -159,10 +159,11 @@ def bounds_at(c: TargetSearch, x: Array, most_open: float) -> tuple[Array, Array
     """Return the bounds (4,), (4,) of the inputs that act and of T5 without its constant, with a limit of CV155."""
     low, high = c.low.copy(), c.high.copy()
     high[CV155] = max(min(high[CV155], most_open), low[CV155])
+    one = x.dtype.type(1.0)
     for i in range(low.shape[0]):
         if c.constants[i] >= 0:
             constant = x[c.constants[i]] / c.scale[i]
-            sign = x.dtype.type(1.0 if i < c.held.shape[0] else -1.0)
+            sign = one if i < c.held.shape[0] else -one
             low[i] += sign * constant
             high[i] += sign * constant
     return low, high
@@ -193,19 +194,19 @@ def least_warm_load(c: TargetSearch, low: Array, high: Array) -> float:
         at = low[i] if c.held[i] > 0 else high[i]
         load += c.held[i] * at
         lacking -= c.temperature[i] * at
-    while lacking > 0:
+    best = 0
+    while lacking > 0 and best >= 0:
         best, most = -1, low.dtype.type(NO_EFFECT)
         for i in range(last):
             warms = c.temperature[i] * c.held[i] > 0  # in the direction in which it holds more
             share = abs(c.temperature[i] / c.held[i])
             if warms and room[i] > 0 and share > most:
                 best, most = i, share
-        if best < 0:
-            break
-        moved = min(room[best], lacking / abs(c.temperature[best]))
-        load += abs(c.held[best]) * moved
-        lacking -= abs(c.temperature[best]) * room[best]
-        room[best] = low.dtype.type(0.0)
+        if best >= 0:
+            moved = min(room[best], lacking / abs(c.temperature[best]))
+            load += abs(c.held[best]) * moved
+            lacking -= abs(c.temperature[best]) * room[best]
+            room[best] = low.dtype.type(0.0)
     return load
 
 

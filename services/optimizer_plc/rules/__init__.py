@@ -54,9 +54,9 @@ class Rule(NamedTuple):
         """The rule and its parameters, as registers show them."""
         return self.chosen.status
 
-    def after_interruption(self, memory: Array) -> int:
+    def after_interruption(self) -> int:
         """Return the q of the period that begins with a load step."""
-        return self.chosen.after_interruption(memory)
+        return self.chosen.after_interruption()
 
 
 @decides_by(Rule)

@@ -34,7 +34,7 @@ class Algorithm1(NamedTuple):
         """Its four parameters."""
         return UpdatingRuleStatus(UpdatingRuleKind.ALGORITHM_1, self.q_first, self.q_min, self.q_max, self.delta)
 
-    def after_interruption(self, memory: Array) -> int:  # noqa: ARG002 it remembers nothing
+    def after_interruption(self) -> int:
         """Return q(t_0): what was learnt of the problem before the step says nothing of the one after."""
         return self.q_first
 

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from coldloop.registers.optimizer_plc import UpdatingRuleKind, UpdatingRuleStatus
 from optimizer_plc.rules.assessment import Assessment, Observation
-from optimizer_plc.rules.interface import decides_by
+from optimizer_plc.rules.interface import OF_PROBLEM, decides_by
 
 Array = NDArray[np.float64]
 
 RATE: Final = 0
 """Place of v (1/s) in the memory."""
-DELIVERED: Final = 1
+DELIVERED: Final = OF_PROBLEM
 """Place of J-hat of the profile before; 0 where it says nothing."""
 
 
@@ -47,9 +47,8 @@ class ContractionRule(NamedTuple):
         """The three numbers that q moves between; the first period has that of quiet."""
         return UpdatingRuleStatus(UpdatingRuleKind.CONTRACTION, self.q_step, self.q_busy, self.q_step)
 
-    def after_interruption(self, memory: Array) -> int:
+    def after_interruption(self) -> int:
         """Return the q of one long solve."""
-        memory[DELIVERED] = 0.0  # another load is another problem: its cost says nothing of contraction
         return self.q_step
 
 

@@ -28,7 +28,7 @@ class FixedPeriod(NamedTuple):
         """The fixed one."""
         return UpdatingRuleStatus(UpdatingRuleKind.FIXED, self.q, self.q, self.q)
 
-    def after_interruption(self, memory: Array) -> int:  # noqa: ARG002 it remembers nothing
+    def after_interruption(self) -> int:
         """Return the fixed one."""
         return self.q
 

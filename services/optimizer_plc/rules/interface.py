@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 MEMORY = 2
 """Numbers that a rule may remember from one period to the next, in an array that begins with zeros."""
+OF_PROBLEM: Final = 1
+"""Place of the one that is of the problem: 0 again at a load step, as another load is another problem."""
 
 
 class UpdatingRule(Protocol):
@@ -32,7 +34,7 @@ class UpdatingRule(Protocol):
     def status(self) -> UpdatingRuleStatus:
         """The rule and its parameters, as registers show them."""
 
-    def after_interruption(self, memory: Array) -> int:
+    def after_interruption(self) -> int:
         """Return the q of the period that begins with a load step."""
 
 

@@ -44,7 +44,7 @@ class OutsideRule:
         """The ladder that it may use."""
         return UpdatingRuleStatus(UpdatingRuleKind.OUTSIDE, self.first, 1, self._most)
 
-    def after_interruption(self, memory: Array) -> int:  # noqa: ARG002 it has its own
+    def after_interruption(self) -> int:
         """Return the q of the period that begins with a load step."""
         return self._asked(getattr(self._rule, "after_interruption", self._rule.first), otherwise=self._most)
 

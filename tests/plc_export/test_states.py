@@ -1,0 +1,245 @@
+"""Kernels with states, parts of arrays and records of results compute in C what they compute in Python."""
+
+import ctypes
+import math
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numba.core.dispatcher import Dispatcher
+from numpy.typing import NDArray
+
+from coldloop.kernels.compiled import kernel
+from rig.plc_export.c99 import Printer
+from rig.plc_export.c99_text import helpers, records_in
+from rig.plc_export.lowering import Lowering
+from rig.plc_export.reading import Program
+from rig.plc_export.subset import UnfitKernelError, type_of
+from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, compiled
+
+needs_compiler = pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER)
+
+Array = NDArray[np.float32]
+N = 4
+
+
+class Table(NamedTuple):
+    """A constant."""
+
+    rows: Array
+    """Shape (3, N)."""
+
+
+class Part(NamedTuple):
+    """A state within a state."""
+
+    numbers: Any
+    z: Array
+
+
+class State(NamedTuple):
+    """What kernels write to."""
+
+    numbers: Any
+    one: Part
+    other: Part
+    marks: Any
+    """Records, shape (N,)."""
+
+
+class Found(NamedTuple):
+    """Results: an array of its own, one of a constant, a number."""
+
+    z: Array
+    rows: Array
+    total: np.float32
+
+
+NUMBERS = np.dtype([("count", "i8"), ("done", "?"), ("sum", np.float32)])
+MARK = np.dtype([("kind", "i8"), ("size", np.float32)])
+
+
+@kernel
+def mark(r: Any, kind: int, size: np.float32) -> None:  # noqa: ANN401 records
+    if r.kind != kind:
+        r.kind, r.size = kind, size
+
+
+@kernel
+def combined(c: Table, z: Array, row: int) -> Found:
+    total, part = z.dtype.type(0.0), c.rows[row]
+    made = z.copy()
+    for i in range(z.shape[0]):
+        made[i] += part[i]
+        total += made[i]
+    return Found(made, c.rows, total)
+
+
+@kernel
+def judged(c: Table, z: Array, row: int) -> tuple[Found, bool]:
+    found = combined(c, z, row)
+    return found, 0 <= found.total < 100.0
+
+
+@kernel
+def of_rows(found: Found) -> np.float32:
+    total = found.total
+    for i in range(found.rows.shape[0]):
+        total += largest(found.rows[i])
+    return total
+
+
+@kernel
+def largest(z: Array) -> np.float32:
+    most = z[0]
+    for i in range(1, z.shape[0]):
+        most = max(most, z[i])
+    return most
+
+
+@kernel
+def swap(m: State) -> int:
+    m.one.numbers[0] = m.other.numbers[0]
+    m.one.z[:], m.other.z[:] = m.other.z, m.other.z.dtype.type(-1.0)
+    return m.one.numbers[0].count
+
+
+@kernel
+def advance(c: Table, m: State, z: Array, row: int) -> None:
+    """Almost everything that a state can do."""
+    now, other = m.numbers[0], m.other.numbers[0]
+    now.count += 1
+    found, small = judged(c, z, row)
+    other.sum = of_rows(found)
+    other.count, other.done = now.count * 2, small
+    m.other.z[:] = found.z
+    m.other.z[1:-1] = z[2:]
+    m.one.z[2:] = z[:2]
+    mask = 0
+    for i in range(m.marks.shape[0]):
+        r = m.marks[i]
+        mark(r, row if z[i] > 0 else -1, z[i])
+        if r.kind >= 0 and np.isfinite(r.size):
+            mask |= 1 << i
+    now.sum = z.dtype.type(mask)
+    now.done = other.done = small and not math.isnan(z[0])
+    count = swap(m)
+    now.count += count
+
+
+@kernel
+def reads_behind(m: State) -> None:
+    now = m.numbers[0]
+    now.count, now.sum = 7, m.one.z[m.numbers[0].count]
+
+
+# -- in C --------------------------------------------------------------------------------------------------------------
+
+
+class CNumbers(ctypes.Structure):
+    """`NUMBERS`."""
+
+    _fields_ = (("count", ctypes.c_int32), ("done", ctypes.c_bool), ("sum", ctypes.c_float))
+
+
+class CMark(ctypes.Structure):
+    """`MARK`."""
+
+    _fields_ = (("kind", ctypes.c_int32), ("size", ctypes.c_float))
+
+
+class CPart(ctypes.Structure):
+    """`Part`."""
+
+    _fields_ = (("numbers", CNumbers * 1), ("z", ctypes.c_float * N))
+
+
+class CState(ctypes.Structure):
+    """`State`."""
+
+    _fields_ = (("numbers", CNumbers * 1), ("one", CPart), ("other", CPart), ("marks", CMark * N))
+
+
+class CTable(ctypes.Structure):
+    """`Table`."""
+
+    _fields_ = (("rows", ctypes.POINTER(ctypes.c_float)),)
+
+
+def empty() -> State:
+    def numbers() -> Any:  # noqa: ANN401 records
+        return np.zeros(1, NUMBERS)
+
+    one, other = (Part(numbers(), np.zeros(N, np.float32)) for _ in range(2))
+    return State(numbers(), one, other, np.zeros(N, MARK))
+
+
+def function(entry: object, *arguments: object) -> tuple[Program, Any]:
+    program = Program()
+    return program, program.function(cast("Dispatcher", entry), tuple(map(type_of, arguments)))
+
+
+TABLE = Table(np.arange(3 * N, dtype=np.float32).reshape(3, N) - np.float32(4.0))
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    folder = tmp_path_factory.mktemp("states")
+    program, _ = function(advance, TABLE, empty(), np.zeros(N, np.float32), 0)
+    printer = Printer(np.float32)
+    text = "\n".join(printer.function(each, "" if each.name == "advance" else "static ") for each in program.functions)
+    types = [each.type for one in program.functions for each in one.parameters]
+    made = [kind for each in program.functions for kind in printer.made_in(each)]
+    records = "\n".join(map(printer.structure, records_in([*types, *made])))
+    literals = f"static const float literals[] = {{{', '.join(printer.literals)}}};"
+    head = "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>"
+    prototype = "".join(f"{printer.signature(each)};\n" for each in program.functions if each.name == "advance")
+    source = "\n".join((head, records, literals, helpers("float", text), prototype, text))
+    (folder / "states.c").write_text(source)
+    return ctypes.CDLL(str(compiled(folder, COMPILERS[0], "-O2", "-shared", "-fPIC")))
+
+
+def shown(numbers: Any) -> tuple[int, bool, float]:  # noqa: ANN401 records
+    return int(numbers[0]["count"]), bool(numbers[0]["done"]), float(numbers[0]["sum"])
+
+
+def shown_in_c(numbers: Any) -> tuple[int, bool, float]:  # noqa: ANN401 records
+    return numbers[0].count, numbers[0].done, numbers[0].sum
+
+
+finite = st.floats(-50.0, 50.0, width=32)
+
+
+@needs_compiler
+@settings(deadline=None)
+@given(steps=st.lists(st.tuples(st.lists(finite, min_size=N, max_size=N), st.integers(0, 2)), min_size=1, max_size=4))
+def test_a_state_goes_the_same_way(library: ctypes.CDLL, steps: list[tuple[list[float], int]]) -> None:
+    m, c = empty(), CState()
+    table = CTable(TABLE.rows.ctypes.data_as(ctypes.POINTER(ctypes.c_float)))
+    for values, row in steps:
+        z = np.array(values, np.float32)
+        advance(TABLE, m, z, row)
+        library.advance(ctypes.byref(table), ctypes.byref(c), z.ctypes.data_as(ctypes.c_void_p), row)
+        assert shown(m.numbers) == shown_in_c(c.numbers)
+        for part, in_c in ((m.one, c.one), (m.other, c.other)):
+            assert shown(part.numbers) == shown_in_c(in_c.numbers)
+            assert part.z.tolist() == list(in_c.z)
+        assert [tuple(each) for each in m.marks.tolist()] == [(each.kind, each.size) for each in c.marks]
+
+
+def test_a_number_that_is_read_behind_its_assignment_is_refused() -> None:
+    with pytest.raises(UnfitKernelError, match="read behind its assignment"):
+        function(reads_behind, empty())
+
+
+def test_structured_text_has_no_states() -> None:
+    _, found = function(swap, empty())
+    with pytest.raises(UnfitKernelError, match="are for C99 alone"):
+        Lowering({}).block(found, {})
+
+
+def test_states_are_written_and_constants_are_not() -> None:
+    _, found = function(advance, TABLE, empty(), np.zeros(N, np.float32), 0)
+    assert found.written == {"m"}

@@ -1,0 +1,252 @@
+"""The exported optimiser, in C, takes the place of ours on the bus: what was simulated is what is loaded."""
+
+import asyncio
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pyarrow.parquet as pq
+import pytest
+
+from coldloop.config import load_configuration
+from coldloop.errors import LinkError, UsageError
+from coldloop.modbus.client import RegisterClient
+from coldloop.process.load_profile import LoadProfile
+from coldloop.registers.codec import WordOrder
+from coldloop.registers.common import Identity
+from coldloop.registers.control_plc import CONTROL_MAP, Mode, Status
+from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
+from coldloop.registers.safety import LeaseState, LeaseStatus
+from rig import cli
+from rig.cli.plc_folder import export_plc
+from rig.cosim.endpoints import REQUIRED
+from rig.cosim.scenario import Scenario
+from rig.cosim.session_client import SessionClient
+from rig.plc_export import exported_optimizer
+from rig.plc_export.recorded_problems import SINGLE
+from rig.settings import Settings
+from tests.conftest import Coldloop, install
+from tests.harness.processes import Processes
+
+if TYPE_CHECKING:
+    from tests.rig.conftest import OnTheBus
+
+PATIENCE_S = 120.0
+RUN = ("--preset", "paper", "--set", "optimizer_plc.program.arithmetic=float32")
+"""Settings of the export, for a command."""
+HEADER = Path("/usr/include/modbus/modbus.h")
+
+
+def settings(*assignments: str) -> Settings:
+    return load_configuration(Settings, environment={}, assignments=[*SINGLE, *assignments]).settings
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An export, not compiled yet."""
+    made = tmp_path_factory.mktemp("exported") / "export"
+    export_plc("c", None, made, settings())
+    return made
+
+
+@pytest.fixture(scope="module")
+def export(folder: Path) -> Path:
+    """The same, compiled."""
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler: cc is not installed")
+    if not HEADER.exists():
+        install("libmodbus-dev")
+    exported_optimizer.exported_optimizer(f"export:{folder}", settings())
+    return folder
+
+
+def assert_same(coldloop: Coldloop, export: Path, tmp_path: Path, *scenario: str) -> None:
+    """Check that runs with ours, and with the exported one on the bus, have the same trace and the same updates."""
+    for way in (("--in-process",), ("--optimizer", f"export:{export}")):
+        outcome = coldloop("run", *way, *RUN, *scenario, "--out", tmp_path / way[0])
+        assert outcome.code == 0, outcome.complaints
+    ours, theirs = (tmp_path / way for way in ("--in-process", "--optimizer"))
+    traces = [json.loads((one / "summary.json").read_text())["trace_sha256"] for one in (ours, theirs)]
+    assert traces[0] == traces[1]
+    assert pq.read_table(ours / "updates.parquet").equals(pq.read_table(theirs / "updates.parquet"))
+
+
+@pytest.mark.usefixtures("undrawn", "processes")
+@pytest.mark.parametrize("period", ["adaptive", "2.5"])
+def test_a_run_with_it_has_the_trace_and_the_updates_of_ours(
+    coldloop: Coldloop, export: Path, tmp_path: Path, period: str
+) -> None:
+    assert_same(coldloop, export, tmp_path, "--load", "e", "--duration", "150s", "--updating-period", period)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.usefixtures("undrawn", "processes")
+@pytest.mark.parametrize("period", ["adaptive", "2.5"])
+def test_so_have_two_hours(coldloop: Coldloop, export: Path, tmp_path: Path, period: str) -> None:
+    assert_same(coldloop, export, tmp_path, "--load", "2h", "--updating-period", period)
+
+
+# -- on a link that is not as it should be -----------------------------------------------------------------------------
+
+
+async def until_accepted(control: RegisterClient, more: int) -> None:
+    """Wait until so many more sequences have been accepted, and one of them is being played."""
+    wanted = (await control.read(Status)).accepted + more
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            status = await control.read(Status)
+            if status.accepted >= wanted and status.mode == Mode.MPC:
+                return
+            await asyncio.sleep(0.05)
+
+
+@pytest.mark.usefixtures("realtime")
+@pytest.mark.parametrize("order", list(WordOrder))
+async def test_it_drives_in_either_word_order_and_drives_again_after_a_restart(
+    order: WordOrder, load_a: LoadProfile, on_the_bus: "OnTheBus", processes: Processes, export: Path
+) -> None:
+    program, own = export / "optimizer" / "bus" / "optimizer", processes.free_port()
+    async with on_the_bus(order=order, services=REQUIRED) as bus:
+        where = ("--port", str(bus.endpoints.control_plc.port), "--listen", str(own))
+        rig = SessionClient(bus.endpoints, bus.settings, services=REQUIRED)
+        shown = RegisterClient(OPTIMIZER_MAP, host="127.0.0.1", port=own, timeout_s=PATIENCE_S)
+        try:
+            await rig.connect(PATIENCE_S)
+            await rig.start(Scenario(14400, load_a, 0.0, 1, realtime=True, factor=5.0))
+            first = processes.script(program, *where)
+            await until_accepted(rig.control, 3)
+            assert (await rig.control.read(LeaseStatus)).state == LeaseState.HELD
+            assert (await shown.read(Identity)).session == rig.session
+            first.kill()
+            shown.close()
+            second = processes.script(program, *where)
+            await until_accepted(rig.control, 3)
+            assert second.alive
+        finally:
+            shown.close()
+            rig.close()
+
+
+@pytest.mark.usefixtures("realtime")
+def test_it_is_kept_up_and_finds_a_control_plc_that_was_killed(
+    coldloop: Coldloop, processes: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, export: Path
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    base = processes.three_ports()
+    words = ("--load", "a", "--factor", "5", "--optimizer", f"export:{export}", *RUN, "--detach")
+    started = processes.coldloop("up", "--port-base", base, *words)
+    assert started.popen.wait(PATIENCE_S) == 0, started.said
+
+    async def driven() -> None:
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                control = RegisterClient(CONTROL_MAP, host="127.0.0.1", port=base + 1, timeout_s=PATIENCE_S)
+                try:
+                    await control.connect(PATIENCE_S)
+                    await until_accepted(control, 2)
+                except LinkError:  # it is being killed
+                    await asyncio.sleep(0.05)
+                else:
+                    return
+                finally:
+                    control.close()
+
+    try:
+        asyncio.run(driven())
+        for service in ("control_plc", "optimizer_plc"):
+            assert coldloop("fault", "kill", service).code == 0
+            asyncio.run(driven())
+        assert re.search(r"^mode +mpc", coldloop("status").out, re.MULTILINE)
+    finally:
+        assert cli.main(["down", "--port-base", str(base)]) == 0
+
+
+async def test_it_ends_with_the_program_that_has_started_it(processes: Processes, export: Path) -> None:
+    program = export / "optimizer" / "bus" / "optimizer"
+    started = await asyncio.create_subprocess_exec(
+        program, "--listen", str(processes.free_port()), "--with-parent", stdin=asyncio.subprocess.PIPE
+    )
+    assert started.stdin
+    started.stdin.close()
+    async with asyncio.timeout(PATIENCE_S):
+        assert await started.wait() == 0
+
+
+# -- what does not fit -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    """The same, not compiled."""
+    made = shutil.copytree(folder, tmp_path / "copy")
+    (made / "optimizer" / "bus" / "optimizer").unlink(missing_ok=True)
+    return made
+
+
+def refusal(folder: Path, *assignments: str) -> str:
+    with pytest.raises(UsageError) as refused:
+        exported_optimizer.exported_optimizer(f"export:{folder}", settings(*assignments))
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+def test_an_export_for_other_settings_is_refused(folder: Path) -> None:
+    why = "it has optimizer_plc.program.adaptive.q_first = 9, the run 5: set it, or export the optimiser again"
+    assert why in refusal(folder, "optimizer_plc.program.adaptive.q_first=5")
+    assert "limits.high" in refusal(folder, "limits.high=[60, 140, 60]")
+
+
+def test_an_updating_period_is_the_sessions(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exported_optimizer, "_compiled", lambda *_: Path("program"))
+    fixed = settings("optimizer_plc.program.updating_period_s=2.5")
+    assert exported_optimizer.exported_optimizer(f"export:{folder}", fixed) == ("program",)
+
+
+def changed_manifest(copy: Path, **fields: object) -> None:
+    file = copy / "optimizer" / "manifest.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **fields}))
+
+
+def test_an_export_of_another_model_or_for_other_registers_is_refused(copy: Path) -> None:
+    changed_manifest(copy, model_digest="ab" * 32)
+    assert "it has the model abababab, the run " in refusal(copy)
+    changed_manifest(copy, register_maps=[1, 2])
+    assert "whose registers are others than those of" in refusal(copy)
+
+
+def test_what_is_no_export_or_of_the_solver_alone_is_refused(copy: Path, tmp_path: Path) -> None:
+    assert "is no export (coldloop export plc --target c" in refusal(tmp_path)
+    shutil.rmtree(copy / "optimizer")
+    assert "has the solver alone, without the optimiser: export it again" in refusal(copy)
+    with pytest.raises(UsageError, match="give export: and the folder"):
+        exported_optimizer.exported_optimizer(str(copy), settings())
+
+
+def test_a_source_that_was_changed_is_refused(copy: Path) -> None:
+    with (copy / "optimizer" / "kernels.c").open("a") as file:
+        file.write("\n")
+    assert "optimizer/kernels.c is not as it was exported: export it again" in refusal(copy)
+
+
+def test_without_a_compiler_or_libmodbus_one_line_says_what_to_install(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if shutil.which("cc"):
+        monkeypatch.setattr(exported_optimizer, "LIBRARY", "#include <modbus/there_is_no_such_header.h>\n")
+        assert "libmodbus is not installed: on Debian, install libmodbus-dev" in refusal(copy)
+    monkeypatch.setenv("PATH", str(copy))
+    assert "there is no C compiler (cc) to compile it: on Debian, install gcc" in refusal(copy)
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler: cc is not installed")
+def test_a_compiler_that_gives_other_bits_is_refused(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exported_optimizer, "FLAGS", ("-std=c99", "-O3", "-ffast-math"))
+    assert "its self-test fails: " in refusal(copy)
+
+
+def test_it_is_for_a_run_on_the_bus(coldloop: Coldloop, tmp_path: Path) -> None:
+    outcome = coldloop("run", "--in-process", "--optimizer", f"export:{tmp_path}")
+    assert outcome.code == 2
+    assert "not allowed with argument" in outcome.complaints[-1]
