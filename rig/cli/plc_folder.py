@@ -11,12 +11,14 @@ import numpy as np
 from coldloop.errors import UsageError
 from optimizer_plc.qp.problem import QuadraticProblem
 from rig.plc_export.folder import OdeExport
+from rig.plc_export.plcopen import plcopen_xml
 from rig.plc_export.recorded_problems import TICKS, GoldenVector, GoldenVectors, record
 from rig.plc_export.st_folder import AT_ONCE, StructuredTextExport, filled, template
 from rig.plc_sizing.operations import Operations, gradient, ode
 from rig.plc_sizing.sizes import dense_sizes
 
 README: Final = "README.md"
+PROJECT: Final = "solver.xml"
 
 
 def export_plc(target: str, ticks: int | None, folder: Path) -> list[Path]:
@@ -30,16 +32,20 @@ def export_plc(target: str, ticks: int | None, folder: Path) -> list[Path]:
     vectors = recorded.telling()
     if not vectors:
         raise UsageError(f"--ticks: no input moves within {ticks} ticks, so nothing would be tested; record more")
-    texts = structured_text(recorded, vectors) if target == "st" else c99(recorded, vectors)
+    texts = c99(recorded, vectors) if target == "c" else structured_text(recorded, vectors, xml=target == "plcopen")
     write_whole(folder, texts)
     return [folder / name for name in texts]
 
 
-def structured_text(recorded: GoldenVectors, vectors: list[GoldenVector]) -> dict[str, str]:
-    """Return the files of Structured Text by their names."""
+def structured_text(recorded: GoldenVectors, vectors: list[GoldenVector], *, xml: bool) -> dict[str, str]:
+    """Return the files of Structured Text by their names: sources, or one of PLCopen XML."""
     export = StructuredTextExport(recorded.method, vectors[0].problem, vectors)
     texts, sizes = export.files(), export.sizes()
+    if xml:
+        texts = {PROJECT: plcopen_xml(texts.values(), "the ODE-based solver, golden vectors and a self-test")}
     return {**texts, README: readme("readme_st.md", vectors, texts, {
+        "LOAD": template("load_plcopen.md" if xml else "load_st.md").rstrip(),
+        "HEAD": "in the documentation of `cl_self_test`" if xml else "at the head of `self_test.st`",
         "AT_ONCE": str(AT_ONCE), "CALLS": str(export.calls()), "CONSTANTS": f"{sizes.constants:,}",
         "SOLVER": f"{sizes.solver:,}", "SELF_TEST": f"{sizes.self_test:,}",
     })}  # fmt: skip
@@ -58,9 +64,10 @@ def readme(name: str, vectors: list[GoldenVector], texts: Mapping[str, str], par
     """Return the README: the template of this name with its figures."""
     problem = vectors[0].problem
     return filled(template(name), {
+        **parts,
         "N": str(len(problem.phi)), "M": str(len(problem.gamma)), "K": str(len(vectors[0].answer.costs)),
         "VECTORS": str(len(vectors)), "FILES": ", ".join(f"`{name}`" for name in texts),
-        "FEWEST": f"{operations(problem, 0):,}", "MOST": f"{operations(problem, len(problem.gamma)):,}", **parts,
+        "FEWEST": f"{operations(problem, 0):,}", "MOST": f"{operations(problem, len(problem.gamma)):,}",
     })  # fmt: skip
 
 

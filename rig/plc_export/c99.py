@@ -121,11 +121,11 @@ class Printer(TreePrinter):
             case For():
                 yield from self._for(statement, depth)
             case While(condition, body):
-                yield f"{pad}while ({self.expression(condition)}) {{"
+                yield f"{pad}while {self._condition(condition)} {{"
                 yield from self._block(body, depth + 1)
                 yield f"{pad}}}"
             case If(condition, body, other):
-                yield f"{pad}if ({self.expression(condition)}) {{"
+                yield f"{pad}if {self._condition(condition)} {{"
                 yield from self._block(body, depth + 1)
                 if other:
                     yield f"{pad}}} else {{"
@@ -133,6 +133,11 @@ class Printer(TreePrinter):
                 yield f"{pad}}}"
             case Return(value):
                 yield f"{pad}return {self.expression(value)};" if value else f"{pad}return;"
+
+    def _condition(self, condition: Expression) -> str:
+        """Return a condition in one pair of parentheses: compilers warn of two around `==`."""
+        text = self.expression(condition)
+        return text if isinstance(condition, Operation) and text.startswith("(") else f"({text})"
 
     def _declared(self, variable: Name, value: Expression | None) -> str:
         name, kind = identifier(variable.name), variable.type
@@ -215,18 +220,21 @@ class Printer(TreePrinter):
         return f"{identifier(function.name)}({', '.join(printed)})"
 
 
-def helpers(real: str) -> str:
-    """Return min and max as the kernels have them, and division that rounds down."""
-    return f"""static inline {real} min_real({real} one, {real} other) {{ return other < one ? other : one; }}
-static inline {real} max_real({real} one, {real} other) {{ return other > one ? other : one; }}
-static inline int32_t min_int(int32_t one, int32_t other) {{ return other < one ? other : one; }}
-static inline int32_t max_int(int32_t one, int32_t other) {{ return other > one ? other : one; }}
-static inline int32_t floor_mod(int32_t one, int32_t other) {{
+def helpers(real: str, used_in: str) -> str:
+    """Return min and max as the kernels have them, and division that rounds down; those that are used in a text."""
+    texts = {
+        "min_real": f"{real} min_real({real} one, {real} other) {{ return other < one ? other : one; }}",
+        "max_real": f"{real} max_real({real} one, {real} other) {{ return other > one ? other : one; }}",
+        "min_int": "int32_t min_int(int32_t one, int32_t other) { return other < one ? other : one; }",
+        "max_int": "int32_t max_int(int32_t one, int32_t other) { return other > one ? other : one; }",
+        "floor_mod": """int32_t floor_mod(int32_t one, int32_t other) {
     const int32_t rest = one % other;
     return rest < 0 ? rest + other : rest;
-}}
-static inline int32_t floor_div(int32_t one, int32_t other) {{ return (one - floor_mod(one, other)) / other; }}
-"""
+}""",
+        "floor_div": "int32_t floor_div(int32_t one, int32_t other) { return (one - floor_mod(one, other)) / other; }",
+    }
+    used = [name for name in texts if f"{name}(" in used_in or (name == "floor_mod" and "floor_div(" in used_in)]
+    return "".join(f"static inline {texts[name]}\n" for name in used)
 
 
 def records_in(types: Iterable[Type]) -> list[RecordType]:

@@ -104,7 +104,7 @@ extern const {self.real} literals[N_LITERALS];
 const {self.real} literals[N_LITERALS] = {{
 {literals}}};
 
-{helpers(self.real)}
+{helpers(self.real, self.kernels)}
 {self.kernels}"""
 
     def _problem_header(self) -> str:

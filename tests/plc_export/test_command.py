@@ -9,14 +9,18 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rig.cli import plc_folder
+from tests.harness.processes import Processes
 from tests.plc_export.st_interpreter import Machine
+from tests.process.runs import started
 
 if TYPE_CHECKING:
     from tests.conftest import Coldloop
 
+TANK = Path(__file__).parents[2] / "examples" / "processes" / "quadruple_tank.toml"
 FILES = {
     "c": ["kernels.h", "kernels.c", "problem.h", "problem.c", "golden.h", "golden.c", "self_test.c", "README.md"],
     "st": ["types.st", "functions.st", "kernels.st", "golden.st", "self_test.st", "configuration.st", "README.md"],
+    "plcopen": ["solver.xml", "README.md"],
 }
 
 
@@ -58,6 +62,17 @@ def test_the_written_c_passes_its_self_test(coldloop: "Coldloop", tmp_path: Path
     assert subprocess.run([out / "self_test"], capture_output=True, text=True, check=True).stdout.endswith(
         ", 0 failures\n"
     )
+
+
+def test_it_is_the_solver_of_the_process_that_is_named(processes: Processes, tmp_path: Path) -> None:
+    out = tmp_path / "tank"
+    outcome = started(processes, "--process", TANK, "export", "plc", "--target", "st", "--out", out)
+    assert outcome.code == 0
+    assert "for 42 variables and 72 rows" in (out / "README.md").read_text()
+    program = Machine(*((out / name).read_text() for name in FILES["st"][:-1])).instance("cl_main")
+    while not program.test.done:
+        program.run_()
+    assert program.test.passed
 
 
 @pytest.mark.parametrize(

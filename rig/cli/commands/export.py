@@ -18,8 +18,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
         ("hdf5", "run.h5, with a group for each of them (needs h5py)"),
     ):
         kinds.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, help=text)
-    kinds.add_argument("--target", choices=("c", "st"), help="with plc: the ODE-based solver in single precision, as"
-                       " C99 or Structured Text (IEC 61131-3), with golden vectors and a self-test")  # fmt: skip
+    kinds.add_argument("--target", choices=("c", "st", "plcopen"), help="with plc: the ODE-based solver in single"
+                       " precision, as C99, Structured Text (IEC 61131-3) or PLCopen XML of it, with golden vectors and"
+                       " a self-test")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="where to (default: the folder of the run)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--ticks", type=_ticks, metavar="N", help="with plc: length of the run whose problems are the"
@@ -50,13 +51,10 @@ def _recorded_run(options: argparse.Namespace) -> list[Path]:
 
 def _solver(options: argparse.Namespace) -> list[Path]:
     from coldloop.errors import UsageError
-    from coldloop.process.loaded import IS_COLD_BOX
     from rig.cli.plc_folder import export_plc
 
     if options.run != PLC:
         raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
     if options.out is None or options.force:
         raise UsageError("export plc: name a new folder with --out; --force does not replace one")
-    if not IS_COLD_BOX:
-        raise UsageError("export plc: of the cold box alone; leave out --process")
     return export_plc(options.target, options.ticks, options.out)

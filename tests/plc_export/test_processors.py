@@ -1,0 +1,70 @@
+"""The exported C99 by other compilers, on other processors, for each process: the bits of the kernels."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tests.plc_export.test_c99 import STRICT
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples" / "processes"
+DRIVER = Path(__file__).with_name("solve_file.c")
+
+
+class Target(NamedTuple):
+    """A compiler, and what runs its programs here."""
+
+    compiler: str
+    options: tuple[str, ...] = ()
+    runner: tuple[str, ...] = ()
+
+    @property
+    def missing(self) -> list[str]:
+        return [name for name in (self.compiler, *self.runner) if not shutil.which(name)]
+
+
+TARGETS = {
+    **{f"{name}{level}": Target(name, (level,)) for name in ("gcc", "clang") for level in ("-O0", "-O2", "-O3")},
+    "armhf": Target("arm-linux-gnueabihf-gcc", ("-O2", "-static"), ("qemu-arm",)),
+    "powerpc, big-endian": Target("powerpc-linux-gnu-gcc", ("-O2", "-static"), ("qemu-ppc",)),
+}
+PROCESSES = {"cold box": None, "tank": EXAMPLES / "quadruple_tank.toml", "column": EXAMPLES / "wood_berry.toml"}
+
+
+@pytest.fixture(scope="module", params=PROCESSES)
+def problems(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an export, problems of six loads and their answers."""
+    folder: Path = tmp_path_factory.mktemp("problems")
+    environment = {name: value for name, value in os.environ.items() if name != "COLDLOOP_PROCESS"}
+    file = PROCESSES[request.param]
+    if file:
+        model = folder / "model.json"
+        made = [sys.executable, "-m", "rig", "process", str(file), "--out", str(model)]
+        subprocess.run(made, cwd=ROOT, env=environment, capture_output=True, check=True)
+        environment["COLDLOOP_PROCESS"] = str(model)
+    command = [sys.executable, "-m", "tests.plc_export.problems_file", str(folder), "3600", *"abcdef"]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) >= 2000
+    return folder
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", TARGETS)
+def test_problems_of_six_loads_have_the_bits_of_the_kernels(problems: Path, tmp_path: Path, name: str) -> None:
+    target = TARGETS[name]
+    if target.missing:
+        pytest.skip(f"not installed: {', '.join(target.missing)}")
+    program = tmp_path / "solve"
+    sources = [problems / "kernels.c", problems / "problem.c", DRIVER]
+    command = [target.compiler, *STRICT, *target.options, f"-I{problems}", *sources, "-lm", "-o", program]
+    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    with (problems / "problems").open("rb") as given:
+        done = subprocess.run([*target.runner, program], stdin=given, capture_output=True, check=True)
+    assert done.stdout == (problems / "answers").read_bytes()
