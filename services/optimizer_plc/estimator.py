@@ -139,7 +139,7 @@ def forget(belief: Belief) -> None:
     b.w, b.mismatch, b.since = zero, zero, 1
     for i in range(belief.readings.shape[0]):
         r = belief.readings[i]
-        r.state, r.since_s, r.agreed_s = USED, zero, zero
+        r.state, r.since_s, r.agreed_s, r.jump, r.jumped_to, r.difference = USED, zero, zero, zero, zero, zero
 
 
 @kernel
@@ -180,7 +180,7 @@ def correct(c: Estimator, belief: Belief, u_before: Array, load: float, y: Array
     J = c.stationary.inverse_covariances[period]
     if c.plausible.sigmas > 0.0:
         innovation = judge(
-            c.plausible, belief.readings, belief.surprise, belief.predicted, innovation, J,
+            c.plausible, belief.readings, belief.surprise, belief.predicted, y, innovation, J,
             real(b.since) * c.tick_s,
         )  # fmt: skip
     if not are_finite(innovation):

@@ -27,9 +27,13 @@ MISSING: Final = 1
 SUSPECT: Final = 2
 """It contradicts prediction and other readings, and is left out."""
 
-READING: Final = (("state", "i8"), ("since_s", "real"), ("agreed_s", "real"))
+READING: Final = (
+    ("state", "i8"), ("since_s", "real"), ("agreed_s", "real"), ("jump", "real"), ("jumped_to", "real"),
+    ("difference", "real"),
+)  # fmt: skip
 """state: `USED`, `MISSING` or `SUSPECT`. since_s: how long it has been that. agreed_s: for how long a suspect has
-agreed with the others again."""
+agreed with the others again. jump, jumped_to: by how much it differed from what the others say of it after its last
+jump, and what it showed then. difference: by how much it differs now."""
 
 
 class Plausibility(NamedTuple):
@@ -132,9 +136,10 @@ def imputed(innovation: Array, inverse_covariance: Array) -> Array:
 
 @kernel
 def judge(
-    p: Plausibility, readings: Any, surprise: Array, predicted: Array, innovation: Array, J: Array, elapsed_s: float  # noqa: ANN401
+    p: Plausibility, readings: Any, surprise: Array, predicted: Array, y: Array, innovation: Array, J: Array,  # noqa: ANN401
+    elapsed_s: float,
 ) -> Array:  # fmt: skip
-    """Return the innovation (n_y,) without the elements of suspects, which are no number.
+    """Return the innovation (n_y,) of a measurement y (n_y,) without the elements of suspects, which are no number.
 
     `readings` is `new_readings`'s, `surprise` that of the readings so far, `elapsed_s` the time since the judgement
     before. Constant errors in `predicted` are set to what a reading shows that is taken back. There are no new suspects
@@ -153,7 +158,7 @@ def judge(
             returning = True
     contradicting, contradicts = against_the_model(p, readings, surprise, J)
     if returning:
-        take_back(p, readings, predicted, innovation, believed, J, elapsed_s, contradicting)
+        take_back(p, readings, predicted, y, innovation, believed, J, elapsed_s, contradicting)
     if elapsed_s <= p.longest_period_s and contradicting < 2:
         suspect_some(p, readings, believed, J, contradicts)
     return believed
@@ -180,10 +185,10 @@ def enter(r: Any, state: int) -> None:  # noqa: ANN401 a record
 
 @kernel
 def take_back(
-    p: Plausibility, readings: Any, predicted: Array, innovation: Array, believed: Array, J: Array, elapsed_s: float,  # noqa: ANN401
-    contradicting: int,
+    p: Plausibility, readings: Any, predicted: Array, y: Array, innovation: Array, believed: Array, J: Array,  # noqa: ANN401
+    elapsed_s: float, contradicting: int,
 ) -> None:  # fmt: skip
-    """Take back suspects that agree again, or have been out for the longest time, and readings that were missing.
+    """Take back suspects that agree again, wander off or have been out for the longest time, and what was missing.
 
     After a long time, or when others contradict the model, what they say of a reading is no better than the reading:
     its constant error, if it has one, is set so that it agrees. One without (L1) counts again in full, and so only
@@ -193,18 +198,35 @@ def take_back(
     for i in range(innovation.shape[0]):
         r, difference = readings[i], innovation[i] - expected[i]
         if r.state != USED and np.isfinite(difference):
-            if abs(difference) > p.allowance[i] + p.sigmas / np.sqrt(J[i, i]):
+            largest = p.allowance[i] + p.sigmas / np.sqrt(J[i, i])
+            if abs(difference) > largest:
                 r.agreed_s = 0.0
             else:
                 r.agreed_s += elapsed_s
+            if r.since_s <= elapsed_s or abs(difference - r.difference) > largest:
+                r.jump, r.jumped_to = difference, y[i]
+            r.difference = difference
             agrees = r.state == SUSPECT and r.agreed_s >= p.agreeing_s
             model_fails = contradicting > (0 if p.constants[i] >= 0 else 1)
-            if agrees or model_fails or r.state == MISSING or r.since_s >= p.longest_s:
+            if agrees or model_fails or wanders_off(r, y[i], largest) or r.state == MISSING or r.since_s >= p.longest_s:
                 believed[i] = innovation[i]
                 if not agrees and p.constants[i] >= 0:
                     predicted[p.constants[i]] += difference
                     believed[i] = expected[i]
                 enter(r, USED)
+
+
+@kernel
+def wanders_off(r: Any, shown: float, least: float) -> bool:  # noqa: ANN401 a record
+    """Return whether a suspect has moved away from what the others say, by itself and as far again as it had jumped.
+
+    So does a sound sensor when the plant is no longer as its model (a valve is stuck), and one that drifts, which is
+    believed, too. One that shows too much by a constant does not, nor does one that is stuck or jumps about.
+    """
+    away = r.difference - r.jump
+    moved = shown - r.jumped_to if away > 0.0 else r.jumped_to - shown
+    wanders: bool = abs(away) > max(abs(r.jump), least) and moved + moved >= abs(away)
+    return wanders
 
 
 @kernel

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from coldloop.process.signals import L1, OUTPUT_NAMES, OUTPUT_UNITS, T5, TICK_S
 from optimizer_plc.computing_settings import Arithmetic, PlausibilitySettings
 from optimizer_plc.estimator import Belief, Estimator, begin_prediction, correct, estimator_of, no_belief, predict
-from optimizer_plc.plausibility import MISSING, USED, suspects_of
+from optimizer_plc.plausibility import MISSING, USED, new_readings, suspects_of, wanders_off
 from optimizer_plc.qp.arithmetic import DOUBLE, Real, real_of
 from optimizer_plc.qp.linear_algebra import respond
 from optimizer_plc.qp.penalties import Preset
@@ -133,6 +133,51 @@ def test_one_that_does_not_agree_is_believed_after_half_an_hour(world: World, ou
     assert world.shown()[output] == pytest.approx(JUMP[output], abs=10.0 * SIGMA[output])
     if output != L1:
         assert world.shown()[L1] == pytest.approx(level, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("jump", "jumped_to", "difference", "shown", "wanders"),
+    [
+        (0.2, 60.2, 0.39, 60.39, False),  # not as far again
+        (0.2, 60.2, 0.41, 60.41, True),
+        (-0.2, 59.8, -0.41, 59.59, True),
+        (0.2, 60.2, -0.01, 59.99, True),  # back, and as far again to the other side
+        (0.2, 60.2, 0.41, 60.2, False),  # stuck: the others moved
+        (0.2, 60.2, 0.41, 60.0, False),
+        (0.2, 60.2, 0.6, 60.41, True),  # half of it by itself
+        (0.2, 60.2, 0.6, 60.39, False),
+        (0.2, 60.2, 0.2, 65.0, False),  # too much by a constant, and the process moved
+        (0.01, 60.0, 0.1, 60.09, False),  # as far as noise moves it
+        (0.01, 60.0, 0.12, 60.11, True),
+    ],
+)
+def test_a_suspect_wanders_off_as_far_again_as_it_had_jumped_and_by_itself(
+    jump: float, jumped_to: float, difference: float, shown: float, *, wanders: bool
+) -> None:
+    reading = new_readings(DOUBLE)[0]
+    reading["jump"], reading["jumped_to"], reading["difference"] = jump, jumped_to, difference
+    assert wanders_off(reading, shown, 0.1) == wanders
+
+
+@pytest.mark.parametrize("output", [L1, T5], ids=["L1", "T5"])
+def test_a_sound_sensor_of_a_plant_that_is_no_longer_as_its_model_is_soon_believed(world: World, output: int) -> None:
+    world.error[output] = JUMP[output]
+    world.updates(1)
+    assert world.suspects == [OUTPUT_NAMES[output]]
+    for _ in range(20):
+        world.error[output] += 0.08 * JUMP[output]
+        world.updates(1)
+    assert world.suspects == []
+    world.updates(10)
+    assert world.shown()[output] == pytest.approx(world.error[output], abs=0.1 * JUMP[output])
+
+
+def test_one_that_jumps_about_is_not_believed(world: World) -> None:
+    for k in range(4 * MINUTE):
+        world.error[L1] = JUMP[L1] * (2.0 + k % 5) * (-1) ** (k // 3)
+        world.updates(1)
+        assert world.suspects == ["L1"]
+    assert abs(world.shown()[L1]) < 0.3 * JUMP[L1]
 
 
 def test_a_sensor_that_was_dead_for_long_is_not_suspected_when_it_shows_something_else(world: World) -> None:

@@ -78,3 +78,12 @@ def test_a_compressor_trip_makes_no_good_sensor_suspect_and_the_level_comes_back
     level = run.recording.y[:, L1]
     assert 55.0 < level.min() < 59.0
     assert level[-400:].min() > 59.0
+
+
+def test_a_stuck_valve_that_nobody_sees_does_not_take_the_level_sensor_with_it() -> None:
+    """CV155 for 20 min in hour c; L1 was suspected for half an hour, and rose to 72 %."""
+    events = [{"at_s": 600, "target": "cv155", "value": 0}, {"at_s": 1800, "target": "cv155", "value": 1}]
+    run = simulate("c", duration_s=2700, plant={"kind": "refrigerator", "refrigerator": {"events": events}})
+    level = run.recording.y[:, L1]
+    assert level.max() < 64.0
+    assert level[-1] < 61.5
