@@ -130,6 +130,15 @@ class Passing(NamedTuple):
     """J/kg."""
 
 
+@inlined
+def warmth_of(cell: Array, h_before: float) -> float:
+    """Return by how much (J/kg) what flows into a cell from before, with `h_before`, is warmer than the cell."""
+    warmth = h_before - cell[H]
+    if (cell[EXPANSION] * warmth).real > MOST_FILLING:
+        warmth = MOST_FILLING / cell[EXPANSION]
+    return warmth
+
+
 @kernel
 def march_flows(
     exchanger: HeatExchanger,
@@ -156,9 +165,7 @@ def march_flows(
         cell = cells[i]
         warmth = 0.0 * h_before
         if forwards[i]:
-            warmth = (cells[i - 1, H] if i > 0 else h_before) - cell[H]
-            if (cell[EXPANSION] * warmth).real > MOST_FILLING:
-                warmth = MOST_FILLING / cell[EXPANSION]
+            warmth = warmth_of(cell, cells[i - 1, H] if i > 0 else h_before)
         through = 1.0 - cell[EXPANSION] * (h_out - cell[H])
         entering = 1.0 - cell[EXPANSION] * warmth
         m = (through * m + tapped - cell[EXPANSION] * heat[i]) / entering

@@ -35,6 +35,7 @@ from plant.components.passes import (
     read_cells,
     supply_at,
     turn_flows,
+    warmth_of,
 )
 from plant.helium.properties import GAS_CONSTANT, ISOBAR_PRESSURE, Helium, supply_cubics
 from plant.numeric import Array, at_least
@@ -287,7 +288,7 @@ def settle_passes(
 ) -> None:
     """Correct the temperatures of the cells in `x` (48) so that they hold what the stages of a step brought.
 
-    The flow into a cell is corrected with them by what its mass is off, and carries the enthalpy of the cell before.
+    The flow into a cell is corrected with them by what its mass is off, and carries what it does in `march_flows`.
 
     Args:
         M: What line and passes hold after the step, kg.
@@ -308,31 +309,42 @@ def settle_passes(
         at = supply_at(side_pressure(volume, M, T_hot, held.mass))
         hold_passes(at, pipes, held)
         cells = held.cells
-        flow, worst_1 = _settled(FIRST, nef2, 0.0, cells[nef34 - 1, H], gains, weight, cells, x)
-        flow, worst_2 = _settled(nef2, nef34, flow, cells[nef6 - 1, H], gains, weight, cells, x)
-        flow, worst_34 = _settled(nef34, nef6, flow, cells[coil, H], gains, weight, cells, x)
-        x[coil] = T_coil + flow * (cells[coil - 1, H] - cells[coil, H]) / pipes.precooler.nef5.capacity
-        _, worst_6 = _settled(nef6, coil, flow, cubic(hot, 0, at.bar), gains, weight, cells, x)
+        flow, h_out, worst_1 = _settled(FIRST, nef2, 0.0, 0.0, cells[nef34 - 1, H], gains, weight, cells, x)
+        flow, h_out, worst_2 = _settled(nef2, nef34, flow, h_out, cells[nef6 - 1, H], gains, weight, cells, x)
+        flow, h_out, worst_34 = _settled(nef34, nef6, flow, h_out, cells[coil, H], gains, weight, cells, x)
+        x[coil] = T_coil + flow * (cells[coil - 1, H] - h_out) / pipes.precooler.nef5.capacity
+        h_out, h_hot = cells[coil - 1, H], cubic(hot, 0, at.bar)
+        _, _, worst_6 = _settled(nef6, coil, flow, h_out, h_hot, gains, weight, cells, x)
         if max(worst_1, worst_2, worst_34, worst_6) <= SETTLED_ENERGY:
             break
 
 
 @kernel
 def _settled(
-    first: int, last: int, flow: float, h_before: float, gains: Gains, weight: float, cells: Array, x: Array
-) -> tuple[float, float]:
+    first: int,
+    last: int,
+    flow: float,
+    h_out: float,
+    h_before: float,
+    gains: Gains,
+    weight: float,
+    cells: Array,
+    x: Array,
+) -> tuple[float, float, float]:
     """Correct the cells from `first` to `last` - 1, out of which `flow` (kg) more flows than the stages let out.
 
-    Returns what more flows into them (kg), and the most that was missing in one (J).
+    It carries `h_out` (J/kg). Returns what more flows into them (kg), what that carries (J/kg), and the most that was
+    missing in one (J).
     """
     worst = 0.0
     for i in range(last - 1, first - 1, -1):
         cell, start = cells[i], gains.start[i]
         entering = flow + cell[MASS] - start[MASS] - weight * gains.gained[i, 0]
-        h_in = cells[i - 1, H] if i > first else h_before
-        missing = start[ENERGY] + weight * gains.gained[i, 1] + entering * h_in - flow * cell[H] - cell[ENERGY]
-        warmer = missing / (cell[CAPACITY] * (1.0 - cell[EXPANSION] * (h_in - cell[H])))
+        warmth = warmth_of(cell, cells[i - 1, H] if i > first else h_before)
+        missing = start[ENERGY] + weight * gains.gained[i, 1] - cell[ENERGY]
+        missing += entering * (cell[H] + warmth) - flow * h_out
+        warmer = missing / (cell[CAPACITY] * (1.0 - cell[EXPANSION] * warmth))
         x[i] += warmer
         worst = max(worst, abs(missing))
-        flow = entering + cell[CAPACITY] * cell[EXPANSION] * warmer
-    return flow, worst
+        flow, h_out = entering + cell[CAPACITY] * cell[EXPANSION] * warmer, cell[H] + warmth
+    return flow, h_out, worst
