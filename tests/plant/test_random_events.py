@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 import pytest
-from hypothesis import Phase, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
@@ -129,26 +129,53 @@ def balances_over_random_events(course: Course) -> tuple[float, float]:
     return missing, crossed
 
 
+def drawn(seed: int) -> Course:
+    """Return hours of pieces whose values are often at their ends."""
+    random = np.random.default_rng(seed)
+
+    def opening() -> float:
+        return float(random.uniform(0.0, 100.0) if random.random() > 0.3 else random.choice([0.0, 100.0]))
+
+    def one_of(*values: float) -> float:
+        return float(random.choice(values))
+
+    def switched() -> float:
+        return one_of(1.0, 1.0, 0.0)
+
+    def piece() -> tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+        return (
+            int(random.integers(40, 1200)), (opening(), random.uniform(0.0, 150.0), opening()),
+            (opening(), opening(), opening(), opening()),
+            (random.uniform(0.0, 6000.0), random.uniform(275.0, 320.0), random.uniform(0.0, 0.01),
+             switched(), switched(), switched(), 0.0, 0.0, switched(), switched(), switched(),
+             one_of(1.0, 1.0, 0.0, 2.0), *(one_of(0.0, 0.0, -10.0, 3.0, 10.0) for _ in range(4))),
+        )  # fmt: skip
+
+    return [piece() for _ in range(24)]
+
+
+def assert_held(course: Course) -> None:
+    missing, crossed = balances_over_random_events(course)
+    assert abs(missing) <= 1e-6 * crossed + 1e-2
+
+
 @given(course=st.lists(pieces, min_size=2, max_size=4))
 @settings(max_examples=3)
 def test_helium_and_energy_are_conserved_whatever_happens(course: Course) -> None:
-    balances_over_random_events(course)
+    assert_held(course)
 
 
 @pytest.mark.exhaustive
 @given(course=st.lists(pieces, min_size=24, max_size=24))
 @settings(max_examples=20)
 def test_helium_and_energy_are_conserved_over_hours_of_whatever_happens(course: Course) -> None:
-    balances_over_random_events(course)
+    assert_held(course)
 
 
-@pytest.mark.exhaustive
-@pytest.mark.xfail(reason="up to 1e-4 where pressures are far outside the tables: docs/roadmap.md", strict=False)
-@given(course=st.lists(pieces, min_size=24, max_size=24))
-@settings(max_examples=5, phases=[Phase.generate])
-def test_the_refrigerator_has_gained_what_crossed_its_boundary_in_hours_of_events(course: Course) -> None:
-    missing, crossed = balances_over_random_events(course)
-    assert abs(missing) <= 1e-6 * crossed + 1e-2
+@pytest.mark.parametrize("seed", [30, 47, 107, 133])
+def test_they_are_where_passes_give_a_third_of_the_flow_and_warm_cells_lie_beside_cold_ones(seed: int) -> None:
+    """NEF6 ran away (30), corrections of the cells did not settle: 700 J to 7e5 J in a step."""
+    assert_held(drawn(seed))
 
 
 box_pieces = st.tuples(st.integers(40, 1200), inputs, st.floats(0.0, 6000.0))

@@ -78,7 +78,7 @@ def boil(
     wet = share * share * (3.0 - 2.0 * share)
     capacity_flow = at_least(helium_flow, TRICKLE) * cp
     heat = capacity_flow * (T_in - BOILING_POINT) * (1.0 - np.exp(-bath.UA * wet / capacity_flow))
-    moving = at_most(helium_flow / STILL, 1.0)
+    moving = at_least(at_most(helium_flow / STILL, 1.0), 0.0)
     if moving.real < 1.0:
         heat = moving * heat + (1.0 - moving) * bath.UA * wet * (T_coil - BOILING_POINT)
     if heat.real < 0.0:

@@ -130,6 +130,15 @@ class Passing(NamedTuple):
     """J/kg."""
 
 
+@inlined
+def warmth_of(h: float, expansion: float, h_before: float) -> float:
+    """Return by how much (J/kg) what flows into a cell from before, with `h_before`, is warmer than the cell."""
+    warmth = h_before - h
+    if (expansion * warmth).real > MOST_FILLING:
+        warmth = MOST_FILLING / expansion
+    return warmth
+
+
 @kernel
 def march_flows(
     exchanger: HeatExchanger,
@@ -156,14 +165,12 @@ def march_flows(
         cell = cells[i]
         warmth = 0.0 * h_before
         if forwards[i]:
-            warmth = (cells[i - 1, H] if i > 0 else h_before) - cell[H]
-            if (cell[EXPANSION] * warmth).real > MOST_FILLING:
-                warmth = MOST_FILLING / cell[EXPANSION]
+            warmth = warmth_of(cell[H], cell[EXPANSION], cells[i - 1, H] if i > 0 else h_before)
         through = 1.0 - cell[EXPANSION] * (h_out - cell[H])
-        entering = 1.0 - cell[EXPANSION] * warmth
-        m = (through * m + tapped - cell[EXPANSION] * heat[i]) / entering
+        kept = 1.0 / (1.0 - cell[EXPANSION] * warmth)  # not in the way of what follows from cell to cell
+        m = kept * through * m + kept * (tapped - cell[EXPANSION] * heat[i])
         tapped = 0.0 * tapped
-        m_P = (through * m_P + cell[COMPRESSION] + cell[EXPANSION] * cell[WORK]) / entering
+        m_P = kept * through * m_P + kept * (cell[COMPRESSION] + cell[EXPANSION] * cell[WORK])
         h_out = cell[H] + warmth
         cell[M_IN], cell[M_IN_P], cell[H_IN] = m, m_P, h_out
     return Passing(m, m_P, h_out)

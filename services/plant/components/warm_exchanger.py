@@ -8,7 +8,7 @@ counter-flow exchanger: at rest, cells in series are exactly one exchanger of th
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from plant.components.heat_exchanger import STILL, TRICKLE, HeatExchanger, HighPressureFlow, LowPressureFlow
+from plant.components.heat_exchanger import STILL, TRICKLE, HeatExchanger, LowPressureFlow
 from plant.components.parameters import require
 from plant.helium.properties import WARM_CP
 from plant.numeric import Array, at_least, at_most
@@ -43,27 +43,28 @@ def exchanged_heat(UA: float, C_high: float, C_low: float, difference: float) ->
 
 @kernel
 def transfer_warm(
-    exchanger: HeatExchanger, T: Array, high: HighPressureFlow, low: LowPressureFlow, heat: Array
+    exchanger: HeatExchanger, T: Array, T_hot: float, flows: Array, low: LowPressureFlow, heat: Array
 ) -> LowPressureFlow:
     """Write what each cell gives to the low-pressure gas into `heat` (W) and return that gas at the hot end.
 
-    `T` holds the temperature at which the high-pressure gas leaves each cell, hot end first (K), and of its wall. As
-    the high-pressure flow comes to rest, the low-pressure gas takes its heat from the wall.
+    `T` holds the temperature at which the high-pressure gas leaves each cell, hot end first (K), and of its wall;
+    `T_hot` (K) is that at which it enters the first one, `flows` (kg/s) what enters each. As that flow comes to rest,
+    the low-pressure gas takes its heat from the wall.
     """
     UA = exchanger.UA / exchanger.cells
-    C_high = at_least(high.mass_flow, TRICKLE) * WARM_CP
-    C_low = at_least(low.mass_flow, TRICKLE) * WARM_CP
-    moving, sweeping = at_most(high.mass_flow / STILL, 1.0), at_most(low.mass_flow / TRICKLE, 1.0)
-    by_wall = (1.0 - moving) * C_low * (1.0 - np.exp(-2.0 * UA / C_low))
+    swept = at_least(low.mass_flow, TRICKLE)
+    C_low, sweeping = swept * WARM_CP, at_most(low.mass_flow / TRICKLE, 1.0)
     T_low, h_low = low.T, low.h
     for i in range(exchanger.cells - 1, -1, -1):
-        T_before = T[i - 1] if i > 0 else high.T
-        given = exchanged_heat(UA, C_high, C_low, T_before - T_low)
-        if moving.real < 1.0:
+        T_before = T[i - 1] if i > 0 else T_hot
+        given = exchanged_heat(UA, at_least(flows[i], TRICKLE) * WARM_CP, C_low, T_before - T_low)
+        if flows[i].real < STILL:
+            moving = at_least(flows[i] / STILL, 0.0)
+            by_wall = (1.0 - moving) * C_low * (1.0 - np.exp(-2.0 * UA / C_low))
             given = sweeping * (moving * given + by_wall * (T[i] - T_low))
         heat[i] = given
         T_low = T_low + given / C_low
-        h_low = h_low + given / at_least(low.mass_flow, TRICKLE)
+        h_low = h_low + given / swept
     return LowPressureFlow(low.mass_flow, low.P, T_low, h_low)
 
 

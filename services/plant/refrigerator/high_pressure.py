@@ -4,8 +4,9 @@ Its helium is one state, so what enters and leaves is what it holds, to rounding
 the temperatures. `plant.components.passes` has the equations of the cells. NEF5's coil lies between NEF6 and NEF34; the
 helium in it belongs to its heat capacity, it has no volume.
 
-The heats are those of the flows at the cold ends, towards CV155 and CV156: the flow without what the passes take. Only
-how fast the driving temperatures fade when it comes to rest, and C_H of NEF6, depend on it.
+The heats of the cold box are those of the flows at the cold ends, towards CV155 and CV156, on which only depends how
+fast the driving temperatures fade when they come to rest. Those of NEF6 and NEF5 are of the flows that are there: the
+more helium the colder passes take or give, the more they differ from those at the cold ends.
 """
 
 from typing import Final, NamedTuple
@@ -15,6 +16,7 @@ import numpy as np
 from coldloop.kernels.compiled import kernel
 from plant.cold_box.physics import ColdBox, Streams
 from plant.components.gas_volume import SECOND_VIRIAL
+from plant.components.heat_exchanger import LowPressureFlow
 from plant.components.passes import (
     CAPACITY,
     COLUMNS,
@@ -23,6 +25,8 @@ from plant.components.passes import (
     EXPANSION,
     GAIN,
     INFLOW,
+    M_IN,
+    M_IN_P,
     MASS,
     H,
     Passing,
@@ -35,10 +39,11 @@ from plant.components.passes import (
     read_cells,
     supply_at,
     turn_flows,
+    warmth_of,
 )
 from plant.helium.properties import GAS_CONSTANT, ISOBAR_PRESSURE, Helium, supply_cubics
 from plant.numeric import Array, at_least
-from plant.refrigerator.precooler import Precooler
+from plant.refrigerator.precooler import Precooler, Precooling, precooler_flows
 
 FIRST: Final = 2
 """Index of the first cell among the states."""
@@ -53,6 +58,9 @@ SETTLED_ENERGY: Final = 1e-4
 """J that was missing in a cell, from which on the correction for it is the last: it leaves a hundredth or so."""
 MOST_TURNS: Final = 6
 """Within which the directions of the flows are found."""
+MOST_PASSES: Final = 6
+SAME_FLOW: Final = 5e-4
+"""kg/s; the heats of NEF6 are those of flows that differ by less. Each pass comes some hundred times closer."""
 
 
 class PipedPasses(NamedTuple):
@@ -175,19 +183,18 @@ def hold_passes(at: Supply, pipes: PipedPasses, held: Held) -> None:
 
 
 class _Ends(NamedTuple):
-    """Flows at the cold ends of the exchangers, through the coil, and into NEF6."""
+    """Flows at the cold ends of the exchangers, and through the coil."""
 
     nef1: Passing
     nef2: Passing
     nef34: Passing
     coil: Passing
     nef6: Passing
-    hot: Passing
 
 
 @kernel
-def _march(heat: Array, cold: Streams, h_hot: float, pipes: PipedPasses, cells: Array, forwards: Array) -> _Ends:
-    """Return the flows as they are affine in dP/dt; `heat` as in `fill_passes`."""
+def _march_cold(heat: Array, cold: Streams, pipes: PipedPasses, cells: Array, forwards: Array) -> _Ends:
+    """Return the flows up to the coil as they are affine in dP/dt; `heat` as in `fill_passes`."""
     box, nef2, nef34, nef6, coil = pipes.box, pipes.nef2, pipes.nef34, pipes.nef6, pipes.coil
     none = 0.0 * cold.m_jt
     out_1 = Passing(cold.m_jt, none, cold.h_jt)
@@ -201,8 +208,7 @@ def _march(heat: Array, cold: Streams, h_hot: float, pipes: PipedPasses, cells: 
         box.nef34, heat[nef34:nef6], out_34, cold.m_t, cells[coil, H], forwards[nef34:nef6], cells[nef34:nef6]
     )
     out_6 = Passing(out_5.m, out_5.slope, cells[coil - 1, H] if forwards[nef34] else cells[coil, H])
-    hot = march_flows(pipes.precooler.nef6, heat[nef6:coil], out_6, none, h_hot, forwards[nef6:coil], cells[nef6:coil])
-    return _Ends(out_1, out_2, out_34, out_5, out_6, hot)
+    return _Ends(out_1, out_2, out_34, out_5, out_6)
 
 
 @kernel
@@ -222,24 +228,32 @@ def fill_passes(
     gained: float,
     T_hot: float,
     cold: Streams,
+    leaving: LowPressureFlow,
     volume: float,
     pipes: PipedPasses,
     held: Held,
     helium: Helium,
+    x: Array,
+    command: float,
+    supply: float,
     dx: Array,
-) -> Filling:
-    """Replace the heats of cells and coil (W) in `dx` by the rates of their temperatures (K/s).
+) -> tuple[Filling, Precooling]:
+    """Write the rates of the pre-cooler, and replace the heats (W) of cells in `dx` by those of their temperatures.
 
     Args:
         P: From `side_pressure`, Pa.
         gained: By the whole high-pressure side, kg/s.
         T_hot: Temperature of the line, K.
         cold: Flows at the cold ends.
+        leaving: From the cold box to NEF6.
         volume: Of the line, m3.
         pipes: The passes.
         held: From `read_passes`; its cells are overwritten.
         helium: Tables.
-        dx: The heats that cells and coil give, at the places of their states.
+        x: States.
+        command: Opening that is asked of CV167, %.
+        supply: 1 with nitrogen in the tank, 0 without.
+        dx: Rates, with the heats that the cells of the cold box give at the places of their states.
     """
     box, nef2, nef34, nef6, coil = pipes.box, pipes.nef2, pipes.nef34, pipes.nef6, pipes.coil
     at, cells = supply_at(P), held.cells
@@ -247,22 +261,46 @@ def fill_passes(
     hot = np.empty(CUBICS, dx.dtype)
     supply_cubics(T_hot + 0.0 * P, helium, hot)
     _, in_line_P = line_mass(volume, P, T_hot)
-    forwards = np.ones(coil, np.bool_)
-    ends = _march(dx, cold, cubic(hot, 0, at.bar), pipes, cells, forwards)
-    dP = (gained + cold.m_jt + cold.m_t - ends.hot.m) / (in_line_P + ends.hot.slope)
-    turns = 0
-    while _turned(dP, pipes, cells, forwards) and turns < MOST_TURNS:
-        ends = _march(dx, cold, cubic(hot, 0, at.bar), pipes, cells, forwards)
-        dP = (gained + cold.m_jt + cold.m_t - ends.hot.m) / (in_line_P + ends.hot.slope)
-        turns += 1
-    none = 0.0 * dP
+    h_hot, forwards, none = cubic(hot, 0, at.bar), np.ones(coil, np.bool_), 0.0 * P
+    flows = np.zeros(coil + 1 - nef6, dx.dtype)
+    for k in range(MOST_PASSES):
+        cooling = precooler_flows(
+            x[nef6 : coil + 3], command, T_hot, flows, leaving, supply, pipes.precooler, dx[nef6 : coil + 3]
+        )
+        if k == 0:  # as if NEF6 rested: its flows then come close to those that follow
+            for i in range(nef6, coil):
+                dx[i] = (cold.m_jt + cold.m_t) * ((cells[i - 1, H] if i > nef6 else h_hot) - cells[i, H])
+        for turns in range(MOST_TURNS + 1):
+            if k == 0 or turns > 0:
+                ends = _march_cold(dx, cold, pipes, cells, forwards)
+            entering = march_flows(
+                pipes.precooler.nef6, dx[nef6:coil], ends.nef6, none, h_hot, forwards[nef6:coil], cells[nef6:coil]
+            )
+            dP = (gained + cold.m_jt + cold.m_t - entering.m) / (in_line_P + entering.slope)
+            if not _turned(dP, pipes, cells, forwards):
+                break
+        if _write_flows(dP, ends.coil, cells[nef6:coil], flows) <= SAME_FLOW and k > 0:
+            break
     pass_rates(box.nef1, ends.nef1, none, dP, cells[FIRST:nef2], dx[FIRST:nef2])
     pass_rates(box.nef2, ends.nef2, none, dP, cells[nef2:nef34], dx[nef2:nef34])
     pass_rates(box.nef34, ends.nef34, cold.m_t, dP, cells[nef34:nef6], dx[nef34:nef6])
     pass_rates(pipes.precooler.nef6, ends.nef6, none, dP, cells[nef6:coil], dx[nef6:coil])
     m = ends.coil.m + ends.coil.slope * dP
     dx[coil] = (m * (ends.nef6.h - ends.coil.h) - dx[coil]) / pipes.precooler.nef5.capacity
-    return Filling(P, dP, ends.hot.m + ends.hot.slope * dP, ends.hot.h, cells)
+    return Filling(P, dP, entering.m + entering.slope * dP, entering.h, cells), cooling
+
+
+@kernel
+def _write_flows(dP: float, through_coil: Passing, cells: Array, flows: Array) -> float:
+    """Write the flows into the cells of NEF6 and through the coil at `dP` (Pa/s); return the largest change (kg/s)."""
+    change, last = 0.0, cells.shape[0]
+    for i in range(last + 1):
+        flow = through_coil.m + through_coil.slope * dP
+        if i < last:
+            flow = cells[i, M_IN] + cells[i, M_IN_P] * dP
+        change = max(change, abs(flow.real - flows[i].real))
+        flows[i] = flow
+    return change
 
 
 @kernel
@@ -287,7 +325,7 @@ def settle_passes(
 ) -> None:
     """Correct the temperatures of the cells in `x` (48) so that they hold what the stages of a step brought.
 
-    The flow into a cell is corrected with them by what its mass is off, and carries the enthalpy of the cell before.
+    The flow into a cell is corrected with them by what its mass is off, and carries what it does in `march_flows`.
 
     Args:
         M: What line and passes hold after the step, kg.
@@ -308,31 +346,42 @@ def settle_passes(
         at = supply_at(side_pressure(volume, M, T_hot, held.mass))
         hold_passes(at, pipes, held)
         cells = held.cells
-        flow, worst_1 = _settled(FIRST, nef2, 0.0, cells[nef34 - 1, H], gains, weight, cells, x)
-        flow, worst_2 = _settled(nef2, nef34, flow, cells[nef6 - 1, H], gains, weight, cells, x)
-        flow, worst_34 = _settled(nef34, nef6, flow, cells[coil, H], gains, weight, cells, x)
-        x[coil] = T_coil + flow * (cells[coil - 1, H] - cells[coil, H]) / pipes.precooler.nef5.capacity
-        _, worst_6 = _settled(nef6, coil, flow, cubic(hot, 0, at.bar), gains, weight, cells, x)
+        flow, h_out, worst_1 = _settled(FIRST, nef2, 0.0, 0.0, cells[nef34 - 1, H], gains, weight, cells, x)
+        flow, h_out, worst_2 = _settled(nef2, nef34, flow, h_out, cells[nef6 - 1, H], gains, weight, cells, x)
+        flow, h_out, worst_34 = _settled(nef34, nef6, flow, h_out, cells[coil, H], gains, weight, cells, x)
+        x[coil] = T_coil + flow * (cells[coil - 1, H] - h_out) / pipes.precooler.nef5.capacity
+        h_out, h_hot = cells[coil - 1, H], cubic(hot, 0, at.bar)
+        _, _, worst_6 = _settled(nef6, coil, flow, h_out, h_hot, gains, weight, cells, x)
         if max(worst_1, worst_2, worst_34, worst_6) <= SETTLED_ENERGY:
             break
 
 
 @kernel
 def _settled(
-    first: int, last: int, flow: float, h_before: float, gains: Gains, weight: float, cells: Array, x: Array
-) -> tuple[float, float]:
+    first: int,
+    last: int,
+    flow: float,
+    h_out: float,
+    h_before: float,
+    gains: Gains,
+    weight: float,
+    cells: Array,
+    x: Array,
+) -> tuple[float, float, float]:
     """Correct the cells from `first` to `last` - 1, out of which `flow` (kg) more flows than the stages let out.
 
-    Returns what more flows into them (kg), and the most that was missing in one (J).
+    It carries `h_out` (J/kg). Returns what more flows into them (kg), what that carries (J/kg), and the most that was
+    missing in one (J).
     """
     worst = 0.0
     for i in range(last - 1, first - 1, -1):
         cell, start = cells[i], gains.start[i]
         entering = flow + cell[MASS] - start[MASS] - weight * gains.gained[i, 0]
-        h_in = cells[i - 1, H] if i > first else h_before
-        missing = start[ENERGY] + weight * gains.gained[i, 1] + entering * h_in - flow * cell[H] - cell[ENERGY]
-        warmer = missing / (cell[CAPACITY] * (1.0 - cell[EXPANSION] * (h_in - cell[H])))
+        warmth = warmth_of(cell[H], cell[EXPANSION], cells[i - 1, H] if i > first else h_before)
+        missing = start[ENERGY] + weight * gains.gained[i, 1] - cell[ENERGY]
+        missing += entering * (cell[H] + warmth) - flow * h_out
+        warmer = missing / (cell[CAPACITY] * (1.0 - cell[EXPANSION] * warmth))
         x[i] += warmer
         worst = max(worst, abs(missing))
-        flow = entering + cell[CAPACITY] * cell[EXPANSION] * warmer
-    return flow, worst
+        flow, h_out = entering + cell[CAPACITY] * cell[EXPANSION] * warmer, cell[H] + warmth
+    return flow, h_out, worst

@@ -57,7 +57,6 @@ from plant.refrigerator.precooler import (
     Precooler,
     Precooling,
     check_precooler,
-    precooler_flows,
     precooler_of,
 )
 
@@ -142,11 +141,12 @@ def evaluate_refrigerator(
     inputs = u if d[4].real + d[5].real > 0.0 else 0.0 * u
     cold, leaving, relief, bath = flows_and_heats(x[:BOX_STATES], inputs, d[0], joined, helium, dx[:BOX_STATES], y)
     high = HighPressureFlow(cold.m_jt + cold.m_t, T_hot, P.HP)
-    cooling = precooler_flows(x[BOX_STATES:STATION], v[3], high, leaving, d[3], precooler, dx[BOX_STATES:STATION])
     flows = station_rates(
         x[STATION:], v, P, high.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station, dx[STATION:]
     )
-    filling = fill_passes(P.HP, dx[STATION], T_hot, cold, station.hp.volume, pipes, held, helium, dx)
+    filling, cooling = fill_passes(
+        P.HP, dx[STATION], T_hot, cold, leaving, station.hp.volume, pipes, held, helium, x, v[3], d[3], dx
+    )
     dx[STATION + 3] += relief
     signals[0], signals[1], signals[2] = P.LP / 1e5, P.HP / 1e5, P.buffer / 1e5
     signals[3], signals[4] = cooling.warm_end.T, x[pipes.coil - 1]

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 
 from coldloop.kernels.compiled import kernel
 from plant.components.actuator import Actuator, check_actuator, opening_rate
-from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow
+from plant.components.heat_exchanger import HeatExchanger, LowPressureFlow
 from plant.components.nitrogen_bath import Boiling, NitrogenBath, boil, check_nitrogen_bath
 from plant.components.valve import Valve
 from plant.components.warm_exchanger import check_warm_exchanger, transfer_warm
@@ -54,7 +54,8 @@ class Precooling(NamedTuple):
 def precooler_flows(
     x: Array,
     command: float,
-    high: HighPressureFlow,
+    T_hot: float,
+    flows: Array,
     low: LowPressureFlow,
     supply: float,
     precooler: Precooler,
@@ -67,15 +68,16 @@ def precooler_flows(
     Args:
         x: States, `PRECOOLER_STATES`.
         command: Opening that is asked of CV167, %.
-        high: From the compressors.
+        T_hot: Of the helium from the compressors, K.
+        flows: Of high-pressure helium into each cell of NEF6 and through the coil, kg/s, shape (9,).
         low: From the cold box.
         supply: 1 with nitrogen in the tank, 0 without.
         precooler: Parameters.
         dx: Heats and rates.
     """
     cells = precooler.nef6.cells
-    warm_end = transfer_warm(precooler.nef6, x[:cells], high, low, dx[:cells])
-    boiling = boil(precooler.nef5, x[cells + 1], high.mass_flow, WARM_CP, x[cells - 1], x[cells], x[cells + 2], supply)
+    warm_end = transfer_warm(precooler.nef6, x[:cells], T_hot, flows[:cells], low, dx[:cells])
+    boiling = boil(precooler.nef5, x[cells + 1], flows[cells], WARM_CP, x[cells - 1], x[cells], x[cells + 2], supply)
     dx[cells] = boiling.heat
     dx[cells + 1] = boiling.feed - boiling.boil_off
     dx[cells + 2] = opening_rate(precooler.actuator, x[cells + 2], command)
