@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 SINGLE = real_of(Arithmetic.FLOAT32)
 
-ON_LINE = {"qp.instance.instance", "qp.profile.inputs_of", "scheme.plan", "scheme.solve"}
+ON_LINE = {"qp.instance.instance", "qp.profile.inputs_of", "decisions.take_update", "scheme.solve"}
 """Kernels that the program calls; those that they call, solvers and rules among them, are part of their code."""
 
 
