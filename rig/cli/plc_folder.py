@@ -28,6 +28,7 @@ from rig.settings import Settings
 
 README: Final = "README.md"
 PROJECT: Final = "solver.xml"
+BESIDE: Final = f"`{OPTIMIZER}/` has the whole optimiser, with a README and a self-test of its own.\n\n"
 FIXED_S: Final = 2.5
 """Updating period of the second half of the golden updates; that of the first is adaptive."""
 
@@ -75,6 +76,7 @@ def c99(recorded: GoldenVectors, vectors: list[GoldenVector]) -> dict[str, str]:
     export = OdeExport(recorded.method, vectors[0].problem, np.arange(1, len(vectors[0].answer.costs) + 1))
     texts, sizes = export.files(vectors), export.sizes(vectors)
     return {**texts, README: readme("readme_c.md", vectors, texts, {
+        "OPTIMIZER": BESIDE if IS_COLD_BOX else "",
         "CONSTANTS": f"{sizes.constants:,}", "STACK": f"{sizes.stack:,}", "SELF_TEST": f"{sizes.self_test:,}",
     })}  # fmt: skip
 

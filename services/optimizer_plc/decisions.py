@@ -12,7 +12,7 @@ from coldloop.kernels.compiled import kernel
 from coldloop.process.signals import CONTROLLED, TICKS_PER_SAMPLE
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.estimator import begin_at_rest, forget
-from optimizer_plc.qp.profile import hold, shift_from, shifted
+from optimizer_plc.qp.profile import hold, shift, shifted
 from optimizer_plc.rules.interface import OF_PROBLEM, UpdatingRule
 from optimizer_plc.scheme import BY_THE_RULE, Constants, begin_sent, plan, predict_played
 from optimizer_plc.session_state import OptimizerState
@@ -146,7 +146,7 @@ def follow_sequence(c: Constants, m: OptimizerState, latched: Latched, u: Array)
         late = latched.tick - now.tick
     if late >= c.shifts.shape[0]:
         real = m.u.dtype.type
-        far = shift_from(c.knots, real(late) / real(TICKS_PER_SAMPLE))
+        far = shift(c.knots, real(late) / real(TICKS_PER_SAMPLE))
         m.playing.z[:] = shifted(far, m.playing.z, c.n_inputs)
     elif late > 0:
         m.playing.z[:] = shifted(c.shifts[late], m.playing.z, c.n_inputs)

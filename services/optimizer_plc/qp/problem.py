@@ -20,7 +20,7 @@ from optimizer_plc.qp.instance import Maps, instance, keep_first_rate
 from optimizer_plc.qp.linear_algebra import add_transposed_product
 from optimizer_plc.qp.penalties import DEFAULT_PENALTIES, PenaltySettings
 from optimizer_plc.qp.prediction import PredictionModel
-from optimizer_plc.qp.profile import hold, inputs_of, interpolation, shift, shift_from, shifted
+from optimizer_plc.qp.profile import hold, inputs_of, interpolation, shift, shifted
 from optimizer_plc.qp.target import rest_of
 
 Array = NDArray[np.float64]
@@ -96,8 +96,9 @@ class PredictiveProblem:
         self.scaled_rate = self._rounded(scaled_rate)
         self.knots = np.array(design.decision_instants, real)
         self.knots_to_samples = self._rounded(weights)
+        instants = np.array(design.decision_instants, DOUBLE)
         self.shifts = self._rounded(
-            np.array([shift(design.decision_instants, ticks / TICKS_PER_SAMPLE) for ticks in range(SHIFTS + 1)])
+            np.array([shift(instants, ticks / TICKS_PER_SAMPLE) for ticks in range(SHIFTS + 1)])
         )
         self.bands = self._rounded(np.array([design.output_low, design.output_high, design.violation_weight]))
         self.resting_outputs = self._rounded(np.tile(y0, design.horizon))
@@ -167,7 +168,7 @@ class PredictiveProblem:
         """Return the profile z shifted by `ticks` ticks."""
         if ticks <= SHIFTS:
             return shifted(self.shifts[ticks], z, self.n_inputs)
-        return shifted(shift_from(self.knots, self._real(ticks) / self._real(TICKS_PER_SAMPLE)), z, self.n_inputs)
+        return shifted(shift(self.knots, self._real(ticks) / self._real(TICKS_PER_SAMPLE)), z, self.n_inputs)
 
     def within_first_rate(self, z: Array, parameters: QpParameters) -> Array:
         """Return the profile z with its first knot within the rate of the input before it, as it can be sent."""

@@ -26,14 +26,6 @@ def interpolation(knots: tuple[int, ...], at: Array) -> Array:
     return weights
 
 
-def shift(knots: tuple[int, ...], periods: float) -> Array:
-    """Return the matrix that shifts a profile by `periods` sampling periods: the standard hot start.
-
-    The value behind the horizon is the last knot's.
-    """
-    return interpolation(knots, np.asarray(knots, dtype=float) + periods)
-
-
 @kernel
 def shifted(S: Array, z: Array, n_inputs: int) -> Array:
     """Return the profile z (n,) whose values at the knots are combined by S (knots, knots), inputs and slacks alike.
@@ -54,8 +46,11 @@ def shifted(S: Array, z: Array, n_inputs: int) -> Array:
 
 
 @kernel
-def shift_from(knots: Array, periods: float) -> Array:
-    """Return the matrix of `shift` in the floating-point type of the knots."""
+def shift(knots: Array, periods: float) -> Array:
+    """Return the matrix that shifts a profile by `periods` sampling periods: the standard hot start.
+
+    It has the floating-point type of the knots. The value behind the horizon is the last knot's.
+    """
     one, last = knots.dtype.type(1.0), knots.shape[0] - 1
     S = np.zeros((last + 1, last + 1), knots.dtype)
     for new in range(last + 1):

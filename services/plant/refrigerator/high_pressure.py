@@ -264,10 +264,11 @@ def fill_passes(
     h_hot, forwards, none = cubic(hot, 0, at.bar), np.ones(coil, np.bool_), 0.0 * P
     flows = np.zeros(coil + 1 - nef6, dx.dtype)
     for k in range(MOST_PASSES):
-        cooling = precooler_flows(
-            x[nef6 : coil + 3], command, T_hot, flows, leaving, supply, pipes.precooler, dx[nef6 : coil + 3]
-        )
-        if k == 0:  # as if NEF6 rested: its flows then come close to those that follow
+        if k > 0:
+            cooling = precooler_flows(
+                x[nef6 : coil + 3], command, T_hot, flows, leaving, supply, pipes.precooler, dx[nef6 : coil + 3]
+            )
+        else:  # as if NEF6 rested: its flows then come close to those that follow
             for i in range(nef6, coil):
                 dx[i] = (cold.m_jt + cold.m_t) * ((cells[i - 1, H] if i > nef6 else h_hot) - cells[i, H])
         for turns in range(MOST_TURNS + 1):
