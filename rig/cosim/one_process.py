@@ -60,6 +60,7 @@ class Programs(NamedTuple):
     def _deliver(self, listener: Listener) -> None:
         sequence = self.optimizer.solve()
         answer = self.control.offer(sequence)
+        self.optimizer.answered(late=False)
         listener.update(as_transmitted(self.optimizer.report(Verdict(answer.verdict))))
 
     def _scan(self, listener: Listener) -> Update | None:

@@ -84,6 +84,7 @@ class OptimizerProgram:
         planned = self.plan(first)
         sequence = self.solve()
         self.prediction()
+        self.answered(late=False)
         self.plan(first._replace(update=1, tick=planned.next_update_tick, playing=sequence.header.number))
 
     def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
