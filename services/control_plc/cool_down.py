@@ -36,7 +36,7 @@ class CoolDownSettings(BaseModel):
 
 
 class CoolDown:
-    """The sequence of a session; it begins with the first measurement of a warm cold box, or never.
+    """The sequence of a session; it begins with the first measurement of a warm cold box, or never, or is under way.
 
     Args:
         settings: Its limits.
@@ -44,6 +44,7 @@ class CoolDown:
         inputs: At the operating point.
         outputs: At the operating point.
         bands: Of L1 and T5.
+        step: Which it had reached before a restart.
     """
 
     def __init__(
@@ -53,12 +54,13 @@ class CoolDown:
         inputs: Sequence[float],
         outputs: Sequence[float],
         bands: Sequence[tuple[float, float]],
+        step: CoolDownStep = CoolDownStep.FINISHED,
     ) -> None:
         self._settings, self._limits = settings, limits
         self._inputs, self._outputs, self._bands = inputs, outputs, bands
-        self._has_begun = False
+        self._has_begun = step is not CoolDownStep.FINISHED
         self._settled_since: int | None = None
-        self.step = CoolDownStep.FINISHED
+        self.step = step
 
     @property
     def is_active(self) -> bool:

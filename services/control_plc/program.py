@@ -19,6 +19,7 @@ from coldloop.registers.audit import EventKind
 from coldloop.registers.control_plc import (
     Acknowledgement,
     Cause,
+    CoolDownStep,
     Heartbeat,
     Mode,
     Operator,
@@ -125,6 +126,7 @@ class ControlProgram:
         updates: int,
         operator: Operator,
         playing: InputSequence | None = None,
+        cool_down: CoolDownStep = CoolDownStep.FINISHED,
     ) -> None:
         """Resume a session after a restart.
 
@@ -136,15 +138,24 @@ class ControlProgram:
             operator: What operators have said.
             playing: What was being played. Its rest is played on, if what the rack applies is of it: a state that was
                 retained some ticks before the end may hold the sequence before.
+            cool_down: Its step then.
         """
         self.operator = operator
-        self._begin(session, tick, SequenceRow(*applied), updates=updates)
+        self._begin(session, tick, SequenceRow(*applied), updates=updates, cool_down=cool_down)
         ours = playing is not None and SequenceRow(*applied) in playing.rows[: max(0, tick - playing.header.first_tick)]
         self.player.resume(playing if ours else None, tick)
         self.ladder = Ladder(self._section.ladder.hold_ticks, Mode.HOLD, Cause.RESTARTED, tick)
         self._note_mode(tick)
 
-    def _begin(self, session: int, tick: int, applied: SequenceRow, *, updates: int) -> None:
+    def _begin(
+        self,
+        session: int,
+        tick: int,
+        applied: SequenceRow,
+        *,
+        updates: int,
+        cool_down: CoolDownStep = CoolDownStep.FINISHED,
+    ) -> None:
         self.session = session
         self.tick = tick
         self.process: Process | None = None
@@ -161,8 +172,9 @@ class ControlProgram:
             self._section.sensors, self._point.outputs, [SEEN * rate for rate in self._limits.rate]
         )
         self.cool_down = CoolDown(
-            self._section.cool_down, self._limits, self._point.inputs, self._point.outputs, self.alarm_settings.bands
-        )
+            self._section.cool_down, self._limits, self._point.inputs, self._point.outputs, self.alarm_settings.bands,
+            cool_down,
+        )  # fmt: skip
         self._unknown = False
         """The load or the state that was measured last makes no sense."""
         self._failed_handshake = -math.inf

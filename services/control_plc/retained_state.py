@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from coldloop.process.signals import INPUT_NAMES, LAST_NUMBER, LAST_TICK
 from coldloop.registers.codec import check_record
 from coldloop.registers.common import SessionPace
-from coldloop.registers.control_plc import SEQUENCE_ROWS, Operator, SequenceHeader, SequenceRow
+from coldloop.registers.control_plc import SEQUENCE_ROWS, CoolDownStep, Operator, SequenceHeader, SequenceRow
 from coldloop.registers.safety import Alarm, AlarmKind
 from coldloop.safety.retained import RetainedFile, RetainedStateError
 from coldloop.safety.retained_writer import RetainedStateWriter
@@ -23,10 +23,10 @@ from control_plc.program import ControlProgram
 
 log = logging.getLogger("coldloop.control_plc")
 
-OWNER: Final = "control_plc/5"
+OWNER: Final = "control_plc/6"
 """Who retained states belong to, and the version of what they hold."""
 ROW: Final = struct.Struct(f">{len(INPUT_NAMES)}f")
-OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing")
+OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing", "cool_down")
 """What is retained of a session."""
 
 Count = Annotated[int, Field(ge=0, lt=2**32)]
@@ -50,6 +50,7 @@ class RetainedControlState(BaseModel):
     """Number of the next update."""
     playing: tuple[SequenceHeader, Annotated[str, Field(max_length=2 * SEQUENCE_ROWS * ROW.size)]] | None
     """Header and rows (base64 of single precision, high byte first) of the sequence being played."""
+    cool_down: CoolDownStep
     operator: Operator
     watchdog: Annotated[int, Field(ge=0, lt=2**16)]
     """Time-out of the optimiser's watchdog, in ticks."""
@@ -137,8 +138,8 @@ class ControlStateStore:
         return {
             "boot": self.boot, "holder": self.holder, "events": program.journal.count, "session": program.session,
             "tick": program.tick, "pace": pace, "updates": program.player.updates,
-            "playing": self._playing(program.player.sequence), "operator": program.operator,
-            "watchdog": program.watchdog.time,
+            "playing": self._playing(program.player.sequence), "cool_down": program.cool_down.step,
+            "operator": program.operator, "watchdog": program.watchdog.time,
             "alarms": tuple(program.alarms.rows),
         }  # fmt: skip
 

@@ -2,7 +2,7 @@
 
 A measurement is bad when it is no number, outside its sensor's range, or frozen: it does not change by a bit for a
 while in which most of the others move. When nothing at all changes, load and states included, the image is an old one:
-a plant that rests is known by its inputs, which rest too.
+a plant that rests is known by its inputs, which rest too. A turbine without a pressure difference may stand still.
 """
 
 from collections.abc import Collection, MutableSequence, Sequence
@@ -17,6 +17,9 @@ from control_plc.numbers import Numbers
 Range = tuple[FiniteFloat, FiniteFloat]
 FIRST_OF_KIND, P1 = (T1, OUTPUT_NAMES.index("P1")) if IS_COLD_BOX else (0, 0)
 """First of the pressures, which are the last outputs; the temperatures are before them. Other outputs have one kind."""
+V1, P5, P6 = map(OUTPUT_NAMES.index, ("V1", "P5", "P6")) if IS_COLD_BOX else (0, 0, 0)
+STANDSTILL_RATIO = 1.1
+"""Of the pressures before and behind the turbine's nozzle, below which it may stand; it is some ten in operation."""
 FEW = int(not IS_COLD_BOX)
 """1: most of the others are counted without the output itself, which matters where there are few."""
 MOVES = 240
@@ -109,6 +112,11 @@ def count_unchanged(
 def is_frozen(unchanged: float, rest: float, least: float) -> bool:
     """Return whether an output is unchanged for at least so many ticks, and for twice its longest rest."""
     return rest >= 0 and unchanged >= least and unchanged >= 2 * rest
+
+
+def may_stand(output: int, y: Sequence[float]) -> bool:
+    """Return whether an output is the speed of a turbine that stands, for all that the pressures say."""
+    return IS_COLD_BOX and output == V1 and y[V1] == 0.0 and y[P6] < STANDSTILL_RATIO * y[P5]
 
 
 def moved(before: Numbers, y: Numbers, first: int, end: int) -> int:
@@ -215,8 +223,7 @@ class SensorMonitor:
         self._tick = self._now = tick
         history = zip(self.unchanged, self.rests, self.least, strict=True)
         frozen: Collection[int] = [output for output, each in enumerate(history) if is_frozen(*each)]
-        if standing:
-            frozen = [output for output in frozen if output not in standing]
+        frozen = [output for output in frozen if output not in standing and not may_stand(output, y)]
         if self._may_rest and not IS_COLD_BOX:
             frozen = self._not_at_rest(frozen, inputs)
         if self._image.unchanged(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:

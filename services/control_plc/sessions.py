@@ -71,7 +71,7 @@ class Sessions:
             self.kept = None
             program.resume(
                 reading.session, reading.tick, reading.u,
-                updates=kept.updates, operator=program.operator, playing=kept.sequence,
+                updates=kept.updates, operator=program.operator, playing=kept.sequence, cool_down=kept.cool_down,
             )  # fmt: skip
         else:
             self.forget_kept()

@@ -1,12 +1,18 @@
 """The cool-down of a cold box: which step follows which, what each asks for, and that the optimiser stays out."""
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import pytest
 
 from coldloop.process.limits import InputLimits
 from coldloop.process.signals import L1, OUTPUT_NAMES, T1, T5
-from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, OperatorMode, SequenceRow
+from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, Operator, OperatorMode, SequenceRow
 from control_plc.cool_down import CoolDown, CoolDownSettings
 from control_plc.ladder import Ladder, LadderInputs
+
+if TYPE_CHECKING:
+    from tests.control_plc.conftest import Bench
 
 INPUTS = (43.0, 75.0, 36.0)
 BY_LOOPS = SequenceRow(50.0, 20.0, 30.0)
@@ -77,3 +83,23 @@ def test_while_it_lasts_the_ladder_is_classical_unless_an_operator_drives(operat
         OperatorMode.MANUAL: (Mode.MANUAL, Cause.OPERATOR),
     }
     assert (ladder.mode, ladder.cause) == chosen[operator]
+
+
+@pytest.mark.parametrize("reached", [CoolDownStep.FILLING, CoolDownStep.SETTLING])
+def test_a_control_plc_that_is_restarted_goes_on_from_the_step_it_had_reached(
+    reached: CoolDownStep, new_bench: "Callable[[InputLimits], Bench]"
+) -> None:
+    """Once one that was restarted while the bath filled invited the optimiser."""
+    bench = new_bench(InputLimits())
+    bench.steady = True
+    program, applied = bench.program, SequenceRow(*INPUTS)
+    program.resume(1, 500, applied, updates=0, operator=Operator(OperatorMode.AUTO, *applied), cool_down=reached)
+    bench.readings = {L1: 30.0}
+    bench.scans(5)
+    assert program.cool_down.step is reached
+    assert (program.mode, program.ladder.cause) == (Mode.CLASSICAL, Cause.COOL_DOWN)
+    assert not program.player.invited
+    bench.readings = {}
+    bench.scans(4 * 620)
+    assert program.cool_down.step is CoolDownStep.FINISHED
+    assert program.player.invited

@@ -13,12 +13,17 @@ import pytest
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.process.model_file import read_header
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.signals import L1, T1, T5
 from coldloop.registers.audit import EVENT_ROWS, Event
 from coldloop.registers.bank import ANYBODY, Caller, RegisterBank
 from coldloop.registers.common import Identity
 from coldloop.registers.control_plc import (
     CONTROL_MAP,
+    Cause,
     ControlSession,
+    CoolDownStep,
+    LadderStatus,
+    Mode,
     Operator,
     OperatorMode,
     PlantLinkState,
@@ -50,6 +55,7 @@ class SmallRack:
         self.bank.put(Identity(map_digest=PLANT_MAP.digest, map_version=PLANT_MAP.version))
         self.written: list[Actuators] = []
         self.generation = 0
+        self.y = list(HEADER.y0)
         self.begin(session)
 
     def begin(self, session: int) -> None:
@@ -62,7 +68,7 @@ class SmallRack:
         self.bank.put(
             sealed(
                 Measurement(
-                    0, HEADER.w0, tuple(HEADER.y0), tuple(HEADER.x0), self.session, u, holder, self.generation, verdict
+                    0, HEADER.w0, tuple(self.y), tuple(HEADER.x0), self.session, u, holder, self.generation, verdict
                 )
             )
         )
@@ -247,6 +253,25 @@ async def test_a_session_is_gone_on_with_after_several_starts_without_the_rack(t
         assert plc.bank.get(Operator).mode == OperatorMode.AUTO
 
 
+async def test_a_cool_down_is_gone_on_with_after_a_restart_though_there_is_liquid(tmp_path: Path) -> None:
+    settings = {"retain": {"file": tmp_path / "state"}}
+    for level, temperature, session in ((0.0, 290.0, 4), (30.0, 4.44, None)):
+        rack = SmallRack(4)
+        rack.y[L1], rack.y[T1], rack.y[T5] = level, temperature, temperature
+        rack.begin(4)
+        async with running(rack, control_plc=settings) as plc:
+            if session is not None:
+                ask(plc, ControlSession(session, 0, 1.0))
+            await until(lambda: plc.sessions.running)
+            plc.clients.granted = 1
+            plc.clients.changed.set()
+            await until(lambda: rack.written)  # noqa: B023 - awaited here
+            plc.clients.granted = 2
+            plc.clients.changed.set()
+            await until(lambda: plc.bank.get(LadderStatus).cause == Cause.COOL_DOWN)
+            assert plc.bank.get(LadderStatus).mode == Mode.CLASSICAL
+
+
 async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -284,6 +309,7 @@ async def test_certificates_that_cannot_be_read_for_a_while_end_nothing(
         {"alarms": [(9, 0, 0, 0, 0, 0, 1, 0)] * len(AlarmKind)},
         {"alarms": [(0, 0, 0, -1, 0, 0, 1, 2**40)] * len(AlarmKind)},
         {"playing": ((2**32 - 1, 0, 0, 0, 0, 0, 0), "")},
+        {"cool_down": max(CoolDownStep) + 1},
     ],
     ids=str,
 )
