@@ -31,12 +31,17 @@ NC1_SPEED, NC2_SPEED = -5, -4
 CV956 = -3
 
 
-def make(events: Sequence[tuple[float, str, float]], **turbine: float) -> RefrigeratorProgram:
+AT_REST = LoadProfile((0,), (FILE.w0,))
+
+
+def make(
+    events: Sequence[tuple[float, str, float]], load: LoadProfile = AT_REST, **turbine: float
+) -> RefrigeratorProgram:
     listed = [RefrigeratorEvent.model_validate({"at_s": at, "target": what, "value": to}) for at, what, to in events]
     return RefrigeratorProgram(
         file=FILE,
         u0=FILE.u0,
-        load=LoadProfile((0,), (FILE.w0,)),
+        load=load,
         station=StationSettings.model_validate({"turbine": turbine}),
         events=EventSchedule(listed, 300.0, 0.0),
     )
@@ -161,6 +166,28 @@ def test_half_blocked_an_exchanger_adds_three_clean_pressure_drops() -> None:
     assert further_drop(0.5) == 3.0
     assert throttled(43.0, 0, 3.0) == pytest.approx(42.783, abs=1e-3)
     assert throttled(43.0, 0, 0.0) == 43.0
+
+
+CHANGES = [
+    (1.0, "leak", 0.5), (2.0, "ambient", 301.0), (3.0, "nitrogen", 0), (4.0, "nc1", 0), (5.0, "cv155", 0),
+    (6.0, "turbine", 0), (7.0, "nc2", 0), (8.0, "blocked_nef34", 8.0), (14.0, "nc1", 1),
+]  # fmt: skip
+
+
+def test_a_tick_that_begins_with_what_the_last_one_read_is_the_same_to_the_bit() -> None:
+    """A resumed program has read nothing: it evaluates its first stage anew, in every tick."""
+    load = LoadProfile((0, 50), (FILE.w0, FILE.w0 + 60.0))
+    going_on, anew = make(CHANGES, load), make(CHANGES, load)
+    for tick in range(60):
+        u = [value + tick // 12 % 2 for value in FILE.u0]
+        going_on.apply(u)
+        retained = anew.retained()
+        anew = make(CHANGES, load)
+        anew.resume(**retained)
+        anew.apply(u)
+        going_on.advance()
+        anew.advance()
+        assert going_on.memory.x.tolist() == anew.memory.x.tolist(), tick
 
 
 def test_what_is_stuck_tripped_and_blocked_survives_a_restart_of_the_rack() -> None:

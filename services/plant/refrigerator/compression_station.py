@@ -9,7 +9,7 @@ line: its mass is theirs, too, and its pressure that of `plant.refrigerator.high
 from typing import Any, Final, NamedTuple
 
 from coldloop.kernels.compiled import kernel
-from plant.components.actuator import Actuator, check_actuator, opening_rate
+from plant.components.actuator import Actuator, check_actuator
 from plant.components.gas_valve import (
     ReliefValve,
     check_gas_valve,
@@ -119,7 +119,6 @@ class StationFlows(NamedTuple):
 @kernel
 def station_rates(
     x: Array,
-    command: Array,
     P: Pressures,
     to_box: float,
     from_box: float,
@@ -129,11 +128,10 @@ def station_rates(
     station: CompressionStation,
     dx: Array,
 ) -> StationFlows:
-    """Write the rates of the station's states into `dx` (9, per second) and return the flows.
+    """Write the rates of the station's states but its valves into `dx` (9, per second) and return the flows.
 
     Args:
         x: States, `STATION_STATES`.
-        command: Openings that are asked of CV956, CV952, CV953, %.
         P: From `station_pressures`.
         to_box: What the cold box takes out of line and passes, kg/s.
         from_box: What it returns to the low-pressure line, kg/s.
@@ -161,8 +159,6 @@ def station_rates(
     for i in range(2):
         rising = run[i] > x[4 + i].real
         dx[4 + i] = (run[i] - x[4 + i]) / (station.run_up if rising else station.run_down)
-    for i in range(3):
-        dx[6 + i] = opening_rate(station.actuator, x[6 + i], command[i])
     power = first.power + second.power
     warmed = compressed * (WARM_CP * station.cooler_approach + SECOND_VIRIAL * (P.HP - P.LP))
     return StationFlows(compressed, bypass, discharge, charge, dx[3], power, at_least(power - warmed, 0.0))

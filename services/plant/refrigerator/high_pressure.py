@@ -234,7 +234,6 @@ def fill_passes(
     held: Held,
     helium: Helium,
     x: Array,
-    command: float,
     supply: float,
     dx: Array,
 ) -> tuple[Filling, Precooling]:
@@ -251,7 +250,6 @@ def fill_passes(
         held: From `read_passes`; its cells are overwritten.
         helium: Tables.
         x: States.
-        command: Opening that is asked of CV167, %.
         supply: 1 with nitrogen in the tank, 0 without.
         dx: Rates, with the heats that the cells of the cold box give at the places of their states.
     """
@@ -266,7 +264,7 @@ def fill_passes(
     for k in range(MOST_PASSES):
         if k > 0:
             cooling = precooler_flows(
-                x[nef6 : coil + 3], command, T_hot, flows, leaving, supply, pipes.precooler, dx[nef6 : coil + 3]
+                x[nef6 : coil + 3], T_hot, flows, leaving, supply, pipes.precooler, dx[nef6 : coil + 3]
             )
         else:  # as if NEF6 rested: its flows then come close to those that follow
             for i in range(nef6, coil):
@@ -305,19 +303,19 @@ def _write_flows(dP: float, through_coil: Passing, cells: Array, flows: Array) -
 
 
 @kernel
-def start_gains(filling: Filling) -> Gains:
-    """Begin to keep account of a step whose first stage is `filling`, with the weight 1."""
-    gains = Gains(filling.cells, np.zeros((filling.cells.shape[0], 2)))
-    add_gains(gains, filling, 1.0)
+def start_gains(cells: Array) -> Gains:
+    """Begin to keep account of a step with its first stage, `Filling.cells`, and the weight 1."""
+    gains = Gains(cells, np.zeros((cells.shape[0], 2)))
+    add_gains(gains, cells, 1.0)
     return gains
 
 
 @kernel
-def add_gains(gains: Gains, filling: Filling, weight: float) -> None:
+def add_gains(gains: Gains, cells: Array, weight: float) -> None:
     """Add what the cells gain at a stage."""
-    for i in range(FIRST, filling.cells.shape[0] - 1):
-        gains.gained[i, 0] += weight * filling.cells[i, INFLOW]
-        gains.gained[i, 1] += weight * filling.cells[i, GAIN]
+    for i in range(FIRST, cells.shape[0] - 1):
+        gains.gained[i, 0] += weight * cells[i, INFLOW]
+        gains.gained[i, 1] += weight * cells[i, GAIN]
 
 
 @kernel

@@ -21,6 +21,7 @@ import numpy as np
 from coldloop.kernels.compiled import kernel
 from coldloop.process import signals as process
 from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, flows_and_heats
+from plant.components.actuator import opening_rate
 from plant.components.cell_account import WILD, widest_move
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
 from plant.components.nitrogen_bath import nitrogen_level
@@ -62,7 +63,11 @@ from plant.refrigerator.precooler import (
 
 BOX_STATES: Final = len(process.STATE_NAMES)
 STATION: Final = BOX_STATES + len(PRECOOLER_STATES)
-"""Index of the station's first state."""
+"""Index of the station's first state; CV167 is before it."""
+VALVES: Final = STATION + STATION_STATES.index("CV956")
+"""Index of the first of the station's valves, in the order of `COMMAND_NAMES`."""
+COIL: Final = BOX_STATES + PRECOOLER_STATES.index("T_nef5")
+"""Index of the last state of the high-pressure passes."""
 STATE_NAMES: Final = (*process.STATE_NAMES, *PRECOOLER_STATES, *STATION_STATES)
 STATE_UNITS: Final = (*process.STATE_UNITS, *PRECOOLER_STATE_UNITS, *STATION_STATE_UNITS)
 COMMAND_NAMES: Final = process.STATION_VALVE_NAMES
@@ -71,6 +76,7 @@ DISTURBANCE_NAMES: Final = ("NCR22_HL", "T_ambient", "leak", "nitrogen", "NC1", 
 
 SIGNAL_NAMES: Final = process.STATION_SIGNAL_NAMES
 SIGNALS: Final = len(SIGNAL_NAMES)
+PA_PER_BAR: Final = 1e5
 
 
 class Refrigerator(NamedTuple):
@@ -142,13 +148,14 @@ def evaluate_refrigerator(
     cold, leaving, relief, bath = flows_and_heats(x[:BOX_STATES], inputs, d[0], joined, helium, dx[:BOX_STATES], y)
     high = HighPressureFlow(cold.m_jt + cold.m_t, T_hot, P.HP)
     flows = station_rates(
-        x[STATION:], v, P, high.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station, dx[STATION:]
+        x[STATION:], P, high.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station, dx[STATION:]
     )
     filling, cooling = fill_passes(
-        P.HP, dx[STATION], T_hot, cold, leaving, station.hp.volume, pipes, held, helium, x, v[3], d[3], dx
+        P.HP, dx[STATION], T_hot, cold, leaving, station.hp.volume, pipes, held, helium, x, d[3], dx
     )
     dx[STATION + 3] += relief
-    signals[0], signals[1], signals[2] = P.LP / 1e5, P.HP / 1e5, P.buffer / 1e5
+    move_valves(x, v, plant, dx)
+    signals[0], signals[1], signals[2] = P.LP / PA_PER_BAR, P.HP / PA_PER_BAR, P.buffer / PA_PER_BAR
     signals[3], signals[4] = cooling.warm_end.T, x[pipes.coil - 1]
     signals[5] = 1e3 * filling.entering
     _write_flows(flows, signals[6:])
@@ -168,6 +175,14 @@ def _write_flows(flows: StationFlows, signals: Array) -> None:
     signals[1], signals[2], signals[3] = 1e3 * flows.bypass, 1e3 * flows.discharge, 1e3 * flows.charge
     signals[4] = 1e3 * flows.out
     signals[5], signals[6] = 1e-3 * flows.power, 1e-3 * flows.cooling
+
+
+@kernel
+def move_valves(x: Array, v: Array, plant: Refrigerator, dx: Array) -> None:
+    """Write the rates of the warm valves' openings into `dx` (48): all that the commands `v` act on at once."""
+    for i in range(3):
+        dx[VALVES + i] = opening_rate(plant.station.actuator, x[VALVES + i], v[i])
+    dx[STATION - 1] = opening_rate(plant.precooler.actuator, x[STATION - 1], v[3])
 
 
 @kernel
@@ -211,22 +226,53 @@ def advance_refrigerator(
     Stable up to dt = 1 s at the operating point. Loops run in a fixed order: the result is the same to the bit
     everywhere.
     """
+    slope, signals = np.empty(x.shape[0]), np.empty(SIGNALS)
+    cells = evaluate_refrigerator(x, u, v, d, plant, helium, slope, np.empty(22), signals).filling.cells
+    return advance_along(x, slope, cells, PA_PER_BAR * signals[1], u, v, d, dt, plant, helium)
+
+
+@kernel
+def advance_along(
+    x: RealArray,
+    first: RealArray,
+    cells: RealArray,
+    P: float,
+    u: RealArray,
+    v: RealArray,
+    d: RealArray,
+    dt: float,
+    plant: Refrigerator,
+    helium: Helium,
+) -> RealArray:
+    """Return the state after `dt` seconds, where the first stage is known.
+
+    Args:
+        x: State, shape (48,).
+        first: dx/dt there.
+        cells: `Filling.cells` there.
+        P: High pressure there, Pa.
+        u: Inputs.
+        v: Commands.
+        d: Disturbances.
+        dt: s.
+        plant: Parameters.
+        helium: Tables.
+    """
     n = x.shape[0]
     slope, y, signals = np.empty(n), np.empty(22), np.empty(SIGNALS)
     stage, total = np.empty(n), np.empty(n)
     stages = np.empty((4, n))
-    crossing = evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
-    account, gains = start_account(crossing.bath, slope), start_gains(crossing.filling)
-    P = crossing.filling.P
+    account = start_account(content(plant.box.separator, x[0], x[1], helium), first)
+    gains = start_gains(cells)
     swing: float = 0.0
     for i in range(n):
         stages[0, i] = x[i]
-        total[i] = slope[i]
-        stage[i] = x[i] + 0.5 * dt * slope[i]
+        total[i] = first[i]
+        stage[i] = x[i] + 0.5 * dt * first[i]
     for k, fraction in ((1, 0.5), (2, 1.0)):
         crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
         account = add_to_account(account, crossing.bath, slope, 2.0)
-        add_gains(gains, crossing.filling, 2.0)
+        add_gains(gains, crossing.filling.cells, 2.0)
         swing = max(swing, abs(crossing.filling.P - P))
         for i in range(n):
             stages[k, i] = stage[i]
@@ -234,7 +280,7 @@ def advance_refrigerator(
             stage[i] = x[i] + fraction * dt * slope[i]
     crossing = evaluate_refrigerator(stage, u, v, d, plant, helium, slope, y, signals)
     account = add_to_account(account, crossing.bath, slope, 1.0)
-    add_gains(gains, crossing.filling, 1.0)
+    add_gains(gains, crossing.filling.cells, 1.0)
     swing = max(swing, abs(crossing.filling.P - P))
     for i in range(n):
         stages[3, i] = stage[i]

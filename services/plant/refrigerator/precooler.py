@@ -7,7 +7,7 @@ States, `PRECOOLER_STATES`: the cells of NEF6 from the hot end on and the coil o
 from typing import Any, Final, NamedTuple
 
 from coldloop.kernels.compiled import kernel
-from plant.components.actuator import Actuator, check_actuator, opening_rate
+from plant.components.actuator import Actuator, check_actuator
 from plant.components.heat_exchanger import HeatExchanger, LowPressureFlow
 from plant.components.nitrogen_bath import Boiling, NitrogenBath, boil, check_nitrogen_bath
 from plant.components.valve import Valve
@@ -53,7 +53,6 @@ class Precooling(NamedTuple):
 @kernel
 def precooler_flows(
     x: Array,
-    command: float,
     T_hot: float,
     flows: Array,
     low: LowPressureFlow,
@@ -61,13 +60,12 @@ def precooler_flows(
     precooler: Precooler,
     dx: Array,
 ) -> Precooling:
-    """Write the rates of the nitrogen and its valve into `dx` (11, per second); return what the pre-cooler does.
+    """Write the rate of the nitrogen into `dx` (11, per second); return what the pre-cooler does.
 
     In the place of the rates of the exchangers' temperatures is the heat that they give (W).
 
     Args:
         x: States, `PRECOOLER_STATES`.
-        command: Opening that is asked of CV167, %.
         T_hot: Of the helium from the compressors, K.
         flows: Of high-pressure helium into each cell of NEF6 and through the coil, kg/s, shape (9,).
         low: From the cold box.
@@ -80,7 +78,6 @@ def precooler_flows(
     boiling = boil(precooler.nef5, x[cells + 1], flows[cells], WARM_CP, x[cells - 1], x[cells], x[cells + 2], supply)
     dx[cells] = boiling.heat
     dx[cells + 1] = boiling.feed - boiling.boil_off
-    dx[cells + 2] = opening_rate(precooler.actuator, x[cells + 2], command)
     return Precooling(warm_end, boiling)
 
 

@@ -23,9 +23,18 @@ from plant.refrigerator.physics import (
     read,
 )
 from plant.refrigerator.station_control import station_law
-from plant.refrigerator.station_law import MEMORY_SIZE, Commands
+from plant.refrigerator.station_law import Commands
 from plant.refrigerator.station_settings import StationSettings
-from plant.refrigerator.tick import ALARMS, HP, LP, MODE, RefrigeratorMemory, advance_program_tick, control_tick
+from plant.refrigerator.tick import (
+    ALARMS,
+    HP,
+    LP,
+    MODE,
+    RefrigeratorMemory,
+    advance_program_tick,
+    begin_memory,
+    control_tick,
+)
 from plant.refrigerator.warm_start import warm_state
 
 AMBIENT: Final = GIVEN_NAMES.index("T_ambient")
@@ -92,6 +101,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         self._plant, self._tables = plain_tuples(plant), plain_tuples(load_helium())
         self.law = station_law(station, file.reference, plant.station)
         """Of the station's controller."""
+        self._law = plain_tuples(self.law)
         self._events = events
         self._gauges = GaugeNoise(station.noise_bar, seed)
         x, v = np.array(file.x0, dtype=np.float64), np.array(file.v0, dtype=np.float64)
@@ -99,8 +109,8 @@ class RefrigeratorProgram(ColdBoxProgram):
         equipment = standing_equipment(np.array(u0)) if warm else resting_equipment(np.array(u0))
         if warm:
             x = warm_state(file.x0, plant, load_helium(), ambient=d[AMBIENT], low_pressure=1e5 * station.lp_bar)
-        y, signals = read(x, equipment[ACTING:DEVIATING], v, d, plant, load_helium())
-        self._memory = RefrigeratorMemory(x, y, signals, v, np.zeros(MEMORY_SIZE), equipment, np.zeros(2, np.int64))
+        self._memory = m = begin_memory(x, v, equipment)
+        m.y[:], m.signals[:] = read(x, equipment[ACTING:DEVIATING], v, d, plant, load_helium())
         control_tick(self._memory, d, self.law)
         super().__init__(box=plant.box, x0=x[:BOX_STATES].tolist(), u0=u0, load=load, noise=noise)
 
@@ -109,7 +119,7 @@ class RefrigeratorProgram(ColdBoxProgram):
 
     def _warm_up(self) -> None:
         d = self._disturbances(0, self.load)
-        advance_program_tick(self.memory, self._u, d, d, self._plant, self._tables, self.law)
+        advance_program_tick(self.memory, self._u, d, d, self._plant, self._tables, self._law)
 
     @property
     def station(self) -> StationSample:
@@ -152,7 +162,7 @@ class RefrigeratorProgram(ColdBoxProgram):
     def advance(self) -> None:
         """Go one tick forward."""
         d, ahead = self._disturbances(self.tick, self.load), self._disturbances(self.tick + 1, 0.0)
-        advance_program_tick(self._memory, self._u, d, ahead, self._plant, self._tables, self.law)
+        advance_program_tick(self._memory, self._u, d, ahead, self._plant, self._tables, self._law)
         self._x = self._memory.x[:BOX_STATES]
         self.tick += 1
         self._measured = self._sample(self._memory.y)
@@ -171,16 +181,8 @@ class RefrigeratorProgram(ColdBoxProgram):
     @property
     def memory(self) -> RefrigeratorMemory:
         """A copy of what a tick changes."""
-        m = self._memory
-        return RefrigeratorMemory(
-            m.x.copy(),
-            m.y.copy(),
-            m.signals.copy(),
-            m.commands.copy(),
-            m.integrals.copy(),
-            m.equipment.copy(),
-            m.status.copy(),
-        )
+        parts: dict[str, Any] = {name: part.copy() for name, part in self._memory._asdict().items()}
+        return RefrigeratorMemory(**parts)
 
     def take_over_whole(self, tick: int, u: RealArray, memory: RefrigeratorMemory, y: RealArray) -> None:
         """Resume at another tick with what `memory` and `measure` would return there; `u` was held up to it."""
@@ -207,6 +209,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         for since, put in warm["given"]:
             self._events.put(int(since), Surroundings(*put))
         self._memory = self._memory._replace(**kept)
+        self._memory.acted[:] = np.nan
 
     def retained(self) -> dict[str, Any]:
         """Return what `resume` needs, as plain data."""

@@ -6,10 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from coldloop.process.signals import OUTPUT_NAMES, TICK_S
+from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, TICK_S
+from plant.components.passes import COLUMNS
 from plant.helium.properties import Helium, helium_of
 from plant.numeric import RealArray
 from plant.refrigerator.equipment import (
+    ACTING,
+    BLOCKED,
     DEVIATING,
     HP_NOISE,
     LP_NOISE,
@@ -22,19 +25,33 @@ from plant.refrigerator.equipment import (
     loaded_compressors,
 )
 from plant.refrigerator.physics import (
+    COIL,
+    DISTURBANCE_NAMES,
+    PA_PER_BAR,
     SIGNAL_NAMES,
+    SIGNALS,
     STATE_NAMES,
     Refrigerator,
-    advance_refrigerator,
+    advance_along,
     evaluate_refrigerator,
+    move_valves,
     refrigerator_of,
 )
-from plant.refrigerator.station_law import StationLaw, StationMeasurement, control_station, raised_alarms
+from plant.refrigerator.station_law import (
+    MEMORY_SIZE,
+    StationLaw,
+    StationMeasurement,
+    control_station,
+    law_of,
+    raised_alarms,
+)
 
 HP, LP, BUFFER, NITROGEN, LOST = (SIGNAL_NAMES.index(name) for name in ("P12", "P11", "P13", "L_N2", "lost"))
 TO_BOX, COMPRESSED = SIGNAL_NAMES.index("M12"), SIGNAL_NAMES.index("M_NC")
 CV956, CV952, CV953 = (STATE_NAMES.index(name) for name in ("CV956", "CV952", "CV953"))
 P1, V1 = OUTPUT_NAMES.index("P1"), OUTPUT_NAMES.index("V1")
+BLOCKED_SHARES: Final = len(INPUT_NAMES) + len(DISTURBANCE_NAMES)
+ACTED: Final = BLOCKED_SHARES + ACTING - BLOCKED
 MODE: Final = 0
 ALARMS: Final = 1
 LEAST_FLOW: Final = 0.1
@@ -58,6 +75,20 @@ class RefrigeratorMemory(NamedTuple):
     """Memory of the machinery, shape (14,): `plant.refrigerator.equipment`."""
     status: NDArray[np.int64]
     """Its mode and alarms, shape (2,)."""
+    slope: RealArray
+    """dx/dt as the sensors were read, shape (48,); the next tick begins with it where the same acts."""
+    cells: RealArray
+    """`plant.refrigerator.high_pressure.Filling.cells` then."""
+    acted: RealArray
+    """What acted then, shape (13,): inputs, disturbances, blocked shares of the exchangers; NaN before any reading."""
+
+
+def begin_memory(x: RealArray, v: RealArray, equipment: RealArray) -> RefrigeratorMemory:
+    """Return a memory at the state `x`, with openings `v` asked and `equipment` as it is; nothing is read yet."""
+    return RefrigeratorMemory(
+        x, np.zeros(len(OUTPUT_NAMES)), np.zeros(SIGNALS), v, np.zeros(MEMORY_SIZE), equipment, np.zeros(2, np.int64),
+        np.zeros_like(x), np.zeros((COIL + 1, COLUMNS)), np.full(ACTED, np.nan),
+    )  # fmt: skip
 
 
 @kernel
@@ -78,9 +109,20 @@ def control_tick(m: RefrigeratorMemory, d: RealArray, law: StationLaw) -> None:
 
 @kernel
 def read_tick(m: RefrigeratorMemory, acting: Acting, helium: Helium) -> None:
-    """Write what the sensors show at the state."""
-    dx = np.empty_like(m.x)
-    evaluate_refrigerator(m.x, acting.u, m.commands, acting.d, acting.plant, helium, dx, m.y, m.signals)
+    """Write what the sensors show at the state, and how the state moves."""
+    u, d = acting.u, acting.d
+    crossing = evaluate_refrigerator(m.x, u, m.commands, d, acting.plant, helium, m.slope, m.y, m.signals)
+    m.cells[:] = crossing.filling.cells
+    m.acted[:] = what_acts(m, acting)
+
+
+@kernel
+def what_acts(m: RefrigeratorMemory, acting: Acting) -> RealArray:
+    """Return what the rates of a state depend on besides the commands, shape (13,)."""
+    acts = np.empty(ACTED)
+    acts[:3], acts[3:BLOCKED_SHARES] = acting.u, acting.d[: BLOCKED_SHARES - 3]
+    acts[BLOCKED_SHARES:] = m.equipment[BLOCKED:ACTING]
+    return acts
 
 
 @kernel
@@ -101,7 +143,14 @@ def advance_tick(
     """
     taken = m.signals[TO_BOX] / max(m.signals[COMPRESSED], LEAST_FLOW)
     acting = act(law.equipment, m.equipment, u, d, m.signals[LP], taken, m.y[V1], plant)
-    m.x[:] = advance_refrigerator(m.x, acting.u, m.commands, acting.d, TICK_S, acting.plant, helium)
+    if np.all(what_acts(m, acting) == m.acted):
+        move_valves(m.x, m.commands, acting.plant, m.slope)
+    else:
+        read_tick(m, acting, helium)
+    P = PA_PER_BAR * m.signals[HP]
+    m.x[:] = advance_along(
+        m.x, m.slope, m.cells, P, acting.u, m.commands, acting.d, TICK_S, acting.plant, helium
+    )  # fmt: skip
     read_tick(m, acting, helium)
     control_tick(m, ahead, law)
 
@@ -114,7 +163,7 @@ def advance_program_tick(
     ahead: RealArray,
     plant: Any,  # noqa: ANN401 - any nesting of tuples
     helium: Any,  # noqa: ANN401 - any nesting of tuples
-    law: StationLaw,
+    law: Any,  # noqa: ANN401 - any nesting of tuples
 ) -> None:
-    """Do `advance_tick`; parameters and tables come as `plain_tuples`."""
-    advance_tick(m, u, d, ahead, refrigerator_of(plant), helium_of(helium), law)
+    """Do `advance_tick`; parameters, tables and law come as `plain_tuples`."""
+    advance_tick(m, u, d, ahead, refrigerator_of(plant), helium_of(helium), law_of(law))
