@@ -13,7 +13,7 @@ from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES
 from coldloop.registers.plant import StationAlarm, StationMode
 from plant.cold_box.physics import REFERENCE, ColdBox, streams
 from plant.components.phase_separator import SUPERHEAT, content, holding, outflow, separate, thinness
-from plant.components.return_line import return_flow
+from plant.components.return_line import LAMINAR, ReturnLine, return_flow
 from plant.helium.properties import (
     HIGHEST_SATURATION,
     LOWEST_SATURATION,
@@ -104,10 +104,25 @@ def test_the_vapour_in_a_dry_bath_is_that_of_coolprop(P: float, superheat: float
 
 def test_a_full_bath_sends_liquid_along_and_no_more_than_it_has() -> None:
     sat = saturation(1.2e5, HELIUM)
-    carried = [outflow(BATH, 1.2e5, share * BATH.volume, sat, HELIUM).h for share in (0.9, 0.97, 0.985, 1.0, 1.01)]
-    assert carried[:2] == [sat.h_v, sat.h_v]
-    assert sat.h_l < carried[2] < sat.h_v
-    assert carried[3:] == pytest.approx([sat.h_l, sat.h_l])
+    tops = [outflow(BATH, 1.2e5, share * BATH.volume, sat, HELIUM) for share in (0.9, 0.97, 0.985, 1.0, 1.01)]
+    assert [(top.h, top.rho) for top in tops[:2]] == [(sat.h_v, sat.rho_v)] * 2
+    assert sat.h_l < tops[2].h < sat.h_v
+    assert sat.rho_v < tops[2].rho < sat.rho_l
+    for top in tops[3:]:
+        assert (top.h, top.rho) == pytest.approx((sat.h_l, sat.rho_l))
+
+
+@given(P=bath_pressures, over=st.floats(100.0, 2e4))
+def test_liquid_that_leaves_a_full_bath_flows_as_a_liquid(P: float, over: float) -> None:
+    line, sat = ReturnLine(REFERENCE.return_line.cold_resistance, 0.0), saturation(P, HELIUM)
+    vapour, liquid = (
+        return_flow(line, P + over, P, 0.0, thinness(BATH, P, share * BATH.volume, HELIUM))[0] for share in (0.9, 1.0)
+    )
+    drops = [
+        2.0 * LAMINAR * thin * flow + line.cold_resistance * thin * flow**2
+        for flow, thin in ((vapour, 1.0), (liquid, sat.rho_v / sat.rho_l))
+    ]
+    assert drops == pytest.approx([over, over])
 
 
 @given(P=bath_pressures, V_l=st.floats(-60.0 * BATH.volume, -31.0 * BATH.volume))
