@@ -9,7 +9,7 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_range import CELLS_K, SATURATION_BAR, WARMEST_BATH_M3, model_range
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.range_bits import ModelRange
-from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES
+from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.plant import StationAlarm, StationMode
 from plant.cold_box.physics import REFERENCE, ColdBox, streams
 from plant.components.phase_separator import SUPERHEAT, content, holding, outflow, separate, thinness
@@ -35,6 +35,7 @@ from plant.refrigerator.physics import (
     advance_refrigerator,
 )
 from plant.refrigerator.program import RefrigeratorProgram
+from plant.refrigerator.tick import COMPRESSED, LEAST_FLOW, LP, TO_BOX, V1, control_tick, read_tick
 from plant.settings import PlantSettings
 
 HELIUM = load_helium()
@@ -284,7 +285,7 @@ EVENTS = {
     "it gets warmer": (LoadProfile((0,), (HEADER.w0,)), ((10.0, "ambient", 310.0),), 300),
 }
 FINER = 8
-"""Steps in the place of one."""
+"""Steps in the place of one; what controls the station goes on once a tick."""
 
 
 @pytest.mark.parametrize(
@@ -293,22 +294,24 @@ FINER = 8
 def test_one_step_a_tick_is_stable_with_a_margin_and_exact_within_a_percent_of_each_move(event: str) -> None:
     load, happens, seconds = EVENTS[event]
     plant = program(load, *happens)
-    fine = plant.memory.x
-    stiffest, courses = 0.0, []
+    fine, stiffest, courses = plant.memory, 0.0, []
     for tick in range(4 * seconds):
-        memory, brought = plant.memory, plant.ahead(0)[0]
+        brought, ahead = plant.ahead(1)
         brought[0] = plant.load
-        law, lp, speed = plant.law.equipment, signal(plant, "P11"), output(plant, "V1")
-        taken = signal(plant, "M12") / max(signal(plant, "M_NC"), 0.1)
-        acting = act(law, memory.equipment, np.array(FILE.u0), brought, lp, taken, speed, PLANT)
-        u, v, d = acting.u, memory.commands, acting.d[: len(DISTURBANCE_NAMES)]
+        taken = fine.signals[TO_BOX] / max(fine.signals[COMPRESSED], LEAST_FLOW)
+        acting = act(
+            plant.law.equipment, fine.equipment, np.array(FILE.u0), brought, fine.signals[LP], taken, fine.y[V1], PLANT
+        )
+        u, v, d = acting.u, fine.commands, acting.d[: len(DISTURBANCE_NAMES)]
         if tick % 8 == 0:
-            A = jacobian(memory.x, u, v, d, PLANT, HELIUM)[: len(STATE_NAMES), : len(STATE_NAMES)]
+            A = jacobian(fine.x, u, v, d, PLANT, HELIUM)[: len(STATE_NAMES), : len(STATE_NAMES)]
             stiffest = min(stiffest, float(np.linalg.eigvals(A).real.min()))
         for _ in range(FINER):
-            fine = advance_refrigerator(fine, u, v, d, 0.25 / FINER, acting.plant, HELIUM)
+            fine.x[:] = advance_refrigerator(fine.x, u, v, d, TICK_S / FINER, acting.plant, HELIUM)
+        read_tick(fine, acting, HELIUM)
+        control_tick(fine, ahead, plant.law)
         plant.advance()
-        courses.append((plant.memory.x, fine))
+        courses.append((plant.memory.x, fine.x.copy()))
     coarse, fine_ones = np.transpose(courses, (1, 0, 2))
     moves = np.ptp(fine_ones, axis=0)
     assert stiffest > 0.85 * -2.785 / 0.25  # where a Runge-Kutta step of a tick ends to be stable
