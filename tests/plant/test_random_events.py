@@ -6,21 +6,24 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from coldloop.process.model_range import model_range
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.balance import energy_gained, energy_rates
 from plant.cold_box.physics import REFERENCE, cold_box_of, derivative
 from plant.components.passes import MASS
 from plant.components.phase_separator import content, start_account
-from plant.helium.properties import helium_of, load_helium, supply_cell
+from plant.helium.properties import helium_of, load_helium, supply_cell, supply_enthalpy_and_density
 from plant.integrator import advance, plain_tuples
 from plant.numeric import RealArray
 from plant.own_model import own_header
 from plant.refrigerator.balance import refrigerator_energy_rates, stored_energy
-from plant.refrigerator.equipment import EquipmentLaw, act, resting_equipment
+from plant.refrigerator.equipment import ACTING, DEVIATING, EquipmentLaw, act, resting_equipment
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
 from plant.refrigerator.high_pressure import FIRST
 from plant.refrigerator.physics import (
+    BOX_STATES,
+    COIL,
     REFERENCE_REFRIGERATOR,
     SIGNAL_NAMES,
     STATE_NAMES,
@@ -39,9 +42,8 @@ HEADER = own_header(DEFAULT_MODEL_FILE)
 FILE = read_refrigerator_file(SHIPPED)
 M_LOST = STATE_NAMES.index("M_lost")
 LAW = station_law(StationSettings(), FILE.reference, PLANT.station).equipment
-LP, TO_BOX, COMPRESSED = (SIGNAL_NAMES.index(name) for name in ("P11", "M12", "M_NC"))
+HP, LP, TO_BOX, COMPRESSED = (SIGNAL_NAMES.index(name) for name in ("P12", "P11", "M12", "M_NC"))
 V1 = OUTPUT_NAMES.index("V1")
-COIL = STATE_NAMES.index("T_nef5")
 PLAIN, TABLES = plain_tuples(PLANT), plain_tuples(HELIUM)
 
 percent = st.floats(0.0, 100.0)
@@ -125,8 +127,31 @@ def balances_over_random_events(course: Course) -> tuple[float, float]:
         gained = content(BATH, x[0], x[1], HELIUM).energy - in_bath
         assert gained == pytest.approx(sums[2], abs=1e-6 * sums[1] + 1e-6)
         in_bath += gained
+        assert_alarmed_where_tables_end(x, equipment[ACTING:DEVIATING], np.array(v), np.array(d))
         missing, crossed = missing + sums[0] - stored_energy(x, d[1], PLANT, HELIUM) + energy, crossed + sums[1]
     return missing, crossed
+
+
+TABLES_END = {
+    "P1": (0.3, 2.25), "P_mix": (0.3, 2.25), "P_turbine": (0.3, 20.0), "P11": (0.3, 2.25), "P12": (5.0, 19.0),
+    "h before the turbine": (6e3, 1.6e6), "coldest cell": (2.5, 340.0), "warmest cell": (2.5, 340.0),
+}  # fmt: skip
+"""Of helium's properties, bar, J/kg and K: arguments at which `coldloop.process.model_range` has to say nothing."""
+
+
+def assert_alarmed_where_tables_end(x: RealArray, u: RealArray, v: RealArray, d: RealArray) -> None:
+    """What the tables are asked for at a state is within them, or the alarm says that it is not."""
+    y, signals = np.empty(len(OUTPUT_NAMES)), np.empty(len(SIGNAL_NAMES))
+    cold = evaluate_refrigerator(x, u, v, d, PLANT, HELIUM, np.empty_like(x), y, signals).cold
+    h, _ = supply_enthalpy_and_density(1e5 * signals[HP], x[BOX_STATES - 1], HELIUM)
+    cells = x[FIRST : COIL + 1]
+    asked = (
+        1e-5 * x[0], 1e-5 * cold.P_mix, 1e-5 * cold.P_turbine, signals[LP], signals[HP], h, cells.min(), cells.max()
+    )  # fmt: skip
+    outside = [
+        name for (name, (low, high)), value in zip(TABLES_END.items(), asked, strict=True) if not low <= value <= high
+    ]
+    assert not outside or model_range(x[:BOX_STATES], signals[HP], signals[LP]), outside
 
 
 def drawn(seed: int) -> Course:
