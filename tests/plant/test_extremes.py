@@ -9,11 +9,11 @@ from coldloop.process.load_profile import LoadProfile
 from coldloop.process.model_range import SATURATION_BAR, WARMEST_BATH_M3, WARMEST_CELL_K, model_range
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.range_bits import ModelRange
-from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES
+from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.plant import StationAlarm, StationMode
 from plant.cold_box.physics import REFERENCE, ColdBox, streams
 from plant.components.phase_separator import SUPERHEAT, content, holding, outflow, separate, thinness
-from plant.components.return_line import return_flow
+from plant.components.return_line import LAMINAR, ReturnLine, return_flow
 from plant.helium.properties import (
     HIGHEST_SATURATION,
     LOWEST_SATURATION,
@@ -35,6 +35,7 @@ from plant.refrigerator.physics import (
     advance_refrigerator,
 )
 from plant.refrigerator.program import RefrigeratorProgram
+from plant.refrigerator.tick import COMPRESSED, LEAST_FLOW, LP, TO_BOX, V1, control_tick, read_tick
 from plant.settings import PlantSettings
 
 HELIUM = load_helium()
@@ -104,10 +105,25 @@ def test_the_vapour_in_a_dry_bath_is_that_of_coolprop(P: float, superheat: float
 
 def test_a_full_bath_sends_liquid_along_and_no_more_than_it_has() -> None:
     sat = saturation(1.2e5, HELIUM)
-    carried = [outflow(BATH, 1.2e5, share * BATH.volume, sat, HELIUM).h for share in (0.9, 0.97, 0.985, 1.0, 1.01)]
-    assert carried[:2] == [sat.h_v, sat.h_v]
-    assert sat.h_l < carried[2] < sat.h_v
-    assert carried[3:] == pytest.approx([sat.h_l, sat.h_l])
+    tops = [outflow(BATH, 1.2e5, share * BATH.volume, sat, HELIUM) for share in (0.9, 0.97, 0.985, 1.0, 1.01)]
+    assert [(top.h, top.rho) for top in tops[:2]] == [(sat.h_v, sat.rho_v)] * 2
+    assert sat.h_l < tops[2].h < sat.h_v
+    assert sat.rho_v < tops[2].rho < sat.rho_l
+    for top in tops[3:]:
+        assert (top.h, top.rho) == pytest.approx((sat.h_l, sat.rho_l))
+
+
+@given(P=bath_pressures, over=st.floats(100.0, 2e4))
+def test_liquid_that_leaves_a_full_bath_flows_as_a_liquid(P: float, over: float) -> None:
+    line, sat = ReturnLine(REFERENCE.return_line.cold_resistance, 0.0), saturation(P, HELIUM)
+    vapour, liquid = (
+        return_flow(line, P + over, P, 0.0, thinness(BATH, P, share * BATH.volume, HELIUM))[0] for share in (0.9, 1.0)
+    )
+    drops = [
+        2.0 * LAMINAR * thin * flow + line.cold_resistance * thin * flow**2
+        for flow, thin in ((vapour, 1.0), (liquid, sat.rho_v / sat.rho_l))
+    ]
+    assert drops == pytest.approx([over, over])
 
 
 @given(P=bath_pressures, V_l=st.floats(-60.0 * BATH.volume, -31.0 * BATH.volume))
@@ -269,7 +285,7 @@ EVENTS = {
     "it gets warmer": (LoadProfile((0,), (HEADER.w0,)), ((10.0, "ambient", 310.0),), 300),
 }
 FINER = 8
-"""Steps in the place of one."""
+"""Steps in the place of one; what controls the station goes on once a tick."""
 
 
 @pytest.mark.parametrize(
@@ -278,22 +294,24 @@ FINER = 8
 def test_one_step_a_tick_is_stable_with_a_margin_and_exact_within_a_percent_of_each_move(event: str) -> None:
     load, happens, seconds = EVENTS[event]
     plant = program(load, *happens)
-    fine = plant.memory.x
-    stiffest, courses = 0.0, []
+    fine, stiffest, courses = plant.memory, 0.0, []
     for tick in range(4 * seconds):
-        memory, brought = plant.memory, plant.ahead(0)[0]
+        brought, ahead = plant.ahead(1)
         brought[0] = plant.load
-        law, lp, speed = plant.law.equipment, signal(plant, "P11"), output(plant, "V1")
-        taken = signal(plant, "M12") / max(signal(plant, "M_NC"), 0.1)
-        acting = act(law, memory.equipment, np.array(FILE.u0), brought, lp, taken, speed, PLANT)
-        u, v, d = acting.u, memory.commands, acting.d[: len(DISTURBANCE_NAMES)]
+        taken = fine.signals[TO_BOX] / max(fine.signals[COMPRESSED], LEAST_FLOW)
+        acting = act(
+            plant.law.equipment, fine.equipment, np.array(FILE.u0), brought, fine.signals[LP], taken, fine.y[V1], PLANT
+        )
+        u, v, d = acting.u, fine.commands, acting.d[: len(DISTURBANCE_NAMES)]
         if tick % 8 == 0:
-            A = jacobian(memory.x, u, v, d, PLANT, HELIUM)[: len(STATE_NAMES), : len(STATE_NAMES)]
+            A = jacobian(fine.x, u, v, d, PLANT, HELIUM)[: len(STATE_NAMES), : len(STATE_NAMES)]
             stiffest = min(stiffest, float(np.linalg.eigvals(A).real.min()))
         for _ in range(FINER):
-            fine = advance_refrigerator(fine, u, v, d, 0.25 / FINER, acting.plant, HELIUM)
+            fine.x[:] = advance_refrigerator(fine.x, u, v, d, TICK_S / FINER, acting.plant, HELIUM)
+        read_tick(fine, acting, HELIUM)
+        control_tick(fine, ahead, plant.law)
         plant.advance()
-        courses.append((plant.memory.x, fine))
+        courses.append((plant.memory.x, fine.x.copy()))
     coarse, fine_ones = np.transpose(courses, (1, 0, 2))
     moves = np.ptp(fine_ones, axis=0)
     assert stiffest > 0.85 * -2.785 / 0.25  # where a Runge-Kutta step of a tick ends to be stable

@@ -136,6 +136,12 @@ def test_entropy_agrees_from_a_cold_turbine_to_a_warm_one(P: float, h: float) ->
     assert helium_at.entropy_before_expansion(P, h, HELIUM) == pytest.approx(s, abs=0.2)
 
 
+@given(P=st.floats(1e5, 12e5), h=st.floats(4e3, 6e3))
+def test_entropy_goes_on_nearly_as_it_does_where_helium_is_colder_than_its_table(P: float, h: float) -> None:
+    s = coolprop("S", "P", P, "H", h)
+    assert helium_at.entropy_before_expansion(P, h, HELIUM) == pytest.approx(s, abs=40.0)
+
+
 @given(P=st.floats(5e5, 19e5), T=st.floats(4.0, 80.0))
 def test_the_supply_away_from_16_bar_is_as_close_as_it_says(P: float, T: float) -> None:
     h, rho_cp, _ = helium_at.supply_cell(P, T, HELIUM)

@@ -11,14 +11,13 @@ from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.balance import energy_gained, energy_rates
 from plant.cold_box.physics import REFERENCE, cold_box_of, derivative
-from plant.components.passes import MASS
-from plant.components.phase_separator import content, start_account
-from plant.helium.properties import helium_of, load_helium, supply_cell, supply_enthalpy_and_density
+from plant.components.phase_separator import content
+from plant.helium.properties import helium_of, load_helium, supply_enthalpy_and_density
 from plant.integrator import advance, plain_tuples
 from plant.numeric import RealArray
 from plant.own_model import own_header
-from plant.refrigerator.balance import refrigerator_energy_rates, stored_energy
-from plant.refrigerator.equipment import ACTING, DEVIATING, EquipmentLaw, act, resting_equipment
+from plant.refrigerator.balance import stored_energy
+from plant.refrigerator.equipment import ACTING, DEVIATING, EquipmentLaw, resting_equipment
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
 from plant.refrigerator.high_pressure import FIRST
 from plant.refrigerator.physics import (
@@ -27,13 +26,13 @@ from plant.refrigerator.physics import (
     REFERENCE_REFRIGERATOR,
     SIGNAL_NAMES,
     STATE_NAMES,
-    advance_refrigerator,
     evaluate_refrigerator,
     inventory,
     refrigerator_of,
 )
 from plant.refrigerator.station_control import station_law
 from plant.refrigerator.station_settings import StationSettings
+from tests.harness.energy_account import AHEAD, CROSSED, SIZE, TO_BATH, WEIGHTS, WORST, accounted_tick
 
 HELIUM = load_helium()
 PLANT = REFERENCE_REFRIGERATOR
@@ -42,8 +41,7 @@ HEADER = own_header(DEFAULT_MODEL_FILE)
 FILE = read_refrigerator_file(SHIPPED)
 M_LOST = STATE_NAMES.index("M_lost")
 LAW = station_law(StationSettings(), FILE.reference, PLANT.station).equipment
-HP, LP, TO_BOX, COMPRESSED = (SIGNAL_NAMES.index(name) for name in ("P12", "P11", "M12", "M_NC"))
-V1 = OUTPUT_NAMES.index("V1")
+HP, LP = (SIGNAL_NAMES.index(name) for name in ("P12", "P11"))
 PLAIN, TABLES = plain_tuples(PLANT), plain_tuples(HELIUM)
 
 percent = st.floats(0.0, 100.0)
@@ -61,11 +59,6 @@ pieces = st.tuples(st.integers(40, 1200), inputs, st.tuples(percent, percent, pe
 Course = list[tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...]]]
 
 
-WEIGHTS = np.array([0.25 / 6.0, 0.25 / 3.0, 0.25 / 3.0, 0.25 / 6.0])
-AHEAD = np.array([0.125, 0.125, 0.25, 0.0])
-"""Of the stages of a tick, s."""
-
-
 @numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def held(
     x: RealArray,
@@ -78,35 +71,18 @@ def held(
     tables: object,
     law: EquipmentLaw,
 ) -> tuple[RealArray, RealArray]:
-    """Return the state after some ticks, and sums over their stages; `equipment` is overwritten.
-
-    What crossed the boundary and its size (J), what the bath's rates brought it (J), and the largest difference between
-    what crosses and what is stored (W). What the line gives the passes beyond the flows of the stages crosses, too.
-    """
+    """Return the state after some ticks, and the sums of `accounted_tick`; `equipment` is overwritten."""
     plant, helium = refrigerator_of(plain), helium_of(tables)
-    T_hot = d[1] + plant.station.cooler_approach
-    sums, slope, y, signals = np.zeros(4), np.empty(x.shape[0]), np.empty(22), np.empty(len(SIGNAL_NAMES))
-    evaluate_refrigerator(x, u, v, d, plant, helium, slope, y, signals)
+    sums, y, signals = np.zeros(4), np.empty(22), np.empty(len(SIGNAL_NAMES))
+    evaluate_refrigerator(x, u, v, d, plant, helium, np.empty(x.shape[0]), y, signals)
     for _ in range(ticks):
-        taken = signals[TO_BOX] / max(signals[COMPRESSED], 0.1)
-        acting = act(law, equipment, u, d, signals[LP], taken, y[V1], plant)
-        stage, given = x, 0.0
-        for k in range(4):
-            crossing = evaluate_refrigerator(stage, acting.u, v, acting.d, acting.plant, helium, slope, y, signals)
-            stored, inwards = refrigerator_energy_rates(stage, slope, crossing, d[0], acting.plant, helium)
-            sums[0] += WEIGHTS[k] * inwards
-            sums[1] += WEIGHTS[k] * abs(inwards)
-            sums[2] += WEIGHTS[k] * start_account(crossing.bath, slope).heat
-            sums[3] = max(sums[3], abs(stored - inwards))
-            given -= WEIGHTS[k] * (crossing.filling.entering - crossing.high.mass_flow)
-            if k == 0:
-                given -= np.sum(crossing.filling.cells[FIRST:COIL, MASS])
-            stage = x + AHEAD[k] * slope
-        x = advance_refrigerator(x, acting.u, v, acting.d, 0.25, acting.plant, helium)
-        filling = evaluate_refrigerator(x, acting.u, v, acting.d, acting.plant, helium, slope, y, signals).filling
-        given += np.sum(filling.cells[FIRST:COIL, MASS])
-        sums[0] += given * supply_cell(filling.P, T_hot, helium)[0]
+        x = accounted_tick(x, y, signals, equipment, u, v, d, plant, helium, law, sums)
     return x, sums
+
+
+def in_parts(course: Course) -> Course:
+    """Return a course whose pieces last for 100 ticks at most: after each, it is looked at."""
+    return [(min(100, ticks - begun), *given) for ticks, *given in course for begun in range(0, ticks, 100)]
 
 
 def balances_over_random_events(course: Course) -> tuple[float, float]:
@@ -118,17 +94,18 @@ def balances_over_random_events(course: Course) -> tuple[float, float]:
     before = inventory(x, PLANT, HELIUM)
     in_bath = content(BATH, x[0], x[1], HELIUM).energy
     missing = crossed = 0.0
-    for ticks, u, v, d in course:
+    for ticks, u, v, d in in_parts(course):
         energy = stored_energy(x, d[1], PLANT, HELIUM)
         x, sums = held(x, equipment, np.array(u), np.array(v), np.array(d), ticks, PLAIN, TABLES, LAW)
         assert np.all(np.isfinite(x))
         assert inventory(x, PLANT, HELIUM) + x[M_LOST] == pytest.approx(before, rel=1e-9)
-        assert sums[3] < 1e-6 * sums[1] / (0.25 * ticks) + 1e-6
+        assert sums[WORST] < 1e-6 * sums[SIZE] / (0.25 * ticks) + 1e-6
         gained = content(BATH, x[0], x[1], HELIUM).energy - in_bath
-        assert gained == pytest.approx(sums[2], abs=1e-6 * sums[1] + 1e-6)
+        assert gained == pytest.approx(sums[TO_BATH], abs=1e-6 * sums[SIZE] + 1e-6)
         in_bath += gained
         assert_alarmed_where_tables_end(x, equipment[ACTING:DEVIATING], np.array(v), np.array(d))
-        missing, crossed = missing + sums[0] - stored_energy(x, d[1], PLANT, HELIUM) + energy, crossed + sums[1]
+        missing += sums[CROSSED] - stored_energy(x, d[1], PLANT, HELIUM) + energy
+        crossed += sums[SIZE]
     return missing, crossed
 
 

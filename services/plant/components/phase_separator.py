@@ -78,7 +78,7 @@ class Outflow(NamedTuple):
     h: float
     """J/kg; below that of saturated vapour where it carries liquid along."""
     rho: float
-    """Density of the vapour, kg/m3."""
+    """Density, kg/m3; of the mixture where it carries liquid along."""
 
 
 @inlined
@@ -138,26 +138,39 @@ def outflow(separator: PhaseSeparator, P: float, V_l: float, sat: Saturation, he
         excess = -SUPERHEAT / separator.volume * V_l
         rho = dry_content(separator, P, V_l, helium).mass / separator.volume
         return Outflow(vapour_temperature(P, sat.h_v + excess, sat, helium), sat.h_v + excess, rho)
-    share = (V_l / separator.volume - CARRY_OVER) / (1.0 - CARRY_OVER)
-    if share.real <= 0.0:
-        return Outflow(sat.T, sat.h_v, sat.rho_v)
-    share = at_most(share, 1.0)
-    carried = share * share * (3.0 - 2.0 * share)
-    return Outflow(sat.T, sat.h_v - carried * (sat.h_v - sat.h_l), sat.rho_v)
+    liquid = carried_liquid(separator, V_l)
+    return Outflow(sat.T, sat.h_v - liquid * (sat.h_v - sat.h_l), sat.rho_v / mixture_thinness(liquid, sat))
+
+
+@inlined
+def carried_liquid(separator: PhaseSeparator, V_l: float) -> float:
+    """Return the share of liquid in what leaves a vessel, by mass."""
+    share = at_most(at_least((V_l / separator.volume - CARRY_OVER) / (1.0 - CARRY_OVER), 0.0), 1.0)
+    return share * share * (3.0 - 2.0 * share)
+
+
+@inlined
+def mixture_thinness(liquid: float, sat: Saturation) -> float:
+    """Return by how much a mixture with this share of liquid is thinner than saturated vapour, 1 or less."""
+    thin: float = 1.0 - liquid * (1.0 - sat.rho_v / sat.rho_l)
+    return thin
 
 
 @inlined
 def thinness(separator: PhaseSeparator, P: float, V_l: float, helium: Helium) -> float:
-    """Return by how much the vapour of a dry vessel is thinner than saturated vapour; 1 in one that is not dry."""
+    """Return by how much what leaves is thinner than saturated vapour: 1 but in a dry vessel, and in a full one."""
     if V_l.real >= 0.0:
-        return 1.0 + 0.0 * P
+        liquid = carried_liquid(separator, V_l)
+        if liquid.real <= 0.0:
+            return 1.0 + 0.0 * P
+        return mixture_thinness(liquid, saturation(P, helium))
     thin: float = separator.volume * saturation(P, helium).rho_v / dry_content(separator, P, V_l, helium).mass
     return thin
 
 
 @inlined
 def bath_relief(separator: PhaseSeparator, P: float, rho: float) -> float:
-    """Return what the relief valve blows into the recovery line (kg/s): choked flow of vapour of density `rho`."""
+    """Return what the relief valve blows into the recovery line (kg/s): choked flow of density `rho`."""
     opened = at_most(at_least(P - separator.relief_pressure, 0.0) / separator.relief_span, 1.0)
     flow: float = separator.relief_area * opened * CHOKED * np.sqrt(P * rho)
     return flow

@@ -26,8 +26,9 @@ def return_flow(
     """Return the mass flow of the vapour (kg/s) and the pressure at the mixing point (Pa).
 
     The flow m_v solves P_bath - P_suction = r_c m_v^2 + r_w (m_v + m_t)^2; nothing flows back into the bath. Where no
-    exhaust joins, a laminar part keeps the flow's slope finite near rest. `thinness` (1 or more) is by how much the
-    vapour is thinner than saturated vapour, as that of a dry bath is: its pressure drop grows in proportion.
+    exhaust joins, a laminar part keeps the flow's slope finite near rest. `thinness` is by how much the
+    vapour is thinner than saturated vapour: its pressure drop grows in proportion. That of a dry bath is, by more than
+    1; what carries liquid along is denser.
     """
     total = thinness * line.cold_resistance + line.warm_resistance
     half_slope = at_least(line.warm_resistance * joining_flow, LAMINAR) + (thinness - 1.0) * LAMINAR

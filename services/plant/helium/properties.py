@@ -33,6 +33,7 @@ LOWEST_DEPARTURE, HIGHEST_DEPARTURE = -11.0, 3.0  # bar from there; beyond, h is
 LOWEST_SUPPLY, HIGHEST_SUPPLY = ISOBAR_PRESSURE + 1e5 * LOWEST_DEPARTURE, ISOBAR_PRESSURE + 1e5 * HIGHEST_DEPARTURE
 COLDEST = 1.0  # K, below the table; for the logarithm
 WARMEST_ISOBAR = 300.0  # K; above it the gas has the heat capacity that it has there
+COLDEST_ENTHALPY = 6.1e3  # J/kg, before a turbine, at the edge of the table
 LARGEST_SUPERHEAT, LARGEST_EXCESS = 115.0, 600e3  # K and J/kg, the same for the vapour
 EDGE_TEMPERATURE = 118.0  # K, of vapour with that excess
 WARM_CP = 5193.2  # J/(kg K), of helium there
@@ -338,9 +339,9 @@ def enthalpy_after_isentropic_expansion(P: float, s: float, helium: Helium) -> f
 def entropy_before_expansion(P: float, h: float, helium: Helium) -> float:
     """Return s (J/(kg K)) at `P` (Pa, 0.3e5 to 20e5) and `h` (J/kg, 6e3 to 1600e3, that is 4 to 305 K at 16 bar).
 
-    Held beyond these ends.
+    Held beyond these ends; below the coldest enthalpy it goes on with ds = dh/T of there.
     """
-    log_pressure = np.log(at_least(P, 1.0))
-    entropy_sum, _ = read_surface(helium.turbine_entropy, log_pressure, np.log(at_least(h, 1.0)))
-    s: float = entropy_sum - GAS_CONSTANT * log_pressure
+    log_pressure, within = np.log(at_least(P, 1.0)), at_least(h, COLDEST_ENTHALPY)
+    entropy_sum, slope = read_surface(helium.turbine_entropy, log_pressure, np.log(within))
+    s: float = entropy_sum - GAS_CONSTANT * log_pressure + slope * (h - within) / within
     return s
