@@ -7,16 +7,21 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coldloop.process.model_file import read_header
+from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.registers.audit import EventKind
-from coldloop.registers.control_plc import LinkCause, PlantLinkState
+from coldloop.registers.control_plc import Cause, CoolDownStep, LadderStatus, LinkCause, Mode, PlantLinkState
 from coldloop.registers.plant import PLANT_MAP, Actuators
 from coldloop.registers.safety import AlarmKind, WatchdogTime
+from coldloop.safety.retained import RetainedFile
+from control_plc.retained_state import OWNER
 from rig.chaos.faults import Direction
 
 if TYPE_CHECKING:
     from tests.harness.processes import Process
     from tests.link.conftest import FieldAt, Rack, WireTo
 
+HEADER = read_header(DEFAULT_MODEL_FILE)
 PATIENCE_S = 100.0
 POLL_S = 0.02
 SAFE_STATE = (30.0, 50.0, 40.0)
@@ -107,6 +112,26 @@ async def test_a_control_plc_that_was_restarted_goes_on_from_where_a_simple_clie
         await rack.until(drives)
         assert rack.violations(since=moved_at) == []
         assert rack.applied[moved_at - 1] == MOVED
+
+
+async def test_a_control_plc_that_was_killed_in_a_cool_down_goes_on_with_it(field: "FieldAt", tmp_path: Path) -> None:
+    settings = f'control_plc.retain.file="{tmp_path}/control"'
+    async with field() as site:
+        control, rack = await site.joined(settings), site.rack
+        await rack.passes(40)
+        control.service.kill()
+        kept = RetainedFile(tmp_path / "control", OWNER, HEADER.short_digest)
+        state = kept.load()
+        assert state is not None
+        assert state["cool_down"] == CoolDownStep.FINISHED
+        kept.save(state | {"cool_down": CoolDownStep.FILLING})  # as of a plant that was warm some hours ago
+        again = site.control(settings, port=control.service.port)
+        await site.follows(again)
+        ladder = await again.client.read(LadderStatus)
+        assert (ladder.mode, ladder.cause) == (Mode.CLASSICAL, Cause.COOL_DOWN)
+        steps = [event.subject for event in await again.events(EventKind.COOL_DOWN)]
+        assert steps == [CoolDownStep.SETTLING], "the bath of this rack is full"
+        assert rack.violations() == []
 
 
 async def test_a_rack_that_stood_still_is_gone_on_with_from_what_it_applies(
