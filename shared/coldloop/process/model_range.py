@@ -25,7 +25,7 @@ COLD_BOX_BAR: Final = (16.0, 1.05)
 
 FIRST_CELL: Final = [state.name for state in COLD_BOX.states].index("T_nef1_1")
 COLDEST_CELLS_K: Final = np.array([2.5] * (len(COLD_BOX.states) - FIRST_CELL - 1) + [5.3])
-"""Shape (26,); the last is before the turbine, whose table of entropy ends at 6 kJ/kg: 5.3 K at 5 bar, 3.8 K at 16."""
+"""Shape (26,); the last is before the turbine, whose table of entropy ends at 6.1 kJ/kg: 5.3 K at 5 bar, 3.9 at 16."""
 HP, LP = STATION_SIGNAL_NAMES.index("P12"), STATION_SIGNAL_NAMES.index("P11")
 
 
