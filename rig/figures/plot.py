@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.load_profile import LOAD_WORD
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
 
 Series = NDArray[np.floating]
@@ -36,7 +37,7 @@ def with_unit(name: str, unit: str) -> str:
 
 
 LABELS: Final[Mapping[str, str]] = {
-    "load_w": with_unit("heat load" if IS_COLD_BOX else PROCESS.load.name, PROCESS.load.unit),
+    "load_w": with_unit(LOAD_WORD, PROCESS.load.unit),
     **{name: with_unit(name, unit) for name, unit in {**BANDED, **MOVED}.items()},
     "tau_u_s": "tau_u (s)",
     "stage_cost": "stage cost (1)",

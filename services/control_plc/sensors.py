@@ -10,15 +10,17 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
-from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, STRETCH, T1, TICK_S
+from coldloop.process.loaded import PROCESS
+from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, STRETCH, TICK_S
 from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
-FIRST_OF_KIND, P1 = (T1, OUTPUT_NAMES.index("P1")) if IS_COLD_BOX else (0, 0)
+QUANTITIES = [output.quantity for output in PROCESS.outputs]
+FIRST_OF_KIND, P1 = (QUANTITIES.index(kind) if kind in QUANTITIES else 0 for kind in ("temperature", "pressure"))
 """First of the pressures, which are the last outputs; the temperatures are before them. Other outputs have one kind."""
-FEW = int(not IS_COLD_BOX)
+FEW = int(P1 == 0)
 """1: most of the others are counted without the output itself, which matters where there are few."""
+MOVES_AS_ONE = PROCESS.moves_as_one
 MOVES = 240
 """Ticks in which an output that is not controlled must have moved before it can be frozen."""
 FIRST_RESTS = [0 if output in CONTROLLED else -MOVES for output in range(len(OUTPUT_NAMES))]
@@ -217,7 +219,7 @@ class SensorMonitor:
         frozen: Collection[int] = [output for output, each in enumerate(history) if is_frozen(*each)]
         if standing:
             frozen = [output for output in frozen if output not in standing]
-        if self._may_rest and not IS_COLD_BOX:
+        if self._may_rest and not MOVES_AS_ONE:
             frozen = self._not_at_rest(frozen, inputs)
         if self._image.unchanged(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
             frozen = range(len(y))

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import LoadFileError
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import LAST_TICK, TICK_S
 
 LOAD_SPAN: Final[tuple[float, float]] = struct.unpack("2f", struct.pack("2f", *PROCESS.load.span))
 """Lowest and highest load, as registers have them."""
 LOAD_UNIT: Final = PROCESS.load.unit
-LOAD_WORD: Final = PROCESS.load.noun.lower() if IS_COLD_BOX else PROCESS.load.name
+LOAD_WORD: Final = PROCESS.load.noun.lower() or PROCESS.load.name
 """What operators call the load."""
 COLUMNS: Final = ("time_s", "load_w")
 
@@ -26,7 +26,7 @@ class LoadProfile:
 
     Raises:
         ValueError: times do not start at 0, do not increase or are after the last tick of a session, lengths differ, or
-            a load is not finite, or negative where it is heat into the bath.
+            a load is not finite.
     """
 
     times: tuple[int, ...]
@@ -43,8 +43,6 @@ class LoadProfile:
             raise ValueError(f"tick {self.times[-1]} is after the last one of a session, {LAST_TICK}")
         if not all(map(math.isfinite, self.watts)):
             raise ValueError("loads must be finite")
-        if IS_COLD_BOX and min(self.watts) < 0.0:
-            raise ValueError("loads must not be negative")
 
     def value(self, tick: int) -> float:
         """Return the load (W) that is held from `tick` (0 or later) to the next."""
@@ -98,8 +96,7 @@ def _step(row: dict[str, str | None], before: list[int], where: str) -> tuple[in
     low, high = LOAD_SPAN
     if not low <= load <= high:
         unit = PROCESS.load.unit
-        meaning = "; loads are heat into the bath" if IS_COLD_BOX else ""
-        raise LoadFileError(f"{where}: {load:g} {unit} is outside {low:g} to {high:g} {unit}{meaning}")
+        raise LoadFileError(f"{where}: {load:g} {unit} is outside {low:g} to {high:g} {unit}")
     tick = round(time / TICK_S)
     if abs(tick * TICK_S - time) > 1e-6:
         raise LoadFileError(f"{where}: {time:g} s is not a multiple of {TICK_S} s")
