@@ -21,6 +21,8 @@ IDENTITY_WORDS = 13
 MAGIC = struct.pack(">f", 123.456)
 RUNNING = 1
 PATIENCE_S = 4.0
+TICK_PATIENCE_S = float(os.environ.get("HEALTHCHECK_TICK_PATIENCE_S", PATIENCE_S))
+"""How long a tick may last."""
 PAUSE_S = 0.05
 
 Read = Callable[[int, int], bytes]
@@ -89,7 +91,7 @@ def examine(service: str, read: Read) -> None:
         raise UnhealthyError("runs no session")
     if not in_real_time(service, first, read):
         return
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TICK_PATIENCE_S
     while time.monotonic() < deadline:
         time.sleep(PAUSE_S)
         if identity(read) != first:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from coldloop.config import Configuration, parsed_toml
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.loaded import IS_COLD_BOX
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import TICK_S
 from coldloop.session.settings import TimeMode
 from plant.load import concatenated, find_load, named_families, telegraph
@@ -153,17 +153,15 @@ def _load(load: str | tuple[str, ...], mean_w: float) -> LoadProfile:
 
 
 def shipped_plans() -> list[ChaosPlan]:
-    """Return the plans that come with Coldloop, by name: for another process those that suit it."""
+    """Return the plans that come with Coldloop, by name: those that suit the process."""
     plans = []
     for entry in SHIPPED.iterdir():
         if entry.name.endswith(".toml"):
             try:
                 plan = parse_plan(entry.read_text(encoding="utf-8"), entry.name, {})
-            except UsageError:
-                if IS_COLD_BOX:
-                    raise
+            except UsageError:  # of signals that are another's
                 continue
-            if IS_COLD_BOX or plan.plant is None:
+            if plan.plant is None or plan.plant in PROCESS.plants:
                 plans.append(plan)
     return sorted(plans, key=lambda plan: plan.name)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from coldloop.config import selected
 from coldloop.errors import UsageError
-from coldloop.process.loaded import IS_COLD_BOX
+from coldloop.process.loaded import PROCESS
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.settings import SHOWN
 from rig.plc_export.bus_registers import bus_files
@@ -51,7 +51,7 @@ def export_plc(target: str, ticks: int | None, folder: Path, settings: Settings)
     if not vectors:
         raise UsageError(f"--ticks: no input moves within {ticks} ticks, so nothing would be tested; record more")
     texts = c99(recorded, vectors) if target == "c" else structured_text(recorded, vectors, xml=target == "plcopen")
-    if target == "c" and IS_COLD_BOX:
+    if target == "c" and PROCESS.has_bath:
         texts |= whole_optimizer(settings, ticks or TICKS)
     write_whole(folder, texts)
     return [folder / name for name in texts]
@@ -76,7 +76,7 @@ def c99(recorded: GoldenVectors, vectors: list[GoldenVector]) -> dict[str, str]:
     export = OdeExport(recorded.method, vectors[0].problem, np.arange(1, len(vectors[0].answer.costs) + 1))
     texts, sizes = export.files(vectors), export.sizes(vectors)
     return {**texts, README: readme("readme_c.md", vectors, texts, {
-        "OPTIMIZER": BESIDE if IS_COLD_BOX else "",
+        "OPTIMIZER": BESIDE if PROCESS.has_bath else "",
         "CONSTANTS": f"{sizes.constants:,}", "STACK": f"{sizes.stack:,}", "SELF_TEST": f"{sizes.self_test:,}",
     })}  # fmt: skip
 

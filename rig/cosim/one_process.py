@@ -3,8 +3,9 @@
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from coldloop.errors import LoadFileError
 from coldloop.kernels.first_use import kernels_of
-from coldloop.process.load_profile import LoadProfile
+from coldloop.process.load_profile import LOAD_SPAN, LOAD_UNIT, LoadProfile
 from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import load as load_model
 from coldloop.registers.codec import as_transmitted
@@ -79,8 +80,15 @@ class Programs(NamedTuple):
 
 
 def load_table(load: LoadProfile) -> LoadProfile:
-    """Return a load as the plant's table has it after crossing the bus."""
+    """Return a load as the plant's table has it after crossing the bus.
+
+    Raises:
+        LoadFileError: The table does not take it.
+    """
     steps = [as_transmitted(LoadStep(*step)) for step in zip(load.times, load.watts, strict=True)]
+    low, high = LOAD_SPAN
+    if not all(low <= step.watts <= high for step in steps):
+        raise LoadFileError(f"a load is outside {low:g} to {high:g} {LOAD_UNIT}")
     return LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
 
 

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.load_profile import LOAD_COLUMN, LOAD_WORD
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, SAMPLING_PERIOD_S
 
 Series = NDArray[np.floating]
@@ -36,7 +37,7 @@ def with_unit(name: str, unit: str) -> str:
 
 
 LABELS: Final[Mapping[str, str]] = {
-    "load_w": with_unit("heat load" if IS_COLD_BOX else PROCESS.load.name, PROCESS.load.unit),
+    LOAD_COLUMN: with_unit(LOAD_WORD, PROCESS.load.unit),
     **{name: with_unit(name, unit) for name, unit in {**BANDED, **MOVED}.items()},
     "tau_u_s": "tau_u (s)",
     "stage_cost": "stage cost (1)",
@@ -97,7 +98,7 @@ def draw_run(curves: RunCurves) -> Figure:
         axes: list[Axes] = list(
             figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, gridspec_kw=PANELS)
         )
-        _curve(axes[0], time, curves.series["load_w"], LABELS["load_w"], PROCESS.load.name)
+        _curve(axes[0], time, curves.series[LOAD_COLUMN], LABELS[LOAD_COLUMN], PROCESS.load.name)
         first = 1 + len(BANDED)
         for place, (name, band) in zip(axes[1:first], curves.bounds.bands.items(), strict=True):
             _curve(place, time, curves.series[name], LABELS[name], name)

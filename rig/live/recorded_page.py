@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.config import load_configuration
+from coldloop.process.load_profile import LOAD_COLUMN
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.control_plc import Cause, Mode, Process
 from coldloop.registers.declaration import fields_of
@@ -26,7 +27,7 @@ from rig.results.columns import STATION_FILE
 from rig.results.recorded_alarms import alarms_after
 from rig.results.run_folder import RunFolder
 
-PROCESS: Final = ("load_w", *INPUT_NAMES, *OUTPUT_NAMES)
+PROCESS: Final = (LOAD_COLUMN, *INPUT_NAMES, *OUTPUT_NAMES)
 SECTIONS: Final = ("model", "limits", "session", "optimizer_plc", "telemetry")
 _MODES: Final = {word(mode): int(mode) for mode in Mode}
 _CAUSES: Final = {word(cause): int(cause) for cause in Cause}

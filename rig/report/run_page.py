@@ -9,6 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
+from coldloop.process.load_profile import LOAD_COLUMN
 from rig.figures.plot import (
     ACCENT,
     BAND,
@@ -89,7 +90,7 @@ def _plot(run: RunFolder) -> str:
 
 
 def _add_curve(figure: Any, row: int, curves: Curves, name: str, scale_s: float) -> None:  # noqa: ANN401 plotly has no types
-    shape = "hv" if name in ("load_w", "tau_u_s") else "linear"
+    shape = "hv" if name in (LOAD_COLUMN, "tau_u_s") else "linear"
     line = {"color": INK, "width": 1.2, "shape": shape}
     values = curves[name].astype("float32")
     if name == "stage_cost" and spans_a_decade(values):

@@ -6,6 +6,7 @@ from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 
+from coldloop.process.load_profile import LOAD_COLUMN
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import (
     INPUT_NAMES,
@@ -53,7 +54,7 @@ _EVENT: Final = fields_of(Event)
 MODEL_RANGE_COLUMN: Final = Column("model_range", pa.int32(), "1", fields_of(ModelRangeStatus)["outside"].description)
 
 PHYSICAL_COLUMNS: Final = (
-    Column("load_w", pa.float32(), PROCESS.load.unit or "1", fields_of(PlantSample)["load"].description),
+    Column(LOAD_COLUMN, pa.float32(), PROCESS.load.unit or "1", fields_of(PlantSample)["load"].description),
     *(
         Column(name, pa.float32(), field.unit, f"{field.description}; applied from this tick on")
         for name, field in zip(INPUT_NAMES, inputs_of(tuple(fields_of(Actuators).values())), strict=True)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from coldloop.process.loaded import IS_COLD_BOX
+from coldloop.process.loaded import PROCESS
 from coldloop.process.model_range import recorded_model_range
 from coldloop.process.signals import TICK_S
 from coldloop.registers.audit import Event
@@ -45,7 +45,7 @@ def trace_table(
 
 def _model_range(block: SampleBlock) -> pa.Array:
     """Return what was outside the property tables; null at unknown ticks."""
-    bits = recorded_model_range(block.x, block.station) if IS_COLD_BOX else np.zeros(len(block.load), np.int32)
+    bits = recorded_model_range(block.x, block.station) if PROCESS.has_station else np.zeros(len(block.load), np.int32)
     return number_array(bits, MODEL_RANGE_COLUMN.kind, np.isnan(block.load))
 
 

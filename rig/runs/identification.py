@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from coldloop.errors import UsageError
+from coldloop.process.load_profile import LOAD_COLUMN
 from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel, RealArray
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S, TICKS_PER_SAMPLE
@@ -87,11 +88,11 @@ def read_record(run: RunFolder, model: LtiModel) -> Record:
             f"{run.path}: a model of {len(model.input_names)} inputs and {len(model.output_names)} outputs, whose names"
             " are not those of the trace; name another with --model"
         )
-    curves = run.series(("load_w", *INPUT_NAMES, *OUTPUT_NAMES), LONGEST_TICKS)
+    curves = run.series((LOAD_COLUMN, *INPUT_NAMES, *OUTPUT_NAMES), LONGEST_TICKS)
     recorded_s = len(curves["time_s"]) * TICK_S
     if recorded_s < LEAST_S:
         raise UsageError(f"{run.path}: a record of {recorded_s:g} s is too short; name one of {LEAST_S:g} s or more")
-    inputs = np.column_stack([curves[name] for name in (*INPUT_NAMES, "load_w")])
+    inputs = np.column_stack([curves[name] for name in (*INPUT_NAMES, LOAD_COLUMN)])
     y = np.column_stack([curves[name] for name in OUTPUT_NAMES])
     gaps = int((~np.isfinite(np.hstack([inputs, y])).all(axis=1)).sum())
     if gaps:

@@ -7,8 +7,7 @@ from typing import Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process.cold_box import LEVEL_BAND, T5_BAND
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import STRETCH, TICK_S
 from coldloop.registers.safety import AlarmKind, AlarmPriority
 
@@ -79,6 +78,8 @@ def _known_name(name: str) -> str:
     return name.lower()
 
 
+DECLARED_BANDS: Final = tuple(band.alarm or (band.low, band.high) for band in PROCESS.bands)
+
 Delay = Annotated[FiniteFloat, Field(ge=0, le=345_600 * TICK_S)]
 
 
@@ -107,10 +108,10 @@ class AlarmSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    level_band: tuple[FiniteFloat, FiniteFloat] = LEVEL_BAND
-    """L1, %, of the cold box, as the next."""
-    t5_band: tuple[FiniteFloat, FiniteFloat] = T5_BAND
-    """T5, K."""
+    level_band: tuple[FiniteFloat, FiniteFloat] = DECLARED_BANDS[0]
+    """Of the first output that has a band: of the cold box L1, %."""
+    t5_band: tuple[FiniteFloat, FiniteFloat] = DECLARED_BANDS[min(1, len(DECLARED_BANDS) - 1)]
+    """Of the second one: of the cold box T5, K. Further ones are as the process declares them."""
     band_delay_s: Delay = 5.0 * STRETCH
     """On-delay of the two band alarms: how long an output must be outside, plant time."""
     rules: dict[Annotated[str, AfterValidator(_known_name)], RuleSettings] = {}
@@ -132,9 +133,7 @@ class AlarmSettings(BaseModel):
     @property
     def bands(self) -> tuple[tuple[float, float], ...]:
         """What each output with a band is to be within."""
-        if IS_COLD_BOX:
-            return self.level_band, self.t5_band
-        return tuple(band.alarm or (band.low, band.high) for band in PROCESS.bands)
+        return (self.level_band, self.t5_band, *DECLARED_BANDS[2:])[: len(DECLARED_BANDS)]
 
     @property
     def band_ticks(self) -> int:

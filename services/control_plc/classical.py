@@ -12,8 +12,10 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 
+from coldloop.process.cold_box import LEVEL_LOOP, T5_LOOP
+from coldloop.process.declaration import Loop
 from coldloop.process.limits import InputLimits
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, SAMPLING_PERIOD_S, TICK_S
 from coldloop.process.whole_ticks import whole_ticks
 from coldloop.registers.control_plc import SequenceRow
@@ -32,22 +34,26 @@ class PiSettings(BaseModel):
     """Setpoint less the output at the operating point of the model file, in the unit of the output."""
 
 
+def _declared(loop: Loop) -> PiSettings:
+    return PiSettings(gain=loop.gain, integral_time_s=loop.integral_time_s, setpoint_offset=loop.setpoint_offset)
+
+
 class TemperatureLoop(PiSettings):
     """T5 (K) by CV156 (%): gain in % per K."""
 
-    gain: FiniteFloat = -5.0
-    integral_time_s: PositiveFloat = 240.0
+    gain: FiniteFloat = T5_LOOP.gain
+    integral_time_s: PositiveFloat = T5_LOOP.integral_time_s
 
 
 class LevelLoop(PiSettings):
     """L1 (%) by NCR22_A (W): gain in W per %."""
 
-    gain: FiniteFloat = -100.0
-    integral_time_s: PositiveFloat = 300.0
+    gain: FiniteFloat = LEVEL_LOOP.gain
+    integral_time_s: PositiveFloat = LEVEL_LOOP.integral_time_s
 
 
 class ClassicalSettings(BaseModel):
-    """The classical loops of the cold box; `docs/science.md` says how they were tuned. Other processes bring theirs."""
+    """The tuning of loops by the quantity of their output, as the cold box declares it; of others it is declared."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -59,18 +65,11 @@ class ClassicalSettings(BaseModel):
     @property
     def pairs(self) -> "tuple[tuple[str, str, PiSettings], ...]":
         """Output, input and tuning of each loop."""
-        if IS_COLD_BOX:
-            return (("L1", "NCR22_A", self.level), ("T5", "CV156", self.temperature))
         return tuple(
-            (
-                output.name, loop.input,
-                PiSettings(
-                    gain=loop.gain, integral_time_s=loop.integral_time_s, setpoint_offset=loop.setpoint_offset
-                ),
-            )
+            (output.name, loop.input, getattr(self, output.quantity) if output.quantity else _declared(loop))
             for output in PROCESS.banded
             if output.band is not None and (loop := output.band.loop) is not None
-        )  # fmt: skip
+        )
 
     @property
     def period_ticks(self) -> int:

@@ -14,7 +14,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from coldloop.process.limits import InputLimits
-from coldloop.process.loaded import IS_COLD_BOX
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import CONTROLLED, L1, OUTPUT_NAMES, T1, T5, TICK_S
 from coldloop.registers.control_plc import CoolDownStep, SequenceRow
 
@@ -94,7 +94,7 @@ class CoolDown:
 
     def _next(self, tick: int, y: Sequence[float]) -> CoolDownStep:
         if not self._has_begun:
-            warm = IS_COLD_BOX and y[T1] > self._settings.warm_k and y[L1] < self._settings.liquid_pct
+            warm = PROCESS.has_bath and y[T1] > self._settings.warm_k and y[L1] < self._settings.liquid_pct
             return CoolDownStep.TURBINE if warm else CoolDownStep.FINISHED
         match self.step:
             case CoolDownStep.TURBINE if y[T5] <= self._outputs[T5]:

@@ -10,18 +10,20 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
-from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, STRETCH, T1, TICK_S
+from coldloop.process.loaded import PROCESS
+from coldloop.process.signals import CONTROLLED, OUTPUT_NAMES, STRETCH, TICK_S
 from control_plc.numbers import Numbers
 
 Range = tuple[FiniteFloat, FiniteFloat]
-FIRST_OF_KIND, P1 = (T1, OUTPUT_NAMES.index("P1")) if IS_COLD_BOX else (0, 0)
+QUANTITIES = [output.quantity for output in PROCESS.outputs]
+FIRST_OF_KIND, P1 = (QUANTITIES.index(kind) if kind in QUANTITIES else 0 for kind in ("temperature", "pressure"))
 """First of the pressures, which are the last outputs; the temperatures are before them. Other outputs have one kind."""
-V1, P5, P6 = map(OUTPUT_NAMES.index, ("V1", "P5", "P6")) if IS_COLD_BOX else (0, 0, 0)
+V1, P5, P6 = map(OUTPUT_NAMES.index, ("V1", "P5", "P6")) if PROCESS.has_bath else (-1, 0, 0)
 STANDSTILL_RATIO = 1.1
 """Of the pressures before and behind the turbine's nozzle, below which it may stand; it is some ten in operation."""
-FEW = int(not IS_COLD_BOX)
+FEW = int(P1 == 0)
 """1: most of the others are counted without the output itself, which matters where there are few."""
+MOVES_AS_ONE = PROCESS.moves_as_one
 MOVES = 240
 """Ticks in which an output that is not controlled must have moved before it can be frozen."""
 FIRST_RESTS = [0 if output in CONTROLLED else -MOVES for output in range(len(OUTPUT_NAMES))]
@@ -116,7 +118,7 @@ def is_frozen(unchanged: float, rest: float, least: float) -> bool:
 
 def may_stand(output: int, y: Sequence[float]) -> bool:
     """Return whether an output is the speed of a turbine that stands, for all that the pressures say."""
-    return IS_COLD_BOX and output == V1 and y[V1] == 0.0 and y[P6] < STANDSTILL_RATIO * y[P5]
+    return output == V1 and y[V1] == 0.0 and y[P6] < STANDSTILL_RATIO * y[P5]
 
 
 def moved(before: Numbers, y: Numbers, first: int, end: int) -> int:
@@ -224,7 +226,7 @@ class SensorMonitor:
         history = zip(self.unchanged, self.rests, self.least, strict=True)
         frozen: Collection[int] = [output for output, each in enumerate(history) if is_frozen(*each)]
         frozen = [output for output in frozen if output not in standing and not may_stand(output, y)]
-        if self._may_rest and not IS_COLD_BOX:
+        if self._may_rest and not MOVES_AS_ONE:
             frozen = self._not_at_rest(frozen, inputs)
         if self._image.unchanged(inputs, y, *others, elapsed=elapsed) >= self.frozen_ticks:
             frozen = range(len(y))

@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from coldloop.process.declaration import NO_LOAD, Input, Output, Range
 from coldloop.process.load_profile import LOAD_UNIT, LOAD_WORD
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import SAMPLING_PERIOD_S
 
 BESIDE_BAND: Final = 1.5
@@ -22,7 +22,7 @@ def process_document() -> dict[str, Any]:
     load = {"word": LOAD_WORD, "unit": LOAD_UNIT, "span": span, "bar": PROCESS.load.bar or span}
     return {
         "name": PROCESS.name,
-        "mimic": "static/mimic.svg" if IS_COLD_BOX else "mimic.svg" if PROCESS.mimic else None,
+        "mimic": PROCESS.shipped_mimic or ("mimic.svg" if PROCESS.mimic else None),
         "sample_s": SAMPLING_PERIOD_S,
         "inputs": [
             {"name": one.name, "label": one.name[: len(one.register)], "register": one.register, "unit": one.unit,
@@ -30,7 +30,7 @@ def process_document() -> dict[str, Any]:
             for one in PROCESS.inputs
         ],
         "controlled": [_output(one) for one in PROCESS.banded],
-        "measured": [_output(one) for one in PROCESS.outputs if one.band is None and not IS_COLD_BOX],
+        "measured": [_output(one) for one in PROCESS.outputs if one.band is None and one.range[0] < one.range[1]],
         "load": None if PROCESS.load == NO_LOAD else load,
     }  # fmt: skip
 
@@ -65,5 +65,6 @@ def decimals_by_unit() -> dict[str, int]:
     steps += [(one.unit, one.noise) for one in PROCESS.outputs]
     found: dict[str, int] = {}
     for unit, step in steps:
-        found[unit] = max(found.get(unit, 0), math.ceil(-math.log10(step)))
-    return found
+        if unit not in PROCESS.decimals:
+            found[unit] = max(found.get(unit, 0), math.ceil(-math.log10(step)))
+    return found | dict(PROCESS.decimals)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, OUTPUT_UNITS, TICK_S
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ModelDeviation, UpdatingRuleStatus
@@ -13,20 +13,17 @@ from hmi.explanation import Branch, Explanation, is_rounded_to_one
 AT_REST: Final = 1e-9
 """A Gamma that is smaller is rounding: the cost is at its floor."""
 
-NOTABLE: Final = {"W": 2.0, "%": 0.2, "Hz": 5.0, "K": 0.05, "bar": 0.005}
-"""A cold box that differs from its model by less is not worth a word, ..."""
 NOTABLE_SHARE: Final = 0.01
-"""... nor another process by less than this share of the range of an input, ..."""
+"""A plant that differs from its model by less than this share of the range of an input is not worth a word, ..."""
 NOTABLE_NOISE: Final = 5.0
-"""... or so many times the noise of an output."""
+"""... nor by less than so many times the noise of an output, where the process does not declare what is notable."""
 
 
 def _notable() -> tuple[float, ...]:
     """Return what is worth a word, by input and output."""
-    if IS_COLD_BOX:
-        return tuple(NOTABLE[unit] for unit in INPUT_UNITS + OUTPUT_UNITS)
-    inputs = (NOTABLE_SHARE * (one.high - one.low) for one in PROCESS.inputs)
-    return *inputs, *(NOTABLE_NOISE * one.noise for one in PROCESS.outputs)
+    usual = [(one.unit, NOTABLE_SHARE * (one.high - one.low)) for one in PROCESS.inputs]
+    usual += [(one.unit, NOTABLE_NOISE * one.noise) for one in PROCESS.outputs]
+    return tuple(PROCESS.notable.get(unit, value) for unit, value in usual)
 
 
 NOTABLE_DEVIATIONS: Final = _notable()

@@ -7,11 +7,11 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from coldloop.process.loaded import IS_COLD_BOX
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
 from coldloop.registers.control_plc import Mode, Process
 
-STATION_NAMES: Final = ("P12", "P11") if IS_COLD_BOX else ()
+STATION_NAMES: Final = ("P12", "P11") if PROCESS.has_station else ()
 """Signals of a refrigerator's station that are kept: high and low pressure."""
 NAMES: Final = ("load", *INPUT_NAMES, *OUTPUT_NAMES, "mode", *STATION_NAMES)
 """Columns of the store; `mode` is that of the fail-safe ladder."""

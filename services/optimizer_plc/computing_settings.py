@@ -6,7 +6,7 @@ from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
 
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.per_signal import PositivePerInput
 from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STRETCH
 
@@ -18,10 +18,10 @@ and `design.violation_weight` wherever it is not set."""
 SIGNALS: Final = (*OUTPUT_NAMES, *INPUT_NAMES)
 GROUPS: Final = {
     "outputs": PROCESS.constants,
-    "inputs": ("CV155", "CV156") if IS_COLD_BOX else INPUT_NAMES,
+    "inputs": tuple(one.name for one in PROCESS.inputs if one.has_constant),
 }
-"""What `estimator.disturbances` calls all outputs, or inputs, that may have one. No sensor tells a
-constant error of L1 from liquid helium, nor one of the heater from the load.
+"""What `estimator.disturbances` calls all outputs, or inputs, that may have one. Of the cold box no sensor tells
+a constant error of L1 from liquid helium, nor one of the heater from the load.
 """
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kept, kernel
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import OUTPUT_NAMES, SAMPLING_PERIOD_S, STATE_NAMES, TICK_S
 from optimizer_plc.computing_settings import (
     SIGNALS,
@@ -243,13 +243,13 @@ def check_detectability(prediction: PredictionModel) -> None:
 
 def state_walks(prediction: PredictionModel, settings: EstimatorSettings) -> list[float]:
     """Return the process noise of each state of the plant's model."""
-    if not IS_COLD_BOX:
-        return [state.walk for state in PROCESS.states]
     by_unit = {
         "Pa": settings.pressure_noise_pa, "m3": settings.volume_noise_m3, "K": settings.temperature_noise_k,
         "kg": settings.mass_noise_kg, "kg/s": settings.flow_noise_kg_s, "bar s": settings.integral_noise_bar_s,
     }  # fmt: skip
-    return [by_unit[unit] for unit in prediction.model.state_units]
+    units, states = prediction.model.state_units, PROCESS.states
+    declared = [state.walk for state in states] + [None] * (len(units) - len(states))
+    return [by_unit[unit] if walk is None else walk for walk, unit in zip(declared, units, strict=True)]
 
 
 def walks_of(prediction: PredictionModel, settings: EstimatorSettings) -> Array:

@@ -4,8 +4,8 @@ The paper does not print its load profiles. The six hours a to f are random tele
 point, each of another family; `docs/science.md` says how they were chosen. `a@2` is a second
 draw of the family of hour a.
 
-For other processes than the cold box the same telegraphs are stretched: in time as their tick is longer, in size so
-that 200 W are the way from the operating point's load to the nearer end of its span.
+For a process that has no named loads of its own these are stretched: in time as its tick is longer, in size so that
+200 W are the way from the operating point's load to the nearer end of its span.
 """
 
 import random
@@ -14,8 +14,8 @@ from typing import Final, NamedTuple
 
 from coldloop.errors import LoadFileError
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.load_profile import LoadProfile, read_load_file
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.load_profile import LOAD_SPAN, LoadProfile, read_load_file
+from coldloop.process.loaded import PROCESS
 
 SECOND_TICKS: Final = int(1.0 / COLD_BOX.tick_s)
 """Ticks of what is a second in the families below: of the cold box it is one."""
@@ -138,11 +138,11 @@ def find_load(name: str, mean_w: float) -> LoadProfile:
         LoadFileError: There is neither such a name nor a file that can be read, or the mean is too low for its steps.
     """
     families = named_families(name)
-    if families is not None and not IS_COLD_BOX:
+    if families is not None and not PROCESS.load.has_named_loads:
         return concatenated([telegraph(_stretched(family, name, mean_w), mean_w) for family in families])
     if families is not None:
         lowest = mean_w + min(step for family in families for step in family.steps)
-        if lowest < 0.0:
+        if lowest < LOAD_SPAN[0]:
             raise LoadFileError(
                 f"load {name}: would go down to {lowest:.0f} W about {mean_w:.0f} W, the load of the model's operating"
                 " point; name a CSV file with loads of this plant"

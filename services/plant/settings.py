@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 from coldloop.modbus.endpoints import PLANT_PORT
 from coldloop.modbus.settings import ServerSettings
 from coldloop.process.limits import InputLimits
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.model_settings import ModelSettings
 from coldloop.process.per_signal import PerInput
 from coldloop.process.signals import STRETCH, TICK_S
@@ -178,7 +178,7 @@ class PlantSection(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    kind: PlantKind = PlantKind.COLD_BOX if IS_COLD_BOX else PlantKind.OF_PROCESS
+    kind: PlantKind = PlantKind(PROCESS.plants[0])
     refrigerator: RefrigeratorSettings = RefrigeratorSettings()
     """Read by the refrigerator only, as is `station`."""
     station: StationSettings = StationSettings()

@@ -4,7 +4,7 @@ import pytest
 
 from coldloop.errors import LoadFileError, UsageError
 from rig.chaos.faults import Drop, Kill, Reset
-from rig.chaos.plan import SPREAD_S, ChaosPlan, find_plan, parse_plan, shipped_plans
+from rig.chaos.plan import SHIPPED, SPREAD_S, ChaosPlan, find_plan, parse_plan, shipped_plans
 
 KINDS = {
     "delay", "drop", "duplicate", "reorder", "reset", "freeze", "truncate", "abort", "flip",
@@ -20,6 +20,7 @@ def with_fault(*lines: str) -> str:
 
 def test_the_shipped_plans_are_sound_and_have_all_kinds() -> None:
     plans = shipped_plans()
+    assert len(plans) == sum(entry.name.endswith(".toml") for entry in SHIPPED.iterdir())
     assert {fault.kind for plan in plans for fault in plan.faults} == KINDS
     assert all(find_plan(plan.name, {}) == plan for plan in plans)
 

@@ -1,6 +1,7 @@
 """What the containers' health check says of servers, right and wrong; needs no container."""
 
 import asyncio
+import json
 import runpy
 import socket
 import threading
@@ -22,6 +23,8 @@ from coldloop.registers.optimizer_plc import OPTIMIZER_MAP
 from coldloop.registers.plant import PLANT_MAP, PlantSession
 from rig.cli.certificates import Authority
 from tests.harness.processes import END_S, Processes
+from tests.process.runs import started
+from tests.process.test_processes import made
 
 PROGRAM = Path(__file__).parents[2] / "docker" / "healthcheck.py"
 MAPS = {"plant": PLANT_MAP, "control_plc": CONTROL_MAP, "optimizer_plc": OPTIMIZER_MAP}
@@ -132,6 +135,20 @@ async def test_one_that_stands_is_not_though_it_answers(service: str, order: Wor
     assert "stays at tick 7" in done.complaint
 
 
+async def test_ticks_may_be_as_long_as_the_process_has_them(standing: Show) -> None:
+    async with standing() as one:
+
+        async def scan_now_and_then() -> None:
+            for tick in range(8, 100):
+                await asyncio.sleep(6.0)
+                one.show(tick)
+
+        task = asyncio.create_task(scan_now_and_then())
+        assert (await one.check({"HEALTHCHECK_TICK_PATIENCE_S": "60"})).complaint == ""
+        task.cancel()
+        assert "stays at tick" in (await one.check()).complaint
+
+
 async def test_in_lock_step_a_service_may_stand_whatever_its_configuration_says(standing: Show) -> None:
     async with standing() as one:
         one.bank.put(ControlSession(70_000, 0, 1.0))
@@ -202,7 +219,8 @@ def test_nor_is_a_server_of_something_else(check: Check) -> None:
     assert "not a register map of ours" in done.complaint
 
 
-def test_the_addresses_it_reads_are_those_of_the_register_maps() -> None:
+def test_the_addresses_it_reads_are_those_of_the_register_maps(processes: Processes, tmp_path: Path) -> None:
+    """Those of the largest process too, whose longer blocks leave these where they are."""
     known = runpy.run_path(str(PROGRAM))
     starters = {"plant": PlantSession, "control_plc": ControlSession}
     addresses = {
@@ -212,6 +230,11 @@ def test_the_addresses_it_reads_are_those_of_the_register_maps() -> None:
         if block.record is starter
     }
     assert known["SESSIONS"] == addresses
+    wide = made(tmp_path, inputs=1, outputs=32, states=20, tick_s=60.0, load=True)
+    code, listing, complaints = started(processes, "--process", wide, "registers", "--format", "json")
+    assert code == 0, complaints
+    starts = {(row["service"], row["block"]): row["address"] for row in json.loads(listing)[::-1]}
+    assert {service: starts[service, "session"] for service in addresses} == addresses
     for register_map in MAPS.values():
         (identity,) = [block for block in register_map.blocks if block.record is Identity]
         assert identity.address == 0

@@ -17,7 +17,7 @@ def others_moved(tick: int) -> tuple[float, ...]:
 @pytest.fixture
 def monitor(monkeypatch: pytest.MonkeyPatch) -> SensorMonitor:
     """The checks of another process than the cold box."""
-    monkeypatch.setattr(sensors, "IS_COLD_BOX", False)
+    monkeypatch.setattr(sensors, "MOVES_AS_ONE", False)
     return SensorMonitor(SensorCheckSettings(), REST, moves=(0.1, 0.1, 0.1))
 
 

@@ -14,8 +14,8 @@ from plant.refrigerator.balance import refrigerator_energy_rates
 from plant.refrigerator.equipment import EquipmentLaw, act
 from plant.refrigerator.high_pressure import FIRST
 from plant.refrigerator.physics import (
+    COIL,
     SIGNAL_NAMES,
-    STATE_NAMES,
     Refrigerator,
     advance_refrigerator,
     evaluate_refrigerator,
@@ -30,7 +30,6 @@ AHEAD: Final = np.array([0.125, 0.125, 0.25, 0.0])
 """Of the stages of a tick, s."""
 LP, TO_BOX, COMPRESSED = (SIGNAL_NAMES.index(name) for name in ("P11", "M12", "M_NC"))
 V1 = OUTPUT_NAMES.index("V1")
-COIL = STATE_NAMES.index("T_nef5")
 
 
 @numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]

@@ -10,10 +10,9 @@ from plant.components.gas_valve import CRITICAL_RATIO
 from plant.components.heat_exchanger import (
     HighPressureFlow,
     LowPressureFlow,
-    cell_rates,
     driving_difference,
+    exchange,
     take_up,
-    transfer,
 )
 from plant.components.phase_separator import content, level, separate
 from plant.components.return_line import return_flow
@@ -98,8 +97,7 @@ def test_what_an_exchanger_takes_from_one_stream_it_gives_to_the_other(
     entering = LowPressureFlow(m_low, 1.15e5, T_low, h_low)
     dT = np.empty(exchanger.cells)
     high = HighPressureFlow(m_high, T_high, 16e5)
-    leaving = transfer(exchanger, T, high, entering, HELIUM, dT)
-    cell_rates(exchanger, T, high, HELIUM, dT)
+    leaving = exchange(exchanger, T, high, entering, HELIUM, dT, is_supply_held=True)
     stored = 0.0
     for T_cell, rate in zip(T, dT, strict=True):
         _, rho_cp, c_wall = supply_cell(16e5, T_cell, HELIUM)

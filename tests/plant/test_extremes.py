@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.model_range import CELLS_K, SATURATION_BAR, WARMEST_BATH_M3, model_range
+from coldloop.process.model_range import SATURATION_BAR, WARMEST_BATH_M3, WARMEST_CELL_K, model_range
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
 from coldloop.process.range_bits import ModelRange
 from coldloop.process.signals import OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S
@@ -324,11 +324,11 @@ def test_the_alarm_for_the_end_of_the_tables_knows_what_has_left_them() -> None:
     assert model_range(x, 16.0, 1.05) == 0
     assert model_range(np.concatenate([[2.3e5], x[1:]]), 16.0, 1.05) == ModelRange.BATH_PRESSURE
     assert model_range(x, 4.0, 0.2) == ModelRange.SUPPLY_PRESSURE | ModelRange.RETURN_PRESSURE
-    far = np.tile(x, (2, 1))
-    far[0, -1], far[1, 5] = CELLS_K[1] + 1.0, CELLS_K[0] - 0.1
+    far = np.tile(x, (3, 1))
+    far[0, -1], far[1, 5], far[2, -1] = 311.0, 2.4, 5.2
     dry = np.concatenate([x[:1], [1.01 * WARMEST_BATH_M3], x[2:]])
     assert model_range(dry, 16.0, 1.05) == ModelRange.WARM_BATH
     warmest = outflow(BATH, 1.2e5, WARMEST_BATH_M3, saturation(1.2e5, HELIUM), HELIUM)
-    assert pytest.approx(CELLS_K[1], abs=1.0) == warmest.T
-    assert model_range(far, 16.0, 1.05).tolist() == [ModelRange.WARM_CELL, ModelRange.COLD_CELL]
+    assert pytest.approx(WARMEST_CELL_K, abs=1.0) == warmest.T
+    assert model_range(far, 16.0, 1.05).tolist() == [ModelRange.WARM_CELL, *[ModelRange.COLD_CELL] * 2]
     assert (1e5 * SATURATION_BAR[0], 1e5 * SATURATION_BAR[1]) == (LOWEST_SATURATION, HIGHEST_SATURATION)

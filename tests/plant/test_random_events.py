@@ -6,18 +6,23 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from coldloop.process.model_range import model_range
 from coldloop.process.model_settings import DEFAULT_MODEL_FILE
+from coldloop.process.signals import OUTPUT_NAMES
 from plant.cold_box.balance import energy_gained, energy_rates
 from plant.cold_box.physics import REFERENCE, cold_box_of, derivative
 from plant.components.phase_separator import content
-from plant.helium.properties import helium_of, load_helium
+from plant.helium.properties import helium_of, load_helium, supply_enthalpy_and_density
 from plant.integrator import advance, plain_tuples
 from plant.numeric import RealArray
 from plant.own_model import own_header
 from plant.refrigerator.balance import stored_energy
-from plant.refrigerator.equipment import EquipmentLaw, resting_equipment
+from plant.refrigerator.equipment import ACTING, DEVIATING, EquipmentLaw, resting_equipment
 from plant.refrigerator.file import SHIPPED, read_refrigerator_file
+from plant.refrigerator.high_pressure import FIRST
 from plant.refrigerator.physics import (
+    BOX_STATES,
+    COIL,
     REFERENCE_REFRIGERATOR,
     SIGNAL_NAMES,
     STATE_NAMES,
@@ -36,6 +41,7 @@ HEADER = own_header(DEFAULT_MODEL_FILE)
 FILE = read_refrigerator_file(SHIPPED)
 M_LOST = STATE_NAMES.index("M_lost")
 LAW = station_law(StationSettings(), FILE.reference, PLANT.station).equipment
+HP, LP = (SIGNAL_NAMES.index(name) for name in ("P12", "P11"))
 PLAIN, TABLES = plain_tuples(PLANT), plain_tuples(HELIUM)
 
 percent = st.floats(0.0, 100.0)
@@ -74,6 +80,11 @@ def held(
     return x, sums
 
 
+def in_parts(course: Course) -> Course:
+    """Return a course whose pieces last for 100 ticks at most: after each, it is looked at."""
+    return [(min(100, ticks - begun), *given) for ticks, *given in course for begun in range(0, ticks, 100)]
+
+
 def balances_over_random_events(course: Course) -> tuple[float, float]:
     """Whatever is stuck, trips, leaks, blocks up or is lost: helium and energy add up, stage by stage.
 
@@ -83,7 +94,7 @@ def balances_over_random_events(course: Course) -> tuple[float, float]:
     before = inventory(x, PLANT, HELIUM)
     in_bath = content(BATH, x[0], x[1], HELIUM).energy
     missing = crossed = 0.0
-    for ticks, u, v, d in course:
+    for ticks, u, v, d in in_parts(course):
         energy = stored_energy(x, d[1], PLANT, HELIUM)
         x, sums = held(x, equipment, np.array(u), np.array(v), np.array(d), ticks, PLAIN, TABLES, LAW)
         assert np.all(np.isfinite(x))
@@ -92,9 +103,32 @@ def balances_over_random_events(course: Course) -> tuple[float, float]:
         gained = content(BATH, x[0], x[1], HELIUM).energy - in_bath
         assert gained == pytest.approx(sums[TO_BATH], abs=1e-6 * sums[SIZE] + 1e-6)
         in_bath += gained
+        assert_alarmed_where_tables_end(x, equipment[ACTING:DEVIATING], np.array(v), np.array(d))
         missing += sums[CROSSED] - stored_energy(x, d[1], PLANT, HELIUM) + energy
         crossed += sums[SIZE]
     return missing, crossed
+
+
+TABLES_END = {
+    "P1": (0.3, 2.25), "P_mix": (0.3, 2.25), "P_turbine": (0.3, 20.0), "P11": (0.3, 2.25), "P12": (5.0, 19.0),
+    "h before the turbine": (6e3, 1.6e6), "coldest cell": (2.5, 340.0), "warmest cell": (2.5, 340.0),
+}  # fmt: skip
+"""Of helium's properties, bar, J/kg and K: arguments at which `coldloop.process.model_range` has to say nothing."""
+
+
+def assert_alarmed_where_tables_end(x: RealArray, u: RealArray, v: RealArray, d: RealArray) -> None:
+    """What the tables are asked for at a state is within them, or the alarm says that it is not."""
+    y, signals = np.empty(len(OUTPUT_NAMES)), np.empty(len(SIGNAL_NAMES))
+    cold = evaluate_refrigerator(x, u, v, d, PLANT, HELIUM, np.empty_like(x), y, signals).cold
+    h, _ = supply_enthalpy_and_density(1e5 * signals[HP], x[BOX_STATES - 1], HELIUM)
+    cells = x[FIRST : COIL + 1]
+    asked = (
+        1e-5 * x[0], 1e-5 * cold.P_mix, 1e-5 * cold.P_turbine, signals[LP], signals[HP], h, cells.min(), cells.max()
+    )  # fmt: skip
+    outside = [
+        name for (name, (low, high)), value in zip(TABLES_END.items(), asked, strict=True) if not low <= value <= high
+    ]
+    assert not outside or model_range(x[:BOX_STATES], signals[HP], signals[LP]), outside
 
 
 def drawn(seed: int) -> Course:

@@ -169,7 +169,7 @@ def test_a_step_that_is_forecast_costs_less_than_one_that_is_not(
     """Of a disturbance that is measured, of one that is estimated, of the load; the pump is slow, 0.1 l/s in 5 s."""
     header, load = "time_s,rain,draw,leak", known == "leak"
     weather = f"{header}\n0,0,0,0\n240,{1.5 * (known == 'rain')},{1.0 * (known == 'draw')},{5.0 * load}\n"
-    (tmp_path / "leak.csv").write_text(f"time_s,load_w\n0,0\n240,{5.0 * load}\n", encoding="utf-8")
+    (tmp_path / "leak.csv").write_text(f"time_s,load\n0,0\n240,{5.0 * load}\n", encoding="utf-8")
     text = FILE.replace("setpoint = 10.5", "setpoint = 10.0").replace("rate = 1.0", "rate = 0.1")
     options = ("--in-process", "--load", str(tmp_path / "leak.csv"), "--duration", "8min", *ELAPSED)
     unknown = run(processes, pond(tmp_path, text, weather), tmp_path / "unknown", *options)

@@ -59,14 +59,14 @@ def _recorded_run(options: argparse.Namespace) -> list[Path]:
 
 def _solver(options: argparse.Namespace) -> list[Path]:
     from coldloop.errors import UsageError
-    from coldloop.process.loaded import IS_COLD_BOX
+    from coldloop.process.loaded import PROCESS
     from rig.cli.plc_folder import export_plc
 
     if options.run != PLC:
         raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
     if options.out is None or options.force:
         raise UsageError("export plc: name a new folder with --out; --force does not replace one")
-    if not (options.target == "c" and IS_COLD_BOX) and (options.config or options.assignments):
+    if not (options.target == "c" and PROCESS.has_bath) and (options.config or options.assignments):
         raise UsageError("--config and --set: are of the whole optimiser, which is --target c without --process")
     return export_plc(options.target, options.ticks, options.out, _settings(options))
 

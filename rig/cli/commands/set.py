@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
-from coldloop.process.load_profile import LOAD_UNIT
+from coldloop.process.load_profile import LOAD_COLUMN, LOAD_UNIT
 from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import TICK_S
 from coldloop.process.whole_ticks import whole_ticks
@@ -36,8 +36,10 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_rig_options(parser)
     what = parser.add_subparsers(title="what", metavar="WHAT", required=True)
-    load = what.add_parser("load", help=f"{UNIT}, or a CSV file time_s,load_w")
-    load.add_argument("new_load", metavar="LOAD|FILE", help=f"{UNIT}, or a CSV file time_s,load_w that begins now")
+    load = what.add_parser("load", help=f"{UNIT}, or a CSV file time_s,{LOAD_COLUMN}")
+    load.add_argument(
+        "new_load", metavar="LOAD|FILE", help=f"{UNIT}, or a CSV file time_s,{LOAD_COLUMN} that begins now"
+    )
     load.add_argument("--at", type=_seconds, metavar="SECONDS", help="plant time at which it begins (default: now)")
     load.set_defaults(document=_load)
     mode = what.add_parser("mode", help="who drives")

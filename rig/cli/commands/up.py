@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from coldloop.process.load_profile import LOAD_COLUMN
 from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.choices import WITHOUT
 from rig.cli.commands.options import PLACES, add_loop_options, check_load, port_base, refuse_ineffective
@@ -12,7 +13,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
     parser.add_argument("--factor", type=float, help="seconds of plant time per second (default: 1)")
-    add_loop_options(parser, "or a CSV file time_s,load_w; its end is held")
+    add_loop_options(parser, f"or a CSV file time_s,{LOAD_COLUMN}; its end is held")
     parser.add_argument("--tls", type=Path, metavar="FOLDER",
                         help="Modbus/TCP Security with what `coldloop certificates --out FOLDER` made")  # fmt: skip
     parser.add_argument("--port-base", type=port_base, metavar="PORT",

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.per_signal import PositivePerInput
 from optimizer_plc.qp.design import N_INPUTS, ControlDesign
 
@@ -46,8 +46,9 @@ class Preset(StrEnum):
     """Sets of settings by name; what is set explicitly in the same place comes before the preset's."""
 
     TUNED = "tuned"
-    """As good as this project knows how to make it: the paper's preset, an estimator of constant errors, a limit of
-    CV155 where opening it further cools less, and rows that keep outputs inside their bands at rest."""
+    """As good as this project knows how to make it: the paper's preset and an estimator of constant errors; of the cold
+    box also a limit of CV155 where opening it further cools less, and rows that keep outputs inside their bands at
+    rest."""
     PAPER = "paper"
     """The paper's problem and estimator, with the truncated solver as good as this project knows how to make it."""
     AS_PRINTED = "as-printed"
@@ -55,14 +56,8 @@ class Preset(StrEnum):
     in their own units, and cost_scale is the one whose costs come down with the iterations as in the paper's figure."""
 
 
-_TUNED_COLD_BOX: Final[Mapping[str, Mapping[str, Any]]] = {
-    "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
-    "cold_end": {"approach_k": 0.3},
-    "design": {"band_margin": (0.1, 0.3)},
-    "plausibility": {"sigmas": 6.0},
-}
 PRESETS: Final[Mapping[Preset, Mapping[str, Mapping[str, Any]]]] = {
-    Preset.TUNED: _TUNED_COLD_BOX if IS_COLD_BOX else {"estimator": {"disturbances": ("outputs",)}},
+    Preset.TUNED: PROCESS.tuned or {"estimator": {"disturbances": ("outputs",)}},
     Preset.PAPER: {},
     Preset.AS_PRINTED: {
         "penalties": {

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.lti_model import LtiModel
 from coldloop.process.signals import CONTROLLED, L1, STATE_NAMES, TICKS_PER_SAMPLE
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
@@ -187,11 +187,11 @@ def state_cost(model: LtiModel, design: ControlDesign) -> Array:
 
 
 def state_weights(model: LtiModel, design: ControlDesign) -> Array:
-    """Return what states weigh themselves, shape (n,): those of the cold box.
+    """Return what states weigh themselves, shape (n,): those of a bath with a cold end.
 
     Pressure, level and the mean of the temperatures weigh alike; further states and those of other processes nothing.
     """
-    if not IS_COLD_BOX:
+    if not PROCESS.has_bath:
         return np.zeros(len(model.x0))
     n = len(STATE_NAMES)
     scales = np.full(n, design.temperature_scale)

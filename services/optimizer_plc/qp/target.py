@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.limits import InputLimits
-from coldloop.process.loaded import IS_COLD_BOX
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import T5
 from optimizer_plc.qp.arithmetic import DOUBLE, Real
 from optimizer_plc.qp.design import N_INPUTS, ControlDesign, Target
@@ -90,7 +90,7 @@ def target_search(
     prediction: PredictionModel, design: ControlDesign, limits: InputLimits, real: Real = DOUBLE
 ) -> TargetSearch:
     """Return what targets of this problem are found with."""
-    if not IS_COLD_BOX:
+    if not PROCESS.has_bath:
         return no_target_search(real)
     rest, n, scale = rest_of(prediction, design), len(prediction.model.x0), np.array(design.input_scale)
     held, states = rest.states[:, -1], rest.states[:, :n]

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.process.model_range import CELLS_K, SATURATION_BAR, model_range
+from coldloop.process.model_range import COLDEST_CELLS_K, SATURATION_BAR, WARMEST_CELL_K, model_range
 from coldloop.process.range_bits import ModelRange
 from coldloop.process.signals import STATE_NAMES, STATE_UNITS, T5
 from plant.cold_box.equilibrium import Equilibrium, NoEquilibriumError, first_guess, relaxed, rest_near
@@ -84,9 +84,10 @@ def obstacles(found: Equilibrium, file: PlantFile, helium: Helium) -> Iterator[s
             " boundaries.p_lp_bar would help, or less flow (cv155.area_mm2, turbine.nozzle_g_sqrt_k_per_s_bar)"
         )
     if outside & (ModelRange.COLD_CELL | ModelRange.WARM_CELL):
-        k = 2 + int(np.argmin(x[2:]) if outside & ModelRange.COLD_CELL else np.argmax(x[2:]))
+        cell = int(np.argmin(x[2:] - COLDEST_CELLS_K) if outside & ModelRange.COLD_CELL else np.argmax(x[2:]))
+        k, coldest = 2 + cell, COLDEST_CELLS_K[cell]
         yield (
-            f"{_part(k)}: {STATE_NAMES[k]} would be {x[k]:.1f} K, and is to be within {CELLS_K[0]:g} to {CELLS_K[1]:g}"
+            f"{_part(k)}: {STATE_NAMES[k]} would be {x[k]:.1f} K, and is to be within {coldest:g} to {WARMEST_CELL_K:g}"
             f" K; change {_part(k)}.ua_w_per_k or the flows through it"
         )
     if s.P_mix > CRITICAL_RATIO * s.P_turbine:

@@ -15,7 +15,7 @@ import numpy as np
 
 from coldloop.kernels.compiled import inlined, kernel
 from plant.components.gas_valve import CRITICAL_RATIO, cold_valve_flow
-from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow, cell_rates, transfer
+from plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow, exchange
 from plant.components.phase_separator import (
     Content,
     PhaseSeparator,
@@ -127,14 +127,14 @@ def mix(vapour: LowPressureFlow, s: Streams, helium: Helium) -> LowPressureFlow:
 
 
 @kernel
-def flows_and_heats(
-    x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Array, y: Array
-) -> tuple[Streams, LowPressureFlow, float, Content]:
-    """Write the rates of the bath into `dx` (28, per second) and the outputs into `y` (22, `OUTPUT_UNITS`).
+def evaluate(
+    x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Array, y: Array, is_supply_held: bool = True  # noqa: FBT001, FBT002 compiled
+) -> tuple[Streams, LowPressureFlow, float, Content]:  # fmt: skip
+    """Write the rates of the states into `dx` (28, per second) and the outputs into `y` (22, `OUTPUT_UNITS`).
 
-    In the place of the rates of the cells is the heat that they give to the low-pressure gas (W). Returns the
-    flows, what leaves at the warm end of the low-pressure side, what the bath's relief valve blows into the
-    recovery line (kg/s), and what the bath holds.
+    If the supply is not held at constant pressure, in the place of the rates of the cells is the heat that they give to
+    the low-pressure gas (W). Returns the flows, what leaves at the warm end of the low-pressure side, what the bath's
+    relief valve blows into the recovery line (kg/s), and what the bath holds.
     """
     s = streams(x, u, box, helium)
     first2 = 2 + box.nef1.cells
@@ -148,12 +148,12 @@ def flows_and_heats(
 
     vapour = LowPressureFlow(s.m_v, x[0], top.T, top.h)
     into_nef1 = HighPressureFlow(s.m_jt, x[first34 - 1], box.P_HP)
-    cold = transfer(box.nef1, x[2:first2], into_nef1, vapour, helium, dx[2:first2])
+    cold = exchange(box.nef1, x[2:first2], into_nef1, vapour, helium, dx[2:first2], is_supply_held)
     mixed = mix(cold, s, helium)
     into_nef2 = HighPressureFlow(s.m_jt, x[first34 + box.nef34.cells - 1], box.P_HP)
-    middle = transfer(box.nef2, x[first2:first34], into_nef2, mixed, helium, dx[first2:first34])
+    middle = exchange(box.nef2, x[first2:first34], into_nef2, mixed, helium, dx[first2:first34], is_supply_held)
     into_nef34 = HighPressureFlow(s.m_jt + s.m_t, box.T_in, box.P_HP)
-    warm = transfer(box.nef34, x[first34:], into_nef34, middle, helium, dx[first34:])
+    warm = exchange(box.nef34, x[first34:], into_nef34, middle, helium, dx[first34:], is_supply_held)
 
     exhaust_saturation = saturation(s.P_mix, helium)
     y[0] = level(box.separator, x[1])
@@ -169,23 +169,6 @@ def flows_and_heats(
     y[10] = box.T_in
     y[11] = warm.T
     _write_pressures(x[0], s, box, y[12:])
-    return s, warm, relief, bath
-
-
-@kernel
-def evaluate(
-    x: Array, u: Array, w: float, box: ColdBox, helium: Helium, dx: Array, y: Array
-) -> tuple[Streams, LowPressureFlow, float, Content]:
-    """Write the rates of the states into `dx` (28, per second), the supply at constant pressure; else as above."""
-    s, warm, relief, bath = flows_and_heats(x, u, w, box, helium, dx, y)
-    first2 = 2 + box.nef1.cells
-    first34 = first2 + box.nef2.cells
-    into_nef1 = HighPressureFlow(s.m_jt, x[first34 - 1], box.P_HP)
-    cell_rates(box.nef1, x[2:first2], into_nef1, helium, dx[2:first2])
-    into_nef2 = HighPressureFlow(s.m_jt, x[first34 + box.nef34.cells - 1], box.P_HP)
-    cell_rates(box.nef2, x[first2:first34], into_nef2, helium, dx[first2:first34])
-    into_nef34 = HighPressureFlow(s.m_jt + s.m_t, box.T_in, box.P_HP)
-    cell_rates(box.nef34, x[first34:], into_nef34, helium, dx[first34:])
     return s, warm, relief, bath
 
 

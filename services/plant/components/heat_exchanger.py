@@ -86,10 +86,14 @@ def take_up(
 
 
 @kernel
-def transfer(
-    exchanger: HeatExchanger, T: Array, high: HighPressureFlow, low: LowPressureFlow, helium: Helium, heat: Array
-) -> LowPressureFlow:
-    """Write what each cell gives to the low-pressure gas into `heat` (W) and return that gas at the hot end.
+def exchange(
+    exchanger: HeatExchanger, T: Array, high: HighPressureFlow, low: LowPressureFlow, helium: Helium, given: Array,
+    is_supply_held: bool,  # noqa: FBT001 compiled
+) -> LowPressureFlow:  # fmt: skip
+    """Write what each cell gives to the low-pressure gas (W) into `given` and return that gas at the hot end.
+
+    If the mass of the high-pressure gas in the cells is held, as is its pressure, the rates of their temperatures (K/s)
+    are written instead: in one march with the heats, whose exponentials are waited for meanwhile.
 
     `T` holds the temperatures of gas and wall in each cell, hot end first (K). The low-pressure side is marched from
     the cold end; in a cell it approaches the mean T_m of the gas that enters and the gas that leaves:
@@ -102,6 +106,7 @@ def transfer(
     moving = at_most(high.mass_flow / STILL, 1.0)
     T_low, h_low = low.T, low.h
     _, cp_low = vapour_enthalpy_and_cp(low.P, T_low, sat.T, helium.vapour)
+    h_cell, rho_cp, c_wall = supply_cell(high.P, T[exchanger.cells - 1], helium)
     for i in range(exchanger.cells - 1, -1, -1):
         T_before = T[i - 1] if i > 0 else high.T
         T_ahead = T_before if moving.real >= 1.0 else T[i] + moving * (T_before - T[i])
@@ -109,21 +114,11 @@ def transfer(
         T_low, h_next, cp_low = take_up(
             LowPressureFlow(sweeping, low.P, T_low, h_low), cp_low, drive, UA, sat, helium.vapour
         )
-        heat[i] = low.mass_flow * (h_next - h_low)
+        given[i] = low.mass_flow * (h_next - h_low)
         h_low = h_next
+        if is_supply_held:
+            h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, helium)
+            capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
+            given[i] = (high.mass_flow * (h_before - h_cell) - given[i]) / capacity
+            h_cell, rho_cp, c_wall = h_before, rho_cp_before, c_wall_before
     return LowPressureFlow(low.mass_flow, low.P, T_low, h_low)
-
-
-@kernel
-def cell_rates(exchanger: HeatExchanger, T: Array, high: HighPressureFlow, helium: Helium, dT: Array) -> None:
-    """Replace what each cell gives to the low-pressure gas (W) in `dT` by the rate of its temperature (K/s).
-
-    The mass of the gas in the cells, as their pressure, is constant.
-    """
-    h_cell, rho_cp, c_wall = supply_cell(high.P, T[exchanger.cells - 1], helium)
-    for i in range(exchanger.cells - 1, -1, -1):
-        T_before = T[i - 1] if i > 0 else high.T
-        h_before, rho_cp_before, c_wall_before = supply_cell(high.P, T_before, helium)
-        capacity = (exchanger.volume * rho_cp + exchanger.aluminium * c_wall) / exchanger.cells
-        dT[i] = (high.mass_flow * (h_before - h_cell) - dT[i]) / capacity
-        h_cell, rho_cp, c_wall = h_before, rho_cp_before, c_wall_before

@@ -20,7 +20,7 @@ import numpy as np
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process import signals as process
-from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, flows_and_heats
+from plant.cold_box.physics import REFERENCE, ColdBox, Streams, cold_box_of, evaluate
 from plant.components.actuator import opening_rate
 from plant.components.cell_account import WILD, widest_move
 from plant.components.heat_exchanger import HighPressureFlow, LowPressureFlow
@@ -145,7 +145,9 @@ def evaluate_refrigerator(
         x[pipes.coil],
     )  # fmt: skip
     inputs = u if d[4].real + d[5].real > 0.0 else 0.0 * u
-    cold, leaving, relief, bath = flows_and_heats(x[:BOX_STATES], inputs, d[0], joined, helium, dx[:BOX_STATES], y)
+    cold, leaving, relief, bath = evaluate(
+        x[:BOX_STATES], inputs, d[0], joined, helium, dx[:BOX_STATES], y, is_supply_held=False
+    )
     high = HighPressureFlow(cold.m_jt + cold.m_t, T_hot, P.HP)
     flows = station_rates(
         x[STATION:], P, high.mass_flow, leaving.mass_flow, d[1], d[2], d[4:].real, station, dx[STATION:]

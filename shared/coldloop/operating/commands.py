@@ -86,7 +86,7 @@ class SetLoad(_Command):
 
 
 class PlayLoad(_Command):
-    """A load file `time_s,load_w` that begins now."""
+    """A load file `time_s,load_w` (`load` in another unit) that begins now."""
 
     kind: Literal["load_file"]
     content: Annotated[str, Field(max_length=LONGEST_FILE)]

@@ -2,12 +2,15 @@
 
 from typing import Final
 
-from coldloop.process.declaration import Band, Input, Load, Output, Process, State
+from coldloop.process.declaration import Band, Input, Load, Loop, Output, Process, State
 
 LEVEL_BAND: Final = (59.0, 61.0)
 """Band of L1, % (paper, section IV)."""
 T5_BAND: Final = (9.0, 16.0)
 """Band of T5, K (paper, section IV)."""
+LEVEL_LOOP: Final = Loop(input="NCR22_A", gain=-100.0, integral_time_s=300.0)
+T5_LOOP: Final = Loop(input="CV156", gain=-5.0, integral_time_s=240.0)
+"""How they were tuned is in `docs/science.md`."""
 
 _VALVES: Final = (
     ("CV155", "cv155", "Opening of the Joule-Thomson valve", 0.5, 43.0),
@@ -23,14 +26,26 @@ _JT_VALVE, _TURBINE_VALVE = (
 _HEATER: Final = Input(
     name="NCR22_A", unit="W", register="ncr22", description="Actuator part of the bath heater's power",
     span=(0, 1000), low=0.0, high=150.0, rate=10.0, safe=75.0, scale=50.0, weight=4e-4, walk=0.5,
-    bar=(-10.0, 160.0),
+    has_constant=False, bar=(-10.0, 160.0),
 )  # fmt: skip
 
 
+_HEAT_LOAD: Final = Load(
+    name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load", bar=(200.0, 600.0), has_named_loads=True,
+    too_much="the bath will run dry", too_little="the turbine gets too cold and the bath floods",
+)  # fmt: skip
+_BANDED: Final = {
+    "L1": (
+        Band(low=LEVEL_BAND[0], high=LEVEL_BAND[1], weight=100.0, alarm_word="level band", loop=LEVEL_LOOP),
+        (56.0, 64.0),
+    ),
+    "T5": (Band(low=T5_BAND[0], high=T5_BAND[1], weight=100.0, alarm_word="t5 band", loop=T5_LOOP), (6.0, 20.0)),
+}
+
+
 def _output(name: str, unit: str, quantity: str) -> Output:
-    bands, bars = {"L1": LEVEL_BAND, "T5": T5_BAND}, {"L1": (56.0, 64.0), "T5": (6.0, 20.0)}
-    band = Band(low=bands[name][0], high=bands[name][1], weight=100.0) if name in bands else None
-    return Output(name=name, unit=unit, quantity=quantity, band=band, bar=bars.get(name))
+    band, bar = _BANDED.get(name, (None, None))
+    return Output(name=name, unit=unit, quantity=quantity, band=band, bar=bar)
 
 
 COLD_BOX: Final = Process(
@@ -51,8 +66,20 @@ COLD_BOX: Final = Process(
         *(State(name=f"T_nef2_{i}", unit="K") for i in range(1, 7)),
         *(State(name=f"T_nef34_{i}", unit="K") for i in range(1, 13)),
     ),
-    load=Load(name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load", bar=(200.0, 600.0)),
+    load=_HEAT_LOAD,
     constants=("V1", *(f"T{i}" for i in range(1, 11)), *(f"P{i}" for i in range(1, 11))),
     decision_instants=(1, 2, 4, 8, 16, 50, 100),
     constraint_instants=(1, 2, 3, 4, 6, 8, 16, 24, 32, 48, 60, 72, 84, 100),
+    has_bath=True,
+    moves_as_one=True,
+    tuned={
+        "estimator": {"disturbances": ("outputs",), "load_walk_w": 1.0},
+        "cold_end": {"approach_k": 0.3},
+        "design": {"band_margin": (0.1, 0.3)},
+        "plausibility": {"sigmas": 6.0},
+    },
+    plants=("cold-box", "refrigerator"),
+    shipped_mimic="static/mimic.svg",
+    decimals={"%": 2, "K": 3, "bar": 3, "W": 1, "Hz": 1, "Pa": 0, "m3": 5},
+    notable={"W": 2.0, "%": 0.2, "Hz": 5.0, "K": 0.05, "bar": 0.005},
 )

@@ -39,6 +39,8 @@ class Input:
     """In the cost, per square of its deviation from the operating point."""
     walk: float
     """Random walk of its constant error, per square root of a sampling period."""
+    has_constant: bool = True
+    """Whether its constant error is told from the load."""
     bar: Range | None = None
     """Ends of its bar on the operator's page; from its bounds where they are not given."""
 
@@ -68,6 +70,8 @@ class Band:
     alarm: Range | None = None
     """Outside of it the alarm is raised; the band where it is not given."""
     loop: Loop | None = None
+    alarm_word: str = ""
+    """What its alarm is called; `NAME outside its band` where this is empty."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,8 +101,8 @@ class State:
 
     name: str
     unit: str
-    walk: float = 0.0
-    """Its process noise, per square root of a sampling period; 0 where the settings of the estimator know its unit."""
+    walk: float | None = None
+    """Its process noise, per square root of a sampling period; None where settings of the estimator say it by unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,10 +114,16 @@ class Load:
     span: Range
     walk: float
     """Random walk of what of it is not measured, per square root of a sampling period."""
-    noun: str = "Load"
-    """What descriptions call it."""
+    has_named_loads: bool = False
+    """Whether the loads that have a name are its own; elsewhere they are stretched to its span."""
+    noun: str = ""
+    """What operators and descriptions call it; where it is empty operators do by its name, descriptions `Load`."""
     bar: Range | None = None
     """Ends of its bar on the operator's page; its span where they are not given."""
+    too_much: str = ""
+    """What follows if there is more of it than can be held, for the alarm `capacity`; empty where it is not known."""
+    too_little: str = ""
+    """What follows if there is less than is needed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,6 +167,23 @@ class Process:
     forecasts: tuple[Forecast, ...] = ()
     mimic: str = ""
     """Drawing for the operator's page, an SVG text; empty where there is none."""
+    shipped_mimic: str = ""
+    """Path of a drawing that comes with the page, whose values name their registers."""
+    has_bath: bool = False
+    """Whether it is a bath with a cold end as the cold box has them, by the same names of signals and order of states:
+    a level L1 that integrates, T5 that falls with cold in excess, CV155 that fills the bath. Targets, the weights of
+    states, the cool-down and what `export plc` writes of the whole optimiser are laws of such a plant. There is one:
+    which of its signals is which is not declared, but known to them."""
+    moves_as_one: bool = False
+    """Whether all outputs move when any do: one that rests meanwhile is frozen, whatever the inputs do."""
+    tuned: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    """Settings of the preset `tuned`, by section; an estimate of the constants of all outputs where there are none."""
+    plants: tuple[str, ...] = ("of-process",)
+    """Kinds of plant that simulate it, by their names in the configuration; the first by default."""
+    decimals: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))
+    """Digits after the point on the page, by unit; from noise and rates where a unit is not named."""
+    notable: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    """How much plant and model differ at least for a word on the page, by unit; likewise."""
 
     def __post_init__(self) -> None:
         for what in (self.inputs, self.outputs, self.states):
@@ -168,6 +195,11 @@ class Process:
             loop = output.band.loop if output.band else None
             if loop is not None and loop.input not in known:
                 raise ValueError(f"the loop of {output.name} moves {loop.input}, which is no input")
+
+    @property
+    def has_station(self) -> bool:
+        """Whether its plant may be a refrigerator, with a compression station and property tables."""
+        return "refrigerator" in self.plants
 
     @property
     def has_load(self) -> bool:
@@ -222,7 +254,9 @@ def _made_of(kind: Any, value: Any) -> Any:  # noqa: ANN401 of any field
         return kind(**{name: _made_of(hints[name], each) for name, each in value.items()})  # type: ignore[operator]
     arguments = get_args(kind)
     if isinstance(value, list):
-        return tuple(_made_of(arguments[0], each) for each in value)
+        return tuple(_made_of(arguments[0] if arguments else Any, each) for each in value)
     if value is not None and type(None) in arguments:
         return _made_of(next(each for each in arguments if each is not type(None)), value)
+    if isinstance(value, Mapping):
+        return {name: _made_of(arguments[1] if arguments else Any, each) for name, each in value.items()}
     return value

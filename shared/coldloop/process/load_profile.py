@@ -9,15 +9,17 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.errors import LoadFileError
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import LAST_TICK, TICK_S
 
 LOAD_SPAN: Final[tuple[float, float]] = struct.unpack("2f", struct.pack("2f", *PROCESS.load.span))
 """Lowest and highest load, as registers have them."""
 LOAD_UNIT: Final = PROCESS.load.unit
-LOAD_WORD: Final = PROCESS.load.noun.lower() if IS_COLD_BOX else PROCESS.load.name
+LOAD_WORD: Final = PROCESS.load.noun.lower() or PROCESS.load.name
 """What operators call the load."""
-COLUMNS: Final = ("time_s", "load_w")
+IN_WATTS: Final = "load_w"
+LOAD_COLUMN: Final = IN_WATTS if LOAD_UNIT == "W" else "load"
+"""Of files and traces. In a file the name that a load in watts has is understood for any."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class LoadProfile:
 
     Raises:
         ValueError: times do not start at 0, do not increase or are after the last tick of a session, lengths differ, or
-            a load is not finite, or negative where it is heat into the bath.
+            a load is not finite.
     """
 
     times: tuple[int, ...]
@@ -43,8 +45,6 @@ class LoadProfile:
             raise ValueError(f"tick {self.times[-1]} is after the last one of a session, {LAST_TICK}")
         if not all(map(math.isfinite, self.watts)):
             raise ValueError("loads must be finite")
-        if IS_COLD_BOX and min(self.watts) < 0.0:
-            raise ValueError("loads must not be negative")
 
     def value(self, tick: int) -> float:
         """Return the load (W) that is held from `tick` (0 or later) to the next."""
@@ -52,7 +52,7 @@ class LoadProfile:
 
 
 def read_load_file(path: Path) -> LoadProfile:
-    """Return the load of a CSV file with the columns time_s and load_w, steps held.
+    """Return the load of a CSV file with the columns time_s and load_w, or load in another unit, steps held.
 
     Raises:
         LoadFileError: One line that names file, line and remedy.
@@ -74,13 +74,15 @@ def load_profile_of(text: str, where: str) -> LoadProfile:
     """
     reader = csv.DictReader(text.splitlines())
     try:
-        missing = set(COLUMNS) - set(reader.fieldnames or ())
-        if missing:
-            raise LoadFileError(f"{where}: no column {' and '.join(sorted(missing))}; the first line is time_s,load_w")
+        found = reader.fieldnames or ()
+        columns = ("time_s", LOAD_COLUMN if LOAD_COLUMN in found else IN_WATTS)
+        if not set(columns) <= set(found):
+            missing = " and ".join(sorted({"time_s", LOAD_COLUMN} - set(found)))
+            raise LoadFileError(f"{where}: no column {missing}; the first line is time_s,{LOAD_COLUMN}")
         times: list[int] = []
         watts: list[float] = []
         for row in reader:
-            tick, load = _step(row, times, f"{where}, line {reader.line_num}")
+            tick, load = _step(row, columns, times, f"{where}, line {reader.line_num}")
             times.append(tick)
             watts.append(load)
     except csv.Error as error:
@@ -90,16 +92,17 @@ def load_profile_of(text: str, where: str) -> LoadProfile:
     return LoadProfile(tuple(times), tuple(watts))
 
 
-def _step(row: dict[str, str | None], before: list[int], where: str) -> tuple[int, float]:
+def _step(
+    row: dict[str, str | None], columns: tuple[str, str], before: list[int], where: str
+) -> tuple[int, float]:  # fmt: skip
     """Return the step (tick, W) in a line, if it may follow those before."""
-    time, load = (_number(row[column], f"{where}, {column}") for column in COLUMNS)
+    time, load = (_number(row[column], f"{where}, {column}") for column in columns)
     if not 0 <= time < LAST_TICK * TICK_S:
         raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * TICK_S:g} s")
     low, high = LOAD_SPAN
     if not low <= load <= high:
         unit = PROCESS.load.unit
-        meaning = "; loads are heat into the bath" if IS_COLD_BOX else ""
-        raise LoadFileError(f"{where}: {load:g} {unit} is outside {low:g} to {high:g} {unit}{meaning}")
+        raise LoadFileError(f"{where}: {load:g} {unit} is outside {low:g} to {high:g} {unit}")
     tick = round(time / TICK_S)
     if abs(tick * TICK_S - time) > 1e-6:
         raise LoadFileError(f"{where}: {time:g} s is not a multiple of {TICK_S} s")

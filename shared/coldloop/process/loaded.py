@@ -46,5 +46,3 @@ FILE: Final = Path(os.environ[VARIABLE]) if os.environ.get(VARIABLE) else None
 """The model file of the process; None is the cold box."""
 PROCESS: Final = _loaded()
 """The process."""
-IS_COLD_BOX: Final = FILE is None
-"""Whether the tables, classical loops and limits of the cold box apply."""

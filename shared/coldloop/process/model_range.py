@@ -16,14 +16,16 @@ SATURATION_BAR: Final = (0.3, 2.25)
 """Of bath and return; helium's critical point is at 2.28 bar."""
 SUPPLY_BAR: Final = (5.0, 19.0)
 """Of the high-pressure side, where its properties are fitted."""
-CELLS_K: Final = (2.5, 310.0)
-"""Of the exchangers' cells: the tables end at 300 K, and up to 340 K helium is perfect within 3 mK and 0.2 %."""
+WARMEST_CELL_K: Final = 310.0
+"""Of the exchangers: the tables end at 300 K, and up to 340 K helium is perfect within 3 mK and 0.2 %."""
 WARMEST_BATH_M3: Final = -6.37
 """V_l of a dry bath that is at 310 K."""
 COLD_BOX_BAR: Final = (16.0, 1.05)
 """Supply and return of a cold box alone; those of a plant file are within the same ranges."""
 
 FIRST_CELL: Final = [state.name for state in COLD_BOX.states].index("T_nef1_1")
+COLDEST_CELLS_K: Final = np.array([2.5] * (len(COLD_BOX.states) - FIRST_CELL - 1) + [5.3])
+"""Shape (26,); the last is before the turbine, whose table of entropy ends at 6.1 kJ/kg: 5.3 K at 5 bar, 3.9 at 16."""
 HP, LP = STATION_SIGNAL_NAMES.index("P12"), STATION_SIGNAL_NAMES.index("P11")
 
 
@@ -34,8 +36,8 @@ def model_range(x: NDArray[Any], supply: NDArray[Any] | float, suction: NDArray[
         ModelRange.BATH_PRESSURE: _outside(bath, SATURATION_BAR),
         ModelRange.SUPPLY_PRESSURE: _outside(supply, SUPPLY_BAR),
         ModelRange.RETURN_PRESSURE: _outside(suction, SATURATION_BAR),
-        ModelRange.COLD_CELL: np.min(cells, axis=-1) < CELLS_K[0],
-        ModelRange.WARM_CELL: np.max(cells, axis=-1) > CELLS_K[1],
+        ModelRange.COLD_CELL: np.any(cells < COLDEST_CELLS_K, axis=-1),
+        ModelRange.WARM_CELL: np.max(cells, axis=-1) > WARMEST_CELL_K,
         ModelRange.WARM_BATH: x[..., 1] < WARMEST_BATH_M3,
     }
     bits = np.zeros(bath.shape, np.int32)

@@ -5,7 +5,7 @@ from enum import IntEnum, IntFlag
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Self
 
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.signals import (
     INPUT_NAMES,
     INPUT_UNITS,
@@ -40,7 +40,7 @@ from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 HISTORY_ROWS: Final = 256
 STATION_ROWS: Final = 128
 LOAD_ROWS: Final = 2048
-NOUN: Final = PROCESS.load.noun
+NOUN: Final = PROCESS.load.noun or "Load"
 SPAN_OF_INPUTS: Final = (min(one.span[0] for one in PROCESS.inputs), float(max(one.span[1] for one in PROCESS.inputs)))
 """No input is outside."""
 MAX_STATE: Final = 1e9
@@ -383,7 +383,7 @@ class Surroundings(NamedTuple):
     blocked_nef6: Annotated[float, _blocking("NEF6")] = 0.0
 
 
-UNUSED: Final = () if IS_COLD_BOX else (StationStatus, StationSample, Surroundings, ModelRangeStatus)
+UNUSED: Final = () if PROCESS.has_station else (StationStatus, StationSample, Surroundings, ModelRangeStatus)
 """Records that mean nothing in this process: of a refrigerator and its property tables."""
 
 PLANT_MAP: Final = RegisterMap(

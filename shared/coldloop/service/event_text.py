@@ -10,8 +10,9 @@ from datetime import UTC, datetime
 from enum import IntEnum
 from typing import Final, NamedTuple
 
+from coldloop.process.declaration import Output
 from coldloop.process.load_profile import LOAD_UNIT
-from coldloop.process.loaded import IS_COLD_BOX, PROCESS
+from coldloop.process.loaded import PROCESS
 from coldloop.process.range_bits import ModelRange
 from coldloop.process.signals import INPUT_NAMES, INPUT_UNITS, OUTPUT_NAMES, TICK_S
 from coldloop.registers.audit import Event, EventKind
@@ -52,13 +53,15 @@ def _members(kind: type[IntEnum]) -> Words:
 
 
 def _alarm_words() -> dict[int, str]:
-    """Return the words for alarms; those of bands name the outputs, but for the cold box, whose names are old."""
-    words = {kind.value: word(kind) for kind in AlarmKind}
-    if not IS_COLD_BOX:
-        first, *further = (output.name for output in PROCESS.banded)
-        words[AlarmKind.LEVEL_BAND] = f"{first} outside its band"
-        words[AlarmKind.T5_BAND] = f"{' or '.join(further) or 'further output'} outside its band"
-    return words
+    """Return the words for alarms; those of bands are of the first output that has one, and of the others."""
+    bands = {AlarmKind.LEVEL_BAND: PROCESS.banded[:1], AlarmKind.T5_BAND: PROCESS.banded[1:]}
+    return {kind.value: word(kind) for kind in AlarmKind} | {kind: _band_word(of) for kind, of in bands.items()}
+
+
+def _band_word(outputs: Sequence[Output]) -> str:
+    declared = [output.band.alarm_word for output in outputs if output.band and output.band.alarm_word]
+    names = " or ".join(output.name for output in outputs) or "further output"
+    return declared[0] if declared else f"{names} outside its band"
 
 
 _ALARM_WORDS: Final = _alarm_words()
@@ -142,13 +145,9 @@ _WORDINGS: Final[Mapping[int, _Wording]] = {
 }
 _FURTHER_BANDS: Final = [output.name for output in PROCESS.banded[1:]]
 _SHORTAGE: Final = (
-    (
-        "",
-        "too much load: reduce it, or the bath will run dry",
-        "too little load: raise it, or the turbine gets too cold and the bath floods",
-    )
-    if IS_COLD_BOX
-    else ("", "too much load: reduce it", "too little load: raise it")
+    "",
+    ", or ".join(filter(None, ("too much load: reduce it", PROCESS.load.too_much))),
+    ", or ".join(filter(None, ("too little load: raise it", PROCESS.load.too_little))),
 )
 _ALARM_CAUSES: Final[Mapping[int, Words]] = {
     AlarmKind.T5_BAND: _listed(_FURTHER_BANDS if len(_FURTHER_BANDS) > 1 else ("",)),
