@@ -13,15 +13,16 @@ from coldloop.errors import UsageError
 from coldloop.process.loaded import IS_COLD_BOX
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.settings import SHOWN
-from rig.plc_export.bus_registers import bus_files
-from rig.plc_export.exported_optimizer import FOLDER as OPTIMIZER
-from rig.plc_export.exported_optimizer import MANIFEST, manifest_of
-from rig.plc_export.folder import OdeExport
-from rig.plc_export.optimizer_folder import OptimizerExport
-from rig.plc_export.plcopen import plcopen_xml
-from rig.plc_export.recorded_problems import LOAD, TICKS, GoldenVector, GoldenVectors, record
-from rig.plc_export.recorded_updates import UpdateRecorder
-from rig.plc_export.st_folder import AT_ONCE, StructuredTextExport, filled, template
+from rig.plc_export.c.bus_registers import bus_files
+from rig.plc_export.c.exported_optimizer import FOLDER as OPTIMIZER
+from rig.plc_export.c.exported_optimizer import MANIFEST, manifest_of
+from rig.plc_export.c.optimizer_files import OptimizerExport
+from rig.plc_export.c.solver_files import OdeExport
+from rig.plc_export.kernels.recorded_problems import LOAD, TICKS, GoldenVector, GoldenVectors, record
+from rig.plc_export.kernels.recorded_updates import UpdateRecorder
+from rig.plc_export.structured_text.plcopen import plcopen_xml
+from rig.plc_export.structured_text.solver_files import AT_ONCE, StructuredTextExport
+from rig.plc_export.templates import filled, template
 from rig.plc_sizing.operations import Operations, gradient, ode
 from rig.plc_sizing.sizes import dense_sizes
 from rig.settings import Settings
@@ -63,8 +64,8 @@ def structured_text(recorded: GoldenVectors, vectors: list[GoldenVector], *, xml
     texts, sizes = export.files(), export.sizes()
     if xml:
         texts = {PROJECT: plcopen_xml(texts.values(), "the ODE-based solver, golden vectors and a self-test")}
-    return {**texts, README: readme("readme_st.md", vectors, texts, {
-        "LOAD": template("load_plcopen.md" if xml else "load_st.md").rstrip(),
+    return {**texts, README: readme("structured_text/readme_solver.md", vectors, texts, {
+        "LOAD": template("structured_text/load_plcopen.md" if xml else "structured_text/load_st.md").rstrip(),
         "HEAD": "in the documentation of `cl_self_test`" if xml else "at the head of `self_test.st`",
         "AT_ONCE": str(AT_ONCE), "CALLS": str(export.calls()), "CONSTANTS": f"{sizes.constants:,}",
         "SOLVER": f"{sizes.solver:,}", "SELF_TEST": f"{sizes.self_test:,}",
@@ -75,7 +76,7 @@ def c99(recorded: GoldenVectors, vectors: list[GoldenVector]) -> dict[str, str]:
     """Return the files of C99 by their names."""
     export = OdeExport(recorded.method, vectors[0].problem, np.arange(1, len(vectors[0].answer.costs) + 1))
     texts, sizes = export.files(vectors), export.sizes(vectors)
-    return {**texts, README: readme("readme_c.md", vectors, texts, {
+    return {**texts, README: readme("c/readme_solver.md", vectors, texts, {
         "OPTIMIZER": BESIDE if IS_COLD_BOX else "",
         "CONSTANTS": f"{sizes.constants:,}", "STACK": f"{sizes.stack:,}", "SELF_TEST": f"{sizes.self_test:,}",
     })}  # fmt: skip
@@ -90,7 +91,7 @@ def whole_optimizer(settings: Settings, ticks: int) -> dict[str, str]:
     order = settings.optimizer_plc.word_order
     texts = {**export.files(), **bus_files(recorder.optimizer, export.kernels, order, shown)}
     sizes = export.sizes()
-    texts[README] = filled(template("readme_optimizer.md"), {
+    texts[README] = filled(template("c/readme_optimizer.md"), {
         "GOLDEN": str(len(golden)), "CONSTANTS": f"{sizes.constants:,}", "STATE": f"{sizes.state:,}",
         "STACK": f"{sizes.stack:,}",
     })  # fmt: skip

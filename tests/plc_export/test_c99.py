@@ -13,9 +13,9 @@ from optimizer_plc.qp.costs import matrices_of
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Costs
 from optimizer_plc.solvers.ode import Flow, OdeMethod, solve
-from rig.plc_export.folder import OdeExport
-from rig.plc_export.ode_program import PER_PROBLEM
-from rig.plc_export.recorded_problems import ITERATIONS, GoldenVector, GoldenVectors
+from rig.plc_export.c.solver_files import OdeExport
+from rig.plc_export.kernels.ode_program import PER_PROBLEM
+from rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector, GoldenVectors
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off")
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]

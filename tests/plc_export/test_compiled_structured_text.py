@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rig.plc_export.recorded_problems import GoldenVectors
-from rig.plc_export.st_folder import StructuredTextExport
+from rig.plc_export.kernels.recorded_problems import GoldenVectors
+from rig.plc_export.structured_text.solver_files import StructuredTextExport
 
 COMPILER = shutil.which("iec2c")
 MAIN = """

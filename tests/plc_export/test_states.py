@@ -12,11 +12,11 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from rig.plc_export.c99 import Printer
-from rig.plc_export.c99_text import helpers, records_in
-from rig.plc_export.lowering import Lowering
-from rig.plc_export.reading import Program
-from rig.plc_export.subset import UnfitKernelError, type_of
+from rig.plc_export.c.printer import Printer
+from rig.plc_export.c.text import helpers, records_in
+from rig.plc_export.structured_text.lowering import Lowering
+from rig.plc_export.tree.reading import Program
+from rig.plc_export.tree.subset import UnfitKernelError, type_of
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, compiled
 
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER)

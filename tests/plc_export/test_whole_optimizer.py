@@ -17,9 +17,9 @@ from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, Update
 from optimizer_plc.program import OptimizerProgram
-from rig.plc_export.optimizer_folder import OptimizerExport
-from rig.plc_export.recorded_problems import SINGLE
-from rig.plc_export.recorded_updates import GoldenUpdate, UpdateRecorder
+from rig.plc_export.c.optimizer_files import OptimizerExport
+from rig.plc_export.kernels.recorded_problems import SINGLE
+from rig.plc_export.kernels.recorded_updates import GoldenUpdate, UpdateRecorder
 from rig.settings import Settings
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, SANITIZED, compiled, output, write
 

@@ -74,7 +74,7 @@ def _solver(options: argparse.Namespace) -> list[Path]:
 def _settings(options: argparse.Namespace) -> "Settings":
     """Return the settings of the optimiser: those of the paper's PLC, unless the user says otherwise."""
     from coldloop.config import load_configuration
-    from rig.plc_export.recorded_problems import SINGLE
+    from rig.plc_export.kernels.recorded_problems import SINGLE
     from rig.settings import Settings
 
     assignments = [*SINGLE, *options.assignments]

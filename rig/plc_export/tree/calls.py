@@ -6,9 +6,8 @@ from typing import Any, Protocol, TypeAlias, cast
 
 from numba.core.dispatcher import Dispatcher
 
-from rig.plc_export.expressions import ExpressionReader, element_of
-from rig.plc_export.subset import Source
-from rig.plc_export.tree import (
+from rig.plc_export.tree.expressions import ExpressionReader, element_of
+from rig.plc_export.tree.nodes import (
     ArrayType,
     Convert,
     Declare,
@@ -31,7 +30,8 @@ from rig.plc_export.tree import (
     Type,
     View,
 )
-from rig.plc_export.values import (
+from rig.plc_export.tree.subset import Source
+from rig.plc_export.tree.values import (
     FUNCTIONS,
     NEW_ARRAYS,
     OPERANDS,

@@ -1,18 +1,16 @@
 """The ODE-based solver as Structured Text: types, function blocks, constants, golden vectors, a self-test."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from importlib.resources import files
+from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.ode import OdeMethod
-from rig.plc_export.lowering import Lowering
-from rig.plc_export.ode_program import PER_PROBLEM, Array, OdeProgram
-from rig.plc_export.recorded_problems import GoldenVector, answered, arrays_in
-from rig.plc_export.slicing import one_iteration_a_call
-from rig.plc_export.structured_text import (
+from rig.plc_export.kernels.ode_program import PER_PROBLEM, Array, OdeProgram
+from rig.plc_export.kernels.recorded_problems import GoldenVector, answered, arrays_in
+from rig.plc_export.structured_text.lowering import Lowering
+from rig.plc_export.structured_text.printer import (
     TABLE,
     StructuredTextPrinter,
     global_name,
@@ -20,8 +18,10 @@ from rig.plc_export.structured_text import (
     memory,
     section,
 )
-from rig.plc_export.subset import UnfitKernelError, type_of
-from rig.plc_export.tree import Path, RecordType
+from rig.plc_export.structured_text.slicing import one_iteration_a_call
+from rig.plc_export.templates import filled, template
+from rig.plc_export.tree.nodes import Path, RecordType
+from rig.plc_export.tree.subset import UnfitKernelError, type_of
 
 LARGEST_LIST: Final = 64 * 1024
 """Bytes of a list of constants: a data block of standard access of an S7-1200 or S7-1500 holds no more."""
@@ -83,7 +83,7 @@ class StructuredTextExport:
         golden = "\n".join(self._golden(number, each) for number, each in enumerate(self.vectors))
         test = self._self_test()
         configuration = self._configuration()
-        functions = template("functions.st")
+        functions = template("structured_text/functions.st")
         texts = {"types.st": self.printer.types(), "functions.st": functions, "kernels.st": self.kernels,
                  "golden.st": golden, "self_test.st": test, "configuration.st": configuration}  # fmt: skip
         return {name: GENERATED + text for name, text in texts.items()}
@@ -175,7 +175,7 @@ END_CONFIGURATION
         n, m, k = len(problem.phi), len(problem.gamma), len(answer.costs)
         lengths = self._lengths()
         self.printer.array_type("DINT", len(lengths))
-        return filled(template("self_test.st"), {
+        return filled(template("structured_text/self_test.st"), {
             "CALLS": str(self.calls()), "N": str(n), "M": str(m), "K": str(k), "POINTS": str(n * k), "LAST": str(n - 1),
             "EXTERNALS": "\n".join(f"    {name} : {kind};" for name, (kind, _, _) in globals_.items()),
             "INSTANCES": "\n".join(f"    golden_{each} : cl_golden_{each};" for each in range(len(self.vectors))),
@@ -251,15 +251,3 @@ def summed(name: str, values: Array) -> str:
     return (f"            FOR i := 0 TO {values.size - 1} DO\n"
             f"                sum := cl_floor_mod(((sum * {FACTOR}) + cl_floor_mod({item}, {PRIME})), {PRIME});\n"
             "            END_FOR;\n")  # fmt: skip
-
-
-def template(name: str) -> str:
-    """Return a file of this package."""
-    return files(__package__ or "").joinpath(name).read_text(encoding="ascii")
-
-
-def filled(text: str, parts: Mapping[str, str]) -> str:
-    """Return a template with its parts."""
-    for name, part in parts.items():
-        text = text.replace(f"@{name}@", part)
-    return text

@@ -7,10 +7,9 @@ from typing import cast
 
 from numba.core.dispatcher import Dispatcher
 
-from rig.plc_export.assignments import SAME, AssignmentReader
-from rig.plc_export.calls import Generic, Returned, rooted
-from rig.plc_export.subset import Source
-from rig.plc_export.tree import (
+from rig.plc_export.tree.assignments import SAME, AssignmentReader
+from rig.plc_export.tree.calls import Generic, Returned, rooted
+from rig.plc_export.tree.nodes import (
     ArrayType,
     Expression,
     Field,
@@ -29,7 +28,8 @@ from rig.plc_export.tree import (
     Type,
     While,
 )
-from rig.plc_export.values import DType, Known, Python, Record, Shape, Value, is_number, named
+from rig.plc_export.tree.subset import Source
+from rig.plc_export.tree.values import DType, Known, Python, Record, Shape, Value, is_number, named
 
 
 class Program:

@@ -5,9 +5,9 @@ from typing import Any, Final, cast
 
 from numba.core.dispatcher import Dispatcher
 
-from rig.plc_export.calls import CallReader, Returned
-from rig.plc_export.expressions import ZERO, element_of
-from rig.plc_export.tree import (
+from rig.plc_export.tree.calls import CallReader, Returned
+from rig.plc_export.tree.expressions import ZERO, element_of
+from rig.plc_export.tree.nodes import (
     ArrayType,
     Assign,
     Copy,
@@ -31,7 +31,7 @@ from rig.plc_export.tree import (
     View,
     walk,
 )
-from rig.plc_export.values import (
+from rig.plc_export.tree.values import (
     DType,
     Elementwise,
     Known,

@@ -9,8 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, cast
 
-from rig.plc_export.subset import UnfitKernelError
-from rig.plc_export.tree import (
+from rig.plc_export.tree.nodes import (
     BEYOND_BLOCKS,
     ArrayType,
     Assign,
@@ -40,6 +39,7 @@ from rig.plc_export.tree import (
     While,
     walk,
 )
+from rig.plc_export.tree.subset import UnfitKernelError
 
 Bindings = Mapping[str, Path]
 VALUE: Final = "result"

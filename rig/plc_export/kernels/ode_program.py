@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Costs
 from optimizer_plc.solvers.ode import OdeMethod, solve
-from rig.plc_export.reading import Program
-from rig.plc_export.subset import type_of
-from rig.plc_export.tree import Function, Type
+from rig.plc_export.tree.nodes import Function, Type
+from rig.plc_export.tree.reading import Program
+from rig.plc_export.tree.subset import type_of
 
 Array = NDArray[Any]
 

@@ -32,10 +32,10 @@ from coldloop.registers.optimizer_plc import (
 )
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.runtime import HEARTBEAT_S, LOOK_OUT_S
-from rig.plc_export.c99_text import GENERATED
-from rig.plc_export.optimizer_program import OptimizerKernels
-from rig.plc_export.st_folder import filled, template
-from rig.plc_export.subset import UnfitKernelError
+from rig.plc_export.c.text import GENERATED
+from rig.plc_export.kernels.optimizer_program import OptimizerKernels
+from rig.plc_export.templates import filled, template
+from rig.plc_export.tree.subset import UnfitKernelError
 
 FILES: Final = ("main.c", "control_plc.c", "control_plc.h", "diagnostics.c", "diagnostics.h", "words.c", "words.h")
 VALUES: Final = len(INPUT_NAMES) * 2 + len(OUTPUT_NAMES) + len(STATE_NAMES)
@@ -72,7 +72,7 @@ def bus_files(
         order: Word order of the optimiser's own registers.
         configuration: What these show of it.
     """
-    texts = {f"bus/{name}": filled(template(f"optimizer_c/bus/{name}"), {"GENERATED": GENERATED.rstrip()})
+    texts = {f"bus/{name}": filled(template(f"c/optimizer/bus/{name}"), {"GENERATED": GENERATED.rstrip()})
              for name in FILES}  # fmt: skip
     return {**texts, "bus/registers.h": _header(optimizer, kernels, order, configuration)}
 

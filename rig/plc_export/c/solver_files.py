@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,15 +10,14 @@ from numpy.typing import NDArray
 from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.solvers.interface import Costs
 from optimizer_plc.solvers.ode import OdeMethod
-from rig.plc_export.c99 import Printer, identifier
-from rig.plc_export.c99_text import GENERATED, helpers, records_in
-from rig.plc_export.ode_program import PER_PROBLEM, OdeProgram, crc, leaves
-from rig.plc_export.recorded_problems import GoldenVector, arrays_in
-from rig.plc_export.tree import ArrayType, Declare, Function, Invocation, Invoke, Kind, walk
+from rig.plc_export.c.printer import Printer, identifier
+from rig.plc_export.c.text import GENERATED, helpers, records_in
+from rig.plc_export.kernels.ode_program import PER_PROBLEM, OdeProgram, crc, leaves
+from rig.plc_export.kernels.recorded_problems import GoldenVector, arrays_in
+from rig.plc_export.templates import template
+from rig.plc_export.tree.nodes import ArrayType, Declare, Function, Invocation, Invoke, Kind, walk
 
 Array = NDArray[Any]
-
-TEMPLATE: Final = Path(__file__).with_name("self_test.c")
 
 
 class Sizes(NamedTuple):
@@ -167,8 +166,8 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
         )
         none = "\n".join(f"    before.{name} = INFINITY;" for name in Costs._fields)
         vectors = "\n".join(f"    qp.{identifier(name)} = {identifier(name)};" for name in PER_PROBLEM)
-        head = TEMPLATE.with_name("problem.c").read_text(encoding="ascii")
-        bytes_ = TEMPLATE.with_name("sums.c").read_text(encoding="ascii")
+        head = template("c/problem.c")
+        bytes_ = template("c/sums.c")
         body = {
             "SUMS_OF_BYTES": bytes_,
             "ARRAYS": arrays,
@@ -202,7 +201,7 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
         return {"golden.h": header, "golden.c": f'{GENERATED}#include <math.h>\n\n#include "golden.h"\n\n{arrays}'}
 
     def _self_test(self) -> str:
-        return self._filled(TEMPLATE.read_text(encoding="ascii"), {})
+        return self._filled(template("c/self_test.c"), {})
 
     def _filled(self, text: str, parts: Mapping[str, str]) -> str:
         single = self.printer.single

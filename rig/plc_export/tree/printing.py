@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rig.plc_export.tree import ArrayType, Element, Expression, Kind, Literal, View
+from rig.plc_export.tree.nodes import ArrayType, Element, Expression, Kind, Literal, View
 
 
 class TreePrinter:

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from rig.plc_export.tree import ArrayType, Expression, Kind, Name, RecordType, RowsType, StructType, Type
+from rig.plc_export.tree.nodes import ArrayType, Expression, Kind, Name, RecordType, RowsType, StructType, Type
 
 BINARY: Final[dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]]] = {
     ast.Add: ("+", operator.add), ast.Sub: ("-", operator.sub), ast.Mult: ("*", operator.mul),

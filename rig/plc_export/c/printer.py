@@ -7,8 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.plc_export.printing import TreePrinter
-from rig.plc_export.tree import (
+from rig.plc_export.tree.nodes import (
     ArrayType,
     Assign,
     Convert,
@@ -42,6 +41,7 @@ from rig.plc_export.tree import (
     While,
     walk,
 )
+from rig.plc_export.tree.printing import TreePrinter
 
 Array = NDArray[Any]
 

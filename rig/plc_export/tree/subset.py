@@ -11,7 +11,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from coldloop.errors import UsageError
-from rig.plc_export.tree import ArrayType, Kind, RecordType, RowsType, StructType, Type
+from rig.plc_export.tree.nodes import ArrayType, Kind, RecordType, RowsType, StructType, Type
 
 KINDS = {"f": Kind.REAL, "i": Kind.INT, "u": Kind.UNSIGNED, "b": Kind.BOOL}
 RESERVED = re.compile(r"(new|result|at|stop)_\d")

@@ -16,9 +16,9 @@ from optimizer_plc.qp.arithmetic import real_of
 from optimizer_plc.rules import make_rule
 from optimizer_plc.rules.interface import DECISIONS, decide_by
 from optimizer_plc.solvers.kernel_solver import KERNELS, solve_by
-from rig.plc_export.reading import Program
-from rig.plc_export.subset import type_of
-from rig.plc_export.tree import Function, Type
+from rig.plc_export.tree.nodes import Function, Type
+from rig.plc_export.tree.reading import Program
+from rig.plc_export.tree.subset import type_of
 
 GENERIC: Final = {
     cast("Callable[..., Any]", of): {kind.__name__: cast("Dispatcher", kernel) for kind, kernel in kernels.items()}

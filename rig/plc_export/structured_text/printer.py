@@ -5,10 +5,8 @@ from typing import Final
 
 import numpy as np
 
-from rig.plc_export.printing import TreePrinter
-from rig.plc_export.st_names import PREFIX, Names, identifier
-from rig.plc_export.subset import UnfitKernelError
-from rig.plc_export.tree import (
+from rig.plc_export.structured_text.names import PREFIX, Names, identifier
+from rig.plc_export.tree.nodes import (
     ArrayType,
     Assign,
     Block,
@@ -28,6 +26,8 @@ from rig.plc_export.tree import (
     Type,
     While,
 )
+from rig.plc_export.tree.printing import TreePrinter
+from rig.plc_export.tree.subset import UnfitKernelError
 
 SCALARS: Final = {Kind.REAL: "REAL", Kind.INT: "DINT", Kind.UNSIGNED: "DINT", Kind.BOOL: "BOOL"}
 BYTES: Final = {"REAL": 4, "DINT": 4, "BOOL": 1}

@@ -2,8 +2,7 @@
 
 from typing import Final, TypeVar
 
-from rig.plc_export.subset import UnfitKernelError
-from rig.plc_export.tree import (
+from rig.plc_export.tree.nodes import (
     Declare,
     Expression,
     For,
@@ -16,6 +15,7 @@ from rig.plc_export.tree import (
     Statement,
     walk,
 )
+from rig.plc_export.tree.subset import UnfitKernelError
 
 Node = TypeVar("Node")
 START: Final = Name(Kind.BOOL, "start")

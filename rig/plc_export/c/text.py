@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import Final
 
-from rig.plc_export.tree import RecordType, RowsType, StructType, Type
+from rig.plc_export.tree.nodes import RecordType, RowsType, StructType, Type
 
 GENERATED: Final = "/* Written by Coldloop from the kernels of its optimiser; changes belong there. */\n"
 

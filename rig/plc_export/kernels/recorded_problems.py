@@ -19,7 +19,7 @@ from optimizer_plc.solvers.ode import OdeMethod, solve
 from plant.load import find_load
 from rig.cosim.one_process import OneProcessRig
 from rig.cosim.scenario import Scenario
-from rig.plc_export.ode_program import PER_PROBLEM
+from rig.plc_export.kernels.ode_program import PER_PROBLEM
 from rig.results.recording import Recorder
 from rig.settings import Settings
 

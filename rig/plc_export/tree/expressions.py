@@ -7,8 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from rig.plc_export.subset import Source
-from rig.plc_export.tree import (
+from rig.plc_export.tree.nodes import (
     ArrayType,
     Element,
     Expression,
@@ -27,7 +26,8 @@ from rig.plc_export.tree import (
     StructType,
     View,
 )
-from rig.plc_export.values import (
+from rig.plc_export.tree.subset import Source
+from rig.plc_export.tree.values import (
     BINARY,
     COMPARISONS,
     DTYPES,

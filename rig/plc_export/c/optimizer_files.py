@@ -11,14 +11,14 @@ from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.updating_periods import LONGEST_TICKS, SHORTEST_TICKS
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from optimizer_plc.program import OptimizerProgram
-from rig.plc_export.c99 import Printer, identifier
-from rig.plc_export.c99_text import GENERATED, helpers, records_in
-from rig.plc_export.folder import stack
-from rig.plc_export.ode_program import crc
-from rig.plc_export.optimizer_program import OptimizerKernels
-from rig.plc_export.recorded_updates import GoldenUpdate
-from rig.plc_export.st_folder import filled, template
-from rig.plc_export.tree import ArrayType, RecordType, StructType
+from rig.plc_export.c.printer import Printer, identifier
+from rig.plc_export.c.solver_files import stack
+from rig.plc_export.c.text import GENERATED, helpers, records_in
+from rig.plc_export.kernels.ode_program import crc
+from rig.plc_export.kernels.optimizer_program import OptimizerKernels
+from rig.plc_export.kernels.recorded_updates import GoldenUpdate
+from rig.plc_export.templates import filled, template
+from rig.plc_export.tree.nodes import ArrayType, RecordType, StructType
 
 Array = NDArray[Any]
 SINGLE: Final = np.dtype(np.float32)
@@ -80,7 +80,7 @@ class OptimizerExport:
         sizes = {"INPUTS": len(INPUT_NAMES), "OUTPUTS": len(OUTPUT_NAMES), "STATES": len(STATE_NAMES),
                  "ROWS": SEQUENCE_ROWS, "LONGEST": LONGEST_TICKS, "SHORTEST": SHORTEST_TICKS}  # fmt: skip
         parts = {"GENERATED": GENERATED.rstrip(), **{name: str(size) for name, size in sizes.items()}}
-        texts = {name: filled(template(f"optimizer_c/{name}"), parts)
+        texts = {name: filled(template(f"c/optimizer/{name}"), parts)
                  for name in ("optimizer.h", "optimizer.c", "self_test.c")}  # fmt: skip
         return {"kernels.h": self._header(), "kernels.c": self._kernels(), "constants.h": self._constants_header(),
                 "constants.c": self._constants(), **self._golden_files(), **texts}  # fmt: skip
@@ -172,7 +172,7 @@ uint32_t sum_of_integers(uint32_t sum, const int32_t *values, int32_t count);
             for of in ("rules", "starts")
         )
         parts = {"GENERATED": GENERATED.rstrip(), "REAL": "float", "BITS": "uint32_t", "BYTES": "4"}
-        sums = filled(template("sums.c"), parts)
+        sums = filled(template("c/sums.c"), parts)
         rule, begin, method = (type(each).__name__ for each in (
             self.kernels.rules[0], self.kernels.starts[0], self.kernels.constants["method"]))  # fmt: skip
         body = "".join(f"    {each}\n" for each in self.sums)
