@@ -14,12 +14,12 @@ MAIN = """
 #include <stdio.h>
 #include "iec_std_lib.h"
 #include "POUS.h"
-extern CL_MAIN CL_RESOURCE__CL_INSTANCE;
+extern CL_MAIN CL_RESOURCE__CL_PROGRAM;
 TIME __CURRENT_TIME;
 BOOL __DEBUG;
 void config_init__(void);
 void config_run__(unsigned long tick);
-#define TEST(name) ((int)__GET_VAR(CL_RESOURCE__CL_INSTANCE.TEST.name))
+#define TEST(name) ((int)__GET_VAR(CL_RESOURCE__CL_PROGRAM.TEST.name))
 int main(void) {
     config_init__();
     for (unsigned long tick = 0; tick < 10000 && !TEST(DONE); tick += 1) { config_run__(tick); }

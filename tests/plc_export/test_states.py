@@ -117,12 +117,13 @@ def advance(c: Table, m: State, z: Array, row: int) -> None:
     m.other.z[:] = found.z
     m.other.z[1:-1] = z[2:]
     m.one.z[2:] = z[:2]
-    mask = 0
+    mask, bit = 0, 1
     for i in range(m.marks.shape[0]):
         r = m.marks[i]
         mark(r, row if z[i] > 0 else -1, z[i])
         if r.kind >= 0 and np.isfinite(r.size):
-            mask |= 1 << i
+            mask += bit
+        bit += bit
     now.sum = z.dtype.type(mask)
     now.done = other.done = small and not math.isnan(z[0])
     count = swap(m)

@@ -16,17 +16,12 @@ from rig.plc_export.c.solver_files import stack
 from rig.plc_export.c.text import GENERATED, helpers, records_in
 from rig.plc_export.kernels.ode_program import crc
 from rig.plc_export.kernels.optimizer_program import OptimizerKernels
-from rig.plc_export.kernels.recorded_updates import GoldenUpdate
+from rig.plc_export.kernels.recorded_updates import GoldenUpdate, integers_of, reals_of
 from rig.plc_export.templates import filled, template
 from rig.plc_export.tree.nodes import ArrayType, RecordType, StructType
 
 Array = NDArray[Any]
 SINGLE: Final = np.dtype(np.float32)
-GOLDEN_INTEGERS: Final = (
-    "fixed_ticks", "update", "tick", "playing", "next_update_tick", "suspects", "number", "first_tick", "tau_u",
-    "length",
-)  # fmt: skip
-"""Of each golden update: a session that begins, or -1; the update; its plan; its sequence, if it was computed."""
 
 
 class OptimizerSizes(NamedTuple):
@@ -202,8 +197,8 @@ uint32_t sum_of_constants(void) {{
     # -- golden updates ------------------------------------------------------------------------------------------------
 
     def _golden_files(self) -> dict[str, str]:
-        integers = np.array([_integers_of(each) for each in self._golden], np.int32)
-        reals = np.array([_reals_of(each) for each in self._golden], SINGLE)
+        integers = np.array([integers_of(each) for each in self._golden], np.int32)
+        reals = np.array([reals_of(each) for each in self._golden], SINGLE)
         rows = np.array([row for each in self._golden if each.sequence for row in each.sequence.rows], SINGLE)
         sum_ = crc(rows, crc(reals, crc(integers)))
         declared = {
@@ -218,19 +213,6 @@ uint32_t sum_of_constants(void) {{
                   f"#define SUM_OF_GOLDEN UINT32_C({sum_})\n{externs}")  # fmt: skip
         arrays = "\n".join(self.printer.tabulated(name, values) for name, values in declared.items())
         return {"golden.h": header, "golden.c": f'{GENERATED}#include <math.h>\n\n#include "golden.h"\n\n{arrays}'}
-
-
-def _integers_of(golden: GoldenUpdate) -> tuple[int, ...]:
-    update, plan = golden.update, golden.plan
-    sent = golden.sequence.header if golden.sequence else None
-    answered = (sent.number, sent.first_tick, sent.tau_u, sent.length) if sent else (0, 0, 0, 0)
-    return (golden.fixed_ticks, update.update, update.tick, update.playing, plan.next_update_tick, plan.suspects,
-            *answered)  # fmt: skip
-
-
-def _reals_of(golden: GoldenUpdate) -> tuple[float, ...]:
-    update, plan = golden.update, golden.plan
-    return (update.load, *update.u_before, *update.u, *update.y, *update.x, plan.load_step, plan.shortage)
 
 
 def size_of(record: RecordType | StructType) -> int:

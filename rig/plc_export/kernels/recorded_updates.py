@@ -30,6 +30,21 @@ class GoldenUpdate(NamedTuple):
     """None if it was interrupted before."""
 
 
+def integers_of(golden: GoldenUpdate) -> tuple[int, ...]:
+    """Return its integers: session, update, plan, header of the sequence, which is 0 if there is none."""
+    update, plan = golden.update, golden.plan
+    sent = golden.sequence.header if golden.sequence else None
+    answered = (sent.number, sent.first_tick, sent.tau_u, sent.length) if sent else (0, 0, 0, 0)
+    return (golden.fixed_ticks, update.update, update.tick, update.playing, plan.next_update_tick, plan.suspects,
+            *answered)  # fmt: skip
+
+
+def reals_of(golden: GoldenUpdate) -> tuple[float, ...]:
+    """Return its numbers with a point, without the rows of the sequence."""
+    update, plan = golden.update, golden.plan
+    return (update.load, *update.u_before, *update.u, *update.y, *update.x, plan.load_step, plan.shortage)
+
+
 def refuse(settings: ProgramSettings) -> None:
     """Refuse what cannot be exported.
 

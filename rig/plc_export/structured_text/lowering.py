@@ -1,21 +1,36 @@
-"""Functions of the typed tree as blocks: no records, no choices within an expression, each call a statement.
+"""Functions of the typed tree as blocks: no records, no parts of arrays, each call a statement, no choice within one.
 
-A record is where its fields are: those that never change are global constants, the others are parameters of every
-block that needs them. Both operands of a logical operator may be computed, as in Structured Text; where the second one
+A record is where its fields are (`places.py`): those of constants and of the one state are global, the others are
+parameters of every block that needs them. A block is for certain places: one that is called with two records of the
+state is there twice. Both operands of a logical operator may be computed, as in Structured Text; where the second one
 must not be, there is a decision instead.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Final, cast
 
+from rig.plc_export.structured_text.places import (
+    ZERO,
+    Entry,
+    Made,
+    Part,
+    Place,
+    Record,
+    Rows,
+    dotted,
+    member,
+    part_of,
+    summed,
+)
 from rig.plc_export.tree.nodes import (
-    BEYOND_BLOCKS,
     ArrayType,
     Assign,
     Block,
     Call,
     Convert,
+    Copy,
     Count,
     Declare,
     Element,
@@ -26,43 +41,50 @@ from rig.plc_export.tree.nodes import (
     If,
     Invocation,
     Invoke,
+    Item,
     Kind,
     Literal,
+    Make,
+    Member,
     Name,
     Operation,
     Path,
-    RecordType,
+    Point,
     Return,
     Select,
     Statement,
+    Target,
     Type,
+    View,
     While,
     walk,
 )
 from rig.plc_export.tree.subset import UnfitKernelError
 
-Bindings = Mapping[str, Path]
+Bindings = Mapping[str, Place]
+Split = Mapping[Path, Sequence[tuple[Path, int]]]
+"""Arrays that are too large for one list of constants: the pieces, with their elements; each has whole rows."""
 VALUE: Final = "result"
 """The output that is a function's value."""
+NOT_SPLIT: Final[Split] = MappingProxyType({})
 
 
 class Lowering:
     """Blocks of functions and of all that they call, callees first.
 
     Args:
-        constants: Fields of records that never change.
+        globals_: Paths of what is global: fields of constants and of the state.
+        split: Those that are in pieces.
     """
 
-    def __init__(self, constants: Mapping[Path, object]) -> None:
-        self.constants = constants
+    def __init__(self, globals_: Collection[Path], split: Split = NOT_SPLIT) -> None:
+        self.globals, self.split = globals_, split
         self.blocks: list[Block] = []
-        self._known: dict[tuple[str, tuple[tuple[str, Path], ...]], Block] = {}
+        self._known: dict[tuple[str, tuple[tuple[str, Place], ...]], Block] = {}
 
     def block(self, function: Function, bindings: Bindings) -> Block:
-        """Return the block of a function whose records are certain ones."""
-        if any(isinstance(node, BEYOND_BLOCKS) for node in walk(function.body)):
-            raise UnfitKernelError(f"{function.source}: records of numbers and parts of arrays are for C99 alone")
-        key = (function.name, tuple(sorted(bindings.items())))
+        """Return the block of a function whose records and arrays are certain ones."""
+        key = (function.name, tuple(sorted(bindings.items(), key=lambda each: each[0])))
         if key not in self._known:
             made = FunctionLowering(self, function, bindings).block()
             name = function.name.replace("__", "_")
@@ -73,15 +95,21 @@ class Lowering:
             self.blocks.append(made)
         return self._known[key]
 
+    def is_global(self, name: Name) -> bool:
+        """Return whether a name is that of a constant or of the state."""
+        return tuple(name.name.split(".")) in self.globals
+
 
 class FunctionLowering:
     """Lowers one function."""
 
     def __init__(self, lowering: Lowering, function: Function, bindings: Bindings) -> None:
-        self.lowering, self.function, self.bindings = lowering, function, bindings
+        self.lowering, self.function = lowering, function
+        self.places: dict[str, Place] = dict(bindings)
         self.constants: dict[Path, None] = {}
-        self.fields: dict[Path, Name] = {}
+        self.fields: dict[str, Name] = {}
         self.before: list[Statement] = []
+        self._given = {node for node in walk(tuple(bindings.values())) if isinstance(node, Name) and "." in node.name}
         self._ranges: dict[str, range] = {}
         self._made = 0
 
@@ -89,20 +117,22 @@ class FunctionLowering:
         """Return the block."""
         function = self.function
         numbers = [each for each in function.parameters if isinstance(each.type, Kind)]
-        arrays = [each for each in function.parameters
-                  if isinstance(each.type, ArrayType) and each.name not in self.bindings]  # fmt: skip
+        shared = [place.array for each in function.parameters if isinstance(each.type, ArrayType)
+                  and isinstance(place := self._place(each), Part)
+                  and not self.lowering.is_global(place.array)]  # fmt: skip
         changed = [each for each in numbers if each in assigned(function.body)]
         body = (*(Assign(each, given(each)) for each in changed), *self._body(function.body))
         body = body[:-1] if body and body[-1] == Return() else body
         results = [*function.results, *([Name(function.value, VALUE)] if function.value else [])]
-        arrays += [each for each in [*results, *self.fields.values()] if isinstance(each.type, ArrayType)]
+        shared += [each for each in [*results, *self.fields.values()] if isinstance(each.type, ArrayType)]
         inputs = [given(each) if each in changed else each for each in numbers]
         inputs += [each for each in self.fields.values() if isinstance(each.type, Kind)]
         outputs = [each for each in results if isinstance(each.type, Kind)]
-        known = {*inputs, *arrays, *outputs}
-        variables = dict.fromkeys(each for each in assigned(body) if each not in known)
-        return Block(function.name, function.source, function.summary, tuple(inputs), tuple(arrays), tuple(outputs),
-                     tuple(variables), tuple(self.constants), body)  # fmt: skip
+        known = {each.name for each in (*inputs, *shared, *outputs)}
+        variables = {(each.name, size_of(each.type)): each for each in assigned(body)
+                     if each.name not in known and not self.lowering.is_global(each)}  # fmt: skip
+        return Block(function.name, function.source, function.summary, tuple(inputs), tuple(shared), tuple(outputs),
+                     tuple(variables.values()), tuple(self.constants), body)  # fmt: skip
 
     # -- statements ----------------------------------------------------------------------------------------------------
 
@@ -117,12 +147,21 @@ class FunctionLowering:
             self.before = outer
         return tuple(result)
 
-    def _statement(self, statement: Statement) -> Iterator[Statement]:
+    def _statement(self, statement: Statement) -> Iterator[Statement]:  # noqa: C901 one case a statement
         match statement:
             case Declare(variable, value):
                 yield from self._declared(variable, value)
             case Assign(target, value):
-                yield from self._assigned(cast("Name | Element", self._expression(target)), value)
+                yield from self._assigned(cast("Target", self._expression(target)), value)
+            case Point(variable, part):
+                self.places[variable.name] = self._place(part)
+            case Make(variable, parts):
+                self.places[variable.name] = Made(tuple((name, self._kept(part)) for name, part in parts))
+            case Copy(target, source):
+                one, other = self._place(target), self._place(source)
+                for name, kind in target.type.fields:  # type: ignore[union-attr]
+                    pair = (cast("Target", part_of(each, name, kind)) for each in (one, other))
+                    yield Assign(*map(self._noted, pair))  # type: ignore[arg-type]
             case Invoke(function, arguments, results):
                 yield self._call(function, arguments, results)
             case For():
@@ -140,15 +179,11 @@ class FunctionLowering:
 
     def _declared(self, variable: Name, value: Expression | None) -> Iterator[Statement]:
         if isinstance(variable.type, ArrayType):
-            kind, size = variable.type.kind, variable.type.size
-            at = Name(Kind.INT, "at.0")
-            row = Name(ArrayType(kind, (size,)), variable.name)
-            zero = Assign(Element(kind, row, (at,)), Literal(kind, 0))
-            yield Count(at, Literal(Kind.INT, 0), Literal(Kind.INT, size - 1), 1, (zero,))
+            yield zeroed(variable)
         else:
             yield from self._assigned(variable, value or Literal(cast("Kind", variable.type), 0))
 
-    def _assigned(self, target: Name | Element, value: Expression) -> Iterator[Statement]:
+    def _assigned(self, target: Target, value: Expression) -> Iterator[Statement]:
         """Yield an assignment; of a choice, a decision between two."""
         if not isinstance(value, Select):
             yield Assign(target, self._expression(value))
@@ -174,37 +209,56 @@ class FunctionLowering:
 
     def _call(self, function: Function, arguments: Sequence[Expression], results: Sequence[Name]) -> Call:
         """Return the call of a function's block: results are arrays that it writes to, or numbers it puts out."""
-        given_fields = {parameter.name: path for parameter, argument in zip(function.parameters, arguments, strict=True)
-                        if not isinstance(parameter.type, Kind) and (path := self._path(argument))}  # fmt: skip
-        block = self.lowering.block(function, given_fields)
-        named: dict[str, Expression] = {
-            parameter.name: self._expression(argument)
-            for parameter, argument in zip(function.parameters, arguments, strict=True)
-            if parameter.name not in given_fields
-        }
+        passed: dict[str, Expression] = {}
+        bindings: dict[str, Place] = {}
+        for parameter, argument in zip(function.parameters, arguments, strict=True):
+            if isinstance(parameter.type, Kind):
+                passed[parameter.name] = self._expression(argument)
+            else:
+                bindings[parameter.name] = self._handed(parameter.name, self._place(argument), passed)
+        block = self.lowering.block(function, bindings)
         taken = [*function.results, *([Name(function.value, VALUE)] if function.value else [])]
         kept: list[tuple[Name, Name]] = []
         for output, variable in zip(taken, results, strict=True):
             if isinstance(output.type, Kind):
                 kept.append((variable, output))
             else:
-                named[output.name] = variable
-        passed = tuple((each, self._passed(each, named)) for each in (*block.inputs, *block.shared))
-        return Call(block, passed, tuple(kept))
+                passed[output.name] = variable
+        listed = tuple((each, self._noted(passed.get(each.name.removesuffix(GIVEN)) or self._own_name(each)))
+                       for each in (*block.inputs, *block.shared))  # fmt: skip
+        return Call(block, listed, tuple(kept))
 
-    def _passed(self, parameter: Name, named: Mapping[str, Expression]) -> Expression:
-        name = parameter.name.removesuffix(GIVEN)
-        return named[name] if name in named else self._field(tuple(name.split(".")), parameter.type)
+    def _handed(self, name: str, place: Place, passed: dict[str, Expression]) -> Place:
+        """Return where a parameter is in what is called; what that needs goes into `passed`."""
+        match place:
+            case Part(array, offset):
+                inner = array
+                if not self.lowering.is_global(array):
+                    inner = Name(array.type, name)
+                    passed[name] = array
+                return Part(inner, self._number_handed(f"{name}.from", offset, passed))
+            case Entry(rows, at):
+                return Entry(rows, self._number_handed(f"{name}.at", at, passed))
+            case Made(parts):
+                return Made(tuple((field, self._handed(f"{name}.{field}", part, passed)) for field, part in parts))
+            case Record() | Rows():
+                return place
+        return self._number_handed(name, place, passed)
+
+    def _number_handed(self, name: str, number: Expression, passed: dict[str, Expression]) -> Expression:
+        if isinstance(number, Literal) or (isinstance(number, Name) and self.lowering.is_global(number)):
+            return number
+        passed[name] = number
+        return Name(number.type, name)
 
     # -- expressions ---------------------------------------------------------------------------------------------------
 
     def _expression(self, expression: Expression) -> Expression:  # noqa: PLR0911 one case a kind of expression
         match expression:
-            case Name(kind) | Field(kind):
-                path = self._path(expression)
-                return self._field(path, kind) if path else expression
+            case Name() | Field() | Member():
+                return self._noted(cast("Expression", self._place(expression)))
             case Element(kind, array, indices):
-                return Element(kind, cast("Name", self._expression(array)), tuple(map(self._expression, indices)))
+                return self._noted(self._element(kind, array, tuple(map(self._expression, indices))))
             case Operation(_, "and" | "or"):
                 return self._logical(expression)
             case Operation(kind, operator, operands):
@@ -247,27 +301,88 @@ class FunctionLowering:
         reached = self._ranges.get(index.name) if isinstance(index, Name) else None
         return reached is not None and reached.start >= 0 and reached.stop <= length
 
-    def _path(self, storage: Expression) -> Path | None:
-        match storage:
-            case Name(_, name):
-                return self.bindings.get(name)
-            case Field(_, record, name):
-                path = self._path(record)
-                return (*path, name) if path else None
-        return None
+    # -- places --------------------------------------------------------------------------------------------------------
 
-    def _field(self, path: Path, kind: Type) -> Name:
-        """Return a field of a record: a constant, or else a parameter."""
-        name = Name(kind, ".".join(path))
-        if isinstance(kind, RecordType):
-            return name
-        if path in self.lowering.constants:
-            self.constants[path] = None
-        else:
-            self.fields[path] = name
+    def _place(self, expression: Expression) -> Place:
+        match expression:
+            case Name(kind, name):
+                unbound = Part(expression, ZERO) if isinstance(kind, ArrayType) else expression
+                return self.places.get(name, unbound)
+            case Field(kind, record, name):
+                whole = self._place(record)
+                found = part_of(whole, name, kind)
+                return found if isinstance(whole, Made) else self._own(found)
+            case View(kind, array, offset):
+                return self._cut(kind, self._place(array), self._captured(self._expression(offset)))
+            case Item(_, rows, index):
+                return Entry(cast("Rows", self._place(rows)), self._captured(self._expression(index)))
+            case Member(kind, struct, name):
+                return self._own(member(cast("Entry", self._place(struct)), kind, name))
+        raise AssertionError(expression)  # no other is where something is
+
+    def _own(self, place: Place) -> Place:
+        """Return a place; fields of records that are not global are parameters."""
+        name = place.array if isinstance(place, Part) else place
+        if isinstance(name, Name):
+            self._own_name(name)
+        return place
+
+    def _own_name(self, name: Name) -> Name:
+        self._given.add(name)
         return name
 
-    def _temporary(self, kind: Kind, what: str) -> Name:
+    def _kept(self, part: Expression) -> Place:
+        """Return where a part of a record is that is made: a number as it is now."""
+        return self._captured(self._expression(part)) if isinstance(part.type, Kind) else self._place(part)
+
+    def _element(self, kind: Kind, array: Expression, indices: tuple[Expression, ...]) -> Element:
+        whole, offset = cast("Part", self._place(array))
+        if tuple(whole.name.split(".")) in self.lowering.split:
+            raise UnfitKernelError(f"{self.function.source}: {whole.name} is in pieces; take a part of it first")
+        if offset == ZERO and whole.type == array.type:
+            return Element(kind, whole, indices)
+        return Element(kind, View(cast("ArrayType", array.type), whole, offset), indices)
+
+    def _cut(self, kind: ArrayType, place: Place, offset: Expression) -> Part:
+        """Return a part of an array; where that is in pieces, a copy of the part."""
+        whole, before = cast("Part", place)
+        pieces = self.lowering.split.get(tuple(whole.name.split(".")))
+        if not pieces:
+            return Part(whole, self._captured(summed(before, offset)))
+        copy = self._temporary(ArrayType(kind.kind, (kind.size,)), "part")
+        statements: tuple[Statement, ...] = ()
+        first = 0
+        for path, size in pieces:
+            piece, at = Name(ArrayType(kind.kind, (size,)), dotted(path)), Name(Kind.INT, "at.0")
+            within = Operation(Kind.INT, "-", (offset, Literal(Kind.INT, first)))
+            source = Element(kind.kind, piece, (Operation(Kind.INT, "+", (within, at)),))
+            taken = Assign(Element(kind.kind, copy, (at,)), self._noted(source))
+            loop = Count(at, ZERO, Literal(Kind.INT, kind.size - 1), 1, (taken,))
+            behind = Operation(Kind.BOOL, ">=", (offset, Literal(Kind.INT, first)))
+            statements = (If(behind, (loop,), statements),) if statements else (loop,)
+            first += size
+        self.before += statements
+        return Part(copy, ZERO)
+
+    def _captured(self, number: Expression) -> Expression:
+        """Return a number that stays as it is now."""
+        if isinstance(number, Literal):
+            return number
+        kept = self._temporary(number.type, "kept")
+        self.before.append(Assign(kept, number))
+        return kept
+
+    def _noted(self, expression: Expression) -> Expression:
+        """Return an expression; what it has of constants, state and fields is noted."""
+        for node in walk(expression):
+            if isinstance(node, Name):
+                if self.lowering.is_global(node):
+                    self.constants[tuple(node.name.split("."))] = None
+                elif node in self._given:
+                    self.fields[node.name] = node
+        return expression
+
+    def _temporary(self, kind: Type, what: str) -> Name:
         self._made += 1
         return Name(kind, f"{what}.{self._made}")
 
@@ -280,12 +395,26 @@ def given(parameter: Name) -> Name:
     return replace(parameter, name=f"{parameter.name}{GIVEN}")
 
 
+def zeroed(array: Name) -> Count:
+    """Return the loop that makes an array zero."""
+    kind = cast("ArrayType", array.type)
+    at, row = Name(Kind.INT, "at.0"), Name(ArrayType(kind.kind, (kind.size,)), array.name)
+    zero = Assign(Element(kind.kind, row, (at,)), Literal(kind.kind, 0))
+    return Count(at, ZERO, Literal(Kind.INT, kind.size - 1), 1, (zero,))
+
+
+def size_of(kind: Type) -> tuple[Kind, int]:
+    """Return what variables of one name differ in: of what and how many."""
+    return (kind.kind, kind.size) if isinstance(kind, ArrayType) else (cast("Kind", kind), 0)
+
+
 def assigned(body: object) -> list[Name]:
     """Return what is written to in statements: variables, arrays, loop variables, what calls put out or fill."""
     found: list[Name] = []
     for node in walk(body):
         match node:
-            case Assign(Name() as target) | Assign(Element(_, Name() as target)) | Declare(target):
+            case (Assign(Name() as target) | Assign(Element(_, Name() as target)) | Declare(target)
+                  | Assign(Element(_, View(_, Name() as target)))):  # fmt: skip
                 found.append(target)
             case Count(variable) | For(variable):
                 found.append(variable)

@@ -24,10 +24,10 @@ from rig.plc_export.tree.nodes import (
     Return,
     Statement,
     Type,
+    View,
     While,
 )
 from rig.plc_export.tree.printing import TreePrinter
-from rig.plc_export.tree.subset import UnfitKernelError
 
 SCALARS: Final = {Kind.REAL: "REAL", Kind.INT: "DINT", Kind.UNSIGNED: "DINT", Kind.BOOL: "BOOL"}
 BYTES: Final = {"REAL": 4, "DINT": 4, "BOOL": 1}
@@ -36,11 +36,18 @@ FUNCTIONS: Final = {
     "sqrt": "SQRT",
     "abs": "ABS",
     "power": "EXPT",
+    "log": "LN",
+    "round": f"{PREFIX}round",
+    "copysign": f"{PREFIX}copysign",
+    "isfinite": f"{PREFIX}is_finite",
     "%": f"{PREFIX}floor_mod",
     "//": f"{PREFIX}floor_div",
 }
 NO_NOTES: Final[Mapping[str, str]] = {}
+NO_STATE: Final[Mapping[Path, Type]] = {}
 TABLE: Final = f"{PREFIX}literals"
+LARGEST: Final = np.finfo(np.float32).max
+"""In the place of what is infinite or no number, for which there is no literal."""
 
 
 class StructuredTextPrinter(TreePrinter):
@@ -48,30 +55,24 @@ class StructuredTextPrinter(TreePrinter):
 
     Args:
         constants: Types of the fields of records that are global constants.
+        state: And of those that are global variables.
     """
 
     table = TABLE
 
-    def __init__(self, constants: Mapping[Path, Type]) -> None:
+    def __init__(self, constants: Mapping[Path, Type], state: Mapping[Path, Type] = NO_STATE) -> None:
         super().__init__(np.float32)
-        self.constants = constants
+        self.globals, self.state = {**constants, **state}, state
         self.arrays: dict[str, str] = {}
         """Definition of each type of arrays, by its name."""
-        self.where = ""
-        """What is being printed, for refusals."""
         self._names, self._notes, self._uses_literals = Names(), NO_NOTES, False
 
     # -- numbers and types ---------------------------------------------------------------------------------------------
 
     def number(self, value: float) -> str:
-        """Return a typed literal with digits enough for its bits.
-
-        Raises:
-            UnfitKernelError: It is infinite or not a number, for which there is no literal.
-        """
-        if not np.isfinite(value):
-            raise UnfitKernelError(f"{self.where}: Structured Text has no literal for {value}")
-        return f"REAL#{np.float32(value):.9E}"
+        """Return a typed literal with digits enough for its bits; the largest one for what is not finite."""
+        finite = value if np.isfinite(value) else LARGEST * (-1 if value < 0 else 1)
+        return f"REAL#{np.float32(finite):.9E}"
 
     def literal(self, value: float) -> str:
         """Return the element of the table that has this value."""
@@ -101,11 +102,12 @@ class StructuredTextPrinter(TreePrinter):
 
     def block(self, block: Block, notes: Mapping[str, str] = NO_NOTES) -> str:
         """Return a function block; variables that have a note are outputs, too."""
-        self.where, self._names, self._uses_literals = block.source, Names(), False
+        self._names, self._uses_literals = Names(), False
         self._notes = notes
         inputs, shared = self._declared(block.inputs), self._declared(block.shared)
         outputs = self._declared([*block.outputs, *(each for each in block.variables if each.name in notes)])
-        constants = {global_name(path): self.type(self.constants[path]) for path in block.constants}
+        constants, state = ({global_name(path): self.type(self.globals[path]) for path in block.constants
+                             if (path in self.state) is variable} for variable in (False, True))  # fmt: skip
         variables = self._declared([each for each in block.variables if each.name not in notes])
         body = [*self._body(block.body, 1)]
         variables |= {self._instance(each): block_name(each) for each in block.called}
@@ -115,7 +117,8 @@ class StructuredTextPrinter(TreePrinter):
         return "".join([
             comment(f"{where}: {block.summary}"), f"FUNCTION_BLOCK {block_name(block)}\n", section("VAR_INPUT", inputs),
             section("VAR_IN_OUT", shared), section("VAR_OUTPUT", outputs), section("VAR_EXTERNAL CONSTANT", constants),
-            section("VAR", variables), *(f"{line}\n" for line in body), "END_FUNCTION_BLOCK\n",
+            section("VAR_EXTERNAL", state), section("VAR", variables), *(f"{line}\n" for line in body),
+            "END_FUNCTION_BLOCK\n",
         ])  # fmt: skip
 
     def _declared(self, names: Iterable[Name]) -> dict[str, str]:
@@ -167,10 +170,9 @@ class StructuredTextPrinter(TreePrinter):
     def _call(self, call: Call) -> Iterator[str]:
         """Yield a call with its arguments by name, and the assignments of what it puts out."""
         instance, inside = self._instance(call.block), interface_names(call.block, self.type)
-        yield f"{instance}("
         passed = [f"{inside[each]} := {self.expression(value)}" for each, value in call.arguments]
-        yield from (f"    {each}," for each in passed[:-1])
-        yield f"    {passed[-1]});"
+        yield f"{instance}({'' if passed else ');'}"
+        yield from (f"    {each}{',' if each is not passed[-1] else ');'}" for each in passed)
         yield from (f"{self._local(variable)} := {instance}.{inside[output]};" for variable, output in call.results)
 
     # -- expressions ---------------------------------------------------------------------------------------------------
@@ -186,15 +188,18 @@ class StructuredTextPrinter(TreePrinter):
                 return f"{value}" if value >= 0 else f"({value})"
             case Name(_, name):
                 path = tuple(name.split("."))
-                return global_name(path) if path in self.constants else self._local(expression)
+                return global_name(path) if path in self.globals else self._local(expression)
             case Element(_, array, _):
-                return f"{self.expression(array)}[{self.place(expression)}]"
+                whole = array.array if isinstance(array, View) else array
+                return f"{self.expression(whole)}[{self.place(expression)}]"
             case Operation():
                 return self._operation(expression)
             case Convert(Kind.REAL, operand):
                 return f"DINT_TO_REAL({self.expression(operand)})"
             case Convert(Kind.BOOL, operand):
                 return f"({self.expression(operand)} <> 0)"
+            case Convert(_, operand) if operand.type is Kind.BOOL:
+                return f"BOOL_TO_DINT({self.expression(operand)})"
             case Convert(_, operand):
                 return self.expression(operand)
         raise AssertionError(expression)  # lowering leaves no other
@@ -204,6 +209,8 @@ class StructuredTextPrinter(TreePrinter):
         match operation.operator:
             case "min" | "max" as name:
                 return f"{PREFIX}{name}_{self.type(operation.type).lower()}({', '.join(parts)})"
+            case "isinf" | "isnan":
+                return f"(NOT {PREFIX}is_finite({parts[0]}))"
             case name if name in FUNCTIONS:
                 return f"{FUNCTIONS[name]}({', '.join(parts)})"
             case "negative":
@@ -227,8 +234,8 @@ def block_name(block: Block) -> str:
 
 
 def global_name(path: Path) -> str:
-    """Return the name of a constant: the fields that lead to it."""
-    return identifier(PREFIX + "_".join(path[1:]).lower())
+    """Return the name of a constant or of the state: the fields that lead to it."""
+    return identifier(PREFIX + "_".join(each for each in path[1:] if each != "numbers").lower())
 
 
 def section(head: str, declared: Mapping[str, str]) -> str:

@@ -277,9 +277,6 @@ class Call:
 
 Statement: TypeAlias = Declare | Assign | Point | Make | Copy | Invoke | For | While | If | Return | Count | Call
 
-BEYOND_BLOCKS = (View, Item, Member, Point, Make, Copy)
-"""What blocks do not have."""
-
 # -- results -----------------------------------------------------------------------------------------------------------
 
 
@@ -333,6 +330,7 @@ class Block:
     outputs: tuple[Name, ...]
     variables: tuple[Name, ...]
     constants: tuple[Path, ...]
+    """What it has of constants and of the state."""
     body: tuple[Statement, ...]
 
     @property

@@ -13,12 +13,12 @@ from rig.plc_export.tree.nodes import ArrayType, Expression, Kind, Name, RecordT
 BINARY: Final[dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]]] = {
     ast.Add: ("+", operator.add), ast.Sub: ("-", operator.sub), ast.Mult: ("*", operator.mul),
     ast.Div: ("/", operator.truediv), ast.Mod: ("%", operator.mod), ast.FloorDiv: ("//", operator.floordiv),
-    ast.Pow: ("power", operator.pow), ast.LShift: ("<<", operator.lshift), ast.BitOr: ("|", operator.or_),
+    ast.Pow: ("power", operator.pow),
 }  # fmt: skip
 COMPARISONS: Final[dict[type[ast.cmpop], str]] = {
     ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
 }  # fmt: skip
-OF_INTEGERS, OF_REALS = ("+", "-", "*", "%", "//", "<<", "|"), ("+", "-", "*", "/", "power")
+OF_INTEGERS, OF_REALS = ("+", "-", "*", "%", "//"), ("+", "-", "*", "/", "power")
 FUNCTIONS: Final[dict[object, str]] = {
     abs: "abs", min: "min", max: "max", np.sqrt: "sqrt", math.sqrt: "sqrt", np.isfinite: "isfinite",
     np.isinf: "isinf", math.isnan: "isnan", math.log: "log", math.copysign: "copysign", round: "round",
