@@ -55,7 +55,7 @@ def test_the_self_test_finds_every_bit_as_the_kernels_have_it(
     folder: Path, recorded: GoldenVectors, compiler: str, level: str
 ) -> None:
     result = self_test(folder, compiler, level)
-    assert result.stdout == f"{len(recorded.vectors)} golden vectors, 0 failures\n"
+    assert result.stdout.endswith(f"\n{len(recorded.vectors)} golden vectors, 0 failures\n")
     assert result.returncode == 0
 
 
@@ -78,7 +78,7 @@ def in_double(recorded: GoldenVectors, most: int) -> GoldenVectors:
 def test_double_precision_has_the_same_bits_too(recorded: GoldenVectors, tmp_path: Path) -> None:
     double = in_double(recorded, 5)
     export_of(double).write(tmp_path, double.vectors)
-    assert self_test(tmp_path, COMPILERS[0], "-O2").stdout == "5 golden vectors, 0 failures\n"
+    assert self_test(tmp_path, COMPILERS[0], "-O2").stdout.endswith("\n5 golden vectors, 0 failures\n")
 
 
 def changed(text: str, place: int) -> str:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from rig.plc_export.kernels.ode_program import leaves
 from rig.plc_export.structured_text.lowering import Lowering
+from rig.plc_export.structured_text.places import Record
 from rig.plc_export.structured_text.printer import StructuredTextPrinter, block_name, memory
 from rig.plc_export.structured_text.slicing import one_iteration_a_call
 from rig.plc_export.tree.nodes import RecordType
@@ -101,8 +102,8 @@ class Exported:
         assert isinstance(compiled, Dispatcher)
         types = tuple(map(type_of, arguments))
         function = Program().function(compiled, types)
-        records = {each.name: (each.name,) for each in function.parameters if isinstance(each.type, RecordType)}
-        constants = leaves(next(iter(records.values())), constant) if records else {}
+        records = {each.name: Record((each.name,)) for each in function.parameters if isinstance(each.type, RecordType)}
+        constants = leaves(next(iter(records.values())).path, constant) if records else {}
         lowering = Lowering(constants)
         self.block = lowering.block(function, records)
         printer = StructuredTextPrinter({path: type_of(value) for path, value in constants.items()})

@@ -29,10 +29,10 @@ POSIX: Final = ("-D_POSIX_C_SOURCE=200809L", "-pthread")
 LIBRARY: Final = "#include <modbus/modbus.h>\n"
 
 
-def manifest_of(settings: Settings, texts: Mapping[str, str]) -> str:
-    """Return the manifest of an export of these files: model, settings, register maps, digests."""
+def manifest_of(settings: Settings, texts: Mapping[str, str], cost: Mapping[str, Any]) -> str:
+    """Return the manifest of an export of these files: model, settings, register maps, what it costs, digests."""
     return json.dumps({
-        "format": FORMAT, "coldloop": __version__, **_identity(settings),
+        "format": FORMAT, "coldloop": __version__, **_identity(settings), **cost,
         "files": {name: hashlib.sha256(text.encode("ascii")).hexdigest() for name, text in texts.items()},
     }, indent=1)  # fmt: skip
 
@@ -89,6 +89,8 @@ def _check(given: str, folder: Path, settings: Settings) -> None:
             raise UsageError(
                 f"--optimizer {given}: it has {key} = {theirs}, the run {own}: set it, or export the optimiser again"
             )
+    if "optimizer.c" not in found["files"]:
+        raise UsageError(f"--optimizer {given}: it is not in C: export it with --target c")
     for name, digest in found["files"].items():
         path = folder / FOLDER / name
         if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != digest:

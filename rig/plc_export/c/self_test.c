@@ -2,11 +2,13 @@
 #include <float.h>
 #include <stdio.h>
 #include <string.h>
+#include <time.h>
 
 #include "golden.h"
 #include "problem.h"
 
 static int failures = 0;
+static double took_us = 0;
 
 static void report(const char *what, int32_t vector, int32_t place) {
     failures += 1;
@@ -59,9 +61,11 @@ static void check_vector(int32_t vector) {
     static @REAL@ points[N_COUNTS * N_VARIABLES], costs[N_COUNTS];
     static int32_t iterations[N_COUNTS];
     @REAL@ guessed;
+    const clock_t begun = clock();
     solve_problem(
         &golden_phi[vector * N_VARIABLES], &golden_gamma[vector * N_ROWS], &golden_low[vector * N_VARIABLES],
         &golden_high[vector * N_VARIABLES], &golden_guess[vector * N_VARIABLES], &guessed, points, costs, iterations);
+    took_us += 1e6 * (double)(clock() - begun) / (double)CLOCKS_PER_SEC;
     compare("the cost of the guess", vector, &guessed, &golden_guessed[vector], 1);
     compare("the profile", vector, points, &golden_points[vector * N_COUNTS * N_VARIABLES], N_COUNTS * N_VARIABLES);
     compare("the cost", vector, costs, &golden_costs[vector * N_COUNTS], N_COUNTS);
@@ -79,6 +83,7 @@ int main(void) {
     for (int32_t vector = 0; vector < N_GOLDEN; vector += 1) {
         check_vector(vector);
     }
+    printf("%.0f us for the %d iterations\n", took_us, N_GOLDEN * N_COUNTS);
     printf("%d golden vectors, %d failures\n", N_GOLDEN, failures);
     return failures == 0 ? 0 : 1;
 }

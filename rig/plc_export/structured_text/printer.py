@@ -177,7 +177,7 @@ class StructuredTextPrinter(TreePrinter):
 
     # -- expressions ---------------------------------------------------------------------------------------------------
 
-    def expression(self, expression: Expression) -> str:  # noqa: PLR0911 one case a kind of expression
+    def expression(self, expression: Expression) -> str:  # noqa: C901, PLR0911 one case a kind of expression
         """Return an expression, with parentheses around each operation."""
         match expression:
             case Literal(Kind.REAL, value):
