@@ -27,7 +27,7 @@ KEYWORDS: Final = """
 
 def identifier(name: str) -> str:
     """Return a name with its letters and digits, changed where it is a keyword or too long."""
-    plain = re.sub(r"_+", "_", re.sub(r"[^A-Za-z0-9]", "_", name)).strip("_")
+    plain = re.sub(r"_+", "_", re.sub(r"[^A-Za-z0-9]", "_", name)).strip("_") or "unused"
     plain = f"{plain}_v" if re.search(rf"\b{plain.lower()}\b", KEYWORDS) else plain
     if len(plain) <= LONGEST:
         return plain
