@@ -106,6 +106,8 @@ class Machine:
                 return 0
             case "DINT", ("int", str(text)):
                 return int(text)
+            case "DINT", ("operation", "-", ("int", str(text))):
+                return -int(text)
             case "BOOL", None | ("bool", "FALSE"):
                 return False
             case "BOOL", ("bool", "TRUE"):

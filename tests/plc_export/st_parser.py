@@ -281,7 +281,7 @@ class Parser:
         return self._named()
 
     def _named(self) -> Tree:
-        name = self.take().lower() if self.next == "SQRT" else self.name()
+        name = self.take().lower() if self.next in {"SQRT", "LN"} else self.name()
         if self.skip("("):
             arguments = [self.expression()]
             while self.skip(","):

@@ -11,6 +11,8 @@ from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.options import check_load, configuration, fixed_updating_period
 
 if TYPE_CHECKING:
+    from optimizer_plc.qp.problem import PredictiveProblem
+    from optimizer_plc.settings import ProgramSettings
     from rig.settings import Settings
 
 USUAL_SCENARIOS: Final = 100
@@ -124,7 +126,20 @@ def _tables(options: argparse.Namespace) -> str:
     settings = configuration(options).settings
     if profile is not None:
         return plc_tables(settings, options.period, profile, lambda there: _costs(there, options))
-    return budget_tables(settings if options.power is None else with_power(settings, options.power), options.period)
+    if options.power is not None:
+        settings = with_power(settings, options.power)
+    program = settings.optimizer_plc.program
+    return budget_tables(settings, options.period, lambda problem: _executed(problem, program))
+
+
+def _executed(problem: "PredictiveProblem", program: "ProgramSettings") -> str:
+    from rig.plc_export.kernels.counted import counter_of
+
+    counter = counter_of(problem, program)
+    return (
+        f"ode as exported, an iteration a call, executed: {counter.unconstrained():,} operations with no row active, "
+        f"{counter.worst():,} in the worst case (every row active, a bound cuts the step)\n"
+    )
 
 
 def _costs(settings: "Settings", options: argparse.Namespace) -> str:

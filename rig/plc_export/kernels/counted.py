@@ -9,10 +9,11 @@ from optimizer_plc.computing_settings import Arithmetic
 from optimizer_plc.decisions import Latched
 from optimizer_plc.program import OptimizerProgram
 from optimizer_plc.qp.arithmetic import real_of
-from optimizer_plc.qp.problem import QuadraticProblem
+from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
 from optimizer_plc.session_state import empty_state
+from optimizer_plc.settings import ProgramSettings
 from optimizer_plc.solvers.interface import Costs
-from optimizer_plc.solvers.ode import OdeMethod
+from optimizer_plc.solvers.ode import OdeMethod, ode_solver
 from rig.plc_export.kernels.ode_program import Array, OdeProgram
 from rig.plc_export.kernels.optimizer_program import OptimizerKernels
 from rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector
@@ -92,6 +93,14 @@ def counted_iterations(method: OdeMethod, vectors: Sequence[GoldenVector]) -> It
     counter = Counter(method, vectors[0].problem)
     found = [one for each in vectors for one in counter.iterations(each.problem, each.guess)]
     return IterationCounts(counter.unconstrained(), counts_of(found), counter.worst(), sum(found))
+
+
+def counter_of(problem: PredictiveProblem, program: ProgramSettings) -> Counter:
+    """Return what counts the iterations of the ODE-based solver for a problem in single precision."""
+    method = ode_solver(program.ode, program.penalties).method
+    m, zero = len(problem.Gamma), np.zeros(problem.size, REAL)
+    qp = QuadraticProblem(problem.Phi, zero, problem.Gamma, np.zeros(m, REAL), zero, zero, REAL(0.0))
+    return Counter(method(qp), qp)
 
 
 def counts_of(found: Sequence[int]) -> CallCounts:
