@@ -1,5 +1,6 @@
-"""The solver's source text for a PLC as a folder: sources, golden vectors, self-test, and a README for who loads it."""
+"""What is exported for a PLC as a folder: sources, golden vectors, self-tests, READMEs for who loads it, manifests."""
 
+import json
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -8,22 +9,26 @@ from typing import Final
 
 import numpy as np
 
+from coldloop import __version__
 from coldloop.config import selected
 from coldloop.errors import UsageError
 from coldloop.process.loaded import PROCESS
-from optimizer_plc.qp.problem import QuadraticProblem
 from optimizer_plc.settings import SHOWN
-from rig.plc_export.bus_registers import bus_files
-from rig.plc_export.exported_optimizer import FOLDER as OPTIMIZER
-from rig.plc_export.exported_optimizer import MANIFEST, manifest_of
-from rig.plc_export.folder import OdeExport
-from rig.plc_export.optimizer_folder import OptimizerExport
-from rig.plc_export.plcopen import plcopen_xml
-from rig.plc_export.recorded_problems import LOAD, TICKS, GoldenVector, GoldenVectors, record
-from rig.plc_export.recorded_updates import UpdateRecorder
-from rig.plc_export.st_folder import AT_ONCE, StructuredTextExport, filled, template
-from rig.plc_sizing.operations import Operations, gradient, ode
-from rig.plc_sizing.sizes import dense_sizes
+from rig.plc_export.c.bus_registers import bus_files
+from rig.plc_export.c.exported_optimizer import FOLDER as OPTIMIZER
+from rig.plc_export.c.exported_optimizer import MANIFEST, manifest_of
+from rig.plc_export.c.optimizer_files import OptimizerExport
+from rig.plc_export.c.solver_files import OdeExport
+from rig.plc_export.kernels.counted import IterationCounts, counted_iterations, counted_updates
+from rig.plc_export.kernels.recorded_problems import LOAD, TICKS, GoldenVector, GoldenVectors, record
+from rig.plc_export.kernels.recorded_updates import GoldenUpdate, UpdateRecorder
+from rig.plc_export.structured_text.optimizer_files import OptimizerText
+from rig.plc_export.structured_text.plcopen import plcopen_xml
+from rig.plc_export.structured_text.register_table import register_table
+from rig.plc_export.structured_text.solver_files import AT_ONCE, StructuredTextExport
+from rig.plc_export.templates import filled, template
+from rig.plc_sizing.exported import ITERATION, CallCost, ExportCost, cost_text
+from rig.plc_sizing.profile import PlcProfile
 from rig.settings import Settings
 
 README: Final = "README.md"
@@ -31,9 +36,13 @@ PROJECT: Final = "solver.xml"
 BESIDE: Final = f"`{OPTIMIZER}/` has the whole optimiser, with a README and a self-test of its own.\n\n"
 FIXED_S: Final = 2.5
 """Updating period of the second half of the golden updates; that of the first is adaptive."""
+COUNTED: Final = 80
+"""Golden updates whose operations are counted."""
 
 
-def export_plc(target: str, ticks: int | None, folder: Path, settings: Settings) -> list[Path]:
+def export_plc(
+    target: str, ticks: int | None, folder: Path, settings: Settings, profile: PlcProfile | None = None
+) -> list[Path]:  # fmt: skip
     """Record problems and write the sources for a target; return the paths.
 
     Args:
@@ -41,82 +50,148 @@ def export_plc(target: str, ticks: int | None, folder: Path, settings: Settings)
         ticks: Length of the run that is recorded.
         folder: Where they are written to.
         settings: Of the optimiser.
+        profile: The PLC that memory and times are compared with, if any.
 
     Raises:
         UsageError: The folder is not empty or cannot be written to, or no input moves in so many ticks.
     """
     refuse_taken(folder)
     recorded = record(ticks or TICKS)
-    vectors = recorded.telling()
-    if not vectors:
-        raise UsageError(f"--ticks: no input moves within {ticks} ticks, so nothing would be tested; record more")
-    texts = c99(recorded, vectors) if target == "c" else structured_text(recorded, vectors, xml=target == "plcopen")
-    if target == "c" and PROCESS.has_bath:
-        texts |= whole_optimizer(settings, ticks or TICKS)
+    vectors = telling(recorded, ticks)
+    texts = c99(recorded, vectors, profile) if target == "c" else structured_text(recorded, vectors, profile, target)
+    if PROCESS.has_bath:
+        written = whole_optimizer(target, settings, ticks, profile)
+        texts |= {f"{OPTIMIZER}/{name}": text for name, text in written.items()}
     write_whole(folder, texts)
     return [folder / name for name in texts]
 
 
-def structured_text(recorded: GoldenVectors, vectors: list[GoldenVector], *, xml: bool) -> dict[str, str]:
+def telling(recorded: GoldenVectors, ticks: int | None) -> list[GoldenVector]:
+    """Return the problems that are golden vectors.
+
+    Raises:
+        UsageError: There are none.
+    """
+    vectors = recorded.telling()
+    if not vectors:
+        raise UsageError(f"--ticks: no input moves within {ticks} ticks, so nothing would be tested; record more")
+    return vectors
+
+
+# -- the solver --------------------------------------------------------------------------------------------------------
+
+
+def structured_text(
+    recorded: GoldenVectors, vectors: list[GoldenVector], profile: PlcProfile | None, target: str
+) -> dict[str, str]:  # fmt: skip
     """Return the files of Structured Text by their names: sources, or one of PLCopen XML."""
     export = StructuredTextExport(recorded.method, vectors[0].problem, vectors)
     texts, sizes = export.files(), export.sizes()
-    if xml:
+    if target == "plcopen":
         texts = {PROJECT: plcopen_xml(texts.values(), "the ODE-based solver, golden vectors and a self-test")}
-    return {**texts, README: readme("readme_st.md", vectors, texts, {
-        "LOAD": template("load_plcopen.md" if xml else "load_st.md").rstrip(),
-        "HEAD": "in the documentation of `cl_self_test`" if xml else "at the head of `self_test.st`",
-        "AT_ONCE": str(AT_ONCE), "CALLS": str(export.calls()), "CONSTANTS": f"{sizes.constants:,}",
-        "SOLVER": f"{sizes.solver:,}", "SELF_TEST": f"{sizes.self_test:,}",
-    })}  # fmt: skip
+    parts = {**loading(target), "AT_ONCE": str(AT_ONCE), "CALLS": str(export.calls())}
+    needed = {"constants": sizes.constants, "an instance of `cl_solver`, with its problem": sizes.solver,
+              "self-test and golden vectors": sizes.self_test}  # fmt: skip
+    return described("structured_text/readme_solver.md", recorded, vectors, texts, parts, needed, profile)
 
 
-def c99(recorded: GoldenVectors, vectors: list[GoldenVector]) -> dict[str, str]:
+def c99(recorded: GoldenVectors, vectors: list[GoldenVector], profile: PlcProfile | None) -> dict[str, str]:
     """Return the files of C99 by their names."""
     export = OdeExport(recorded.method, vectors[0].problem, np.arange(1, len(vectors[0].answer.costs) + 1))
     texts, sizes = export.files(vectors), export.sizes(vectors)
-    return {**texts, README: readme("readme_c.md", vectors, texts, {
+    needed = {"constants": sizes.constants, "stack of `solve_problem`, about": sizes.stack,
+              "self-test and golden vectors": sizes.self_test}  # fmt: skip
+    return described("c/readme_solver.md", recorded, vectors, texts, {}, needed, profile)
+
+
+def described(
+    name: str, recorded: GoldenVectors, vectors: list[GoldenVector], texts: Mapping[str, str],
+    parts: Mapping[str, str], needed: dict[str, int], profile: PlcProfile | None,
+) -> dict[str, str]:  # fmt: skip
+    """Return the files with a README, the template of this name with its figures, and a manifest with what it costs."""
+    problem, count = vectors[0].problem, counted_iterations(recorded.method, vectors)
+    iterations = len(vectors) * len(vectors[0].answer.costs)
+    cost = ExportCost(variables=len(problem.phi), operations={ITERATION: cost_of(count)}, bytes=needed,
+                      self_test={"iterations": iterations, "operations": count.total})  # fmt: skip
+    readme = filled(template(name), {
+        **parts, "COST": cost_text(cost, profile), "RECORDED": str(iterations),
         "OPTIMIZER": BESIDE if PROCESS.has_bath else "",
-        "CONSTANTS": f"{sizes.constants:,}", "STACK": f"{sizes.stack:,}", "SELF_TEST": f"{sizes.self_test:,}",
-    })}  # fmt: skip
-
-
-def whole_optimizer(settings: Settings, ticks: int) -> dict[str, str]:
-    """Return the files of the whole optimiser by their names, with its golden updates."""
-    recorder = UpdateRecorder(settings)
-    golden = [each for period_s in (0.0, FIXED_S) for each in recorder.record(ticks, LOAD, period_s)]
-    export = OptimizerExport(recorder.optimizer, golden)
-    shown = selected(settings, SHOWN)
-    order = settings.optimizer_plc.word_order
-    texts = {**export.files(), **bus_files(recorder.optimizer, export.kernels, order, shown)}
-    sizes = export.sizes()
-    texts[README] = filled(template("readme_optimizer.md"), {
-        "GOLDEN": str(len(golden)), "CONSTANTS": f"{sizes.constants:,}", "STATE": f"{sizes.state:,}",
-        "STACK": f"{sizes.stack:,}",
-    })  # fmt: skip
-    texts[MANIFEST] = manifest_of(settings, texts)
-    return {f"{OPTIMIZER}/{name}": text for name, text in texts.items()}
-
-
-def readme(name: str, vectors: list[GoldenVector], texts: Mapping[str, str], parts: Mapping[str, str]) -> str:
-    """Return the README: the template of this name with its figures."""
-    problem = vectors[0].problem
-    return filled(template(name), {
-        **parts,
         "N": str(len(problem.phi)), "M": str(len(problem.gamma)), "K": str(len(vectors[0].answer.costs)),
         "VECTORS": str(len(vectors)), "FILES": ", ".join(f"`{name}`" for name in texts),
-        "FEWEST": f"{operations(problem, 0):,}", "MOST": f"{operations(problem, len(problem.gamma)):,}",
     })  # fmt: skip
+    manifest = {"coldloop": __version__, **cost.model_dump(exclude_none=True)}
+    return {**texts, README: readme, MANIFEST: json.dumps(manifest, indent=1)}
 
 
-def operations(problem: QuadraticProblem, active: int) -> int:
-    """Return the operations of an iteration with so many active rows, no zero left out, where a bound cuts the step.
+def cost_of(count: IterationCounts) -> CallCost:
+    """Return what a call of one iteration takes."""
+    recorded = count.recorded
+    return CallCost(least=recorded.least, mean=recorded.mean, most=recorded.most, worst=count.worst)
 
-    That takes the velocity four times: before, in between, behind, and behind once more at the bound.
-    """
-    n, m = len(problem.phi), len(problem.gamma)
-    sizes = dense_sizes(n, m, n)
-    return round(ode(sizes, active).plus(gradient(sizes, active), Operations(n)).flops)
+
+def loading(target: str) -> dict[str, str]:
+    """Return what a README of Structured Text says of loading."""
+    xml = target == "plcopen"
+    return {"LOAD": template(f"structured_text/load_{target}.md").rstrip(),
+            "HEAD": "in the documentation of `cl_self_test`" if xml else "at the head of `self_test.st`"}  # fmt: skip
+
+
+# -- the whole optimiser -----------------------------------------------------------------------------------------------
+
+
+def whole_optimizer(
+    target: str, settings: Settings, ticks: int | None, profile: PlcProfile | None
+) -> dict[str, str]:  # fmt: skip
+    """Return the files of the whole optimiser by their names, with its golden updates."""
+    recorder = UpdateRecorder(settings)
+    golden = [each for period_s in (0.0, FIXED_S) for each in recorder.record(ticks or TICKS, LOAD, period_s)]
+    write = optimizer_in_c if target == "c" else optimizer_in_text
+    name, texts, parts, needed = write(target, settings, recorder, golden)
+    recorded = record(ticks or TICKS, settings=settings)
+    count = counted_iterations(recorded.method, telling(recorded, ticks))
+    others = {call: CallCost(**found._asdict()) for call, found in
+              counted_updates(recorder.optimizer, golden[:COUNTED]).items()}  # fmt: skip
+    cost = ExportCost(variables=len(recorded.vectors[0].guess), operations={**others, ITERATION: cost_of(count)},
+                      bytes=needed)  # fmt: skip
+    texts[README] = filled(template(name), {
+        **parts, "COST": cost_text(cost, profile),
+        "GOLDEN": str(len(golden)), "COUNTED": str(min(COUNTED, len(golden))),
+        "FILES": ", ".join(f"`{name}`" for name in texts if not name.endswith(".md")),
+    })  # fmt: skip
+    texts[MANIFEST] = manifest_of(settings, texts, cost.model_dump(exclude_none=True))
+    return texts
+
+
+Written = tuple[str, dict[str, str], dict[str, str], dict[str, int]]
+"""Name of the template of the README, files, parts of the README, bytes."""
+
+
+def optimizer_in_c(_: str, settings: Settings, recorder: UpdateRecorder, golden: list[GoldenUpdate]) -> Written:
+    """Return the whole optimiser as C99, with its place on the bus."""
+    export = OptimizerExport(recorder.optimizer, golden)
+    order, shown = settings.optimizer_plc.word_order, selected(settings, SHOWN)
+    texts = {**export.files(), **bus_files(recorder.optimizer, export.kernels, order, shown)}
+    sizes = export.sizes()
+    needed = {"constants": sizes.constants, "state": sizes.state, "stack, about": sizes.stack}
+    return "c/readme_optimizer.md", texts, {}, needed
+
+
+def optimizer_in_text(
+    target: str, _: Settings, recorder: UpdateRecorder, golden: list[GoldenUpdate]
+) -> Written:  # fmt: skip
+    """Return the whole optimiser as Structured Text or PLCopen XML, with the table of registers."""
+    export = OptimizerText(recorder.optimizer, golden)
+    texts, sizes = export.files(), export.sizes()
+    if target == "plcopen":
+        texts = {f"{OPTIMIZER}.xml": plcopen_xml(texts.values(), "the whole optimiser and a self-test")}
+    texts["registers.md"] = register_table() + "\n"
+    needed = {"constants": sizes.constants, "state": sizes.state, "instances of the four blocks": sizes.blocks,
+              "self-test and golden updates": sizes.self_test}  # fmt: skip
+    parts = {**loading(target), "DIGEST": str(recorder.optimizer.model_digest)}
+    return "structured_text/optimizer/readme.md", texts, parts, needed
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
 
 
 def refuse_taken(folder: Path) -> None:

@@ -46,12 +46,18 @@ class CountedSizes(NamedTuple):
     without_zeros: QpSizes
 
 
-def budget_tables(settings: Settings, period_s: float | None) -> str:
-    """Return the tables as text, for the configured power and one updating period or several."""
+def budget_tables(settings: Settings, period_s: float | None, executed: Callable[[PredictiveProblem], str]) -> str:
+    """Return the tables as text, for the configured power and one updating period or several.
+
+    Args:
+        settings: Of the optimiser.
+        period_s: One updating period, or None for several.
+        executed: Returns what an iteration as exported takes.
+    """
     problem, prediction = problem_of(settings)
     return "\n".join([
         _speed(reference_curve(), problem.size),
-        _operations(problem, prediction),
+        _operations(problem, prediction) + executed(problem),
         _iterations(settings.optimizer_plc.program, problem, period_s),
         _memory(settings, problem, prediction, MEMORY_BYTES),
     ])  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
+from coldloop.process.lti_model import discretise
 
 Array = NDArray[np.float64]
 
@@ -101,6 +102,22 @@ def identified(record: Record) -> Identified:
         A, B / u_scale, whole.C * y_scale[:, np.newaxis], whole.constant * y_scale + y_mean, rests,
         1.0 - candidates[order - 1].error,
     )  # fmt: skip
+
+
+def unexplained(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array:
+    """Return what a model in continuous time leaves of a record: rms error of each output over its deviation.
+
+    Initial state and constants are those that leave least.
+    """
+    n, m = B.shape
+    u, scale = record.inputs - record.operating, np.maximum(record.outputs.std(axis=0), 1e-12)
+    at = discretise(A, B, np.zeros(n), record.period_s)
+    responses = _responses(at.A, C, u)
+    left = record.outputs - responses[:, :, n : n + n * m] @ at.B.ravel() - u @ D.T
+    free = np.delete(responses, np.s_[n : n + n * m], axis=2) / scale[:, np.newaxis]
+    unknowns = np.linalg.lstsq(free.reshape(-1, free.shape[2]), (left / scale).ravel())[0]
+    error: Array = np.sqrt(((left / scale - free @ unknowns) ** 2).mean(axis=0))
+    return error
 
 
 def _check_moves(record: Record, deviations: Array) -> None:

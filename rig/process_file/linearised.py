@@ -16,7 +16,7 @@ from plant.own.python_class import Equations, equations_of, evaluated
 from rig.process_file.declaration import LagSection, PlantSection, ProcessFile
 from rig.process_file.fmu_model import from_fmu
 from rig.process_file.linear_model import Linearised, given_outputs, jacobian, operating_point, with_disturbances
-from rig.process_file.step_test import from_step_test
+from rig.process_file.step_test import from_step_test, record_compared
 
 Array = NDArray[np.float64]
 
@@ -48,21 +48,23 @@ def linearised(file: ProcessFile, folder: Path) -> Linearised:
     else:
         found = _from_lags(file, plant)
     if file.prediction.step_test is not None:
-        found = _by_record(file, found, from_step_test(file, folder / file.prediction.step_test))
+        found = _by_record(file, found, folder / file.prediction.step_test)
     for name in ("A", "B", "F", "C", "D", "G", "x0", "y0"):
         if not np.isfinite(getattr(found, name)).all():
             raise UsageError(f"plant: {name} of the linear model is not finite; look at the plant's equations there")
     return with_disturbances(file, found)
 
 
-def _by_record(file: ProcessFile, plant: Linearised, model: Linearised) -> Linearised:
+def _by_record(file: ProcessFile, plant: Linearised, path: Path) -> Linearised:
     """Return the model of a record, for a plant that hides its states."""
+    model = from_step_test(file, path)
     hidden = dict(plant.parameters)
     if plant.kind == PYTHON:
         hidden["rest"] = plant.x0.tolist()
     elif plant.kind == FMU:
         hidden["wiring"] = {**hidden["wiring"], "states": ()}
-    notes = (*plant.notes, *model.notes, *_gains_compared(file, plant, model))
+    compared = (*_gains_compared(file, plant, model), *record_compared(file, path, plant, model))
+    notes = (*plant.notes, *model.notes, *compared)
     return model._replace(kind=plant.kind, parameters=hidden, digest=plant.digest, notes=notes)
 
 

@@ -11,13 +11,17 @@ from coldloop.errors import UsageError
 from plant.own.maker import LINEAR
 from rig.process_file.csv_columns import TIME, columns, header
 from rig.process_file.declaration import DisturbanceSection, LoadSection, ProcessFile
-from rig.process_file.identified import Identified, Record, identified
+from rig.process_file.identified import Identified, Record, identified, unexplained
 from rig.process_file.linear_model import Linearised, operating_point
 
 Array = NDArray[np.float64]
 
 POOR: Final = 0.5
 """Share of an output's variation, explained of the data held back, below which a model is no good."""
+UNLIKE: Final = 0.3
+"""Rms error of a plant on a record of it, over the deviation of the output, from which on it is told, ..."""
+FAR: Final = 3.0
+"""... if it is so many times that of the model found in the record."""
 EVEN: Final = 0.01
 """Largest deviation of an interval from the others, over their length."""
 
@@ -28,6 +32,35 @@ def from_step_test(file: ProcessFile, path: Path) -> Linearised:
     Raises:
         UsageError: One line that names file, line and remedy.
     """
+    record, moved = _recorded(file, path)
+    found = identified(record)
+    notes = [
+        f"unknown    {path.name} has no column {one.name}: the model does not know what it does"
+        for one in file.outside
+        if one not in moved
+    ]
+    model = model_identified(file, found, _outputs(file, found), moved)
+    return model._replace(notes=(*model.notes, *notes))
+
+
+def record_compared(file: ProcessFile, path: Path, plant: Linearised, model: Linearised) -> list[str]:
+    """Return which outputs of a record the plant that it is for explains by far worse than the model found in it."""
+    record, moved = _recorded(file, path)
+    places = _places(file, moved)
+    by_plant, by_model = (
+        unexplained(one.A, np.hstack([one.B, one.F[:, places]]), one.C, np.hstack([one.D, one.G[:, places]]), record)
+        for one in (plant, model)
+    )
+    return [
+        f"warning    {path.name}: of {one.name} the plant itself explains {100 * max(0.0, 1.0 - its):.0f} %, the model "
+        f"found in it {100 * max(0.0, 1.0 - found):.0f} %; are its columns those of this plant?"
+        for one, its, found in zip(file.outputs, by_plant, by_model, strict=True)
+        if its > max(UNLIKE, FAR * found)
+    ]
+
+
+def _recorded(file: ProcessFile, path: Path) -> tuple[Record, list[LoadSection | DisturbanceSection]]:
+    """Return a record in samples of the model, and what moved in it beside the inputs."""
     moved = [one for one in file.outside if one.name in header(path)]
     names = [one.name for one in (*file.inputs, *moved)]
     rows = columns(path, [TIME, *names, *(one.name for one in file.outputs)])
@@ -38,15 +71,12 @@ def from_step_test(file: ProcessFile, path: Path) -> Linearised:
     count = len(rows) // every
     held = inputs[: count * every].reshape(count, every, -1).mean(axis=1)
     at = np.array([one.at for one in (*file.inputs, *moved)])
-    record = Record(period_s * every, held, outputs[: count * every : every], at, tuple(names), str(path))
-    found = identified(record)
-    notes = [
-        f"unknown    {path.name} has no column {one.name}: the model does not know what it does"
-        for one in file.outside
-        if one not in moved
-    ]
-    model = model_identified(file, found, _outputs(file, found), moved)
-    return model._replace(notes=(*model.notes, *notes))
+    return Record(period_s * every, held, outputs[: count * every : every], at, tuple(names), str(path)), moved
+
+
+def _places(file: ProcessFile, moved: Sequence[LoadSection | DisturbanceSection]) -> list[int]:
+    """Return the columns that load and disturbances have in F and G."""
+    return [1 + file.disturbances.index(one) if isinstance(one, DisturbanceSection) else 0 for one in moved]
 
 
 def model_identified(
@@ -63,9 +93,7 @@ def model_identified(
     u, w = operating_point(file)
     n, m, p = len(found.A), len(u), len(y0)
     F = np.zeros((n, len(w)))
-    F[:, [1 + file.disturbances.index(one) if isinstance(one, DisturbanceSection) else 0 for one in moved]] = found.B[
-        :, m:
-    ]
+    F[:, _places(file, moved)] = found.B[:, m:]
     poor = [one.name for one, share in zip(file.outputs, found.fit, strict=True) if share < POOR]
     warning = (
         (f"warning    fit: the record does not explain {', '.join(poor)}; something else moves it",) if poor else ()

@@ -283,8 +283,9 @@ def least_plausible(p: Plausibility, readings: Any, believed: Array, expected: A
 @kernel
 def suspects_of(readings: Any) -> int:  # noqa: ANN401 records
     """Return the suspects: bit i is output i."""
-    mask = 0
+    mask, bit = 0, 1
     for i in range(readings.shape[0]):
         if readings[i].state == SUSPECT:
-            mask |= 1 << i
+            mask += bit
+        bit += bit
     return mask

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rig.plc_export.recorded_problems import GoldenVectors, record
+from rig.plc_export.kernels.recorded_problems import GoldenVectors, record
 
 
 @pytest.fixture(scope="package")

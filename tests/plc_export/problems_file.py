@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.plc_export.folder import OdeExport
-from rig.plc_export.ode_program import PER_PROBLEM
-from rig.plc_export.recorded_problems import ITERATIONS, GoldenVector, record
+from rig.plc_export.c.solver_files import OdeExport
+from rig.plc_export.kernels.ode_program import PER_PROBLEM
+from rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector, record
 
 GIVEN = (*PER_PROBLEM, "guess")
 

@@ -14,16 +14,26 @@ import numpy as np
 
 from tests.plc_export.st_parser import Library, Tree, Unit, Variable, parsed
 
-_POWF = ctypes.CDLL(ctypes.util.find_library("m") or "libm.so.6").powf
+_LIBM = ctypes.CDLL(ctypes.util.find_library("m") or "libm.so.6")
+_POWF, _LOGF = _LIBM.powf, _LIBM.logf
 _POWF.restype, _POWF.argtypes = ctypes.c_float, (ctypes.c_float, ctypes.c_float)
-STANDARD: Final = {"sqrt": ("np.sqrt", "REAL"), "abs": ("abs", "REAL"), "expt": ("power", "REAL"),
-                   "real_to_dint": ("to_integer", "DINT")}  # fmt: skip
+_LOGF.restype, _LOGF.argtypes = ctypes.c_float, (ctypes.c_float,)
+STANDARD: Final = {
+    "sqrt": ("np.sqrt", "REAL", "REAL"), "abs": ("abs", "REAL", "REAL"), "expt": ("power", "REAL", "REAL"),
+    "ln": ("logarithm", "REAL", "REAL"), "real_to_dint": ("to_integer", "REAL", "DINT"),
+    "dint_to_real": ("np.float32", "DINT", "REAL"), "bool_to_dint": ("int", "BOOL", "DINT"),
+}  # fmt: skip
+"""In Python, with the types of arguments and result."""
 COMPARISONS: Final = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
 LOGICAL: Final = {"AND": "&", "OR": "|"}
 
 
 def power(base: np.float32, exponent: np.float32) -> np.float32:
     return np.float32(_POWF(base, exponent))
+
+
+def logarithm(value: np.float32) -> np.float32:
+    return np.float32(_LOGF(value))
 
 
 def to_integer(value: np.float32) -> int:
@@ -57,11 +67,12 @@ class Machine:
 
     def __init__(self, *texts: str) -> None:
         self.library: Library = parsed(*texts)
-        self.constants = SimpleNamespace()
-        self.names: dict[str, Any] = {"np": np, "power": power, "to_integer": to_integer, "dint": dint, "put": put,
-                                      "quotient": quotient, "constants": self.constants, "reals": Reals()}  # fmt: skip
-        for variable in self.library.constants.values():
-            setattr(self.constants, variable.name, self.initial(variable))
+        self.globals = SimpleNamespace()
+        self.names: dict[str, Any] = {"np": np, "power": power, "to_integer": to_integer, "logarithm": logarithm,
+                                      "dint": dint, "put": put, "quotient": quotient,
+                                      "globals": self.globals, "reals": Reals()}  # fmt: skip
+        for variable in self.library.globals.values():
+            setattr(self.globals, variable.name, self.initial(variable))
         for unit in self.library.units.values():
             exec(Translation(self.library, unit).text(), self.names)  # noqa: S102 the tests' own text
 
@@ -86,16 +97,16 @@ class Machine:
 
     @staticmethod
     def value(kind: str, written: object) -> object:
+        if written is None:
+            return {"REAL": np.float32(0), "DINT": 0, "BOOL": False}[kind]
         match kind, written:
-            case "REAL", None:
-                return np.float32(0)
             case "REAL", ("real", str(text)):
                 return np.float32(text.removeprefix("REAL#"))
-            case "DINT", None:
-                return 0
             case "DINT", ("int", str(text)):
                 return int(text)
-            case "BOOL", None | ("bool", "FALSE"):
+            case "DINT", ("operation", "-", ("int", str(text))):
+                return -int(text)
+            case "BOOL", ("bool", "FALSE"):
                 return False
             case "BOOL", ("bool", "TRUE"):
                 return True
@@ -114,9 +125,9 @@ class Translation:
         self.library, self.unit = library, unit
         for variable in unit.variables.values():
             if variable.section == "VAR_EXTERNAL":
-                there = library.constants.get(variable.name)
+                there = library.globals.get(variable.name)
                 assert there, variable.name
-                assert there.type == variable.type, variable.name
+                assert (there.type, there.constant) == (variable.type, variable.constant), variable.name
 
     def text(self) -> str:
         """Return the Python function."""
@@ -124,7 +135,7 @@ class Translation:
         if unit.kind != "FUNCTION":
             return "\n".join([f"def run_{unit.name}(self):", *self.block(unit.body)])
         inputs = [each.name for each in unit.variables.values() if each.section == "VAR_INPUT"]
-        zeros = {"REAL": "np.float32(0)", "DINT": "0"}
+        zeros = {"REAL": "np.float32(0)", "DINT": "0", "BOOL": "False"}
         local = [f" {each.name} = {zeros[each.type]}" for each in unit.variables.values() if each.name not in inputs]
         head = f"def call_{unit.name}({', '.join(inputs)}):"
         return "\n".join([head, *local, *self.block(unit.body), f" return {unit.name}"])
@@ -228,12 +239,12 @@ class Translation:
         if self.unit.kind == "FUNCTION":
             return name, self.unit.result if name == self.unit.name else self.unit.variables[name].type
         variable = self.unit.variables[name]
-        return f"{'constants' if variable.section == 'VAR_EXTERNAL' else 'self'}.{name}", variable.type
+        return f"{'globals' if variable.section == 'VAR_EXTERNAL' else 'self'}.{name}", variable.type
 
     def function(self, name: str, arguments: list[Tree]) -> tuple[str, str]:
         if name in STANDARD:
-            called, result = STANDARD[name]
-            return f"{called}({', '.join(self.of(each, 'REAL') for each in arguments)})", result
+            called, taken, result = STANDARD[name]
+            return f"{called}({', '.join(self.of(each, taken) for each in arguments)})", result
         function = self.library.units[name]
         wanted = [each.type for each in function.variables.values() if each.section == "VAR_INPUT"]
         passed = [self.of(each, kind) for each, kind in zip(arguments, wanted, strict=True)]

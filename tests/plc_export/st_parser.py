@@ -47,7 +47,7 @@ class Library:
 
     arrays: dict[str, tuple[int, str]] = field(default_factory=dict)
     units: dict[str, Unit] = field(default_factory=dict)
-    constants: dict[str, Variable] = field(default_factory=dict)
+    globals: dict[str, Variable] = field(default_factory=dict)
 
 
 class Parser:
@@ -128,9 +128,8 @@ class Parser:
         self.name()
         while self.next == "VAR_GLOBAL":
             for variable in self._section():
-                assert variable.name not in self.library.constants
-                assert variable.constant
-                self.library.constants[variable.name] = variable
+                assert variable.name not in self.library.globals
+                self.library.globals[variable.name] = variable
         while not self.skip("END_CONFIGURATION"):
             self.take()
 
@@ -282,7 +281,7 @@ class Parser:
         return self._named()
 
     def _named(self) -> Tree:
-        name = self.take().lower() if self.next == "SQRT" else self.name()
+        name = self.take().lower() if self.next in {"SQRT", "LN"} else self.name()
         if self.skip("("):
             arguments = [self.expression()]
             while self.skip(","):

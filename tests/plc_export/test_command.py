@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from tests.conftest import Coldloop
 
 TANK = Path(__file__).parents[2] / "examples" / "processes" / "quadruple_tank.toml"
+SOLVER_TEXTS = ["types.st", "functions.st", "kernels.st", "golden.st", "self_test.st", "configuration.st"]
+DESCRIBED = ["README.md", "manifest.json"]
 FILES = {
     "c": [
         "kernels.h",
@@ -27,6 +29,7 @@ FILES = {
         "golden.c",
         "self_test.c",
         "README.md",
+        "manifest.json",
         *(
             f"optimizer/{name}"
             for name in (
@@ -52,8 +55,21 @@ FILES = {
             )
         ),
     ],
-    "st": ["types.st", "functions.st", "kernels.st", "golden.st", "self_test.st", "configuration.st", "README.md"],
-    "plcopen": ["solver.xml", "README.md"],
+    "st": [
+        *SOLVER_TEXTS,
+        *DESCRIBED,
+        *(
+            f"optimizer/{name}"
+            for name in (*SOLVER_TEXTS[:3], "optimizer.st", *SOLVER_TEXTS[3:], "registers.md", *DESCRIBED)
+        ),
+    ],
+    "plcopen": [
+        "solver.xml",
+        *DESCRIBED,
+        "optimizer/optimizer.xml",
+        "optimizer/registers.md",
+        *(f"optimizer/{name}" for name in DESCRIBED),
+    ],
 }
 
 
@@ -67,7 +83,7 @@ def test_the_sources_and_a_readme_are_written(coldloop: "Coldloop", tmp_path: Pa
     assert written == sorted(FILES[target])
     readme = (out / "README.md").read_text()
     assert "@" not in readme
-    assert all(name in readme for name in FILES[target] if name != "README.md" and "/" not in name)
+    assert all(name in readme for name in FILES[target] if name not in DESCRIBED and "/" not in name)
     assert all("@" not in file.read_text() for file in out.rglob("optimizer/**/*.*"))
     assert [path.name for path in out.parent.iterdir()] == [target]
 
@@ -77,7 +93,7 @@ def test_the_written_structured_text_passes_its_self_test_in_as_many_calls_as_th
 ) -> None:
     out = tmp_path / "st"
     assert coldloop("export", "plc", "--target", "st", "--out", out, "--ticks", 800).code == 0
-    test = Machine(*((out / name).read_text() for name in FILES["st"][:-1])).instance("cl_self_test")
+    test = Machine(*((out / name).read_text() for name in SOLVER_TEXTS)).instance("cl_self_test")
     test.run, calls = True, 0
     while not test.done:
         test.run_()
@@ -104,7 +120,7 @@ def test_it_is_the_solver_of_the_process_that_is_named(processes: Processes, tmp
     outcome = started(processes, "--process", TANK, "export", "plc", "--target", "st", "--out", out)
     assert outcome.code == 0
     assert "for 42 variables and 72 rows" in (out / "README.md").read_text()
-    program = Machine(*((out / name).read_text() for name in FILES["st"][:-1])).instance("cl_main")
+    program = Machine(*((out / name).read_text() for name in SOLVER_TEXTS)).instance("cl_main")
     while not program.test.done:
         program.run_()
     assert program.test.passed
@@ -130,8 +146,8 @@ def test_the_c_of_another_process_is_the_solver_alone_and_says_so(processes: Pro
         (("plc", "--target", "c", "--out", "new", "--ticks", "40"), "no input moves within 40 ticks"),
         (("runs", "--target", "c", "--out", "new"), "runs: has no target"),
         (("runs", "--csv", "--ticks", "40"), "--ticks: is for coldloop export plc"),
-        (("plc", "--target", "st", "--out", "new", "--set", "plant.seed=2"), "are of the whole optimiser"),
-        (("runs", "--csv", "--set", "plant.seed=2"), "--config and --set: are for coldloop export plc"),
+        (("plc", "--target", "st", "--out", "new", "--plc", "none"), "--plc none: neither a file nor one of"),
+        (("runs", "--csv", "--set", "plant.seed=2"), "--config, --set and --plc: are for coldloop export plc"),
         (
             ("plc", "--target", "c", "--out", "new", "--set", "optimizer_plc.program.arithmetic=float64"),
             "in single precision alone",

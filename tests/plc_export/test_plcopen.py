@@ -7,9 +7,9 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from rig.plc_export.plcopen import NAMESPACE, POUS, SECTIONS, XHTML, plcopen_xml
-from rig.plc_export.recorded_problems import GoldenVectors
-from rig.plc_export.st_folder import StructuredTextExport
+from rig.plc_export.kernels.recorded_problems import GoldenVectors
+from rig.plc_export.structured_text.plcopen import NAMESPACE, POUS, SECTIONS, XHTML, plcopen_xml
+from rig.plc_export.structured_text.solver_files import StructuredTextExport
 from tests.plc_export.st_interpreter import Machine
 from tests.plc_export.st_parser import parsed
 

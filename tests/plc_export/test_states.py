@@ -12,12 +12,19 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
-from rig.plc_export.c99 import Printer
-from rig.plc_export.c99_text import helpers, records_in
-from rig.plc_export.lowering import Lowering
-from rig.plc_export.reading import Program
-from rig.plc_export.subset import UnfitKernelError, type_of
+from rig.plc_export.c.printer import Printer
+from rig.plc_export.c.text import helpers, records_in
+from rig.plc_export.structured_text import constants
+from rig.plc_export.structured_text.constants import Constants, configuration, in_pieces, types_in
+from rig.plc_export.structured_text.lowering import Lowering
+from rig.plc_export.structured_text.optimizer_files import state_types
+from rig.plc_export.structured_text.places import Record
+from rig.plc_export.structured_text.printer import StructuredTextPrinter, global_name, section
+from rig.plc_export.templates import template
+from rig.plc_export.tree.reading import Program
+from rig.plc_export.tree.subset import UnfitKernelError, type_of
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, compiled
+from tests.plc_export.st_interpreter import Machine
 
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER)
 
@@ -117,12 +124,13 @@ def advance(c: Table, m: State, z: Array, row: int) -> None:
     m.other.z[:] = found.z
     m.other.z[1:-1] = z[2:]
     m.one.z[2:] = z[:2]
-    mask = 0
+    mask, bit = 0, 1
     for i in range(m.marks.shape[0]):
         r = m.marks[i]
         mark(r, row if z[i] > 0 else -1, z[i])
         if r.kind >= 0 and np.isfinite(r.size):
-            mask |= 1 << i
+            mask += bit
+        bit += bit
     now.sum = z.dtype.type(mask)
     now.done = other.done = small and not math.isnan(z[0])
     count = swap(m)
@@ -210,11 +218,12 @@ def shown_in_c(numbers: Any) -> tuple[int, bool, float]:  # noqa: ANN401 records
 
 
 finite = st.floats(-50.0, 50.0, width=32)
+STEPS = st.lists(st.tuples(st.lists(finite, min_size=N, max_size=N), st.integers(0, 2)), min_size=1, max_size=4)
 
 
 @needs_compiler
 @settings(deadline=None)
-@given(steps=st.lists(st.tuples(st.lists(finite, min_size=N, max_size=N), st.integers(0, 2)), min_size=1, max_size=4))
+@given(steps=STEPS)
 def test_a_state_goes_the_same_way(library: ctypes.CDLL, steps: list[tuple[list[float], int]]) -> None:
     m, c = empty(), CState()
     table = CTable(TABLE.rows.ctypes.data_as(ctypes.POINTER(ctypes.c_float)))
@@ -234,10 +243,67 @@ def test_a_number_that_is_read_behind_its_assignment_is_refused() -> None:
         function(reads_behind, empty())
 
 
-def test_structured_text_has_no_states() -> None:
-    _, found = function(swap, empty())
-    with pytest.raises(UnfitKernelError, match="are for C99 alone"):
-        Lowering({}).block(found, {})
+class InText:
+    """`advance` as Structured Text: the state is global, the table may be in pieces."""
+
+    def __init__(self) -> None:
+        _, found = function(advance, TABLE, empty(), np.zeros(N, np.float32), 0)
+        values, split = in_pieces({("c", "rows"): TABLE.rows})
+        state = dict(state_types(("m", "state"), type_of(empty())))
+        lowering = Lowering({*values, *split, *state}, split)
+        lowering.block(found, {"c": Record(("c",)), "m": Record(("m", "state"))})
+        printer = StructuredTextPrinter(types_in(values), state)
+        blocks = "\n".join(map(printer.block, lowering.blocks))
+        globals_ = section("VAR_GLOBAL", {global_name(path): printer.type(kind) for path, kind in state.items()})
+        lists = configuration(iter([*Constants(values, printer).lists(), globals_]))
+        functions = template("structured_text/functions.st")
+        self.machine = Machine(printer.types(), functions, blocks, "PROGRAM cl_main END_PROGRAM", lists)
+        self.instance = self.machine.instance("cl_advance")
+
+    def clear(self) -> None:
+        """Make the state zero."""
+        for name, variable in self.machine.library.globals.items():
+            if not variable.constant:
+                setattr(self.machine.globals, name, self.machine.initial(variable))
+
+    def step(self, z: Array, row: int) -> None:
+        self.instance.z, self.instance.row = dict(enumerate(z)), row
+        self.instance.run_()
+
+    def shown(self, *path: str) -> tuple[int, bool, float]:
+        count, done, total = (getattr(self.machine.globals, "_".join(("cl_state", *path, name)))
+                              for name in ("count", "done", "sum"))  # fmt: skip
+        return count, done, float(total)
+
+    def array(self, name: str) -> list[float]:
+        return [float(each) for each in getattr(self.machine.globals, f"cl_state_{name}").values()]
+
+
+@pytest.mark.parametrize("largest_list", [64 * 1024, 4 * N * 2], ids=["whole", "in pieces"])
+def test_a_state_goes_the_same_way_in_structured_text(monkeypatch: pytest.MonkeyPatch, largest_list: int) -> None:
+    monkeypatch.setattr(constants, "LARGEST_LIST", largest_list)
+    text = InText()
+    monkeypatch.undo()
+
+    @settings(deadline=None)
+    @given(
+        steps=st.lists(st.tuples(st.lists(finite, min_size=N, max_size=N), st.integers(0, 2)), min_size=1, max_size=4)
+    )
+    def check(steps: list[tuple[list[float], int]]) -> None:
+        m = empty()
+        text.clear()
+        for values, row in steps:
+            z = np.array(values, np.float32)
+            advance(TABLE, m, z, row)
+            text.step(z, row)
+            assert text.shown() == shown(m.numbers)
+            for name, part in (("one", m.one), ("other", m.other)):
+                assert text.shown(name) == shown(part.numbers)
+                assert text.array(f"{name}_z") == part.z.tolist()
+            assert text.array("marks_kind") == m.marks["kind"].tolist()
+            assert text.array("marks_size") == m.marks["size"].tolist()
+
+    check()
 
 
 def test_states_are_written_and_constants_are_not() -> None:

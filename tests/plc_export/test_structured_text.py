@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.plc_export import st_folder
-from rig.plc_export.ode_program import PER_PROBLEM
-from rig.plc_export.recorded_problems import ITERATIONS, GoldenVector, GoldenVectors
-from rig.plc_export.st_folder import StructuredTextExport, sum_of
-from rig.plc_export.st_names import LONGEST, Names, identifier
-from rig.plc_export.structured_text import StructuredTextPrinter
-from rig.plc_export.subset import UnfitKernelError
+from rig.plc_export.kernels.ode_program import PER_PROBLEM
+from rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector, GoldenVectors
+from rig.plc_export.structured_text import constants
+from rig.plc_export.structured_text.names import LONGEST, Names, identifier
+from rig.plc_export.structured_text.printer import StructuredTextPrinter
+from rig.plc_export.structured_text.solver_files import StructuredTextExport, sum_of
+from rig.plc_export.tree.subset import UnfitKernelError
 from tests.plc_export.st_interpreter import Machine
 
 NUMBER = re.compile(r"REAL#-?\d\.\d{9}E[+-]\d\d")
@@ -201,19 +201,18 @@ def test_a_literal_is_read_back_with_its_bits(value: float) -> None:
     assert bits(float(text.removeprefix("REAL#"))) == bits(value)  # by way of double precision, as some compilers do
 
 
-@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
-def test_what_has_no_literal_is_refused(value: float) -> None:
-    with pytest.raises(UnfitKernelError, match="no literal"):
-        StructuredTextPrinter({}).number(value)
+@pytest.mark.parametrize(("value", "largest"), [(np.inf, "3.4"), (-np.inf, "-3.4"), (np.nan, "3.4")])
+def test_what_has_no_literal_is_the_largest_number(value: float, largest: str) -> None:
+    assert StructuredTextPrinter({}).number(value).startswith(f"REAL#{largest}02823466E+38")
 
 
 def test_constants_are_in_lists_that_tools_take(export: StructuredTextExport, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = {"cl_phi": 4 * 49 * 49, "cl_gamma": 4 * 94 * 49}
-    monkeypatch.setattr(st_folder, "LARGEST_LIST", sizes["cl_gamma"])
+    monkeypatch.setattr(constants, "LARGEST_LIST", sizes["cl_gamma"])
     lists = export.files()["configuration.st"].split("VAR_GLOBAL CONSTANT")[1:]
     assert len(lists) > 4
     assert not any("cl_phi :" in each and "cl_gamma :" in each for each in lists)
-    monkeypatch.setattr(st_folder, "LARGEST_LIST", sizes["cl_gamma"] - 1)
+    monkeypatch.setattr(constants, "LARGEST_LIST", sizes["cl_gamma"] - 1)
     with pytest.raises(UnfitKernelError, match="cl_gamma: 18424 bytes, and a list of constants has at most 18423"):
         export.files()
 

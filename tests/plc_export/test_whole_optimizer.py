@@ -1,10 +1,8 @@
 """The whole optimiser in C answers updates by the plans and sequences of the kernels, in every bit."""
 
 import ctypes
-import math
 import re
 import shutil
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,41 +15,24 @@ from coldloop.process.signals import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.registers.codec import as_transmitted
 from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, Update
 from optimizer_plc.program import OptimizerProgram
-from rig.plc_export.optimizer_folder import OptimizerExport
-from rig.plc_export.recorded_problems import SINGLE
-from rig.plc_export.recorded_updates import GoldenUpdate, UpdateRecorder
+from rig.plc_export.c.optimizer_files import OptimizerExport
+from rig.plc_export.kernels.recorded_problems import SINGLE
+from rig.plc_export.kernels.recorded_updates import UpdateRecorder
 from rig.settings import Settings
 from tests.plc_export.c_programs import COMPILERS, NO_COMPILER, SANITIZED, compiled, output, write
+from tests.plc_export.recorded_optimizers import OPTIMISERS, disturbed, recorded_updates, recorder
 
 pytestmark = pytest.mark.skipif(not COMPILERS, reason=NO_COMPILER)
 
-PROGRAM = "optimizer_plc.program."
-OPTIMISERS = {
-    "paper": (),
-    "tuned, own rule, load steps interrupt": (
-        f"{PROGRAM}preset=tuned", f"{PROGRAM}adaptive.rule=contraction", f"{PROGRAM}interrupting_load_step_w=10",
-    ),
-}  # fmt: skip
 SHORT = 480
 NUMBER = re.compile(r"(?<=[ {])-?\d\.\d{9}e[+-]\d\df")
-
-
-@cache
-def recorder(*assignments: str) -> UpdateRecorder:
-    settings = load_configuration(Settings, environment={}, assignments=[*SINGLE, *assignments]).settings
-    return UpdateRecorder(settings)
-
-
-def recorded(ticks: int, load: str, *assignments: str) -> list[GoldenUpdate]:
-    """Return the updates of a session with adaptive periods, and of one with periods of 2.5 s."""
-    return [each for period_s in (0.0, 2.5) for each in recorder(*assignments).record(ticks, load, period_s)]
 
 
 @pytest.fixture(scope="module", params=OPTIMISERS)
 def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("optimizer")
     assignments = OPTIMISERS[request.param]
-    golden = recorded(SHORT, "e", *assignments)
+    golden = recorded_updates(SHORT, "e", *assignments)
     write(made, OptimizerExport(recorder(*assignments).optimizer, golden).files())
     return made
 
@@ -71,7 +52,7 @@ def test_the_self_test_finds_plans_and_sequences_as_the_kernels_have_them(
 def test_two_hours_of_updates_have_the_same_bits_at_every_level_of_optimisation(
     tmp_path: Path, assignments: tuple[str, ...]
 ) -> None:
-    golden = recorded(28800, "2h", *assignments)
+    golden = recorded_updates(28800, "2h", *assignments)
     write(tmp_path, OptimizerExport(recorder(*assignments).optimizer, golden).files())
     for compiler in COMPILERS:
         for options in (("-O0",), ("-O2",), ("-O3",), SANITIZED):
@@ -179,20 +160,12 @@ def sent(optimizer: OptimizerProgram) -> tuple[Any, ...]:
     return (header.number, header.update, header.first_tick, header.length, header.tau_u), [tuple(row) for row in rows]
 
 
-def disturbed(update: Update, tick: int, number: int, playing: int, rng: np.random.Generator) -> Update:
-    """Return an update with what a bad day does to it: gaps, others who drive, bad readings, load steps."""
-    load = update.load + float(rng.choice([0.0, 0.0, 40.0, -60.0]))
-    y = tuple(math.nan if rng.random() < 0.05 else value for value in update.y)
-    playing = playing if rng.random() < 0.85 else int(rng.choice([0, playing + 7]))
-    return as_transmitted(update._replace(update=number, tick=tick, playing=playing, load=load, y=y))
-
-
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("fixed_ticks", [0, 10])
 def test_whatever_arrives_is_answered_as_in_python(folder: Path, library: Path, seed: int, fixed_ticks: int) -> None:
     assignments = next(each for each in OPTIMISERS.values() if ("contraction" in str(each)) == is_tuned(folder))
     optimizer, c, rng = recorder(*assignments).optimizer, Exported(library), np.random.default_rng(seed)
-    source = [each.update for each in recorded(SHORT, "e", *assignments)]
+    source = [each.update for each in recorded_updates(SHORT, "e", *assignments)]
     optimizer.restart(0.25 * fixed_ticks)
     assert c.library.optimizer_restart(fixed_ticks)
     tick = playing = 0
@@ -217,7 +190,7 @@ def is_tuned(folder: Path) -> bool:
 
 def test_numbers_beyond_32_bits_and_periods_that_there_are_not_are_refused(library: Path, tmp_path: Path) -> None:
     c = Exported(Path(shutil.copy(library, tmp_path)))  # one that has not begun
-    update = recorded(SHORT, "e")[0].update
+    update = recorded_updates(SHORT, "e")[0].update
     assert c.plan(update) is None
     assert not any(c.library.optimizer_restart(period) for period in (-1, 1, 21))
     assert c.library.optimizer_restart(20)
@@ -232,7 +205,7 @@ def test_numbers_beyond_32_bits_and_periods_that_there_are_not_are_refused(libra
 
 
 def test_double_precision_is_refused() -> None:
-    double = f"{PROGRAM}arithmetic=float64"
+    double = "optimizer_plc.program.arithmetic=float64"
     settings = load_configuration(Settings, environment={}, assignments=[*SINGLE, double]).settings
     with pytest.raises(UsageError, match="in single precision alone"):
         UpdateRecorder(settings)

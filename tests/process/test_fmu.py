@@ -19,6 +19,7 @@ from plant.own.fmu_file import Fmu
 from rig.process_file.judgement import described
 from rig.process_file.making import Made, made_from
 from tests.harness.processes import PROGRAM_S, Processes
+from tests.process.runs import run
 
 fmpy = pytest.importorskip("fmpy")
 
@@ -259,6 +260,28 @@ def test_an_fmu_is_driven_through_the_rig_over_the_link_as_in_one_process(
         traces.append(next(line for line in text.splitlines() if line.startswith("trace ")))
     assert traces[0] == traces[1]
     assert not left_behind()
+
+
+@pytest.mark.parametrize("disturbance", ["[load]", "[[disturbances]]"])
+def test_what_an_fmu_meets_may_be_forecast(
+    disturbance: str, compiled: Path, tmp_path: Path, processes: Processes
+) -> None:
+    """More flows in from a tick on than the feed, 0.01 m3/s in 5 s, can make up for at once."""
+    tanks(tmp_path, compiled)
+    (tmp_path / "inflow.csv").write_text("time_s,w\n0,0.1\n200,0.3\n", encoding="utf-8")
+    load = tmp_path / "load.csv"
+    load.write_text("time_s,load\n0,0.1\n200,0.3\n", encoding="utf-8")
+    text = TANKS.replace("[5.0, 8.0]", "[1.7, 1.8]").replace("rate = 0.5", "rate = 0.01")
+    if disturbance != "[load]":
+        text = text.replace("[load]", disturbance) + 'course = "inflow.csv"\n'
+    options = ("--duration", "8min", "--set", "limits.rate_reference=elapsed")
+    options += ("--load", str(load)) if disturbance == "[load]" else ()
+    unknown = run(processes, written(tmp_path, text), tmp_path / "unknown", "--in-process", *options)
+    file = written(tmp_path, text + 'forecast = "inflow.csv"\n')
+    here = run(processes, file, tmp_path / "here", "--in-process", *options)
+    there = run(processes, file, tmp_path / "there", *options)
+    assert here["trace_sha256"] == there["trace_sha256"]
+    assert here["J_BF"] < 0.5 * unknown["J_BF"]
 
 
 # -- what is refused --------------------------------------------------------------------------------------------------

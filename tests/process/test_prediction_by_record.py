@@ -90,6 +90,21 @@ def test_a_record_of_another_plant_is_told_by_its_gains(tmp_path: Path) -> None:
         assert "is the record of this plant" in text
 
 
+@pytest.mark.parametrize("seed", [1, 7, 8])
+@pytest.mark.parametrize(("header", "told"), [("v1,v2,leak,h2,h1", True), ("v2,v1,leak,h1,h2", True),
+                                              ("v1,v2,leak,h1,h2", False)])  # fmt: skip
+def test_columns_that_are_exchanged_are_told_by_what_the_plant_explains(
+    header: str, told: bool, seed: int, tmp_path: Path  # noqa: FBT001
+) -> None:  # fmt: skip
+    """Gains of the tanks differ by less than a factor of 2 from one pump to the other."""
+    file = written(tmp_path, seed)
+    record = tmp_path / "record.csv"
+    _, _, lines = record.read_text(encoding="utf-8").partition("\n")
+    record.write_text(f"time_s,{header}\n{lines}", encoding="utf-8")
+    text = described(made_from(file))
+    assert all((f"of {name} the plant itself explains" in text) == told for name in ("h1", "h2"))
+
+
 @pytest.mark.parametrize("load", ["a", "c"])
 def test_a_model_from_a_step_test_costs_hardly_more_than_the_true_one(
     load: str, processes: Processes, tmp_path: Path
@@ -112,6 +127,21 @@ def test_such_a_plant_is_the_same_over_the_link_and_hides_its_states(processes: 
     assert found.plant == "python"
     assert found.plant_parameters["rest"] == pytest.approx([12.263, 12.783, 1.634, 1.409], abs=1e-3)
     assert not found.x0.any()
+
+
+def test_a_forecast_is_worth_what_it_is_with_the_true_model(processes: Processes, tmp_path: Path) -> None:
+    """A leak from one tick on, and pumps that are slow, 0.02 V in 5 s."""
+    (tmp_path / "leak.csv").write_text("time_s,leak,load\n0,0,0\n240,2,2\n", encoding="utf-8")
+    options = ("--load", str(tmp_path / "leak.csv"), "--duration", "15min", "--set", "limits.rate_reference=elapsed")
+    file = written(tmp_path)
+    slow = file.read_text(encoding="utf-8").replace("rate = 0.5", "rate = 0.02")
+    file.write_text(slow, encoding="utf-8")
+    unknown = run(processes, file, tmp_path / "unknown", "--in-process", *options)
+    file.write_text(slow.replace('name = "leak"', 'name = "leak"\nforecast = "leak.csv"'), encoding="utf-8")
+    here = run(processes, file, tmp_path / "here", "--in-process", *options)
+    there = run(processes, file, tmp_path / "there", *options)
+    assert here["trace_sha256"] == there["trace_sha256"]
+    assert here["J_BF"] < 0.7 * unknown["J_BF"]
 
 
 def test_a_load_that_moves_one_output_is_not_taken_for_an_error_of_its_sensor(tmp_path: Path) -> None:

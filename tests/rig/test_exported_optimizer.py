@@ -24,8 +24,8 @@ from rig.cli.plc_folder import export_plc
 from rig.cosim.endpoints import REQUIRED
 from rig.cosim.scenario import Scenario
 from rig.cosim.session_client import SessionClient
-from rig.plc_export import exported_optimizer
-from rig.plc_export.recorded_problems import SINGLE
+from rig.plc_export.c import exported_optimizer
+from rig.plc_export.kernels.recorded_problems import SINGLE
 from rig.settings import Settings
 from tests.conftest import Coldloop, install
 from tests.harness.processes import Processes

@@ -3,6 +3,7 @@
 import argparse
 import math
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import UsageError
@@ -10,6 +11,8 @@ from coldloop.service.command_line import add_configuration_options
 from rig.cli.commands.options import check_load, configuration, fixed_updating_period
 
 if TYPE_CHECKING:
+    from optimizer_plc.qp.problem import PredictiveProblem
+    from optimizer_plc.settings import ProgramSettings
     from rig.settings import Settings
 
 USUAL_SCENARIOS: Final = 100
@@ -25,6 +28,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
     speed.add_argument("--plc", metavar="PLC",
                        help="a PLC instead: a profile (TOML) or one that is shipped, and a sentence that says whether "
                        "the controller runs there; --list names them")  # fmt: skip
+    parser.add_argument("--export", type=Path, metavar="FOLDER",
+                        help="what an export for a PLC costs: operations of its calls and bytes; with --plc also times"
+                        " there, and what does not fit")  # fmt: skip
+    parser.add_argument("--took", type=_power, metavar="US",
+                        help="with --export: a PLC took so many microseconds for the iterations of the solver's"
+                        " self-test; prints its profile")  # fmt: skip
     parser.add_argument("--list", action="store_true", help="list the shipped PLCs")
     parser.add_argument("--load", dest="loads", nargs="+", metavar="LOAD", default=[],
                         help="with --plc: whether an adaptive updating period pays there under these loads, against "
@@ -71,7 +80,11 @@ def execute(options: argparse.Namespace) -> int:
     """Print the tables."""
     if options.loads and options.plc is None:
         raise UsageError("--load: says whether an adaptive period pays on a PLC; name one with --plc")
-    sys.stdout.write(_listing() if options.list else _certified(options) if options.certify else _tables(options))
+    if options.took and not options.export:
+        raise UsageError("--took: is of an export's self-test; name its folder with --export")
+    shown = (_listing() if options.list else _exported(options) if options.export else _certified(options)
+             if options.certify else _tables(options))  # fmt: skip
+    sys.stdout.write(shown)
     return 0
 
 
@@ -80,6 +93,16 @@ def _listing() -> str:
     from rig.text_tables import aligned
 
     return aligned([(name, find_profile(name).name) for name in shipped_profiles()])
+
+
+def _exported(options: argparse.Namespace) -> str:
+    from rig.plc_sizing.exported import cost_text, profile_of, read_cost
+    from rig.plc_sizing.profile import find_profile
+
+    cost = read_cost(options.export)
+    if options.took:
+        return profile_of(cost, options.took)
+    return cost_text(cost, find_profile(options.plc) if options.plc else None)
 
 
 def _certified(options: argparse.Namespace) -> str:
@@ -103,7 +126,20 @@ def _tables(options: argparse.Namespace) -> str:
     settings = configuration(options).settings
     if profile is not None:
         return plc_tables(settings, options.period, profile, lambda there: _costs(there, options))
-    return budget_tables(settings if options.power is None else with_power(settings, options.power), options.period)
+    if options.power is not None:
+        settings = with_power(settings, options.power)
+    program = settings.optimizer_plc.program
+    return budget_tables(settings, options.period, lambda problem: _executed(problem, program))
+
+
+def _executed(problem: "PredictiveProblem", program: "ProgramSettings") -> str:
+    from rig.plc_export.kernels.counted import counter_of
+
+    counter = counter_of(problem, program)
+    return (
+        f"ode as exported, an iteration a call, executed: {counter.unconstrained():,} operations with no row active, "
+        f"{counter.worst():,} in the worst case (every row active, a bound cuts the step)\n"
+    )
 
 
 def _costs(settings: "Settings", options: argparse.Namespace) -> str:

@@ -1,4 +1,4 @@
-"""`coldloop export`: a recorded run as CSV, MATLAB or HDF5 files, with units; or the solver as sources for a PLC."""
+"""`coldloop export`: a recorded run as CSV, MATLAB or HDF5 files, with units; or the optimiser as sources for a PLC."""
 
 import argparse
 import sys
@@ -16,7 +16,7 @@ PLC: Final = Path("plc")
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_configuration_options(parser)
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run; or plc, with --target: the solver")
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run; or plc, with --target: the optimiser")
     kinds = parser.add_mutually_exclusive_group(required=True)
     for kind, text in (
         ("csv", "a CSV file for each of trace, updates, events"),
@@ -25,10 +25,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
     ):
         kinds.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, help=text)
     kinds.add_argument("--target", choices=("c", "st", "plcopen"), help="with plc: as C99 the whole optimiser in single"
-                       " precision and its ODE-based solver, as Structured Text (IEC 61131-3) or PLCopen XML of it the"
-                       " solver; with golden vectors and self-tests")  # fmt: skip
+                       " precision and its ODE-based solver, as Structured Text (IEC 61131-3), or as PLCopen XML of"
+                       " that; with golden vectors and self-tests")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="where to (default: the folder of the run)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
+    parser.add_argument("--plc", metavar="PLC", help="with plc: a profile, as of coldloop budget: the READMEs say what"
+                        " takes how long there, and what does not fit")  # fmt: skip
     parser.add_argument("--ticks", type=_ticks, metavar="N", help="with plc: length of the run whose problems are the"
                         " golden vectors (default: 1440, six minutes)")  # fmt: skip
 
@@ -52,8 +54,8 @@ def _recorded_run(options: argparse.Namespace) -> list[Path]:
 
     if options.ticks is not None:
         raise UsageError("--ticks: is for coldloop export plc --target")
-    if options.config or options.assignments:
-        raise UsageError("--config and --set: are for coldloop export plc --target")
+    if options.config or options.assignments or options.plc:
+        raise UsageError("--config, --set and --plc: are for coldloop export plc --target")
     return export(options.run, options.kind, options.out or options.run, force=options.force)
 
 
@@ -61,20 +63,22 @@ def _solver(options: argparse.Namespace) -> list[Path]:
     from coldloop.errors import UsageError
     from coldloop.process.loaded import PROCESS
     from rig.cli.plc_folder import export_plc
+    from rig.plc_sizing.profile import find_profile
 
     if options.run != PLC:
         raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
     if options.out is None or options.force:
         raise UsageError("export plc: name a new folder with --out; --force does not replace one")
-    if not (options.target == "c" and PROCESS.has_bath) and (options.config or options.assignments):
-        raise UsageError("--config and --set: are of the whole optimiser, which is --target c without --process")
-    return export_plc(options.target, options.ticks, options.out, _settings(options))
+    if not PROCESS.has_bath and (options.config or options.assignments):
+        raise UsageError("--config and --set: are of the whole optimiser, and with --process the solver is exported")
+    profile = find_profile(options.plc) if options.plc else None
+    return export_plc(options.target, options.ticks, options.out, _settings(options), profile)
 
 
 def _settings(options: argparse.Namespace) -> "Settings":
     """Return the settings of the optimiser: those of the paper's PLC, unless the user says otherwise."""
     from coldloop.config import load_configuration
-    from rig.plc_export.recorded_problems import SINGLE
+    from rig.plc_export.kernels.recorded_problems import SINGLE
     from rig.settings import Settings
 
     assignments = [*SINGLE, *options.assignments]

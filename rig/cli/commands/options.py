@@ -137,7 +137,7 @@ def exported(given: str | None, settings: "Settings") -> tuple[str, ...]:
     """
     if given is None:
         return ()
-    from rig.plc_export.exported_optimizer import exported_optimizer
+    from rig.plc_export.c.exported_optimizer import exported_optimizer
 
     return exported_optimizer(given, settings)
 

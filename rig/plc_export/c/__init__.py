@@ -1,0 +1,1 @@
+"""The tree as C99: the solver, the whole optimiser, and its place on the bus."""

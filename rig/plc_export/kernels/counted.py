@@ -1,0 +1,136 @@
+"""Operations of the calls of an export, counted by executing what is printed (`tree/counting.py`)."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from optimizer_plc.computing_settings import Arithmetic
+from optimizer_plc.decisions import Latched
+from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.qp.arithmetic import real_of
+from optimizer_plc.qp.problem import PredictiveProblem, QuadraticProblem
+from optimizer_plc.session_state import empty_state
+from optimizer_plc.settings import ProgramSettings
+from optimizer_plc.solvers.interface import Costs
+from optimizer_plc.solvers.ode import OdeMethod, ode_solver
+from rig.plc_export.kernels.ode_program import Array, OdeProgram
+from rig.plc_export.kernels.optimizer_program import OptimizerKernels
+from rig.plc_export.kernels.recorded_problems import ITERATIONS, GoldenVector
+from rig.plc_export.kernels.recorded_updates import GoldenUpdate
+from rig.plc_export.tree.counting import CountedProgram
+
+REAL: Final = real_of(Arithmetic.FLOAT32)
+NEAR: Final = REAL(0.01)
+"""Of the bounds to the guess, where they are to cut a step."""
+FAR: Final = REAL(1e6)
+"""Of bounds and rows that have no effect."""
+COUNTS: Final = np.arange(1, ITERATIONS + 1)
+ITERATION: Final = "descend"
+"""The kernel that a call does one iteration by."""
+
+
+class CallCounts(NamedTuple):
+    """Operations of a call of one kind."""
+
+    least: int
+    mean: float
+    most: int
+    """Least, mean and most of the recorded calls."""
+
+
+class IterationCounts(NamedTuple):
+    """Operations of a call that does one iteration."""
+
+    unconstrained: int
+    """No row is active, no bound is reached."""
+    recorded: CallCounts
+    worst: int
+    """Every row is active at each point, no variable is held, a bound cuts the step, and the step is taken."""
+    total: int
+    """Of all recorded ones."""
+
+
+class Counter:
+    """Counts iterations of the solver for the matrices of one problem.
+
+    Args:
+        method: Constants of the solver, in single precision.
+        problem: One of the problems.
+    """
+
+    def __init__(self, method: OdeMethod, problem: QuadraticProblem) -> None:
+        self.method, self.problem = method, problem
+        ode = OdeProgram(method, problem, COUNTS)
+        self._entry, self._program = ode.entry.name, CountedProgram(ode.functions)
+        self._noted = self._program.noting(ITERATION)
+
+    def iterations(self, problem: QuadraticProblem, guess: Array) -> list[int]:
+        """Return the operations of `ITERATIONS` iterations, each of which is a call."""
+        self._noted.clear()
+        none = Costs(REAL(np.inf), REAL(np.inf))
+        room = (np.zeros((ITERATIONS, len(guess)), REAL), np.zeros(ITERATIONS, REAL), np.zeros_like(COUNTS))
+        self._program[self._entry](self.method, problem, guess, COUNTS, none, *room)
+        return list(self._noted)
+
+    def unconstrained(self) -> int:
+        """Return the operations of an iteration without active rows and bounds."""
+        return self._constructed(FAR, FAR)
+
+    def worst(self) -> int:
+        """Return the operations of an iteration that does all that an iteration can do."""
+        return self._constructed(-FAR, NEAR)
+
+    def _constructed(self, rows: float, bounds: float) -> int:
+        qp = self.problem
+        n, gamma = len(qp.phi), np.full(len(qp.gamma), rows, REAL)
+        guess, high = np.zeros(n, REAL), np.full(n, bounds, REAL)
+        return max(self.iterations(qp._replace(gamma=gamma, low=-high, high=high), guess))
+
+
+def counted_iterations(method: OdeMethod, vectors: Sequence[GoldenVector]) -> IterationCounts:
+    """Return the operations of an iteration; the recorded ones are those of golden vectors."""
+    counter = Counter(method, vectors[0].problem)
+    found = [one for each in vectors for one in counter.iterations(each.problem, each.guess)]
+    return IterationCounts(counter.unconstrained(), counts_of(found), counter.worst(), sum(found))
+
+
+def counter_of(problem: PredictiveProblem, program: ProgramSettings) -> Counter:
+    """Return what counts the iterations of the ODE-based solver for a problem in single precision."""
+    method = ode_solver(program.ode, program.penalties).method
+    m, zero = len(problem.Gamma), np.zeros(problem.size, REAL)
+    qp = QuadraticProblem(problem.Phi, zero, problem.Gamma, np.zeros(m, REAL), zero, zero, REAL(0.0))
+    return Counter(method(qp), qp)
+
+
+def counts_of(found: Sequence[int]) -> CallCounts:
+    """Return least, mean and most."""
+    return CallCounts(min(found), sum(found) / len(found), max(found))
+
+
+def counted_updates(optimizer: OptimizerProgram, golden: Iterable[GoldenUpdate]) -> Mapping[str, CallCounts]:
+    """Return the operations of the calls that golden updates take beside the iterations: plan, start, finish."""
+    kernels = OptimizerKernels(optimizer)
+    begin, take, solve, _ = (each.name for each in kernels.entries)
+    program = CountedProgram(kernels.functions)
+    c, method = kernels.constants["constants"], kernels.constants["method"]
+    state = empty_state(len(optimizer.state.belief.x), len(optimizer.state.sent.z), REAL)
+    noted = {name: program.noting(name) for name in (take, "pose", "warm_start", "deliver")}
+    for each in golden:
+        if each.fixed_ticks >= 0:
+            c = c._replace(fixed_ticks=each.fixed_ticks)
+            state = empty_state(len(state.belief.x), len(state.sent.z), REAL)
+            program[begin](c, state)
+        program[take](c, kernels.rules[c.fixed_ticks], kernels.starts[c.fixed_ticks], state, latched(each))
+        if each.sequence:
+            program[solve](c, method, state)
+    starts = [sum(both) for both in zip(noted["pose"], noted["warm_start"], strict=True)]
+    calls = {"plan": noted[take], "start": starts, "finish": noted["deliver"]}
+    return {name: counts_of(found) for name, found in calls.items()}
+
+
+def latched(golden: GoldenUpdate) -> Latched:
+    """Return an update as the kernels take it."""
+    update = golden.update
+    u_before, u, y, x, ahead = (np.array(each, REAL) for each in (update.u_before, update.u, update.y, update.x, ()))
+    return Latched(update.update, update.tick, update.playing, REAL(update.load), u_before, u, y, x, ahead)

@@ -1,0 +1,104 @@
+"""Problems of a run in single precision, and what the ODE-based solver's kernels make of each: golden vectors."""
+
+from typing import Final, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coldloop.config import load_configuration
+from coldloop.process.lti_model import load as load_model
+from coldloop.safety.sequence import InputSequence
+from optimizer_plc import scheme
+from optimizer_plc.computing_settings import Arithmetic
+from optimizer_plc.program import OptimizerProgram
+from optimizer_plc.qp.arithmetic import real_of
+from optimizer_plc.qp.problem import QuadraticProblem
+from optimizer_plc.rules import UpdatingRule
+from optimizer_plc.solvers.interface import Answer, Costs
+from optimizer_plc.solvers.ode import OdeMethod, solve
+from plant.load import find_load
+from rig.cosim.one_process import OneProcessRig
+from rig.cosim.scenario import Scenario
+from rig.plc_export.kernels.ode_program import PER_PROBLEM
+from rig.results.recording import Recorder
+from rig.settings import Settings
+
+Array = NDArray[np.float64]
+
+SINGLE: Final = (
+    "optimizer_plc.program.preset=paper",
+    "optimizer_plc.program.arithmetic=float32",
+    "optimizer_plc.program.solver=ode",
+)
+"""What the run is made with: the paper's configuration in the arithmetic of its PLC."""
+ITERATIONS: Final = 20
+"""Of the solver for each recorded problem; each one is compared."""
+
+TELLING: Final = 8
+"""Golden vectors of an export; each takes 5 kB."""
+LEAST_GAIN: Final = 1e-6
+"""Of the cost: a problem at rest gains less, by rounding alone."""
+TICKS, LOAD = 1440, "e"
+"""Of the run that is recorded: six minutes, in which this load has a large step."""
+
+
+class GoldenVector(NamedTuple):
+    """A problem, the guess it is begun from, and the kernels' answer after 1, 2, ... `ITERATIONS` iterations."""
+
+    problem: QuadraticProblem
+    guess: Array
+    answer: Answer
+
+
+class GoldenVectors(NamedTuple):
+    """Problems of one run, which have the same matrices, and the solver's constants."""
+
+    method: OdeMethod
+    vectors: list[GoldenVector]
+
+    def telling(self, most: int = TELLING) -> list[GoldenVector]:
+        """Return the problems that the solver lowers most, in their order; none that leave the inputs at rest."""
+        gains = [float(each.answer.guessed) - float(each.answer.costs[-1]) for each in self.vectors]
+        by_gain = sorted(range(len(gains)), key=lambda place: -gains[place])
+        return [self.vectors[place] for place in sorted(by_gain[:most]) if gains[place] > LEAST_GAIN]
+
+
+class _ListeningOptimizer(OptimizerProgram):
+    """Keeps every problem with its guess."""
+
+    def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
+        """Reset."""
+        self.heard: list[tuple[QuadraticProblem, Array]] = []
+        super().restart(updating_period_s, rule)
+
+    def solve(self) -> InputSequence:
+        """Keep what is solved, and solve it: posing a problem twice gives the same bits."""
+        qp, guess = scheme.pose(self.constants, self.state)
+        self.heard.append((qp, guess))
+        return super().solve()
+
+
+def record(ticks: int = TICKS, load: str = LOAD, settings: Settings | None = None) -> GoldenVectors:
+    """Return the problems of a run of so many ticks under a named load, adaptive updating period, with the answers.
+
+    Settings are by default those of the paper's PLC.
+    """
+    settings = settings or load_configuration(Settings, environment={}, assignments=SINGLE).settings
+    model, rig = load_model(settings.model.file), OneProcessRig(settings, compiled=False)
+    optimizer = rig.optimizer = _ListeningOptimizer(model, settings.optimizer_plc.program, settings.limits)
+    rig.run(Scenario(ticks, find_load(load, model.w0), 0.0, seed=1), Recorder(ticks, []))
+    method = cast("OdeMethod", optimizer.method)
+    return GoldenVectors(method, [answered(method, qp, guess) for qp, guess in optimizer.heard])
+
+
+def answered(method: OdeMethod, problem: QuadraticProblem, guess: Array) -> GoldenVector:
+    """Return a problem with what the kernels answer, in single precision."""
+    real = real_of(Arithmetic.FLOAT32)
+    none, counts = Costs(real(np.inf), real(np.inf)), np.arange(1, ITERATIONS + 1)
+    return GoldenVector(problem, guess, solve(method, problem, guess, counts, none))
+
+
+def arrays_in(vector: GoldenVector) -> dict[str, Array]:
+    """Return the arrays of a golden vector by their names."""
+    return {**{name: getattr(vector.problem, name) for name in PER_PROBLEM}, "guess": vector.guess,
+            **{name: getattr(vector.answer, name).ravel() for name in ("points", "costs", "iterations")}}  # fmt: skip

@@ -1,0 +1,1 @@
+"""The tree as Structured Text and PLCopen XML."""

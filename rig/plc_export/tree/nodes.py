@@ -1,0 +1,353 @@
+"""The typed tree between the kernels' Python and what is printed from it: functions of fixed shapes, no Python left."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass
+from enum import Enum
+from typing import TypeAlias
+
+
+class Kind(Enum):
+    """Types of scalars."""
+
+    REAL = "real"
+    """The on-line type, single or double precision."""
+    INT = "int"
+    UNSIGNED = "unsigned"
+    """An index that does not count from the end."""
+    BOOL = "bool"
+
+
+@dataclass(frozen=True)
+class ArrayType:
+    """An array whose shape is known when it is printed."""
+
+    kind: Kind
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        size = 1
+        for length in self.shape:
+            size *= length
+        return size
+
+
+@dataclass(frozen=True)
+class StructType:
+    """A record of numbers, all of which may be written to: an element of a structured array."""
+
+    name: str
+    fields: tuple[tuple[str, Kind], ...]
+
+
+@dataclass(frozen=True)
+class RowsType:
+    """An array of such records."""
+
+    struct: StructType
+    length: int
+
+
+@dataclass(frozen=True)
+class RecordType:
+    """A NamedTuple: constant, and so are its arrays, unless it is a state."""
+
+    name: str
+    fields: tuple[tuple[str, "Type"], ...]
+    state: bool = False
+    """It has arrays of records of numbers: all of its arrays are its own, and may be written to."""
+
+
+Type: TypeAlias = Kind | ArrayType | StructType | RowsType | RecordType
+
+# -- expressions -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Literal:
+    """A number of a stated type."""
+
+    type: Kind
+    value: float
+
+
+@dataclass(frozen=True)
+class Name:
+    """A parameter or a variable."""
+
+    type: Type
+    name: str
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of a record."""
+
+    type: Type
+    record: "Name | Field"
+    name: str
+
+
+@dataclass(frozen=True)
+class View:
+    """A part of an array in a row, from the element `offset` on; all dimensions counted."""
+
+    type: ArrayType
+    array: "Name | Field"
+    offset: "Expression"
+
+
+@dataclass(frozen=True)
+class Item:
+    """A record of numbers in an array of them."""
+
+    type: StructType
+    rows: "Name | Field"
+    index: "Expression"
+
+
+@dataclass(frozen=True)
+class Member:
+    """A number of a record of numbers."""
+
+    type: Kind
+    struct: "Item | Name"
+    name: str
+
+
+@dataclass(frozen=True)
+class Element:
+    """An element of an array."""
+
+    type: Kind
+    array: "Name | Field | View"
+    indices: tuple["Expression", ...]
+
+
+@dataclass(frozen=True)
+class Operation:
+    """An operator with one or two operands, in Python's spelling; or the name of a function, such as sqrt."""
+
+    type: Kind
+    operator: str
+    operands: tuple["Expression", ...]
+
+
+@dataclass(frozen=True)
+class Select:
+    """The one or the other; only that one is computed."""
+
+    type: Kind
+    condition: "Expression"
+    one: "Expression"
+    other: "Expression"
+
+
+@dataclass(frozen=True)
+class Convert:
+    """A number or a truth value as another type."""
+
+    type: Kind
+    operand: "Expression"
+
+
+@dataclass(frozen=True)
+class Invocation:
+    """The result of a function with one scalar result that writes to no argument."""
+
+    type: Kind
+    function: "Function"
+    arguments: tuple["Expression", ...]
+
+
+Place: TypeAlias = Name | Field | View | Item | Member | Element
+Expression: TypeAlias = Literal | Place | Operation | Select | Convert | Invocation
+Storage: TypeAlias = Name | Field | View | Item
+Target: TypeAlias = Name | Element | Member
+
+# -- statements --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Declare:
+    """A new variable; without a value it is zero everywhere."""
+
+    variable: Name
+    value: Expression | None = None
+
+
+@dataclass(frozen=True)
+class Assign:
+    """A new value of a variable, of an element or of a number in a record."""
+
+    target: Target
+    value: Expression
+
+
+@dataclass(frozen=True)
+class Point:
+    """A name for a part of an array, or for a record in one."""
+
+    variable: Name
+    part: View | Item
+    constant: bool
+
+
+@dataclass(frozen=True)
+class Make:
+    """A new constant record, of numbers and of arrays that have names."""
+
+    variable: Name
+    parts: tuple[tuple[str, Expression], ...]
+
+
+@dataclass(frozen=True)
+class Copy:
+    """All numbers of a record become those of another."""
+
+    target: Item | Name
+    source: Item | Name
+
+
+@dataclass(frozen=True)
+class Invoke:
+    """A call for what it writes; results go to variables."""
+
+    function: "Function"
+    arguments: tuple[Expression, ...]
+    results: tuple[Name, ...]
+
+
+@dataclass(frozen=True)
+class For:
+    """A counted loop; bounds are computed once."""
+
+    variable: Name
+    start: Expression
+    stop: Expression
+    step: int
+    body: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class While:
+    """A loop."""
+
+    condition: Expression
+    body: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class If:
+    """A decision."""
+
+    condition: Expression
+    body: tuple["Statement", ...]
+    other: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class Return:
+    """The end of a function, with its value where it has one that is not a result parameter."""
+
+    value: Expression | None = None
+
+
+@dataclass(frozen=True)
+class Count:
+    """A counted loop that includes its last value; only in blocks (`lowering.py`)."""
+
+    variable: Name
+    first: Expression
+    last: Expression
+    step: int
+    body: tuple["Statement", ...]
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call of a block, with its arguments by name and the variables that get its outputs; only in blocks."""
+
+    block: "Block"
+    arguments: tuple[tuple[Name, Expression], ...]
+    results: tuple[tuple[Name, Name], ...]
+    """Variable, output."""
+
+
+Statement: TypeAlias = Declare | Assign | Point | Make | Copy | Invoke | For | While | If | Return | Count | Call
+
+# -- results -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Group:
+    """Results that belong together: a tuple, or a NamedTuple of this name with its fields."""
+
+    name: str
+    parts: tuple[tuple[str, "Name | Field | Group"], ...]
+    """Results of the function, or fields of its parameters."""
+
+
+@dataclass
+class Function:
+    """A kernel for arguments of certain types.
+
+    One scalar result is returned by value; arrays, and results that are several, are parameters behind the others.
+    """
+
+    name: str
+    source: str
+    """File and line of the kernel."""
+    summary: str
+    """What it does, in a sentence."""
+    parameters: tuple[Name, ...]
+    written: set[str] = field(default_factory=set)
+    """Parameters that it writes to: arrays and states."""
+    used: set[str] = field(default_factory=set)
+    results: tuple[Name, ...] = ()
+    returned: Name | Field | Group | None = None
+    """How they belong together."""
+    value: Kind | None = None
+    body: tuple[Statement, ...] = ()
+
+
+Path: TypeAlias = tuple[str, ...]
+"""A record's field: the names from the first record to it."""
+
+
+@dataclass(eq=False)
+class Block:
+    """A function without records, whose every call is a statement: what a function block is printed from."""
+
+    name: str
+    source: str
+    summary: str
+    inputs: tuple[Name, ...]
+    """Numbers."""
+    shared: tuple[Name, ...]
+    """Arrays of the caller, read or written."""
+    outputs: tuple[Name, ...]
+    variables: tuple[Name, ...]
+    constants: tuple[Path, ...]
+    """What it has of constants and of the state."""
+    body: tuple[Statement, ...]
+
+    @property
+    def called(self) -> list["Block"]:
+        """Blocks that it calls, each once."""
+        return list(dict.fromkeys(node.block for node in walk(self.body) if isinstance(node, Call)))
+
+
+def walk(node: object) -> Iterator[object]:
+    """Yield a node and those below it; not what is called."""
+    yield node
+    if isinstance(node, tuple):
+        parts: Iterator[object] = iter(node)
+    elif is_dataclass(node):
+        parts = (getattr(node, each.name) for each in fields(node))
+    else:
+        return
+    for part in parts:
+        if not isinstance(part, Function | Block):
+            yield from walk(part)

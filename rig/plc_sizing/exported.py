@@ -1,0 +1,129 @@
+"""What an export for a PLC costs there, from its manifest: operations of its calls, bytes, times."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Final
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from coldloop.errors import UsageError
+from coldloop.process.signals import TICK_S
+from optimizer_plc.budget import MAX_PERIOD_TICKS
+from rig.plc_sizing.profile import PlcProfile
+from rig.text_tables import markdown_table
+
+MANIFEST: Final = "manifest.json"
+ITERATION: Final = "iteration"
+COLUMNS: Final = ("call", "least", "mean", "most recorded", "worst case")
+
+Count = Annotated[float, Field(ge=0)]
+
+
+class CallCost(BaseModel):
+    """Operations of a call of one kind."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    least: Count
+    mean: Count
+    most: Count
+    """Of recorded calls."""
+    worst: Count | None = None
+    """That there can be, where that is known."""
+
+    @property
+    def bound(self) -> float:
+        """The most that is known of."""
+        return self.worst or self.most
+
+
+class ExportCost(BaseModel):
+    """What an export needs."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    variables: Annotated[int, Field(ge=1)]
+    operations: dict[str, CallCost]
+    """By the kind of the call."""
+    bytes: dict[str, int]
+    """By what takes them."""
+    self_test: dict[str, int] = {}
+    """Iterations and operations of the solver in the self-test."""
+
+    @property
+    def memory(self) -> int:
+        """Bytes without the self-test."""
+        return sum(size for what, size in self.bytes.items() if not what.startswith("self-test"))
+
+    def seconds(self, operations: float, profile: PlcProfile) -> float:
+        """Return the time of so many operations on a PLC."""
+        return operations / profile.flops_per_s(self.variables)
+
+
+def read_cost(folder: Path) -> ExportCost:
+    """Return what an export needs, from its folder.
+
+    Raises:
+        UsageError: It is no export.
+    """
+    try:
+        return ExportCost.model_validate(json.loads((folder / MANIFEST).read_text(encoding="ascii")))
+    except (OSError, ValueError, ValidationError):
+        raise UsageError(f"{folder}: has no manifest of an export (coldloop export plc --out FOLDER)") from None
+
+
+def cost_text(cost: ExportCost, profile: PlcProfile | None = None) -> str:
+    """Return tables of operations and bytes, with the times on a PLC and a line for each thing that does not fit."""
+    header = (*COLUMNS, *(("worst case, s",) if profile else ()))
+    rows = [(name, *_numbers(each), *((f"{cost.seconds(each.bound, profile):.3f}",) if profile else ()))
+            for name, each in cost.operations.items()]  # fmt: skip
+    memory = [(what, f"{size:,}") for what, size in cost.bytes.items()]
+    tables = [markdown_table(header, rows, "Operations of a call:"), markdown_table(("bytes", ""), memory)]
+    if profile:
+        found = misfits(cost, profile)
+        tables += ["\n".join(found) if found else f"{profile.name}: it fits, in memory and time."]
+    return "\n\n".join(tables) + "\n"
+
+
+def _numbers(call: CallCost) -> tuple[str, ...]:
+    return tuple("" if each is None else f"{each:,.0f}" for each in (call.least, call.mean, call.most, call.worst))
+
+
+def misfits(cost: ExportCost, profile: PlcProfile) -> list[str]:
+    """Return a line for each thing that does not fit into a PLC."""
+    found = []
+    if cost.memory > profile.memory_bytes:
+        found.append(f"{profile.name}: memory: it takes {cost.memory:,} of {profile.memory_bytes:,} bytes")
+    for name, call in cost.operations.items():
+        longest_s = cost.seconds(call.bound, profile)
+        if profile.cycle_s is not None and longest_s > profile.cycle_s:
+            found.append(f"{profile.name}: a call ({name}) takes up to {longest_s:.3g} s, and its cycle monitoring"
+                         f" stops a program after {profile.cycle_s:g} s: set that higher")  # fmt: skip
+    once_s, longest_s = cost.seconds(sum(call.bound for call in cost.operations.values()), profile), _longest_s()
+    if once_s > longest_s:
+        found.append(f"{profile.name}: time: with one iteration it takes up to {once_s:.3g} s, and the longest updating"
+                     f" period is {longest_s:g} s")  # fmt: skip
+    return found
+
+
+def _longest_s() -> float:
+    return MAX_PERIOD_TICKS * TICK_S
+
+
+def profile_of(cost: ExportCost, total_us: float) -> str:
+    """Return the profile of a PLC that took so long for the iterations of the self-test, as TOML.
+
+    Its name and memory are for the user to fill in.
+
+    Raises:
+        UsageError: The export has no self-test of the solver.
+    """
+    if not cost.self_test:
+        raise UsageError("--took: this export has no self-test of the solver alone; name the folder above it")
+    nanoseconds = 1e3 * total_us / cost.self_test["operations"]
+    return (
+        'name = "our PLC"\n'
+        f'source = "self-test of the export: {cost.self_test["iterations"]} iterations in {total_us:g} us"\n'
+        f"memory_bytes = {cost.memory}  # what the export takes: put the PLC's here\n"
+        f"operation_ns = {nanoseconds:.4e}\n"
+    )
