@@ -80,6 +80,6 @@ COLD_BOX: Final = Process(
     },
     plants=("cold-box", "refrigerator"),
     shipped_mimic="static/mimic.svg",
-    decimals={"%": 2, "K": 3, "bar": 3, "W": 1, "Hz": 1, "Pa": 0, "m3": 5},
+    decimals={"%": 2, "K": 3, "bar": 3, "W": 1, "Hz": 1},
     notable={"W": 2.0, "%": 0.2, "Hz": 5.0, "K": 0.05, "bar": 0.005},
 )
