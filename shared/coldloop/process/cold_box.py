@@ -31,8 +31,8 @@ _HEATER: Final = Input(
 
 
 _HEAT_LOAD: Final = Load(
-    name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load", bar=(200.0, 600.0), has_named_loads=True,
-    too_much="the bath will run dry", too_little="the turbine gets too cold and the bath floods",
+    name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load", word="heat load", bar=(200.0, 600.0),
+    has_named_loads=True, too_much="the bath will run dry", too_little="the turbine gets too cold and the bath floods",
 )  # fmt: skip
 _BANDED: Final = {
     "L1": (
