@@ -96,7 +96,7 @@ class Machine:
         return {place: self.value(kind, each) for place, each in enumerate(values)}
 
     @staticmethod
-    def value(kind: str, written: object) -> object:
+    def value(kind: str, written: object) -> object:  # noqa: PLR0911 one case a kind
         match kind, written:
             case "REAL", None:
                 return np.float32(0)
