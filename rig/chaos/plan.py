@@ -11,7 +11,7 @@ from coldloop.config import Configuration, parsed_toml
 from coldloop.errors import LoadFileError, UsageError
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.loaded import PROCESS
-from coldloop.process.signals import TICK_S
+from coldloop.process.signals import SAMPLING_PERIOD_S, TICK_S
 from coldloop.session.settings import TimeMode
 from plant.load import concatenated, find_load, named_families, telegraph
 from plant.settings import PlantKind
@@ -50,7 +50,7 @@ class ChaosPlan(BaseModel):
     """Of all that is drawn: instants, the fate of frames, the sensors' noise."""
     mode: TimeMode = TimeMode.LOCKSTEP
     factor: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
-    updating_period_s: Annotated[float, Field(ge=0, le=5)] = 0.0
+    updating_period_s: Annotated[float, Field(ge=0, le=SAMPLING_PERIOD_S)] = 0.0
     """0 is adaptive."""
     standstill_s: Annotated[float, Field(gt=0, le=600)] = 8.0
     """In lock-step a fault that stops plant time ends after this real time. The control PLC drops an

@@ -56,7 +56,7 @@ class SensorCheckSettings(BaseModel):
     """How long the classical loops work with the last good value of a controlled output; then that loop is left."""
     estimated_s: Annotated[float, Field(ge=0)] = 1800.0 * STRETCH
     """How long MPC works without one, by its estimate from the others."""
-    estimated_most: Annotated[int, Field(ge=0, le=22)] = 5
+    estimated_most: Annotated[int, Field(ge=0, le=len(OUTPUT_NAMES))] = min(5, len(OUTPUT_NAMES))
     """Bad sensors at most for that; with more, MPC is left after `bridged_s`, too."""
 
     @property

@@ -14,9 +14,9 @@ from coldloop.registers.text import from_words
 from hmi.process_view import decimals_by_unit
 
 DECIMALS: Final = {
-    "%": 2, "K": 3, "bar": 3, "W": 1, "s": 3, "ms": 2, "ppm": 1, "g/s": 2, "kg": 2, "kW": 1,
+    "%": 2, "K": 3, "bar": 3, "W": 1, "s": 3, "ms": 2, "ppm": 1, "Pa": 0, "m3": 5, "g/s": 2, "kg": 2, "kW": 1,
 } | decimals_by_unit()  # fmt: skip
-"""Digits after the point: of PLCs, links and a refrigerator's station, and of the process, which comes first."""
+"""Digits after the point: of PLCs, links, states and a refrigerator's station, and of the process, which come first."""
 _WORD: Final = re.compile(r"(\d+) ([^,;:()]+?)(?: \([^)]*\))?(?=[,;:]|$)")
 
 

@@ -25,6 +25,12 @@ int main(void) {
     printf("%d %d %d\\n", TEST(DONE), TEST(PASSED), TEST(WHAT));
 }
 """
+SINGLE: Final = """
+#include <math.h>
+#define pow(base, exponent) powf(base, exponent)
+#define log(value) logf(value)
+"""
+"""MATIEC computes EXPT and LN of REAL in double precision, the kernels in single."""
 NEEDS_MATIEC: Final = pytest.mark.skipif(
     not (COMPILER and shutil.which("gcc")), reason="no iec2c (MATIEC) on PATH, with its lib beside it"
 )
@@ -36,8 +42,9 @@ def self_test(folder: Path, texts: Mapping[str, str], level: str) -> str:
     library = Path(COMPILER).resolve().parent / "lib"
     (folder / "all.st").write_text("\n".join(texts.values()))
     (folder / "main.c").write_text(MAIN)
+    (folder / "single.h").write_text(SINGLE)
     subprocess.run([COMPILER, "-I", library, "-T", folder, "all.st"], cwd=folder, check=True, capture_output=True)
     sources = ("main.c", "cl_configuration.c", "cl_resource.c")
-    flags = ("-w", level, "-ffp-contract=off", f"-I{library / 'C'}", "-I.", "-lm")
+    flags = ("-w", level, "-ffp-contract=off", "-include", "single.h", f"-I{library / 'C'}", "-I.", "-lm")
     subprocess.run(["gcc", *sources, *flags, "-o", "self_test"], cwd=folder, check=True)
     return subprocess.run(["./self_test"], cwd=folder, capture_output=True, text=True, check=True).stdout.strip()

@@ -224,6 +224,11 @@ def test_what_is_no_export_or_of_the_solver_alone_is_refused(copy: Path, tmp_pat
         exported_optimizer.exported_optimizer(str(copy), settings())
 
 
+def test_structured_text_is_refused(copy: Path) -> None:
+    changed_manifest(copy, files={"kernels.st": "ab" * 32})
+    assert "it is not in C: export it with --target c" in refusal(copy)
+
+
 def test_a_source_that_was_changed_is_refused(copy: Path) -> None:
     with (copy / "optimizer" / "kernels.c").open("a") as file:
         file.write("\n")

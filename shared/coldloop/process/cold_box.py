@@ -31,8 +31,8 @@ _HEATER: Final = Input(
 
 
 _HEAT_LOAD: Final = Load(
-    name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load", bar=(200.0, 600.0), has_named_loads=True,
-    too_much="the bath will run dry", too_little="the turbine gets too cold and the bath floods",
+    name="NCR22_HL", unit="W", span=(0, 10_000.0), walk=3.0, noun="Heat load", word="heat load", bar=(200.0, 600.0),
+    has_named_loads=True, too_much="the bath will run dry", too_little="the turbine gets too cold and the bath floods",
 )  # fmt: skip
 _BANDED: Final = {
     "L1": (
@@ -80,6 +80,6 @@ COLD_BOX: Final = Process(
     },
     plants=("cold-box", "refrigerator"),
     shipped_mimic="static/mimic.svg",
-    decimals={"%": 2, "K": 3, "bar": 3, "W": 1, "Hz": 1, "Pa": 0, "m3": 5},
+    decimals={"%": 2, "K": 3, "bar": 3, "W": 1, "Hz": 1},
     notable={"W": 2.0, "%": 0.2, "Hz": 5.0, "K": 0.05, "bar": 0.005},
 )

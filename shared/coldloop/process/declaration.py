@@ -116,8 +116,10 @@ class Load:
     """Random walk of what of it is not measured, per square root of a sampling period."""
     has_named_loads: bool = False
     """Whether the loads that have a name are its own; elsewhere they are stretched to its span."""
-    noun: str = ""
-    """What operators and descriptions call it; where it is empty operators do by its name, descriptions `Load`."""
+    noun: str = "Load"
+    """What descriptions call it."""
+    word: str = ""
+    """What operators call it; its name where this is empty."""
     bar: Range | None = None
     """Ends of its bar on the operator's page; its span where they are not given."""
     too_much: str = ""

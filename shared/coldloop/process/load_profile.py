@@ -15,7 +15,7 @@ from coldloop.process.signals import LAST_TICK, TICK_S
 LOAD_SPAN: Final[tuple[float, float]] = struct.unpack("2f", struct.pack("2f", *PROCESS.load.span))
 """Lowest and highest load, as registers have them."""
 LOAD_UNIT: Final = PROCESS.load.unit
-LOAD_WORD: Final = PROCESS.load.noun.lower() or PROCESS.load.name
+LOAD_WORD: Final = PROCESS.load.word or PROCESS.load.name
 """What operators call the load."""
 IN_WATTS: Final = "load_w"
 LOAD_COLUMN: Final = IN_WATTS if LOAD_UNIT == "W" else "load"

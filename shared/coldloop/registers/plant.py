@@ -40,7 +40,7 @@ from coldloop.registers.safety import LeaseStatus, WatchdogStatus, WatchdogTime
 HISTORY_ROWS: Final = 256
 STATION_ROWS: Final = 128
 LOAD_ROWS: Final = 2048
-NOUN: Final = PROCESS.load.noun or "Load"
+NOUN: Final = PROCESS.load.noun
 SPAN_OF_INPUTS: Final = (min(one.span[0] for one in PROCESS.inputs), float(max(one.span[1] for one in PROCESS.inputs)))
 """No input is outside."""
 MAX_STATE: Final = 1e9
