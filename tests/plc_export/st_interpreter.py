@@ -96,19 +96,17 @@ class Machine:
         return {place: self.value(kind, each) for place, each in enumerate(values)}
 
     @staticmethod
-    def value(kind: str, written: object) -> object:  # noqa: PLR0911 one case a kind
+    def value(kind: str, written: object) -> object:
+        if written is None:
+            return {"REAL": np.float32(0), "DINT": 0, "BOOL": False}[kind]
         match kind, written:
-            case "REAL", None:
-                return np.float32(0)
             case "REAL", ("real", str(text)):
                 return np.float32(text.removeprefix("REAL#"))
-            case "DINT", None:
-                return 0
             case "DINT", ("int", str(text)):
                 return int(text)
             case "DINT", ("operation", "-", ("int", str(text))):
                 return -int(text)
-            case "BOOL", None | ("bool", "FALSE"):
+            case "BOOL", ("bool", "FALSE"):
                 return False
             case "BOOL", ("bool", "TRUE"):
                 return True
