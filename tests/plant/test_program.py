@@ -117,7 +117,6 @@ def test_a_load_profile_holds_its_steps(data: st.DataObject) -> None:
         ((1,), (5.0,)),
         ((0, 4), (1.0,)),
         ((0, 4, 4), (1.0, 2.0, 3.0)),
-        ((0,), (-1.0,)),
         ((0,), (float("nan"),)),
     ],
 )
