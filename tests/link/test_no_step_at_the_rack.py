@@ -127,8 +127,13 @@ async def test_a_control_plc_that_was_killed_in_a_cool_down_goes_on_with_it(fiel
         kept.save(state | {"cool_down": CoolDownStep.FILLING})  # as of a plant that was warm some hours ago
         again = site.control(settings, port=control.service.port)
         await site.follows(again)
-        ladder = await again.client.read(LadderStatus)
-        assert (ladder.mode, ladder.cause) == (Mode.CLASSICAL, Cause.COOL_DOWN)
+
+        async def cools_down() -> bool:
+            ladder = await again.client.read(LadderStatus)  # the first tick holds what the rack applies
+            return (ladder.mode, ladder.cause) == (Mode.CLASSICAL, Cause.COOL_DOWN)
+
+        await rack.until(cools_down)
+        await rack.passes(1)
         steps = [event.subject for event in await again.events(EventKind.COOL_DOWN)]
         assert steps == [CoolDownStep.SETTLING], "the bath of this rack is full"
         assert rack.violations() == []
